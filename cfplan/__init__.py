@@ -1,0 +1,3 @@
+"""cfplan: plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,72 @@
+"""Errors that a user can cause, and the exit codes that they end in."""
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """How a command ends."""
+
+    OK = 0
+    USAGE = 2
+    INFEASIBLE = 3
+    NOT_CERTIFIED = 4  # certificate or dry run failed
+    PREFLIGHT = 5
+    ENDED_BY_PILOT = 6
+    ENDED_BY_SAFETY = 7
+    LINK_LOST = 8
+
+
+class CfplanError(Exception):
+    """What went wrong, where, and what to do about it.
+
+    `where` is a place that the user can go to: `file:line:column`, a waypoint, a key, a URI.
+    The text is one line, so that it can stand alone in a terminal or a log.
+    """
+
+    exit_code = ExitCode.USAGE
+
+    def __init__(self, what: str, *, where: str = "", hint: str = ""):
+        self.what, self.where, self.hint = what, where, hint
+        super().__init__(what)
+
+    def __str__(self) -> str:
+        place = f"{self.where}: " if self.where else ""
+        remedy = f" (hint: {self.hint})" if self.hint else ""
+        return f"{place}{self.what}{remedy}"
+
+    def __reduce__(self):  # keyword-only arguments must survive the way between processes
+        return _rebuild, (type(self), self.what, self.where, self.hint)
+
+
+def _rebuild(kind: type[CfplanError], what: str, where: str, hint: str) -> CfplanError:
+    return kind(what, where=where, hint=hint)
+
+
+class InputError(CfplanError):
+    """A file or an argument is wrong."""
+
+    exit_code = ExitCode.USAGE
+
+
+class InfeasibleError(CfplanError):
+    """No flight can meet the limits."""
+
+    exit_code = ExitCode.INFEASIBLE
+
+
+class NotCertifiedError(CfplanError):
+    """The certificate or the dry run failed."""
+
+    exit_code = ExitCode.NOT_CERTIFIED
+
+
+class PreflightError(CfplanError):
+    """A preflight check failed; nothing was armed."""
+
+    exit_code = ExitCode.PREFLIGHT
+
+
+class LinkError(CfplanError):
+    """The vehicle cannot be reached, or was lost."""
+
+    exit_code = ExitCode.LINK_LOST

@@ -1,0 +1,33 @@
+"""One face for every source of poses."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where the vehicle was."""
+
+    time: float
+    # s on the clock of time.monotonic(), when it was there (already less the source's latency)
+    received: float
+    # s, when it reached this process
+    position: tuple[float, float, float]
+    # m
+    quaternion: tuple[float, float, float, float]
+    # body→world, x y z w
+
+
+class PoseSource(Protocol):
+    """Gives poses as they come; never the same one twice. Opened in the process that uses it."""
+
+    def open(self) -> None:
+        """Begin. Raises a CfplanError within 5 s where nothing can come."""
+
+    def poses(self) -> list[Pose]:
+        """All that came since the last call, oldest first; empty when there is none. Never blocks."""
+
+    def close(self) -> None:
+        """End; may be called twice."""

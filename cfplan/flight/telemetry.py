@@ -1,0 +1,108 @@
+"""What the pilot reports while it flies: small frozen messages on the clock of time.monotonic()."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+Triple = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Phase(StrEnum):
+    """The phases of a flight, in their order."""
+
+    CONNECT = "connect"
+    RELEASE = "release"
+    CONFIGURE = "configure"
+    FEED = "feed"
+    CONVERGE = "converge"
+    PREFLIGHT = "preflight"
+    ARM = "arm"
+    TAKE_OFF = "take off"
+    GO_TO_START = "go to start"
+    STREAM = "stream"
+    HOLD = "hold"
+    HAND_BACK = "hand back"
+    LAND = "land"
+    DISARM = "disarm"
+    CLOSED = "closed"
+
+
+@dataclass(frozen=True, slots=True)
+class SetpointSent:
+    """A full-state setpoint as the vehicle decodes it."""
+
+    time: float
+    # s, when it was handed to the link
+    due: float
+    # s, its deadline; time - due is the lateness
+    index: int
+    # row of the encoded flight
+    position: Triple
+    velocity: Triple
+    acceleration: Triple
+    quaternion: Quaternion
+    body_rate: Triple
+
+
+@dataclass(frozen=True, slots=True)
+class PoseReceived:
+    """A pose from motion capture."""
+
+    time: float
+    # s, when the vehicle was there
+    received: float
+    # s, when the pose reached the pilot
+    position: Triple
+    quaternion: Quaternion
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """The vehicle's own estimate, from its log."""
+
+    time: float
+    position: Triple
+    velocity: Triple
+    acceleration: Triple
+    quaternion: Quaternion
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleStatus:
+    """Rates, motors, battery and supervisor, from the vehicle's log."""
+
+    time: float
+    body_rate: Triple
+    motor: tuple[int, int, int, int]
+    # 16-bit commands
+    battery_voltage: float
+    supervisor: int
+    # bits of supervisor.info
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseEntered:
+    """The pilot went into a phase."""
+
+    time: float
+    phase: Phase
+
+
+class Level(StrEnum):
+    """How grave an event is."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that a reader of the record should know."""
+
+    time: float
+    level: Level
+    text: str
+
+
+Telemetry = SetpointSent | PoseReceived | Estimate | VehicleStatus | PhaseEntered | Event
