@@ -1,0 +1,141 @@
+"""Minimum-snap paths: degree-7 pieces through waypoints, after Mellinger and Kumar (2011).
+
+What minimises ∫|γ''''|² ds through given points is a spline of degree 7 that is C⁶. Its unknowns are γ', γ'', γ''' at
+the waypoints; their normal equations are block-tridiagonal and positive definite, so a banded Cholesky solves
+them in linear time, scaled to a unit diagonal because segments differ in length.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import solveh_banded
+
+from cfplan.errors import InputError
+from cfplan.geometry.path import Path
+from cfplan.geometry.polynomials import shifted
+
+CLOSEST = 0.01
+# m, waypoints nearer than this to their predecessor are one point mistyped
+
+
+def _hermite() -> NDArray:
+    """(8, 8): coefficients on [0, 1] from the value and three derivatives at 0, then at 1."""
+    rows = np.zeros((8, 8))
+    for order in range(4):
+        for power in range(order, 8):
+            value = np.prod(np.arange(power - order + 1, power + 1))
+            rows[order, power] = value if power == order else 0.0
+            rows[4 + order, power] = value
+    return np.linalg.inv(rows)
+
+
+def _snap_energy() -> NDArray:
+    """(8, 8): ∫ of the squared fourth derivative on [0, 1], as a form in the coefficients."""
+    power = np.arange(8)
+    fourth = power * (power - 1) * (power - 2) * (power - 3)
+    exponent = np.maximum(power[:, None] + power - 7, 1)
+    return np.outer(fourth, fourth) / exponent
+
+
+_HERMITE = _hermite()
+_ENERGY = _HERMITE.T @ _snap_energy() @ _HERMITE
+
+
+def min_snap(waypoints: ArrayLike, *, nominal_speed: float = 1.0) -> Path:
+    """The path of least snap through waypoints, (K, 3) m, at rest at both ends.
+
+    Each segment takes its straight distance over the nominal speed, m/s, so at 1 m/s s is in metres flown, nearly.
+
+    Raises:
+        InputError: fewer than two waypoints, two in a row that (nearly) coincide, numbers that are not finite.
+    """
+    points, times = _checked(waypoints, nominal_speed)
+    return _through(points, times, rest=True)
+
+
+def smooth_through(points: ArrayLike) -> Path:
+    """The same with free ends: γ'''' = 0 and no rest. For dense points, where rest in one segment is too sudden."""
+    return _through(*_checked(points, 1.0, closest=0.001), rest=False)
+
+
+def check_points(points: NDArray, closest: float = CLOSEST) -> None:
+    """Refuse too few points, and neighbours nearer than `closest`, m."""
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"waypoints must be x, y, z each, not an array of shape {points.shape}")
+    if len(points) < 2:
+        raise InputError(f"a path needs two waypoints at least, not {len(points)}")
+    bad = ~np.isfinite(points).all(axis=1)
+    if bad.any():
+        raise InputError("coordinates must be finite numbers", where=f"waypoint {int(np.argmax(bad)) + 1}")
+    distances = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    near = int(np.argmin(distances))
+    if distances[near] < closest:
+        raise InputError(
+            f"waypoints {near + 1} and {near + 2} are {distances[near]:.4f} m apart, less than {closest} m",
+            where=f"waypoint {near + 2}",
+            hint="take one of them out",
+        )
+
+
+def _checked(waypoints: ArrayLike, nominal_speed: float, closest: float = CLOSEST) -> tuple[NDArray, NDArray]:
+    points = np.asarray(waypoints, dtype=float)
+    check_points(points, closest)
+    if not (np.isfinite(nominal_speed) and nominal_speed > 0.0):
+        raise InputError(f"the nominal speed must be positive, not {nominal_speed}")
+    return points, np.linalg.norm(np.diff(points, axis=0), axis=1) / nominal_speed
+
+
+def _through(points: NDArray, times: NDArray, rest: bool) -> Path:
+    derivatives = _waypoint_derivatives(points, times, rest)
+    powers = times[:, None] ** np.arange(4)
+    values = np.concatenate([points[:, None], derivatives], axis=1)  # (K, 4, 3)
+    ends = np.concatenate([values[:-1] * powers[..., None], values[1:] * powers[..., None]], axis=1)
+    table = (_HERMITE @ ends) / times[:, None, None] ** np.arange(8)[:, None]
+    breaks = np.concatenate([[0.0], np.cumsum(times)])
+    if len(table) == 1:  # two pieces, so that each end is the origin of one
+        breaks = np.array([0.0, times[0] / 2, times[0]])
+        table = np.concatenate([table, table])
+    # The last piece is expanded about its right end, where its first four coefficients are known.
+    table[-1] = shifted(table[-1:], np.array([times[-1]]))[0]
+    table[-1, :4] = values[-1] / np.array([1.0, 1.0, 2.0, 6.0])[:, None]
+    return Path(breaks, table)
+
+
+def _waypoint_derivatives(points: NDArray, times: NDArray, rest: bool) -> NDArray:
+    """(K, 3, 3): γ', γ'', γ''' at each waypoint, by minimising snap."""
+    count = len(points)
+    # In units of each segment's time the energy is a constant matrix; T^-7 and powers of T bring it back.
+    powers = times[:, None] ** np.tile(np.arange(4), 2)
+    energy = _ENERGY * powers[:, :, None] * powers[:, None, :] / times[:, None, None] ** 7
+
+    diagonal = np.zeros((count, 3, 3))
+    diagonal[:-1] += energy[:, 1:4, 1:4]
+    diagonal[1:] += energy[:, 5:8, 5:8]
+    beside = energy[:, 1:4, 5:8]
+    force = np.zeros((count, 3, 3))
+    ends = np.stack([points[:-1] - points[:-1], points[1:] - points[:-1]], axis=1)  # moving a segment costs nothing
+    force[:-1] -= energy[:, 1:4][:, :, [0, 4]] @ ends
+    force[1:] -= energy[:, 5:8][:, :, [0, 4]] @ ends
+
+    first, last = (1, count - 1) if rest else (0, count)
+    solution = np.zeros((count, 3, 3))
+    if last > first:
+        solution[first:last] = _solve_block_tridiagonal(
+            diagonal[first:last], beside[first : last - 1], force[first:last]
+        )
+    return solution
+
+
+def _solve_block_tridiagonal(diagonal: NDArray, beside: NDArray, force: NDArray) -> NDArray:
+    """Symmetric positive definite, 3 × 3 blocks: diagonal (n, 3, 3), right neighbour (n-1, 3, 3), force (n, 3, 3)."""
+    count = 3 * len(diagonal)
+    scale = 1.0 / np.sqrt(np.diagonal(diagonal, axis1=1, axis2=2))  # (n, 3)
+    diagonal = diagonal * scale[:, :, None] * scale[:, None, :]
+    beside = beside * scale[:-1, :, None] * scale[1:, None, :]
+    bands = np.zeros((6, count))  # upper form: bands[5 + row - column, column]
+    for row in range(3):
+        for column in range(3):
+            if column >= row:
+                bands[5 + row - column, column::3] = diagonal[:, row, column]
+            bands[2 + row - column, 3 + column :: 3] = beside[:, row, column]
+    flat = solveh_banded(bands, (force * scale[..., None]).reshape(count, 3))
+    return flat.reshape(-1, 3, 3) * scale[..., None]

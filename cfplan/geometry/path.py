@@ -1,0 +1,139 @@
+"""The path γ(s): where to fly, nothing about how fast."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cfplan.errors import InputError
+
+MAX_ORDER = 5
+STANDSTILL = 0.01
+# |γ'|, 1 where the path is flown at its nominal 1 m/s: below this inside a path the path is taken to stop there
+_SAMPLES = 32
+# a piece, where a path is searched
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """γ(s) for s in [0, end], piecewise polynomial, at least C⁴ where it was made by this package.
+
+    s is nominal time at about 1 m/s. At a rest end γ' = γ'' = γ''' = 0 exactly: the first piece is expanded about
+    its left end, so is every other but the last, which is expanded about its right end; a path with two rest ends
+    thus needs two pieces. Beyond its ends a path stays where it ends.
+    """
+
+    breaks: NDArray
+    # (M+1,) ascending from 0
+    coefficients: NDArray
+    # (M, D, 3) m, ascending powers of s - breaks[i], in the last piece of s - breaks[-1]
+    _origins: NDArray = field(init=False, repr=False)
+    # (M,)
+    _tables: tuple[NDArray, ...] = field(init=False, repr=False)
+    # one an order: (M, D - order, 3) coefficients of the derivative
+
+    def __post_init__(self) -> None:
+        breaks = np.array(self.breaks, dtype=float)
+        table = np.array(self.coefficients, dtype=float)
+        if breaks.ndim != 1 or table.ndim != 3 or table.shape[::2] != (len(breaks) - 1, 3) or not table.shape[1]:
+            raise InputError(f"breaks {breaks.shape} and coefficients {table.shape} do not make a path")
+        if not (np.isfinite(breaks).all() and np.isfinite(table).all()):
+            raise InputError("breaks or coefficients of a path are not finite numbers")
+        if breaks[0] != 0.0 or (np.diff(breaks) <= 0.0).any():
+            raise InputError("breaks of a path must ascend from 0")
+        origins = breaks[:-1].copy()
+        origins[-1] = breaks[-1]
+        tables = [table]
+        for _ in range(MAX_ORDER):
+            powers = np.arange(1, tables[-1].shape[1])
+            derivative = tables[-1][:, 1:] * powers[:, None]
+            tables.append(derivative if len(powers) else np.zeros((len(table), 1, 3)))
+        for array in (breaks, origins, *tables):
+            array.setflags(write=False)
+        for name, value in (
+            ("breaks", breaks), ("coefficients", table), ("_origins", origins), ("_tables", tuple(tables)),
+        ):  # fmt: skip
+            object.__setattr__(self, name, value)
+
+    @property
+    def end(self) -> float:
+        """The last s."""
+        return float(self.breaks[-1])
+
+    @property
+    def length(self) -> float:
+        """Arc length, m, by Gauss quadrature of |γ'| on every piece."""
+        return float(self.piece_lengths().sum())
+
+    def piece_lengths(self) -> NDArray:
+        """(M,) m, the arc length of each piece."""
+        half = np.diff(self.breaks) / 2
+        nodes = (self.breaks[:-1] + half)[:, None] + half[:, None] * _GAUSS_NODES
+        return half * (np.linalg.norm(self(nodes, 1), axis=-1) @ _GAUSS_WEIGHTS)
+
+    def __call__(self, s: ArrayLike, order: int = 0) -> NDArray:
+        """The derivative of that order, 0 to 5, with respect to s: shape s.shape + (3,)."""
+        if not 0 <= order <= MAX_ORDER:
+            raise ValueError(f"a path has derivatives of order 0 to {MAX_ORDER}, not {order}")
+        s = np.clip(np.asarray(s, dtype=float), 0.0, self.breaks[-1])
+        piece = np.minimum(np.searchsorted(self.breaks, s, side="right") - 1, len(self._origins) - 1)
+        x = (s - self._origins[piece])[..., None]
+        table = self._tables[order]
+        value = table[piece, -1]
+        for power in range(table.shape[1] - 2, -1, -1):
+            value = table[piece, power] + x * value
+        return value
+
+    def placed(self, offset: ArrayLike, yaw: float = 0.0) -> "Path":
+        """This path turned by `yaw` about the world's z axis, then moved by `offset`, (3,) m."""
+        table = self.coefficients @ rotation_about_z(yaw).T
+        table[:, 0] += np.asarray(offset, dtype=float)
+        return Path(self.breaks, table)
+
+    def check(self, where: str = "") -> None:
+        """Refuse a path that stands still anywhere but at its ends: a cusp, a reversal, a piece without length.
+
+        Raises:
+            InputError: naming s and the place.
+        """
+        s = (self.breaks[:-1, None] + np.diff(self.breaks)[:, None] * np.arange(_SAMPLES) / _SAMPLES).ravel()
+        s = np.append(s, self.end)
+        speed = np.linalg.norm(self(s, 1), axis=-1)
+
+        still = speed[:-1].reshape(-1, _SAMPLES).max(axis=1) < 1e-6
+        if still.any():
+            self._refuse("a piece has no length", float(self.breaks[int(np.argmax(still))]), where)
+
+        dips = 1 + np.flatnonzero((speed[1:-1] <= speed[:-2]) & (speed[1:-1] <= speed[2:]))
+        for i in dips:
+            slowest = self._slowest(s[i - 1], s[i + 1])
+            # |γ'| falls to 0 at a rest end: only what lies between two faster places is a stop inside the path
+            if np.linalg.norm(self(slowest, 1)) < STANDSTILL:
+                self._refuse("the path comes to a stop inside (a cusp or a reversal)", slowest, where)
+
+    def _slowest(self, low: float, high: float) -> float:
+        """Where |γ'| is least between two s, by golden section."""
+        ratio = (math.sqrt(5) - 1) / 2
+        for _ in range(60):
+            left, right = high - ratio * (high - low), low + ratio * (high - low)
+            if np.linalg.norm(self(left, 1)) < np.linalg.norm(self(right, 1)):
+                high = right
+            else:
+                low = left
+        return (low + high) / 2
+
+    def _refuse(self, what: str, s: float, where: str) -> None:
+        x, y, z = self(s)
+        raise InputError(
+            f"{what} at s = {s:.3f} of {self.end:.3f}, position ({x:.3f}, {y:.3f}, {z:.3f}) m",
+            where=where,
+            hint="move a waypoint aside there so that the path turns in a curve, or split the flight in two",
+        )
+
+
+def rotation_about_z(yaw: float) -> NDArray:
+    """(3, 3): turns vectors by `yaw` about z."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
