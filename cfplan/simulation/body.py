@@ -1,0 +1,154 @@
+"""The simulated vehicle: a rigid body with motor lag and rotor drag, stepped at 1 kHz.
+
+Semi-implicit Euler, each line using what the lines above it made: motors, body rate, velocity, position, attitude.
+Everything runs inside numba, so state and parameters are flat arrays:
+
+    state (17,)   position 0:3 m, velocity 3:6 m/s, quaternion 6:10 body→world x y z w,
+                  body rate 10:13 rad/s in body axes, thrust of each motor 13:17 N
+
+The floor is inelastic and holds: a body on it that the rotors do not lift stands still and level.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+
+TIME_STEP = 0.001  # s
+
+POSITION = slice(0, 3)
+VELOCITY = slice(3, 6)
+QUATERNION = slice(6, 10)
+BODY_RATE = slice(10, 13)
+MOTORS = slice(13, 17)
+STATE_SIZE = 17
+
+# Where each parameter lies in the array that `pack_body` makes.
+_MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, _THRUST_MAX, _LAG, _DRAG, _AXIAL_DRAG, _FLOOR = range(11)
+
+STILL_AIR = np.zeros(3)
+ALL_WELL = np.ones(4)
+
+
+def pack_body(airframe: Airframe, *, floor: float = 0.0) -> NDArray:
+    """The airframe's parameters for `step_body`; `floor` is the height of the ground, -inf for none."""
+    return np.array(
+        [
+            airframe.mass,
+            *airframe.inertia,
+            airframe.arm,
+            airframe.thrust_to_torque,
+            airframe.motor_thrust_max,
+            airframe.motor_time_constant,
+            *airframe.drag,
+            floor,
+        ],
+        dtype=float,
+    )
+
+
+def hovering(airframe: Airframe, position: NDArray, yaw: float = 0.0) -> NDArray:
+    """(17,) the state of a vehicle that hovers."""
+    state = at_rest(position, yaw)
+    state[MOTORS] = airframe.hover_thrust
+    return state
+
+
+def at_rest(position: NDArray, yaw: float = 0.0) -> NDArray:
+    """(17,) the state of a vehicle that stands still, level, its motors off."""
+    state = np.zeros(STATE_SIZE)
+    state[POSITION] = position
+    state[QUATERNION] = 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)
+    return state
+
+
+@njit(cache=True)
+def rotation(quaternion: NDArray) -> NDArray:
+    """(3, 3) body→world of a unit quaternion x y z w."""
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    matrix = np.empty((3, 3))
+    matrix[0, 0] = 1 - 2 * (y * y + z * z)
+    matrix[0, 1] = 2 * (x * y - z * w)
+    matrix[0, 2] = 2 * (x * z + y * w)
+    matrix[1, 0] = 2 * (x * y + z * w)
+    matrix[1, 1] = 1 - 2 * (x * x + z * z)
+    matrix[1, 2] = 2 * (y * z - x * w)
+    matrix[2, 0] = 2 * (x * z - y * w)
+    matrix[2, 1] = 2 * (y * z + x * w)
+    matrix[2, 2] = 1 - 2 * (x * x + y * y)
+    return matrix
+
+
+@njit(cache=True)
+def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, efficiency: NDArray) -> None:
+    """Carry `state` on by one TIME_STEP, in place.
+
+    `command` (4,) N is what each motor is asked for, clipped to what it can give; `wind` (3,) m/s in world axes;
+    `efficiency` (4,) is the share of its thrust that each motor really gives, 1 when well.
+    """
+    lag = min(1.0, TIME_STEP / max(body[_LAG], 1e-9))
+    push = np.empty(4)
+    for motor in range(4):
+        asked = min(max(command[motor], 0.0), body[_THRUST_MAX])
+        state[13 + motor] += (asked - state[13 + motor]) * lag
+        push[motor] = state[13 + motor] * efficiency[motor]
+    thrust = push[0] + push[1] + push[2] + push[3]
+
+    # On the floor the ground takes all torque and every force that does not lift the body off it.
+    turn = rotation(state[6:10])
+    on_floor = state[2] <= body[_FLOOR]
+    if on_floor and state[5] <= 0.0 and thrust * turn[2, 2] <= body[_MASS] * GRAVITY:
+        _rest(state, body[_FLOOR])
+        return
+
+    torque_x = body[_ARM] * (-push[0] - push[1] + push[2] + push[3])
+    torque_y = body[_ARM] * (-push[0] + push[1] + push[2] - push[3])
+    torque_z = body[_THRUST_TO_TORQUE] * (-push[0] + push[1] - push[2] + push[3])
+    wx, wy, wz = state[10], state[11], state[12]
+    jx, jy, jz = body[_JX], body[_JY], body[_JZ]
+    state[10] += TIME_STEP * (torque_x + (jy - jz) * wy * wz) / jx
+    state[11] += TIME_STEP * (torque_y + (jz - jx) * wz * wx) / jy
+    state[12] += TIME_STEP * (torque_z + (jx - jy) * wx * wy) / jz
+
+    ax, ay, az = state[3] - wind[0], state[4] - wind[1], state[5] - wind[2]
+    force_x = -body[_DRAG] * (turn[0, 0] * ax + turn[1, 0] * ay + turn[2, 0] * az)
+    force_y = -body[_DRAG] * (turn[0, 1] * ax + turn[1, 1] * ay + turn[2, 1] * az)
+    force_z = thrust - body[_AXIAL_DRAG] * (turn[0, 2] * ax + turn[1, 2] * ay + turn[2, 2] * az)
+    for axis in range(3):
+        force = turn[axis, 0] * force_x + turn[axis, 1] * force_y + turn[axis, 2] * force_z
+        state[3 + axis] += TIME_STEP * force / body[_MASS]
+    state[5] -= TIME_STEP * GRAVITY
+    for axis in range(3):
+        state[axis] += TIME_STEP * state[3 + axis]
+    _turn(state)
+    if state[2] < body[_FLOOR]:
+        _rest(state, body[_FLOOR])
+
+
+@njit(cache=True)
+def _turn(state: NDArray) -> None:
+    """Turn the attitude by the body rate over one TIME_STEP, exactly for a constant rate."""
+    wx, wy, wz = state[10], state[11], state[12]
+    rate = np.sqrt(wx * wx + wy * wy + wz * wz)
+    half = 0.5 * rate * TIME_STEP
+    share = 0.5 * TIME_STEP if half < 1e-9 else np.sin(half) / rate
+    rx, ry, rz, rw = wx * share, wy * share, wz * share, np.cos(half)
+    x, y, z, w = state[6], state[7], state[8], state[9]
+    state[6] = w * rx + x * rw + y * rz - z * ry
+    state[7] = w * ry - x * rz + y * rw + z * rx
+    state[8] = w * rz + x * ry - y * rx + z * rw
+    state[9] = w * rw - x * rx - y * ry - z * rz
+    state[6:10] /= np.sqrt(np.sum(state[6:10] ** 2))
+
+
+@njit(cache=True)
+def _rest(state: NDArray, floor: float) -> None:
+    """Stand on the floor: still and level, yaw kept."""
+    state[2] = floor
+    state[3:6] = 0.0
+    state[10:13] = 0.0
+    x, y, z, w = state[6], state[7], state[8], state[9]
+    half = 0.5 * np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    state[6:8] = 0.0
+    state[8], state[9] = np.sin(half), np.cos(half)
