@@ -1,0 +1,129 @@
+"""What a record says before its first message: which flight this is, on what vehicle, under what limits."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import InputError
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import Airframe
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class FlightBounds:
+    """Where a flight is judged and the plots draw their lines; NaN where there is no such limit."""
+
+    speed: float = math.nan
+    # m/s
+    acceleration: float = math.nan
+    # m/s², gravity not counted
+    body_rate: float = math.nan
+    # rad/s, norm
+    deviation: float = math.nan
+    # m, from the reference in time
+    lateness: float = math.nan
+    # s, of a setpoint
+    pose_age: float = math.nan
+    # s
+    battery_voltage: float = math.nan
+    # V, least
+
+
+@dataclass(frozen=True, slots=True)
+class RecordHeader:
+    """Known before take-off; enough to draw and judge the flight without any other file."""
+
+    name: str
+    version: str
+    # of cfplan
+    uri: str
+    planner: str
+    vehicle: Airframe
+    thrust_at_full_command: float
+    # N, one motor's thrust at the 16-bit command 65535
+    plan_limits: PlanLimits
+    bounds: FlightBounds
+    travel_time: float
+    # s, planned
+    path: NDArray
+    # (M, 3) m, samples for drawing and for the distance to the path
+    fence: tuple[Triple, Triple]
+    # m, lower and upper corner
+    wall_time_at_zero: float
+    # s since 1970, when time.monotonic() was zero
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    # whatever else tells where the plan came from: file, model hash, …
+
+
+def header_to_json(header: RecordHeader) -> str:
+    """One line; numbers that are not finite become null."""
+    return json.dumps(_plain({f.name: getattr(header, f.name) for f in fields(header)}), allow_nan=False)
+
+
+def header_from_json(text: str, *, where: str = "") -> RecordHeader:
+    """Raises InputError where a key is missing or of the wrong kind; keys of later versions are ignored."""
+    try:
+        values = json.loads(text)
+        return RecordHeader(
+            name=str(values["name"]),
+            version=str(values["version"]),
+            uri=str(values["uri"]),
+            planner=str(values["planner"]),
+            vehicle=_airframe(values["vehicle"]),
+            thrust_at_full_command=_number(values["thrust_at_full_command"]),
+            plan_limits=PlanLimits(**{f.name: _number(values["plan_limits"][f.name]) for f in fields(PlanLimits)}),
+            bounds=FlightBounds(**{f.name: _number(values["bounds"].get(f.name)) for f in fields(FlightBounds)}),
+            travel_time=_number(values["travel_time"]),
+            path=np.array(values["path"], dtype=float).reshape(-1, 3),
+            fence=(_triple(values["fence"][0]), _triple(values["fence"][1])),
+            wall_time_at_zero=_number(values["wall_time_at_zero"]),
+            provenance={str(key): str(value) for key, value in values["provenance"].items()},
+        )
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
+        raise InputError(
+            f"the record's header cannot be read ({type(error).__name__}: {error})".replace("\n", " "),
+            where=where,
+            hint="it was written by another version of cfplan, or is damaged",
+        ) from error
+
+
+def _airframe(values: Mapping[str, Any]) -> Airframe:
+    numbers = {f.name: _number(values[f.name]) for f in fields(Airframe) if f.type is float}
+    return Airframe(
+        name=str(values["name"]),
+        inertia=_triple(values["inertia"]),
+        drag=(_number(values["drag"][0]), _number(values["drag"][1])),
+        source=str(values["source"]),
+        **numbers,
+    )
+
+
+def _triple(values: list[float | None]) -> Triple:
+    x, y, z = (_number(value) for value in values)
+    return x, y, z
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _plain(value: Any) -> Any:
+    """The same as JSON knows it."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "__dataclass_fields__"):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

@@ -1,0 +1,151 @@
+"""Reads a record back, whole or as far as it goes."""
+
+import io
+import json
+import struct
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Message, Metadata
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
+
+from cfplan.errors import InputError
+from cfplan.recording.header import RecordHeader, header_from_json
+from cfplan.recording.record import FLIGHT_FILE, SUMMARY_FILE, Record
+from cfplan.recording.topics import FORMAT, METADATA, PROFILE, TOPICS, columns_from_json
+
+MAGIC = b"\x89MCAP0\r\n"
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, EOFError, MemoryError, OverflowError)
+
+
+def read_record(place: Path) -> Record:
+    """The record in a folder, or in the MCAP file itself.
+
+    What was cut off or damaged is left out, and `truncated` says so. Raises InputError where the place holds no record
+    of ours, or not even its header.
+    """
+    file = _find(Path(place))
+    data = _read(file)
+    header: RecordHeader | None = None
+    topics: dict[int, str] = {}
+    payloads: dict[str, list[bytes]] = {topic.name: [] for topic in TOPICS}
+    whole = False
+    for entry in _entries(data):
+        match entry:
+            case Header(profile=profile) if profile != PROFILE:
+                raise _not_ours(file, f"its profile is '{profile}'")
+            case Metadata(name=name, metadata=values) if name == METADATA:
+                header = _header(values, file)
+            case Channel(id=number, topic=name):
+                topics[number] = name
+            case Message(channel_id=number, data=payload) if topics.get(number) in payloads:
+                payloads[topics[number]].append(payload)
+            case Footer():
+                whole = data.endswith(MAGIC)
+    if header is None:
+        raise InputError(
+            "the record ends before its header; nothing of it can be read",
+            where=str(file),
+            hint="the flight ended as the record was opened, or copying it failed",
+        )
+    streams = {topic.stream: _columns(topic, payloads[topic.name], file) for topic in TOPICS}
+    return Record(folder=file.parent, header=header, summary=_summary(file.parent), truncated=not whole, **streams)
+
+
+def _find(place: Path) -> Path:
+    if place.is_dir():
+        file = place / FLIGHT_FILE
+        if not file.is_file():
+            raise InputError(f"no {FLIGHT_FILE} in it", where=str(place), hint="name the folder of one flight")
+        return file
+    if not place.exists():
+        raise InputError(
+            "no such record", where=str(place), hint="records lie where `cfplan fly` said, one folder each"
+        )
+    return place
+
+
+def _read(file: Path) -> bytes:
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", where=str(file)) from error
+    if not data:
+        raise InputError("the record is empty", where=str(file), hint="the flight ended as the record was opened")
+    if not data.startswith(MAGIC):
+        if MAGIC.startswith(data):
+            raise InputError("the record ends before its header; nothing of it can be read", where=str(file))
+        raise _not_ours(file, "it is no MCAP file")
+    return data
+
+
+def _not_ours(file: Path, reason: str) -> InputError:
+    return InputError(
+        f"not a record of cfplan: {reason}", where=str(file), hint=f"name a flight's folder or its {FLIGHT_FILE}"
+    )
+
+
+def _header(values: Mapping[str, str], file: Path) -> RecordHeader:
+    if values.get("format") != FORMAT:
+        raise InputError(
+            f"the record has format {values.get('format')}, this version reads {FORMAT}",
+            where=str(file),
+            hint="use the version of cfplan that wrote it, or a newer one",
+        )
+    return header_from_json(values.get("header", ""), where=str(file))
+
+
+def _entries(data: bytes) -> Iterator[McapRecord]:
+    """Every MCAP record, those in chunks too, up to the first that is cut off or damaged."""
+    reader = StreamReader(io.BytesIO(data), emit_chunks=True, record_size_limit=len(data))
+    try:
+        for entry in reader.records:
+            if isinstance(entry, Chunk):
+                yield from _chunk_entries(entry)
+            else:
+                yield entry
+    except _DAMAGE:
+        return
+
+
+def _chunk_entries(chunk: Chunk) -> Iterator[McapRecord]:
+    """The messages and channels of a chunk; written for speed, as a flight has hundreds of messages a second."""
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    data = stream.read(size)
+    place = 0
+    while place < size:
+        opcode, length = _RECORD.unpack_from(data, place)
+        place += _RECORD.size
+        if opcode == Opcode.MESSAGE:
+            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, place)
+            payload = data[place + _MESSAGE.size : place + length]
+            yield Message(channel, log_time, payload, publish_time, sequence)
+        elif opcode == Opcode.CHANNEL:
+            yield Channel.read(ReadDataStream(io.BytesIO(data[place : place + length])))
+        place += length
+
+
+def _columns(topic: Any, payloads: list[bytes], file: Path) -> Any:
+    try:
+        return columns_from_json(topic, payloads)
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(
+            f"the messages of {topic.name} cannot be read ({type(error).__name__}: {error})".replace("\n", " "),
+            where=str(file),
+            hint="the record was written by another version of cfplan, or changed since",
+        ) from error
+
+
+def _summary(folder: Path) -> Mapping[str, Any]:
+    try:
+        summary = json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return summary if isinstance(summary, dict) else {}

@@ -1,0 +1,148 @@
+"""Everything that a flight measured, commanded and decided, on one clock, as columns."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.recording.header import RecordHeader
+
+FLIGHT_FILE = "flight.mcap"
+SUMMARY_FILE = "summary.json"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setpoints:
+    """The setpoints as sent; see telemetry.SetpointSent."""
+
+    time: NDArray
+    # (N,) s, when each was handed to the link
+    due: NDArray
+    # (N,) s, its deadline
+    index: NDArray
+    # (N,) int, row of the encoded flight
+    position: NDArray
+    # (N, 3) m
+    velocity: NDArray
+    # (N, 3) m/s
+    acceleration: NDArray
+    # (N, 3) m/s²
+    quaternion: NDArray
+    # (N, 4) body→world, x y z w
+    body_rate: NDArray
+    # (N, 3) rad/s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """The poses from motion capture; see telemetry.PoseReceived."""
+
+    time: NDArray
+    # (N,) s, when the vehicle was there
+    received: NDArray
+    # (N,) s
+    position: NDArray
+    # (N, 3) m
+    quaternion: NDArray
+    # (N, 4) body→world, x y z w
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimates:
+    """The vehicle's own estimates; see telemetry.Estimate."""
+
+    time: NDArray
+    # (N,) s
+    position: NDArray
+    # (N, 3) m
+    velocity: NDArray
+    # (N, 3) m/s
+    acceleration: NDArray
+    # (N, 3) m/s²
+    quaternion: NDArray
+    # (N, 4) body→world, x y z w
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Status:
+    """Rates, motors, battery and supervisor; see telemetry.VehicleStatus."""
+
+    time: NDArray
+    # (N,) s
+    body_rate: NDArray
+    # (N, 3) rad/s
+    motor: NDArray
+    # (N, 4) int, 16-bit commands
+    battery_voltage: NDArray
+    # (N,) V
+    supervisor: NDArray
+    # (N,) int, bits of supervisor.info
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Phases:
+    """When the pilot went into which phase."""
+
+    time: NDArray
+    # (N,) s
+    phase: NDArray
+    # (N,) str, a value of telemetry.Phase
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Events:
+    """What a reader should know."""
+
+    time: NDArray
+    # (N,) s
+    level: NDArray
+    # (N,) str, a value of telemetry.Level
+    text: NDArray
+    # (N,) str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Record:
+    """A flight as it was; times are those of time.monotonic() on the machine that flew it."""
+
+    folder: Path
+    header: RecordHeader
+    setpoints: Setpoints
+    poses: Poses
+    estimates: Estimates
+    status: Status
+    phases: Phases
+    events: Events
+    summary: Mapping[str, Any]
+    # as written at the end of the flight; empty where there is none
+    truncated: bool
+    # the file ends before its time; the streams hold all that can be read
+
+    @property
+    def start(self) -> float:
+        """s, the earliest time of any message; 0 in a record without messages."""
+        firsts = [float(np.nanmin(times)) for times in self._times() if np.any(np.isfinite(times))]
+        return min(firsts, default=0.0)
+
+    @property
+    def duration(self) -> float:
+        """s, from the first message to the last."""
+        lasts = [float(np.nanmax(times)) for times in self._times() if np.any(np.isfinite(times))]
+        return max(lasts, default=self.start) - self.start
+
+    def phase_span(self, phase: str) -> tuple[float, float] | None:
+        """s, from the first entry into a phase until the next phase or the record's end; None where it never was."""
+        entries = np.flatnonzero(self.phases.phase == phase)
+        if len(entries) == 0:
+            return None
+        first = int(entries[0])
+        after = first + 1
+        end = self.phases.time[after] if after < len(self.phases.time) else self.start + self.duration
+        return float(self.phases.time[first]), float(end)
+
+    def _times(self) -> list[NDArray]:
+        streams = (self.setpoints, self.poses, self.estimates, self.status, self.phases, self.events)
+        return [stream.time for stream in streams]

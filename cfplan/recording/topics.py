@@ -1,0 +1,105 @@
+"""How each kind of message stands in a record's MCAP file: its topic, its JSON Schema, and its way to JSON and back."""
+
+import json
+import math
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from typing import Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.flight import telemetry
+from cfplan.recording import record
+
+PROFILE = "cfplan"
+# the profile that our MCAP files name; a file with another is not a record
+METADATA = "cfplan"
+# the metadata entry that holds format and header
+FORMAT = "1"
+# raised when older versions can no longer read a record
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One kind of message and the columns that it is read back into."""
+
+    name: str
+    message: type
+    columns: type
+    stream: str
+    # its field in Record
+
+
+TOPICS = (
+    Topic("/setpoint", telemetry.SetpointSent, record.Setpoints, "setpoints"),
+    Topic("/pose", telemetry.PoseReceived, record.Poses, "poses"),
+    Topic("/estimate", telemetry.Estimate, record.Estimates, "estimates"),
+    Topic("/status", telemetry.VehicleStatus, record.Status, "status"),
+    Topic("/phase", telemetry.PhaseEntered, record.Phases, "phases"),
+    Topic("/event", telemetry.Event, record.Events, "events"),
+)
+
+
+def json_schema(message: type) -> dict[str, Any]:
+    """The JSON Schema of a message type, from its fields."""
+    hints = get_type_hints(message)
+    return {
+        "title": message.__name__,
+        "description": f"{message.__doc__} A number that is not finite is null.",
+        "type": "object",
+        "properties": {f.name: _schema(hints[f.name]) for f in fields(message)},
+        "required": [f.name for f in fields(message)],
+    }
+
+
+def _schema(kind: Any) -> dict[str, Any]:
+    if get_origin(kind) is tuple:
+        items = get_args(kind)
+        return {"type": "array", "items": _schema(items[0]), "minItems": len(items), "maxItems": len(items)}
+    if issubclass(kind, StrEnum):
+        return {"type": "string", "enum": [item.value for item in kind]}
+    return {"type": {float: "number", int: "integer", str: "string"}[kind]}
+
+
+def message_to_json(message: telemetry.Telemetry) -> bytes:
+    """Exact: a float reads back as the same float."""
+    values = {f.name: getattr(message, f.name) for f in fields(message)}
+    try:
+        return json.dumps(values, separators=(",", ":"), allow_nan=False, default=_from_numpy).encode()
+    except ValueError:
+        return json.dumps(_finite(values), separators=(",", ":"), allow_nan=False).encode()
+
+
+def _from_numpy(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"a {type(value).__name__} does not belong into a message")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return _finite(value.tolist())
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def columns_from_json(topic: Topic, payloads: list[bytes]) -> Any:
+    """The messages of one topic as arrays. Raises ValueError, KeyError or TypeError where they are not its messages."""
+    messages = json.loads(b"[" + b",".join(payloads) + b"]")
+    hints = get_type_hints(topic.message)
+    return topic.columns(
+        **{f.name: _column([m[f.name] for m in messages], hints[f.name]) for f in fields(topic.columns)}
+    )
+
+
+def _column(values: list[Any], kind: Any) -> NDArray:
+    items = get_args(kind)
+    item = items[0] if items else kind
+    if not items and issubclass(item, str):
+        return np.array([str(value) for value in values], dtype=np.str_)
+    shape = (len(values), len(items)) if items else (len(values),)
+    return np.array(values, dtype=np.int64 if item is int else np.float64).reshape(shape)
