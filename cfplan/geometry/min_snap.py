@@ -11,21 +11,13 @@ from scipy.linalg import solveh_banded
 
 from cfplan.errors import InputError
 from cfplan.geometry.path import Path
-from cfplan.geometry.polynomials import shifted
+from cfplan.geometry.polynomials import hermite
+from cfplan.geometry.rest import rest_path, with_rest_ends
 
 CLOSEST = 0.01
 # m, waypoints nearer than this to their predecessor are one point mistyped
-
-
-def _hermite() -> NDArray:
-    """(8, 8): coefficients on [0, 1] from the value and three derivatives at 0, then at 1."""
-    rows = np.zeros((8, 8))
-    for order in range(4):
-        for power in range(order, 8):
-            value = np.prod(np.arange(power - order + 1, power + 1))
-            rows[order, power] = value if power == order else 0.0
-            rows[4 + order, power] = value
-    return np.linalg.inv(rows)
+CLOSEST_DENSE = 0.001
+# m, the same for lists of points
 
 
 def _snap_energy() -> NDArray:
@@ -36,7 +28,7 @@ def _snap_energy() -> NDArray:
     return np.outer(fourth, fourth) / exponent
 
 
-_HERMITE = _hermite()
+_HERMITE = hermite(4)
 _ENERGY = _HERMITE.T @ _snap_energy() @ _HERMITE
 
 
@@ -48,13 +40,19 @@ def min_snap(waypoints: ArrayLike, *, nominal_speed: float = 1.0) -> Path:
     Raises:
         InputError: fewer than two waypoints, two in a row that (nearly) coincide, numbers that are not finite.
     """
-    points, times = _checked(waypoints, nominal_speed)
-    return _through(points, times, rest=True)
+    points, times = _checked(waypoints, nominal_speed, CLOSEST)
+    return rest_path(times, _pieces(points, times, rest=True))
 
 
 def smooth_through(points: ArrayLike) -> Path:
-    """The same with free ends: γ'''' = 0 and no rest. For dense points, where rest in one segment is too sudden."""
-    return _through(*_checked(points, 1.0, closest=0.001), rest=False)
+    """The path of least snap with free ends, then brought to rest: for dense points, (K, 3) m with K at least 4.
+
+    Rest imposed on a first segment of centimetres would make the path oscillate; here it is a matter of timing alone.
+    """
+    points, times = _checked(points, 1.0, CLOSEST_DENSE)
+    if len(points) < 4:
+        raise InputError(f"a smooth path with free ends needs four points at least, not {len(points)}")
+    return with_rest_ends(times, _pieces(points, times, rest=False))
 
 
 def check_points(points: NDArray, closest: float = CLOSEST) -> None:
@@ -76,7 +74,7 @@ def check_points(points: NDArray, closest: float = CLOSEST) -> None:
         )
 
 
-def _checked(waypoints: ArrayLike, nominal_speed: float, closest: float = CLOSEST) -> tuple[NDArray, NDArray]:
+def _checked(waypoints: ArrayLike, nominal_speed: float, closest: float) -> tuple[NDArray, NDArray]:
     points = np.asarray(waypoints, dtype=float)
     check_points(points, closest)
     if not (np.isfinite(nominal_speed) and nominal_speed > 0.0):
@@ -84,20 +82,13 @@ def _checked(waypoints: ArrayLike, nominal_speed: float, closest: float = CLOSES
     return points, np.linalg.norm(np.diff(points, axis=0), axis=1) / nominal_speed
 
 
-def _through(points: NDArray, times: NDArray, rest: bool) -> Path:
+def _pieces(points: NDArray, times: NDArray, rest: bool) -> NDArray:
+    """(K-1, 8, 3): each segment about its left end."""
     derivatives = _waypoint_derivatives(points, times, rest)
     powers = times[:, None] ** np.arange(4)
     values = np.concatenate([points[:, None], derivatives], axis=1)  # (K, 4, 3)
     ends = np.concatenate([values[:-1] * powers[..., None], values[1:] * powers[..., None]], axis=1)
-    table = (_HERMITE @ ends) / times[:, None, None] ** np.arange(8)[:, None]
-    breaks = np.concatenate([[0.0], np.cumsum(times)])
-    if len(table) == 1:  # two pieces, so that each end is the origin of one
-        breaks = np.array([0.0, times[0] / 2, times[0]])
-        table = np.concatenate([table, table])
-    # The last piece is expanded about its right end, where its first four coefficients are known.
-    table[-1] = shifted(table[-1:], np.array([times[-1]]))[0]
-    table[-1, :4] = values[-1] / np.array([1.0, 1.0, 2.0, 6.0])[:, None]
-    return Path(breaks, table)
+    return (_HERMITE @ ends) / times[:, None, None] ** np.arange(8)[:, None]
 
 
 def _waypoint_derivatives(points: NDArray, times: NDArray, rest: bool) -> NDArray:

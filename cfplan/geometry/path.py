@@ -80,10 +80,10 @@ class Path:
         s = np.clip(np.asarray(s, dtype=float), 0.0, self.breaks[-1])
         piece = np.minimum(np.searchsorted(self.breaks, s, side="right") - 1, len(self._origins) - 1)
         x = (s - self._origins[piece])[..., None]
-        table = self._tables[order]
-        value = table[piece, -1]
-        for power in range(table.shape[1] - 2, -1, -1):
-            value = table[piece, power] + x * value
+        terms = self._tables[order][piece]
+        value = terms[..., -1, :]
+        for power in range(terms.shape[-2] - 2, -1, -1):
+            value = terms[..., power, :] + x * value
         return value
 
     def placed(self, offset: ArrayLike, yaw: float = 0.0) -> "Path":
@@ -106,22 +106,20 @@ class Path:
         if still.any():
             self._refuse("a piece has no length", float(self.breaks[int(np.argmax(still))]), where)
 
+        # |γ'| falls to 0 at a rest end: only what lies between two faster places is a stop inside the path
         dips = 1 + np.flatnonzero((speed[1:-1] <= speed[:-2]) & (speed[1:-1] <= speed[2:]))
-        for i in dips:
-            slowest = self._slowest(s[i - 1], s[i + 1])
-            # |γ'| falls to 0 at a rest end: only what lies between two faster places is a stop inside the path
-            if np.linalg.norm(self(slowest, 1)) < STANDSTILL:
-                self._refuse("the path comes to a stop inside (a cusp or a reversal)", slowest, where)
+        slowest = self._slowest(s[dips - 1], s[dips + 1])
+        stops = slowest[np.linalg.norm(self(slowest, 1), axis=-1) < STANDSTILL]
+        if len(stops):
+            self._refuse("the path comes to a stop inside (a cusp or a reversal)", float(stops[0]), where)
 
-    def _slowest(self, low: float, high: float) -> float:
-        """Where |γ'| is least between two s, by golden section."""
+    def _slowest(self, low: NDArray, high: NDArray) -> NDArray:
+        """Where |γ'| is least between each two s, by golden section."""
         ratio = (math.sqrt(5) - 1) / 2
-        for _ in range(60):
+        for _ in range(45):
             left, right = high - ratio * (high - low), low + ratio * (high - low)
-            if np.linalg.norm(self(left, 1)) < np.linalg.norm(self(right, 1)):
-                high = right
-            else:
-                low = left
+            rising = np.linalg.norm(self(left, 1), axis=-1) < np.linalg.norm(self(right, 1), axis=-1)
+            low, high = np.where(rising, low, left), np.where(rising, right, high)
         return (low + high) / 2
 
     def _refuse(self, what: str, s: float, where: str) -> None:

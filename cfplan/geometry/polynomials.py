@@ -1,6 +1,6 @@
 """Arithmetic on polynomials with coefficients in ascending powers, many at a time."""
 
-from math import comb
+from math import comb, factorial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,21 @@ def shifted(table: NDArray, offset: NDArray) -> NDArray:
     return (binomials * offset[:, None, None] ** exponents) @ table
 
 
+def reversed_pieces(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
+    """The same curve flown backwards, each piece about its new left end."""
+    signs = (-1.0) ** np.arange(table.shape[1])
+    return durations[::-1], (shifted(table, durations) * signs[:, None])[::-1]
+
+
+def end_values(durations: NDArray, table: NDArray, orders: int = 5) -> tuple[NDArray, NDArray]:
+    """(M, orders, 3) twice: derivatives of each piece at its left and its right end."""
+    factorials = np.array([factorial(k) for k in range(orders)], dtype=float)[:, None]
+    return table[:, :orders] * factorials, shifted(table, durations)[:, :orders] * factorials
+
+
 def padded(table: NDArray, count: int) -> NDArray:
     """The same polynomials with `count` coefficients each, (M, count, 3)."""
     return np.pad(table, ((0, 0), (0, count - table.shape[1]), (0, 0)))
-
-
-def product(a: NDArray, b: NDArray, count: int) -> NDArray:
-    """a·b to `count` coefficients; (..., D) each."""
-    return np.convolve(a, b)[:count]
 
 
 def composed(outer: NDArray, inner: NDArray, count: int) -> NDArray:
@@ -30,6 +37,16 @@ def composed(outer: NDArray, inner: NDArray, count: int) -> NDArray:
     result = np.zeros((count, 3))
     for coefficient in outer[::-1]:
         for axis in range(3):
-            result[:, axis] = product(result[:, axis], inner, count)
+            result[:, axis] = np.convolve(result[:, axis], inner)[:count]
         result[0] += coefficient
     return result
+
+
+def hermite(orders: int) -> NDArray:
+    """Coefficients on [0, 1] from the value and derivatives, `orders` of them, at 0 and then at 1."""
+    rows = np.zeros((2 * orders, 2 * orders))
+    for order in range(orders):
+        for power in range(order, 2 * orders):
+            rows[orders + order, power] = factorial(power) / factorial(power - order)
+        rows[order, order] = factorial(order)
+    return np.linalg.inv(rows)

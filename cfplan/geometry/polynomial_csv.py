@@ -1,0 +1,61 @@
+"""Trajectories as Crazyswarm writes them: rows of a duration and 4 × 8 coefficients."""
+
+import pathlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import InputError
+from cfplan.geometry.path import Path
+from cfplan.geometry.polynomials import end_values
+from cfplan.geometry.rest import mended, with_rest_ends
+from cfplan.geometry.text_source import read_table
+
+ROW = "duration, x^0 to x^7, y^0 to y^7, z^0 to z^7, yaw^0 to yaw^7"
+_COLUMNS = 1 + 4 * 8
+_SHORTEST = 0.001
+# s
+_POSITION_STEP = 0.001
+# m, between pieces
+_DERIVATIVE_STEP = 0.02
+# share of the largest derivative of that order: what six decimals in a file cost, and no more
+_NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
+_UNITS = ("m", "m/s", "m/s²", "m/s³", "m/s⁴")
+
+
+def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> Path:
+    """The curve in space of a polynomial file, at rest at both ends and at 1 m/s nominal in the mean.
+
+    Its own timing and its yaw are left: the planner times the path, and yaw comes from the yaw mode.
+
+    Raises:
+        InputError: with the line: rows of another length, durations not positive, steps between rows up to snap.
+    """
+    rows, lines = read_table(file, _COLUMNS, ROW)
+    durations = rows[:, 0]
+    if (durations < _SHORTEST).any():
+        bad = int(np.argmax(durations < _SHORTEST))
+        raise InputError(
+            f"a duration must be at least {_SHORTEST} s, not {durations[bad]:g}", where=f"{file}:{lines[bad]}"
+        )
+    table = rows[:, 1:25].reshape(-1, 3, 8).transpose(0, 2, 1)
+    durations, table = np.tile(durations, laps), np.tile(table, (laps, 1, 1))
+    _check_steps(file, lines * laps, durations, table)
+    return with_rest_ends(*mended(durations, table))
+
+
+def _check_steps(file: pathlib.Path, lines: list[int], durations: NDArray, table: NDArray) -> None:
+    left, right = end_values(durations, table)
+    if not np.isfinite(right).all():
+        raise InputError("the polynomials leave all bounds", where=str(file))
+    largest = np.linalg.norm(np.concatenate([left, right]), axis=-1).max(axis=0)
+    allowed = np.maximum(_DERIVATIVE_STEP * largest, 1e-6)
+    allowed[0] = _POSITION_STEP
+    steps = np.linalg.norm(left[1:] - right[:-1], axis=-1)
+    for piece, order in np.argwhere(steps > allowed)[:1]:
+        between = f"lines {lines[piece]} and {lines[piece + 1]}"
+        raise InputError(
+            f"{_NAMES[order]} jumps by {steps[piece, order]:.4g} {_UNITS[order]} between {between}",
+            where=f"{file}:{lines[piece + 1]}",
+            hint="make the file again with continuous derivatives up to snap, or give the path as points",
+        )

@@ -1,0 +1,140 @@
+"""Rest at both ends, and continuity, for paths whose source has neither to the letter.
+
+A source that moves at its ends, or only stops there, is re-timed: p(σ(s)) with σ = s, shifted, away from the ends and
+σ' = L·I_u(a, 5) near them, where u = s / L and I is the regularised incomplete beta function. That is a polynomial,
+monotone, C⁵ where it meets σ' = 1, and with σ' ~ s^a at the end; a = 3 takes γ', γ'', γ''' to 0 from any motion and
+a = 1 from rest with an acceleration. The curve in space stays as it is. The composition is again kept as piecewise
+polynomials: on pieces this short its Taylor series reaches the limit of double precision in a few terms.
+"""
+
+from math import comb, factorial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.geometry.path import Path
+from cfplan.geometry.polynomials import composed, end_values, hermite, padded, reversed_pieces, shifted
+
+WARP = 1.5
+# s, nominal time that gathering speed takes; half of the path at most
+_WARP_PIECES = 16
+_TERMS = 16
+# Taylor terms kept of the composition
+_NEGLIGIBLE = 1e-3
+# of the largest derivative of that order: below this an end derivative is taken for rounding in the file
+_HERMITE = hermite(5)
+
+
+def with_rest_ends(durations: NDArray, table: NDArray) -> Path:
+    """The path of pieces (M, D, 3), each about its left end and lasting durations[i], brought to rest at both ends.
+
+    s is scaled so that the mean of |γ'| is 1: whatever speed a source had, s is again in nominal seconds at 1 m/s.
+    """
+    durations, table = _at_nominal_speed(durations, table)
+    for _ in range(2):  # the start, then the end as the start of the way back
+        durations, table = _with_rest_start(durations, table)
+        durations, table = reversed_pieces(durations, table)
+    return rest_path(durations, table)
+
+
+def rest_path(durations: NDArray, table: NDArray) -> Path:
+    """A Path of pieces that are at rest at both ends but for rounding, which is removed."""
+    if len(durations) == 1:  # two pieces, so that each end is the origin of one
+        durations = np.repeat(durations / 2, 2)
+        table = np.concatenate([table, shifted(table, durations[:1])])
+    table = table.copy()
+    table[-1] = shifted(table[-1:], durations[-1:])[0]
+    table[0, 1:4] = 0.0
+    table[-1, 1:4] = 0.0
+    return Path(np.concatenate([[0.0], np.cumsum(durations)]), table)
+
+
+def mended(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
+    """The same pieces with the steps between them closed to fourth order, half of each step on either side.
+
+    The change is the least polynomial that does it, of degree 9 on each piece.
+    """
+    left, right = end_values(durations, table)
+    step = (left[1:] - right[:-1]) / 2
+    left_change, right_change = np.zeros_like(left), np.zeros_like(right)
+    left_change[1:], right_change[:-1] = -step, step
+    powers = durations[:, None] ** np.arange(5)
+    ends = np.concatenate([left_change * powers[..., None], right_change * powers[..., None]], axis=1)
+    change = (_HERMITE @ ends) / durations[:, None, None] ** np.arange(10)[:, None]
+    count = max(table.shape[1], 10)
+    return durations, padded(table, count) + padded(change, count)
+
+
+def _at_nominal_speed(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
+    breaks = np.concatenate([[0.0], np.cumsum(durations)])
+    about_right = table.copy()
+    about_right[-1] = shifted(table[-1:], durations[-1:])[0]
+    stretch = Path(breaks, about_right).length / breaks[-1]
+    return durations * stretch, table / stretch ** np.arange(table.shape[1])[:, None]
+
+
+def _with_rest_start(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
+    left, right = end_values(durations, table)
+    largest = np.linalg.norm(np.concatenate([left, right]), axis=-1).max(axis=0)
+    moving = np.linalg.norm(left[0], axis=-1) > _NEGLIGIBLE * largest
+    if not moving[1:4].any():
+        return durations, table
+    flatness = 3 if moving[1] else 1
+    return _warped(durations, table, flatness)
+
+
+def _warped(durations: NDArray, table: NDArray, flatness: int) -> tuple[NDArray, NDArray]:
+    """The pieces with their start re-timed by σ."""
+    sigma = _warp(flatness)
+    reach = np.polynomial.polynomial.polyval(1.0, sigma)  # σ(L) / L
+    breaks = np.concatenate([[0.0], np.cumsum(durations)])
+    length = min(WARP, breaks[-1] / 2 / reach)
+    u = np.linspace(0.0, 1.0, _WARP_PIECES + 1)
+    inner = breaks[(breaks > 1e-9) & (breaks < length * reach * (1 - 1e-9))]
+    joints = _inverse(sigma, inner / length)
+    if len(joints):  # pieces far shorter than the others would cost digits
+        apart = np.abs(u[:, None] - joints).min(axis=1) > 0.25 / _WARP_PIECES
+        apart[[0, -1]] = True
+        u = np.sort(np.concatenate([u[apart], joints]))
+
+    pieces = []
+    for start in u[:-1]:
+        local = shifted(np.repeat(sigma[None, :, None], 3, axis=2), np.array([start]))[0, :, 0]
+        local *= length ** (1.0 - np.arange(len(local)))
+        at = local[0]
+        piece = min(int(np.searchsorted(breaks, at + 1e-12 * length, side="right")) - 1, len(durations) - 1)
+        outer = shifted(table[piece : piece + 1], np.array([at - breaks[piece]]))[0]
+        local[0] = 0.0
+        pieces.append(composed(outer, local, _TERMS))
+
+    after = int(np.searchsorted(breaks, length * reach, side="right")) - 1
+    rest = table[after:].copy()
+    rest_durations = durations[after:].copy()
+    cut = length * reach - breaks[after]
+    rest[0] = shifted(rest[:1], np.array([cut]))[0]
+    rest_durations[0] -= cut
+    count = max(_TERMS, table.shape[1])
+    return (
+        np.concatenate([np.diff(u) * length, rest_durations]),
+        np.concatenate([padded(np.array(pieces), count), padded(rest, count)]),
+    )
+
+
+def _warp(flatness: int) -> NDArray:
+    """Coefficients of σ(u) on [0, 1]: σ'' = u^(a-1) (1-u)^4 / B(a, 5)."""
+    a = flatness
+    norm = factorial(a + 4) / (factorial(a - 1) * factorial(4))
+    sigma = np.zeros(a + 6)
+    for k in range(5):
+        sigma[a + 1 + k] = norm * (-1) ** k * comb(4, k) / ((a + k) * (a + 1 + k))
+    return sigma
+
+
+def _inverse(sigma: NDArray, values: NDArray) -> NDArray:
+    """u with σ(u) = value, by bisection: σ is monotone."""
+    low, high = np.zeros_like(values), np.ones_like(values)
+    for _ in range(60):
+        middle = (low + high) / 2
+        below = np.polynomial.polynomial.polyval(middle, sigma) < values
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return (low + high) / 2
