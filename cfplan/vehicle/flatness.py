@@ -128,6 +128,7 @@ def motor_thrusts(airframe: Airframe, collective: Scalar, torque: Vector) -> tup
         torque[2] / (4.0 * airframe.thrust_to_torque),
     )
     one, two, three, four = (
-        0.25 * collective + float(sx) * roll + float(sy) * pitch + float(sz) * yaw for sx, sy, sz in MOTOR_TORQUE_SIGNS.T
+        0.25 * collective + float(sx) * roll + float(sy) * pitch + float(sz) * yaw
+        for sx, sy, sz in MOTOR_TORQUE_SIGNS.T
     )
     return one, two, three, four

@@ -76,9 +76,7 @@ class SpeedProfile:
 
     def boundary(self, node: int) -> BoundaryState:
         """The state at a grid point."""
-        return BoundaryState(
-            *(float(values[node]) for values in (self.h, self.dh, self.ddh, self.yaw, self.dyaw))
-        )
+        return BoundaryState(*(float(values[node]) for values in (self.h, self.dh, self.ddh, self.yaw, self.dyaw)))
 
     def slowed(self, share: float) -> "SpeedProfile":
         """The same flight at `share` of its speed: h scaled by share², yaw unchanged along the path."""

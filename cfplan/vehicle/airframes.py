@@ -1,0 +1,85 @@
+"""Airframes by name, each number with its source.
+
+Sources:
+  RotorPy    `rotorpy.vehicles.crazyflie_params` and `crazyfliebrushless_params` of RotorPy 3.0.0
+  models     `drone_models/data/params.toml` of drone-models 0.1.0: identified on flying vehicles with markers
+  firmware   crazyflie-firmware 2026.08: the motor thrust caps, which hold while the battery does (above about 3.1 V)
+
+Where `models` gives rotor dynamics n' = k₁(u − n) + k₂(u² − n²), up and down apart, the time constant here is the mean
+of 1/(k₁ + 2k₂n) of both at the hover speed n: to first order thrust lags as the rotor speed does.
+"""
+
+import difflib
+from pathlib import Path
+from types import MappingProxyType
+
+from cfplan.errors import InputError
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+
+_ROTORPY_HOVER = (0.030 * GRAVITY / 4 / 2.3e-8) ** 0.5  # rad/s, from mass and k_eta
+
+AIRFRAMES = MappingProxyType(
+    {
+        airframe.name: airframe
+        for airframe in (
+            Airframe(
+                name="crazyflie-2.0",
+                mass=0.030,
+                inertia=(1.43e-5, 1.43e-5, 2.89e-5),
+                arm=0.043 / 2**0.5,
+                thrust_to_torque=7.8e-10 / 2.3e-8,  # k_m / k_eta; four times what was measured on the 2.1+
+                motor_thrust_min=0.0,
+                motor_thrust_max=2.3e-8 * 2500.0**2,  # k_eta · rotor_speed_max², 0.14375 N
+                motor_time_constant=0.072,  # Eschmann et al. (2024); RotorPy had 0.005 s in the paper's day
+                drag=(4 * 1.02506e-6 * _ROTORPY_HOVER, 4 * 7.553e-7 * _ROTORPY_HOVER),  # k_d and k_z at hover
+                source="RotorPy 3.0.0, as the paper used it but for the motor time constant (0.005 s then)",
+            ),
+            Airframe(
+                name="crazyflie-2.1+",
+                mass=0.0318,
+                inertia=(16.8e-6, 16.8e-6, 29.8e-6),
+                arm=0.046 / 2**0.5,
+                thrust_to_torque=0.0069928948992470565,
+                motor_thrust_min=0.012817578393224994,
+                motor_thrust_max=0.12,
+                motor_time_constant=0.105,
+                drag=(0.01351483, 0.01677452),
+                source="drone-models 0.1.0 cf2x_P250, measured with markers; thrust cap of firmware 2026.08",
+            ),
+            Airframe(
+                name="crazyflie-thrust-upgrade",
+                mass=0.0379,
+                inertia=(16.8e-6, 16.8e-6, 29.8e-6),  # not measured; that of the 2.1
+                arm=0.046 / 2**0.5,
+                thrust_to_torque=0.005355990836477486,
+                motor_thrust_min=0.01922636758983749,
+                motor_thrust_max=0.18,
+                motor_time_constant=0.079,
+                drag=(0.01556697, 0.02191672),
+                source="drone-models 0.1.0 cf2x_T350, measured with markers; thrust cap of firmware 2026.08",
+            ),
+            Airframe(
+                name="crazyflie-2.1-brushless",
+                mass=0.04338,
+                inertia=(25e-6, 28e-6, 49e-6),
+                arm=0.050 / 2**0.5,
+                thrust_to_torque=0.00593893393599368,
+                motor_thrust_min=0.02136263065537499,
+                motor_thrust_max=0.20,
+                motor_time_constant=0.060,
+                drag=(0.02149163, 0.02359736),
+                source="drone-models 0.1.0 cf21B_500, measured with markers; thrust cap of firmware 2026.08",
+            ),
+        )
+    }
+)
+
+
+def load_airframe(name_or_file: str | Path) -> Airframe:
+    """The airframe of that name. Raises InputError."""
+    text = str(name_or_file)
+    if text in AIRFRAMES:
+        return AIRFRAMES[text]
+    near = difflib.get_close_matches(text, AIRFRAMES, n=1)
+    guess = f"did you mean {near[0]}? " if near else ""
+    raise InputError(f"unknown vehicle {text!r}", hint=f"{guess}known: {', '.join(AIRFRAMES)}")

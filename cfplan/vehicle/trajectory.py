@@ -1,0 +1,154 @@
+"""A speed profile along a path as motion in time: the full state at any time."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cfplan.errors import NotCertifiedError
+from cfplan.geometry.path import Path
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.flatness import flat_state
+from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.timing import Timing, measure
+
+_SAME_S = 1e-9  # ends of path and profile nearer than this are the same
+
+
+@dataclass(frozen=True, slots=True)
+class FullState:
+    """Everything that the vehicle does at N moments. For a scalar time the leading axis is absent."""
+
+    time: NDArray
+    # (N,) s from the start
+    s: NDArray
+    # (N,) where on the path
+    position: NDArray
+    # (N, 3) m
+    velocity: NDArray
+    # (N, 3) m/s
+    acceleration: NDArray
+    # (N, 3) m/s², without gravity
+    jerk: NDArray
+    # (N, 3) m/s³
+    snap: NDArray
+    # (N, 3) m/s⁴
+    quaternion: NDArray
+    # (N, 4) body→world, x y z w, continuous
+    yaw: NDArray
+    # (N,) rad, of the Hopf fibration, not wrapped
+    body_rate: NDArray
+    # (N, 3) rad/s, body axes
+    angular_acceleration: NDArray
+    # (N, 3) rad/s², body axes
+    torque: NDArray
+    # (N, 3) N m, body axes
+    specific_thrust: NDArray
+    # (N,) m/s², collective thrust over mass
+    thrust_axis: NDArray
+    # (N, 3) body z in the world
+    motor_thrust: NDArray
+    # (N, 4) N, motors 1 to 4
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """The flight of one profile. Before its start and after its end it hovers level at that end of the path.
+
+    Raises NotCertifiedError where h is not finite or not positive everywhere, also between the grid points.
+    """
+
+    path: Path
+    profile: SpeedProfile
+    airframe: Airframe
+    timing: Timing = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "timing", measure(self.profile))
+        start, end = float(self.profile.s[0]), float(self.profile.s[-1])
+        if abs(start) > _SAME_S or abs(end - self.path.end) > _SAME_S * (1.0 + self.path.end):
+            raise NotCertifiedError(
+                f"the speed profile goes from s = {start:g} to {end:g}, the path to {self.path.end:g}"
+            )
+
+    @property
+    def duration(self) -> float:
+        """s"""
+        return float(self.timing.time[-1])
+
+    def time_at(self, s: ArrayLike) -> NDArray:
+        """s of time at which the vehicle is at s, (N,); within 1e-9 s. s is held within the path."""
+        return self.timing.time_at(s)
+
+    def s_at(self, time: ArrayLike) -> NDArray:
+        """Where on the path the vehicle is at each time, (N,); within 1e-9. Time is held within the flight."""
+        return self.timing.s_at(time)
+
+    def at(self, time: ArrayLike) -> FullState:
+        """The full state at each time, s from the start."""
+        times = np.asarray(time, dtype=float)
+        flat = times.reshape(-1)
+        s = self.s_at(flat)
+        state = state_at(self.path, self.profile, self.airframe, s, time=flat)
+        resting = ~((flat >= 0.0) & (flat <= self.duration))
+        if np.any(resting):
+            _hover(state, resting, self.airframe)
+        return state if times.ndim else FullState(*(getattr(state, name)[0] for name in FullState.__slots__))
+
+
+def state_at(
+    path: Path,
+    profile: SpeedProfile,
+    airframe: Airframe,
+    s: NDArray,
+    *,
+    time: NDArray,
+    interval: NDArray | None = None,
+) -> FullState:
+    """The full state at s, (N,), by the polynomials of `interval` where given (see SpeedProfile.at)."""
+    sample = profile.at(s, interval)
+    position = path(s)
+    derivatives = [path(s, order) for order in (1, 2, 3, 4)]
+    flat = flat_state(
+        airframe,
+        tuple((d[:, 0], d[:, 1], d[:, 2]) for d in derivatives),  # type: ignore[arg-type]
+        (sample.h, sample.dh, sample.ddh, sample.dddh),
+        (sample.yaw, sample.dyaw, sample.ddyaw),
+        np.cos,
+        np.sin,
+    )
+    axis = np.stack(flat.thrust_axis, axis=-1)
+    return FullState(
+        time=time,
+        s=s,
+        position=position,
+        velocity=np.stack(flat.velocity, axis=-1),
+        acceleration=np.stack(flat.acceleration, axis=-1),
+        jerk=np.stack(flat.jerk, axis=-1),
+        snap=np.stack(flat.snap, axis=-1),
+        quaternion=hopf_quaternion(axis, sample.yaw),
+        yaw=sample.yaw,
+        body_rate=np.stack(flat.body_rate, axis=-1),
+        angular_acceleration=np.stack(flat.angular_acceleration, axis=-1),
+        torque=np.stack(flat.torque, axis=-1),
+        specific_thrust=flat.specific_thrust,
+        thrust_axis=axis,
+        motor_thrust=np.stack(flat.motor_thrust, axis=-1),
+    )
+
+
+def hopf_quaternion(axis: NDArray, yaw: NDArray) -> NDArray:
+    """(N, 4) x y z w: the least turn from the vertical to `axis`, (N, 3) unit, after a turn by yaw, (N,)."""
+    a, b, c = axis[:, 0], axis[:, 1], axis[:, 2]
+    cos, sin = np.cos(yaw / 2), np.sin(yaw / 2)
+    norm = np.sqrt(2.0 * (1.0 + c))
+    return np.stack([(-b * cos + a * sin) / norm, (a * cos + b * sin) / norm, sin * norm / 2, cos * norm / 2], axis=-1)
+
+
+def _hover(state: FullState, rows: NDArray, airframe: Airframe) -> None:
+    for name in ("velocity", "acceleration", "jerk", "snap", "body_rate", "angular_acceleration", "torque"):
+        getattr(state, name)[rows] = 0.0
+    state.specific_thrust[rows] = GRAVITY
+    state.motor_thrust[rows] = airframe.hover_thrust
+    state.thrust_axis[rows] = (0.0, 0.0, 1.0)
+    state.quaternion[rows] = hopf_quaternion(state.thrust_axis[rows], state.yaw[rows])
