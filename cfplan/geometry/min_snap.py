@@ -5,6 +5,8 @@ the waypoints; their normal equations are block-tridiagonal and positive definit
 them in linear time, scaled to a unit diagonal because segments differ in length.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solveh_banded
@@ -16,6 +18,8 @@ from cfplan.geometry.rest import rest_path, with_rest_ends
 
 CLOSEST = 0.01
 # m, waypoints nearer than this to their predecessor are one point mistyped
+FARTHEST = 1e5
+# m, from the origin along each axis: beyond this millimetres are lost to rounding
 CLOSEST_DENSE = 0.001
 # m, the same for lists of points
 
@@ -55,21 +59,29 @@ def smooth_through(points: ArrayLike) -> Path:
     return with_rest_ends(times, _pieces(points, times, rest=False))
 
 
-def check_points(points: NDArray, closest: float = CLOSEST) -> None:
-    """Refuse too few points, and neighbours nearer than `closest`, m."""
+def check_points(points: NDArray, closest: float = CLOSEST, where: Callable[[int], str] | None = None) -> None:
+    """Refuse too few points, points far off, and neighbours nearer than `closest`, m.
+
+    `where` names the place of a point by its index in messages.
+    """
+    where = where or (lambda index: f"waypoint {index + 1}")
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"waypoints must be x, y, z each, not an array of shape {points.shape}")
     if len(points) < 2:
         raise InputError(f"a path needs two waypoints at least, not {len(points)}")
-    bad = ~np.isfinite(points).all(axis=1)
+    bad = ~(np.abs(points) <= FARTHEST).all(axis=1)
     if bad.any():
-        raise InputError("coordinates must be finite numbers", where=f"waypoint {int(np.argmax(bad)) + 1}")
+        index = int(np.argmax(bad))
+        raise InputError(
+            f"coordinates must be numbers within {FARTHEST:g} m of the origin, not {points[index].tolist()}",
+            where=where(index),
+        )
     distances = np.linalg.norm(np.diff(points, axis=0), axis=1)
     near = int(np.argmin(distances))
     if distances[near] < closest:
         raise InputError(
             f"waypoints {near + 1} and {near + 2} are {distances[near]:.4f} m apart, less than {closest} m",
-            where=f"waypoint {near + 2}",
+            where=where(near + 1),
             hint="take one of them out",
         )
 

@@ -23,9 +23,10 @@ _NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
 _UNITS = ("m", "m/s", "m/s²", "m/s³", "m/s⁴")
 
 
-def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> Path:
+def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> tuple[Path, NDArray]:
     """The curve in space of a polynomial file, at rest at both ends and at 1 m/s nominal in the mean.
 
+    With it the points where its rows begin and the last one ends, (K, 3) m.
     Its own timing and its yaw are left: the planner times the path, and yaw comes from the yaw mode.
 
     Raises:
@@ -40,14 +41,20 @@ def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> Path:
         )
     table = rows[:, 1:25].reshape(-1, 3, 8).transpose(0, 2, 1)
     durations, table = np.tile(durations, laps), np.tile(table, (laps, 1, 1))
-    _check_steps(file, lines * laps, durations, table)
-    return with_rest_ends(*mended(durations, table))
+    _check_pieces(file, lines * laps, durations, table)
+    corners = np.concatenate([table[:, 0], end_values(durations[-1:], table[-1:])[1][:, 0]])
+    return with_rest_ends(*mended(durations, table)), corners
 
 
-def _check_steps(file: pathlib.Path, lines: list[int], durations: NDArray, table: NDArray) -> None:
+def _check_pieces(file: pathlib.Path, lines: list[int], durations: NDArray, table: NDArray) -> None:
     left, right = end_values(durations, table)
-    if not np.isfinite(right).all():
-        raise InputError("the polynomials leave all bounds", where=str(file))
+    extent = np.abs(table[:, 1:] * durations[:, None, None] ** np.arange(1, 8)[:, None]).sum(axis=1).max(axis=1)
+    if (extent < _POSITION_STEP).any():
+        raise InputError(
+            "the piece stays in one place",
+            where=f"{file}:{lines[int(np.argmin(extent))]}",
+            hint="take the row out; a path cannot wait",
+        )
     largest = np.linalg.norm(np.concatenate([left, right]), axis=-1).max(axis=0)
     allowed = np.maximum(_DERIVATIVE_STEP * largest, 1e-6)
     allowed[0] = _POSITION_STEP

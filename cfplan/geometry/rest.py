@@ -20,8 +20,8 @@ WARP = 1.5
 _WARP_PIECES = 16
 _TERMS = 16
 # Taylor terms kept of the composition
-_NEGLIGIBLE = 1e-3
-# of the largest derivative of that order: below this an end derivative is taken for rounding in the file
+_NEGLIGIBLE = np.array([1e-3, 1e-2, 1e-1])
+# γ', γ'', γ''' at 1 m/s nominal: an end that moves less is at rest but for rounding in its file
 _HERMITE = hermite(5)
 
 
@@ -58,11 +58,18 @@ def mended(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
     step = (left[1:] - right[:-1]) / 2
     left_change, right_change = np.zeros_like(left), np.zeros_like(right)
     left_change[1:], right_change[:-1] = -step, step
-    powers = durations[:, None] ** np.arange(5)
-    ends = np.concatenate([left_change * powers[..., None], right_change * powers[..., None]], axis=1)
-    change = (_HERMITE @ ends) / durations[:, None, None] ** np.arange(10)[:, None]
-    count = max(table.shape[1], 10)
-    return durations, padded(table, count) + padded(change, count)
+    return durations, _changed(durations, table, left_change, right_change, slice(None))
+
+
+def _changed(durations: NDArray, table: NDArray, left: NDArray, right: NDArray, pieces: slice) -> NDArray:
+    """The pieces with polynomials of degree 9 added that have these end values, (n, 5, 3) each."""
+    times = durations[pieces, None, None]
+    powers = times ** np.arange(5)[:, None]
+    result = padded(table, max(table.shape[1], 10))
+    result[pieces, :10] += (
+        _HERMITE @ np.concatenate([left * powers, right * powers], axis=1) / (times ** np.arange(10)[:, None])
+    )
+    return result
 
 
 def _at_nominal_speed(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
@@ -74,13 +81,13 @@ def _at_nominal_speed(durations: NDArray, table: NDArray) -> tuple[NDArray, NDAr
 
 
 def _with_rest_start(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
-    left, right = end_values(durations, table)
-    largest = np.linalg.norm(np.concatenate([left, right]), axis=-1).max(axis=0)
-    moving = np.linalg.norm(left[0], axis=-1) > _NEGLIGIBLE * largest
-    if not moving[1:4].any():
-        return durations, table
-    flatness = 3 if moving[1] else 1
-    return _warped(durations, table, flatness)
+    start = end_values(durations[:1], table[:1])[0][0]
+    moving = np.linalg.norm(start[1:4], axis=-1) > _NEGLIGIBLE
+    if moving.any():
+        return _warped(durations, table, 3 if moving[0] else 1)
+    change = np.zeros((1, 5, 3))
+    change[0, 1:4] = -start[1:4]
+    return durations, _changed(durations, table, change, np.zeros((1, 5, 3)), slice(0, 1))
 
 
 def _warped(durations: NDArray, table: NDArray, flatness: int) -> tuple[NDArray, NDArray]:

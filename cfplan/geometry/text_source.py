@@ -11,6 +11,8 @@ from cfplan.errors import InputError
 
 LARGEST_FILE = 4_000_000
 # bytes; a path or a set of limits is a few kilobytes
+LARGEST_NUMBER = 1e6
+# metres, seconds or coefficients: beyond this it is a slip, and arithmetic would suffer
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 
 
@@ -79,6 +81,8 @@ def _numbers(cells: list[str], columns: int, what: str, where: str) -> list[floa
             raise InputError(f"column {column} is not a number: {cell[:40]!r}", where=where)
         if not math.isfinite(float(cell)):
             raise InputError(f"column {column} is not a finite number: {cell[:40]}", where=where)
+        if abs(float(cell)) > LARGEST_NUMBER:
+            raise InputError(f"column {column} is out of all bounds: {cell[:40]}", where=where)
     return [float(cell) for cell in cells]
 
 

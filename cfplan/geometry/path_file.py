@@ -1,0 +1,182 @@
+"""path.yaml: which curve to fly, where in the room, and which way to point.
+
+name: figure eight
+waypoints: [[0, 0, 1], [1, 1, 1], …]    # or  points: file.csv  (x, y, z a row)
+                                        # or  polynomials: file.csv  (as Crazyswarm writes them)
+yaw: {mode: fixed, angle_deg: 30}       # or  yaw: tangent,  yaw: free;  fixed at 0 if left out
+laps: 3                                 # of a closed path, flown through without a stop
+speed: 0.5                              # share of the speed that the limits allow
+place: {x: 0, y: 0, z: 0, yaw_deg: 90}  # turned about z through the origin, then moved; a fixed yaw turns too
+"""
+
+import math
+import pathlib
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from cfplan.errors import InputError
+from cfplan.geometry.min_snap import CLOSEST, CLOSEST_DENSE, check_points, min_snap, smooth_through
+from cfplan.geometry.path import Path, rotation_about_z
+from cfplan.geometry.polynomial_csv import read_polynomials
+from cfplan.geometry.text_source import read_table
+from cfplan.geometry.yaml_source import Places, read_yaml_with_places
+from cfplan.geometry.yaw import YawMode
+
+_FEW = 8
+# points: fewer than these are waypoints, with room between them to gather speed
+_MOST = 50_000
+# points over all laps
+
+
+@dataclass(frozen=True, slots=True)
+class PathFile:
+    """What a path file asks for."""
+
+    name: str
+    path: Path
+    # in the room
+    yaw: YawMode
+    yaw_angle: float
+    # rad, in the room; of mode fixed, otherwise 0
+    speed: float
+    # share of the speed limit, in (0, 1]
+    laps: int
+    waypoints: NDArray
+    # (K, 3) m, in the room, all laps
+    source: pathlib.Path
+
+
+class _Yaw(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mode: YawMode
+    angle_deg: float = Field(default=0.0, ge=-360.0, le=360.0)
+
+
+class _Place(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    yaw_deg: float = Field(default=0.0, ge=-360.0, le=360.0)
+
+
+def _short_yaw(value: Any) -> Any:
+    return {"mode": value} if isinstance(value, str) else value
+
+
+class _Content(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(default="", max_length=100, pattern=r"^[^\n\r]*$")
+    waypoints: list[list[float]] | None = None
+    points: str | None = None
+    polynomials: str | None = None
+    yaw: Annotated[_Yaw, BeforeValidator(_short_yaw)] = _Yaw(mode=YawMode.FIXED)
+    laps: int = Field(default=1, ge=1, le=1000)
+    speed: float = Field(default=1.0, gt=0.0, le=1.0)
+    place: _Place = _Place()
+
+
+def load_path_file(file: pathlib.Path | str) -> PathFile:
+    """The path of a path.yaml, checked to be one that can be flown through without a stop.
+
+    Raises:
+        InputError: whatever is wrong with it or with the file that it names, with line and column.
+    """
+    file = pathlib.Path(file)
+    content, places = read_yaml_with_places(file, _Content)
+    given = _source(content, places)
+    path, waypoints = _SOURCES[given](content, places)
+    path.check(where=places.where(given))
+
+    if content.yaw.angle_deg and content.yaw.mode is not YawMode.FIXED:
+        raise InputError("angle_deg is for mode fixed only", where=places.where_key("yaw", "angle_deg"))
+    place, turn = content.place, math.radians(content.place.yaw_deg)
+    offset = np.array([place.x, place.y, place.z])
+    fixed = content.yaw.mode is YawMode.FIXED
+    angle = math.remainder(math.radians(content.yaw.angle_deg) + turn, math.tau) if fixed else 0.0
+    return PathFile(
+        name=content.name or file.stem,
+        path=path.placed(offset, turn),
+        yaw=content.yaw.mode,
+        yaw_angle=angle,
+        speed=content.speed,
+        laps=content.laps,
+        waypoints=waypoints @ rotation_about_z(turn).T + offset,
+        source=file,
+    )
+
+
+def read_points(file: pathlib.Path) -> tuple[NDArray, list[int]]:
+    """(K, 3) m from a file of x, y, z a row, and the line of each."""
+    return read_table(file, 3, "x, y, z")
+
+
+def _source(content: _Content, places: Places) -> str:
+    given = [key for key in _SOURCES if getattr(content, key) is not None]
+    if not given:
+        raise InputError(f"one of {', '.join(_SOURCES)} is needed", where=places.where())
+    if len(given) > 1:
+        later = max(given, key=lambda key: places.keys[(key,)])
+        raise InputError(f"only one of {' and '.join(given)} may be given", where=places.where_key(later))
+    return given[0]
+
+
+def _from_waypoints(content: _Content, places: Places) -> tuple[Path, NDArray]:
+    rows = content.waypoints or []
+    for index, row in enumerate(rows):
+        if len(row) != 3:
+            raise InputError(
+                f"waypoint {index + 1} has {len(row)} numbers, not x, y, z", where=places.where("waypoints", index)
+            )
+    points = np.array(rows, dtype=float).reshape(-1, 3)
+    if len(points) < 2:
+        raise InputError(f"a path needs two waypoints at least, not {len(points)}", where=places.where("waypoints"))
+    check_points(points, CLOSEST, lambda index: places.where("waypoints", index))
+    points = _repeated(points, content.laps, places)
+    return min_snap(points), points
+
+
+def _from_points(content: _Content, places: Places) -> tuple[Path, NDArray]:
+    file = _beside(places, content.points)
+    points, lines = read_points(file)
+    if len(points) < 2:
+        raise InputError(f"a path needs two points at least, not {len(points)}", where=str(file))
+    few = len(points) < _FEW
+    check_points(points, CLOSEST if few else CLOSEST_DENSE, lambda index: f"{file}:{lines[index]}")
+    points = _repeated(points, content.laps, places)
+    return (min_snap(points) if few else smooth_through(points)), points
+
+
+def _from_polynomials(content: _Content, places: Places) -> tuple[Path, NDArray]:
+    return read_polynomials(_beside(places, content.polynomials), laps=content.laps)
+
+
+_SOURCES = {"waypoints": _from_waypoints, "points": _from_points, "polynomials": _from_polynomials}
+
+
+def _beside(places: Places, name: str | None) -> pathlib.Path:
+    return pathlib.Path(places.file).parent / (name or "")
+
+
+def _repeated(points: NDArray, laps: int, places: Places) -> NDArray:
+    """The points of all laps: the end of a lap is the start of the next, so it stands once."""
+    if 1 + laps * (len(points) - 1) > _MOST:
+        raise InputError(f"more than {_MOST} points", where=places.where("laps"))
+    if laps == 1:
+        return points
+    gap = float(np.linalg.norm(points[-1] - points[0]))
+    if gap >= CLOSEST:
+        raise InputError(
+            f"{laps} laps need a closed path, but the last point is {gap:.3f} m from the first",
+            where=places.where("laps"),
+            hint="end the path with its first point",
+        )
+    lap = np.concatenate([points[1:-1], points[:1]])
+    return np.concatenate([points[:1], np.tile(lap, (laps, 1))])

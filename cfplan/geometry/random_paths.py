@@ -1,0 +1,105 @@
+"""Paths from seeds: random waypoints, and paths near a given one."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BSpline, PPoly
+
+from cfplan.errors import InputError
+from cfplan.geometry.path import Path
+from cfplan.geometry.polynomials import padded, shifted
+
+SPACING = 0.5
+# m, least distance between waypoints in a row
+KNOT_SPACING = 1.0
+# s at 1 m/s nominal, between knots of a perturbation
+_TRIES = 1000
+_DEGREE = 5
+# of a perturbation: C⁴, as a path must be
+
+
+def generator(seed: int | np.random.SeedSequence) -> np.random.Generator:
+    """Random numbers that are the same on every machine."""
+    sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    return np.random.Generator(np.random.PCG64(sequence))
+
+
+def random_waypoints(
+    seed: int | np.random.SeedSequence,
+    box: ArrayLike,
+    count_range: tuple[int, int] = (3, 6),
+    *,
+    spacing: float = SPACING,
+) -> NDArray:
+    """(K, 3) m, K uniform in count_range with both ends, uniform in the box (2, 3) of low and high corner.
+
+    Waypoints in a row are at least `spacing`, m, apart.
+
+    Raises:
+        InputError: a box that is none, or too small for the spacing.
+    """
+    low, high = np.asarray(box, dtype=float)
+    if not (np.isfinite([low, high]).all() and (low <= high).all()):
+        raise InputError(f"a box needs a low and a high corner, not {np.asarray(box).tolist()}")
+    if not 2 <= count_range[0] <= count_range[1]:
+        raise InputError(f"a path needs two waypoints at least, not {count_range[0]} to {count_range[1]}")
+    random = generator(seed)
+    count = int(random.integers(count_range[0], count_range[1], endpoint=True))
+    points = [random.uniform(low, high)]
+    for _ in range(_TRIES * count):
+        if len(points) == count:
+            break
+        point = random.uniform(low, high)
+        if np.linalg.norm(point - points[-1]) >= spacing:
+            points.append(point)
+    else:
+        raise InputError(f"no room for waypoints {spacing} m apart in a box of {(high - low).tolist()} m")
+    return np.array(points)
+
+
+def perturbed(path: Path, epsilon: float, seed: int | np.random.SeedSequence) -> Path:
+    """A path of the family π_ε(γ): piecewise polynomial, C⁴, nowhere farther than ε, m, from γ at the same s.
+
+    ("Robustness against Perturbations" in the paper asks this of the nodes; here it holds between them too.)
+    To γ is added a quintic B-spline whose control points are uniform in a ball of radius ε. A spline lies in the
+    convex hull of its control points, hence the bound. At the ends four control points coincide, so rest stays rest.
+    """
+    if not (np.isfinite(epsilon) and epsilon >= 0.0):
+        raise InputError(f"a perturbation must be at least 0, not {epsilon}")
+    spans = max(5, round(path.end / KNOT_SPACING))
+    knots = np.linspace(0.0, path.end, spans + 1)
+    control = _in_ball(generator(seed), spans + _DEGREE, epsilon)
+    control[:3], control[-3:] = control[3], control[-4]
+    breaks, table = _sum(path, knots, _spline_pieces(knots, control))
+    for end in (0, -1):  # rounding must not move an end that rests
+        table[end, 1:4] = path.coefficients[end, 1:4]
+    return Path(breaks, table)
+
+
+def _sum(path: Path, knots: NDArray, pieces: NDArray) -> tuple[NDArray, NDArray]:
+    """Breaks and coefficients of γ plus polynomials (M, D, 3), each about its left knot, on the same range of s."""
+    breaks = np.union1d(path.breaks, knots)
+    breaks = breaks[np.diff(breaks, append=np.inf) > 1e-9 * path.end]  # a knot may be a break but for rounding
+    origins = breaks[:-1].copy()
+    origins[-1] = path.end
+
+    middles = (breaks[:-1] + breaks[1:]) / 2
+    ours = np.searchsorted(path.breaks, middles) - 1
+    theirs = np.searchsorted(knots, middles) - 1
+    our_origins = path.breaks[:-1].copy()
+    our_origins[-1] = path.end
+    count = max(path.coefficients.shape[1], pieces.shape[1])
+    table = padded(shifted(path.coefficients[ours], origins - our_origins[ours]), count)
+    return breaks, table + padded(shifted(pieces[theirs], origins - knots[theirs]), count)
+
+
+def _in_ball(random: np.random.Generator, count: int, radius: float) -> NDArray:
+    direction = random.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return direction * radius * np.cbrt(random.uniform(size=(count, 1)))
+
+
+def _spline_pieces(knots: NDArray, control: NDArray) -> NDArray:
+    """(M, 6, 3): the clamped B-spline's polynomials about their left knots."""
+    clamped = np.concatenate([np.repeat(knots[0], _DEGREE), knots, np.repeat(knots[-1], _DEGREE)])
+    pieces = PPoly.from_spline(BSpline(clamped, control, _DEGREE))
+    return pieces.c[::-1, _DEGREE : _DEGREE + len(knots) - 1].transpose(1, 0, 2)
