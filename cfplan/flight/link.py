@@ -1,0 +1,336 @@
+"""The connection to one Crazyflie: cflib for what it does well, and bounded waits where it would wait for ever.
+
+cflib connects, fetches the tables and carries parameters and logs. What is sent in flight goes straight to the link
+driver: cflib's own sending holds a lock while a dying link joins the thread that waits for it.
+"""
+
+import os
+import struct
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cfplan.errors import LinkError
+from cfplan.flight.packets import decompress_quaternion
+from cfplan.flight.telemetry import Estimate, Telemetry, Triple, VehicleStatus
+from cfplan.vehicle.airframe import GRAVITY
+
+FIRST_ANSWER = 4.0  # s, from opening the link to the first packet
+WHOLE_CONNECTION = 30.0  # s, to the last parameter, over a lossy radio without a cache
+HIGH_LEVEL_PORT, GENERIC_PORT, LOCALIZATION_PORT, SUPERVISOR_PORT, PLATFORM_PORT = 8, 7, 6, 9, 13
+TAKE_OFF, LAND, STOP, GO_TO = 7, 8, 3, 12  # commands of the on-board commander
+EXTERNAL_POSE = 8
+
+_MILLI = 1e-3
+_ESTIMATE = [f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az")]
+_ESTIMATE_LOG = ([(name, "int16_t") for name in _ESTIMATE] + [("stateEstimateZ.quat", "uint32_t")], 10)
+_STATUS_LOG = (
+    [(f"stateEstimateZ.{name}", "int16_t") for name in ("rateRoll", "ratePitch", "rateYaw")]
+    + [(f"motor.m{motor}", "uint16_t") for motor in (1, 2, 3, 4)]
+    + [("pm.vbatMV", "uint16_t"), ("supervisor.info", "uint16_t")],
+    20,
+)
+_VARIANCE_LOG = ([(f"kalman.var{axis}", "float") for axis in "XYZ"], 10)
+
+
+class _Serialized:
+    """A link driver that sends for one thread at a time, and gives a packet up rather than wait for a stuck one."""
+
+    def __init__(self, driver: Any):
+        self._driver, self._lock = driver, threading.Lock()
+        self.needs_resending = driver.needs_resending
+
+    def send_packet(self, packet: Any) -> None:
+        if self._lock.acquire(timeout=0.1):
+            try:
+                self._driver.send_packet(packet)
+            finally:
+                self._lock.release()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._driver, name)
+
+
+class Link:
+    """A connected Crazyflie. Made by `connect`."""
+
+    def __init__(self, crazyflie: Any, uri: str, report: Callable[[Telemetry], None]):
+        self._crazyflie, self.uri, self._report = crazyflie, uri, report
+        self.lost = ""
+        # why the link is gone; empty while it stands
+        self.estimate: Estimate | None = None
+        self.status: VehicleStatus | None = None
+        self.position_variance: Triple | None = None
+        # m² along x, y, z
+        self.replies: dict[int, int] = {}
+        # command of the on-board commander: the code that it answered, 0 for done
+        self.firmware = ""
+        self._variance_block: Any = None
+        crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
+        crazyflie.add_port_callback(PLATFORM_PORT, self._on_platform)
+
+    @property
+    def protocol(self) -> int:
+        return int(self._crazyflie.platform.get_protocol_version())
+
+    @property
+    def round_trip(self) -> float:
+        """s, 95th percentile of the last echoes; 0 before the first."""
+        return float(self._crazyflie.link_statistics.latency.latency) * _MILLI
+
+    # What is sent in flight: never waits.
+
+    def _send(self, port: int, channel: int, data: bytes) -> None:
+        self.send(packet(port, channel, data))
+
+    def send(self, prepared: Any) -> None:
+        """Send a packet made by `packet`. A link that is gone takes it silently: watch `lost`."""
+        driver = self._crazyflie.link
+        if driver is not None:
+            driver.send_packet(prepared)
+
+    def send_pose(self, position: Sequence[float], quaternion: Sequence[float]) -> None:
+        self._send(LOCALIZATION_PORT, 1, struct.pack("<B7f", EXTERNAL_POSE, *position, *quaternion))
+
+    def release_priority(self) -> None:
+        """Give the vehicle back to its on-board commander."""
+        self._send(GENERIC_PORT, 1, struct.pack("<BI", 0, 0))
+
+    def take_off(self, height: float, duration: float) -> None:
+        """Straight up to `height`, m above the origin, keeping yaw."""
+        self._command(TAKE_OFF, struct.pack("<Bff?f", 0, height, 0.0, True, duration))
+
+    def land(self, height: float, duration: float) -> None:
+        """Straight down to `height`, keeping yaw; motors off at the end."""
+        self._command(LAND, struct.pack("<Bff?f", 0, height, 0.0, True, duration))
+
+    def go_to(self, position: Sequence[float], yaw: float, duration: float) -> None:
+        self._command(GO_TO, struct.pack("<BBB5f", 0, False, False, *position, yaw, duration))
+
+    def stop_motors(self) -> None:
+        """End what the on-board commander does; motors off."""
+        self._command(STOP, b"\0")
+
+    def _command(self, command: int, arguments: bytes) -> None:
+        self.replies.pop(command, None)
+        self._send(HIGH_LEVEL_PORT, 0, bytes([command]) + arguments)
+
+    def arm(self, do_arm: bool) -> None:
+        if self.protocol >= 12:
+            self._send(SUPERVISOR_PORT, 1, bytes([1, do_arm]))
+        else:
+            self._send(PLATFORM_PORT, 0, bytes([1, do_arm]))
+
+    def emergency_stop(self) -> None:
+        """Motors off at once, wherever it is; the vehicle must be restarted after it."""
+        if self.protocol >= 12:
+            self._send(SUPERVISOR_PORT, 1, b"\x03")
+        else:
+            self._send(LOCALIZATION_PORT, 1, b"\x03")
+
+    # What waits for an answer: for the ground only.
+
+    def set_parameter(self, name: str, value: float, patience: float = 2.0) -> float:
+        """Write, then read what the vehicle has. Raises LinkError where it has no such parameter or does not answer."""
+        group, _, short = name.partition(".")
+        values: list[float] = []
+        answered = threading.Event()
+
+        def note(_: str, text: str) -> None:
+            values.append(float(text))
+            if len(values) == 2:  # the first answers the writing, the second the reading
+                answered.set()
+
+        self._crazyflie.param.add_update_callback(group, short, note)
+        try:
+            self._crazyflie.param.set_value(name, value)
+            self._crazyflie.param.request_param_update(name)
+            if not answered.wait(patience):
+                raise LinkError(f"no answer to setting {name}", where=self.uri, hint="check the radio link")
+        except (KeyError, AttributeError) as error:
+            raise LinkError(
+                f"the vehicle has no parameter {name} that can be set", where=self.uri, hint="update its firmware"
+            ) from error
+        finally:
+            self._crazyflie.param.remove_update_callback(group, short, note)
+        return values[-1]
+
+    def start_logs(self) -> None:
+        """From here on `estimate`, `status` and `position_variance` are kept, and the first two reported."""
+        self._log("estimate", _ESTIMATE_LOG, self._on_estimate)
+        self._log("status", _STATUS_LOG, self._on_status)
+        self._variance_block = self._log("variance", _VARIANCE_LOG, self._on_variance)
+
+    def stop_variance_log(self) -> None:
+        if self._variance_block is not None:
+            self._variance_block.stop()
+
+    def _log(self, name: str, variables: tuple[list[tuple[str, str]], int], note: Callable[..., None]) -> Any:
+        from cflib.crazyflie.log import LogConfig
+
+        names, period_ms = variables
+        block = LogConfig(name, period_ms)
+        for variable, kind in names:
+            block.add_variable(variable, kind)
+        block.data_received_cb.add_callback(note)
+        try:
+            self._crazyflie.log.add_config(block)
+        except KeyError as error:
+            raise LinkError(f"{error.args[0]}", where=self.uri, hint="update the vehicle's firmware") from error
+        block.start()
+        return block
+
+    def ask_firmware(self) -> None:
+        """`firmware` is set when the answer comes, where the vehicle gives one."""
+        self._send(PLATFORM_PORT, 1, b"\x01")
+
+    def close(self) -> None:
+        """Close the link. On the ground only: it sends a zero setpoint, which stops the motors."""
+        closing = threading.Thread(target=self._crazyflie.close_link, daemon=True)
+        closing.start()
+        closing.join(timeout=2.0)
+
+    # What comes in: these run in cflib's thread and must be quick.
+
+    def _on_estimate(self, _: int, data: dict[str, int], __: Any) -> None:
+        x, y, z, vx, vy, vz, ax, ay, az = (data[name] * _MILLI for name in _ESTIMATE)
+        q = decompress_quaternion(np.array([data["stateEstimateZ.quat"]], dtype=np.uint32))[0]
+        self.estimate = Estimate(
+            time=time.monotonic(),
+            position=(x, y, z),
+            velocity=(vx, vy, vz),
+            acceleration=(ax, ay, az - GRAVITY),  # the log counts gravity in
+            quaternion=(float(q[0]), float(q[1]), float(q[2]), float(q[3])),
+        )
+        self._report(self.estimate)
+
+    def _on_status(self, _: int, data: dict[str, int], __: Any) -> None:
+        roll, pitch, yaw = (data[f"stateEstimateZ.{name}"] * _MILLI for name in ("rateRoll", "ratePitch", "rateYaw"))
+        self.status = VehicleStatus(
+            time=time.monotonic(),
+            body_rate=(roll, -pitch, yaw),  # the log's pitch rate is nose up
+            motor=(data["motor.m1"], data["motor.m2"], data["motor.m3"], data["motor.m4"]),
+            battery_voltage=data["pm.vbatMV"] * _MILLI,
+            supervisor=data["supervisor.info"],
+        )
+        self._report(self.status)
+
+    def _on_variance(self, _: int, data: dict[str, float], __: Any) -> None:
+        self.position_variance = data["kalman.varX"], data["kalman.varY"], data["kalman.varZ"]
+
+    def _on_reply(self, packet: Any) -> None:
+        if len(packet.data) >= 4:
+            self.replies[packet.data[0]] = packet.data[3]
+
+    def _on_platform(self, packet: Any) -> None:
+        if packet.channel == 1 and len(packet.data) > 1 and packet.data[0] == 1:
+            self.firmware = bytes(packet.data[1:]).split(b"\0")[0].decode("ascii", "replace")
+
+
+def packet(port: int, channel: int, data: bytes) -> Any:
+    """A CRTP packet that `Link.send` takes."""
+    from cflib.crtp.crtpstack import CRTPPacket
+
+    made = CRTPPacket()
+    made.set_header(port, channel)
+    made.data = bytearray(data)
+    return made
+
+
+def connect(
+    uri: str,
+    report: Callable[[Telemetry], None],
+    drivers: Sequence[type] = (),
+    *,
+    waiting: Callable[[], None] = lambda: None,
+) -> Link:
+    """Connect, and take the vehicle out of whatever an earlier connection left it in.
+
+    `drivers` are cflib link drivers tried before cflib's own. `waiting` is called while nothing happens, and may raise.
+    Raises LinkError, within 5 s where nothing answers.
+    """
+    from cflib import crtp
+    from cflib.crazyflie import Crazyflie
+
+    if not crtp.CLASSES:
+        crtp.init_drivers()
+    for driver in reversed(drivers):
+        if driver not in crtp.CLASSES:
+            crtp.CLASSES.insert(0, driver)
+
+    answered, complete, failed = threading.Event(), threading.Event(), threading.Event()
+    reasons: list[str] = []
+
+    def fail(_: str, reason: str = "the link was closed") -> None:
+        reasons.append(reason)
+        failed.set()
+
+    crazyflie = Crazyflie(rw_cache=_table_cache())
+    crazyflie.link_established.add_callback(lambda _: answered.set())
+    crazyflie.fully_connected.add_callback(lambda _: complete.set())
+    crazyflie.connection_failed.add_callback(fail)
+    crazyflie.disconnected.callbacks.insert(0, fail)  # before cflib's own, one of which may never return
+
+    def open_link() -> None:
+        crazyflie.open_link(uri)
+        if crazyflie.link is not None:
+            crazyflie.link = _Serialized(crazyflie.link)
+
+    threading.Thread(target=open_link, daemon=True).start()
+    try:
+        _wait(answered, failed, FIRST_ANSWER, waiting)
+        if not failed.is_set() and not answered.is_set():
+            raise LinkError("nothing answers", where=uri, hint=_hint(uri, ""))
+        _wait(complete, failed, WHOLE_CONNECTION, waiting)
+        if failed.is_set():
+            reason = reasons[0].splitlines()[0].removeprefix("Couldn't load link driver: ")
+            raise LinkError(f"cannot connect: {reason}", where=uri, hint=_hint(uri, reason))
+        if not complete.is_set():
+            raise LinkError("the vehicle answers, but its tables do not come through", where=uri,
+                            hint="move closer, or choose a freer channel")  # fmt: skip
+    except BaseException:
+        threading.Thread(target=crazyflie.close_link, daemon=True).start()
+        raise
+
+    link = Link(crazyflie, uri, report)
+
+    def note_loss(_: str, reason: str = "the link was closed") -> None:
+        link.lost = link.lost or reason
+
+    crazyflie.disconnected.callbacks.insert(0, note_loss)
+    crazyflie.connection_lost.add_callback(note_loss)
+    link.release_priority()
+    link.ask_firmware()
+    return link
+
+
+def _wait(done: threading.Event, failed: threading.Event, patience: float, waiting: Callable[[], None]) -> None:
+    end = time.monotonic() + patience
+    while not (done.is_set() or failed.is_set()) and time.monotonic() < end:
+        waiting()
+        done.wait(0.02)
+
+
+def _hint(uri: str, reason: str) -> str:
+    if "No driver" in reason or "malformed" in reason:
+        return "a URI looks like radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:19850 or sim://0"
+    if uri.startswith("radio://") and ("dongle" in reason.lower() or "backend" in reason.lower()):
+        return "plug a Crazyradio in; `cfplan doctor` shows what is found"
+    if uri.startswith("radio://"):
+        return "is the Crazyflie on, and are channel, rate and address right?"
+    return "is the other end running?"
+
+
+def _table_cache() -> str | None:
+    """Where cflib keeps the vehicle's tables between connections; None where nothing can be written."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "cfplan" / "tables"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return str(folder) if os.access(folder, os.W_OK) else None

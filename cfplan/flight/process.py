@@ -1,0 +1,186 @@
+"""The pilot in a process of its own, and the main process's side of it."""
+
+import contextlib
+import gc
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+
+from cfplan.errors import CfplanError, LinkError
+from cfplan.flight.keys import Keyboard, Order
+from cfplan.flight.link import connect
+from cfplan.flight.mission import Mission
+from cfplan.flight.outcome import FlightOutcome
+from cfplan.flight.pilot import Pilot
+from cfplan.flight.poses import PoseSource
+from cfplan.flight.reporter import Reporter
+from cfplan.flight.telemetry import Telemetry
+
+_SWITCH_INTERVAL = 0.0005  # s; the stream gets the interpreter back after at most this
+_STREAM_PRIORITY = 20  # of SCHED_FIFO, where the system permits it
+_POLL = 0.05  # s
+
+
+def fly(
+    mission: Mission,
+    *,
+    uri: str,
+    pose_source: PoseSource,
+    drivers: Sequence[type] = (),
+    on_telemetry: Callable[[Telemetry], None] = lambda _: None,
+) -> FlightOutcome:
+    """Fly a mission and come back when the vehicle is down. Call from the main thread, so that Ctrl-C lands.
+
+    `pose_source` and `drivers` (cflib link drivers tried before cflib's own) go to the pilot's process by pickle.
+    `on_telemetry` gets every message, in order; what it raises is raised here after the vehicle has landed.
+    Raises LinkError where the vehicle cannot be reached or the pilot's process dies, and what the pose source raises.
+    """
+    context = multiprocessing.get_context("spawn")
+    telemetry, telemetry_end = context.Pipe(duplex=False)
+    orders_end, orders = context.Pipe(duplex=False)
+    process = context.Process(
+        target=_run, args=(mission, uri, tuple(drivers), pose_source, telemetry_end, orders_end), name="pilot"
+    )
+    with Keyboard() as keyboard, telemetry, orders:
+        with _signals_ignored():
+            process.start()
+        telemetry_end.close()
+        orders_end.close()
+        try:
+            return _attend(process, telemetry, orders, keyboard, on_telemetry)
+        finally:
+            process.join(5.0)
+            if process.is_alive():
+                process.kill()
+
+
+def _attend(
+    process: BaseProcess,
+    telemetry: Connection,
+    orders: Connection,
+    keyboard: Keyboard,
+    on_telemetry: Callable[[Telemetry], None],
+) -> FlightOutcome:
+    """Pass telemetry one way and orders the other until the pilot's last message."""
+    failure: BaseException | None = None
+    watched: list[Connection | int] = [telemetry]
+    if keyboard.descriptor is not None:
+        watched.append(keyboard.descriptor)
+    while True:
+        ready = wait(watched, _POLL)
+        for order in keyboard.orders():
+            _send(orders, order)
+        if telemetry not in ready:
+            continue
+        try:
+            message = telemetry.recv()
+        except (EOFError, OSError):
+            process.join(5.0)
+            raise LinkError(
+                f"the pilot's process died (exit code {process.exitcode})",
+                hint="the vehicle levels out after 0.5 s without setpoints and stops its motors after 2 s",
+            ) from failure
+        if isinstance(message, list):
+            if failure is None:
+                try:
+                    for each in message:
+                        on_telemetry(each)
+                except BaseException as error:  # whatever breaks here must not break the flight
+                    failure = error
+                    _send(orders, Order.LAND)
+            continue
+        if failure is not None:
+            raise failure
+        if isinstance(message, CfplanError):
+            raise message
+        return message
+
+
+def _send(orders: Connection, order: Order) -> None:
+    with contextlib.suppress(OSError):  # a pilot that is gone is noticed by its telemetry
+        orders.send(order)
+
+
+@contextlib.contextmanager
+def _signals_ignored():
+    """A process started meanwhile never sees a Ctrl-C, not even before it runs its first line."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP, signal.SIGTSTP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+class Orders:
+    """What the main process tells the pilot, read by a thread; `gone` when there is no main process any more."""
+
+    def __init__(self, connection: Connection):
+        self._connection = connection
+        self.worst: Order | None = None
+        self.gone = False
+        threading.Thread(target=self._run, name="orders", daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            while True:
+                self.give(self._connection.recv())
+        except (EOFError, OSError):
+            self.gone = True
+
+    def give(self, order: Order) -> None:
+        self.worst = max(order, self.worst or order)
+
+
+def _run(
+    mission: Mission,
+    uri: str,
+    drivers: tuple[type, ...],
+    pose_source: PoseSource,
+    telemetry: Connection,
+    orders_connection: Connection,
+) -> None:
+    """The pilot's process, from its first line to its last."""
+    with contextlib.suppress(OSError):
+        os.setsid()  # the terminal's signals are the main process's affair
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
+        signal.signal(number, signal.SIG_IGN)
+    orders, report = Orders(orders_connection), Reporter(telemetry)
+    signal.signal(signal.SIGTERM, lambda *_: orders.give(Order.LAND))
+    logging.getLogger("cflib").setLevel(logging.CRITICAL)  # what matters is reported as telemetry
+    warnings.filterwarnings("ignore", module="cflib")
+    sys.setswitchinterval(_SWITCH_INTERVAL)
+    last: FlightOutcome | CfplanError
+    try:
+        pilot = Pilot(
+            mission,
+            connect=lambda waiting: connect(uri, report, drivers, waiting=waiting),
+            source=pose_source,
+            report=report,
+            orders=orders,
+            before_arming=_quieten,
+        )
+        last = pilot.fly()
+    except CfplanError as error:
+        last = error
+    report.close(last)
+    os._exit(0)  # cflib leaves threads behind that never end
+
+
+def _quieten() -> None:
+    """Nothing but the flight from here on: no collection of garbage, and first in the queue for the processor."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    with contextlib.suppress(OSError):
+        # Threads made later, by cflib, do not inherit it.
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_STREAM_PRIORITY))

@@ -1,0 +1,62 @@
+"""Telemetry on its way out of the pilot's process, never in the stream's way."""
+
+import threading
+import time
+from collections import deque
+from multiprocessing.connection import Connection
+
+from cfplan.flight.telemetry import Telemetry
+
+CAPACITY = 20_000  # messages: half a minute of a flight
+_PERIOD = 0.02  # s between batches
+_LAST_WORDS = 2.0  # s that the end of a flight waits for a slow reader
+
+
+class Reporter:
+    """Takes messages at once and sends them in batches from a thread of its own.
+
+    A reader that is slow or stuck costs the oldest messages, which are counted, and never time.
+    """
+
+    def __init__(self, connection: Connection, capacity: int = CAPACITY):
+        self._connection = connection
+        self._waiting: deque[Telemetry] = deque(maxlen=capacity)
+        self.dropped = 0
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
+        self._thread.start()
+
+    def __call__(self, message: Telemetry) -> None:
+        if len(self._waiting) == self._waiting.maxlen:
+            self.dropped += 1
+        self._waiting.append(message)
+
+    def _run(self) -> None:
+        try:
+            while not self._closing.is_set():
+                self._closing.wait(_PERIOD)
+                batch = []
+                while self._waiting:
+                    batch.append(self._waiting.popleft())
+                if batch:
+                    self._connection.send(batch)
+        except OSError:
+            return  # no reader any more; the pilot learns that from its orders
+
+    def close(self, last: object) -> None:
+        """Send what waits, then `last`, as far as the reader takes it within 2 s."""
+        end = time.monotonic() + _LAST_WORDS
+        self._closing.set()
+        self._thread.join(_LAST_WORDS)
+        if self._thread.is_alive():
+            return
+        sending = threading.Thread(target=self._send_last, args=(last,), daemon=True)
+        sending.start()
+        sending.join(max(0.1, end - time.monotonic()))
+
+    def _send_last(self, last: object) -> None:
+        try:
+            self._connection.send(list(self._waiting))
+            self._connection.send(last)
+        except OSError:
+            return
