@@ -25,7 +25,7 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 
 MONOTONIC = 5000.0  # s, when the made-up flight begins
-STREAM, TRAVEL, HOLD = 7.0, 9.0, 3.0  # s: begin of the stream, its length, and the hold after it
+STREAM, TRAVEL, HOLD = 7.0, 10.0, 3.0  # s: begin of the stream, its length, and the hold after it
 LANDED = STREAM + TRAVEL + HOLD + 4.0
 START_HEIGHT = 1.0
 
@@ -72,9 +72,9 @@ def reference(times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     angle = 2 * np.pi * (10 * x**3 - 15 * x**4 + 6 * x**5)
     rate = 2 * np.pi / TRAVEL * 30 * x**2 * (1 - x) ** 2
     jolt = 2 * np.pi / TRAVEL**2 * 60 * x * (1 - x) * (1 - 2 * x)
-    place = np.stack([0.8 * np.sin(2 * angle), 1.6 * np.sin(angle), START_HEIGHT + 0.3 * np.sin(angle) ** 2], axis=-1)
-    slope = np.stack([1.6 * np.cos(2 * angle), 1.6 * np.cos(angle), 0.3 * np.sin(2 * angle)], axis=-1)
-    bend = np.stack([-3.2 * np.sin(2 * angle), -1.6 * np.sin(angle), 0.6 * np.cos(2 * angle)], axis=-1)
+    place = np.stack([0.6 * np.sin(2 * angle), 1.2 * np.sin(angle), START_HEIGHT + 0.3 * np.sin(angle) ** 2], axis=-1)
+    slope = np.stack([1.2 * np.cos(2 * angle), 1.2 * np.cos(angle), 0.3 * np.sin(2 * angle)], axis=-1)
+    bend = np.stack([-2.4 * np.sin(2 * angle), -1.2 * np.sin(angle), 0.6 * np.cos(2 * angle)], axis=-1)
     return place, slope * rate[..., None], bend * rate[..., None] ** 2 + slope * jolt[..., None]
 
 
@@ -116,7 +116,7 @@ def flight_messages(seed: int = 0) -> list[Telemetry]:
         late = 0.012 if i == 400 else 0.0002 + abs(rng.normal(0, 0.0002))
         messages.append(
             SetpointSent(
-                t + late, t, min(i, 900), tuple(place[i]), tuple(velocity[i]), tuple(acceleration[i]),
+                t + late, t, min(i, 1000), tuple(place[i]), tuple(velocity[i]), tuple(acceleration[i]),
                 tuple(asked[i]), (0.0, 0.0, 0.0),
             )
         )  # fmt: skip

@@ -1,0 +1,78 @@
+"""Where each part of the rerun view stands."""
+
+import numpy as np
+import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
+
+from cfplan.recording.plots import plots
+from cfplan.recording.record import Record
+
+TIMELINE = "flight"
+WORLD = "world"
+FENCE = f"{WORLD}/fence"
+FLOOR = f"{WORLD}/floor"
+PATH = f"{WORLD}/path"
+FLOWN = f"{WORLD}/flown"
+TAIL = f"{WORLD}/flown_tail"
+BODY = f"{WORLD}/vehicle"
+GHOST = f"{WORLD}/setpoint"
+WANTED_TAIL = f"{WORLD}/setpoint_tail"
+PLOTS = "plots"
+PHASES = "phase"
+SUPERVISOR = "supervisor"
+EVENTS = "events"
+SUMMARY = "summary"
+
+TAIL_SECONDS = 2.0
+
+
+def blueprint(record: Record) -> rrb.Blueprint:
+    """3-D at the left, the plots beside it in two columns, phases, events and the summary below."""
+    grid = rrb.Grid(*(_plot(plot.name, plot.title) for plot in plots(record)), grid_columns=2)
+    below = rrb.Horizontal(
+        rrb.StateTimelineView(contents=[PHASES, SUPERVISOR], name="Phases"),
+        rrb.Tabs(
+            rrb.TextLogView(origin=EVENTS, name="Events", columns=_event_columns()),
+            rrb.TextDocumentView(origin=SUMMARY, name="Summary"),
+        ),
+        column_shares=[3, 2],
+    )
+    return rrb.Blueprint(
+        rrb.Vertical(rrb.Horizontal(_room(record), grid, column_shares=[6, 5]), below, row_shares=[5, 1]),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="paused"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+    )
+
+
+def _event_columns() -> rrb.TextLogColumns:
+    return rrb.TextLogColumns(
+        timeline_columns=[TimelineColumn(TIMELINE)],
+        text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
+    )
+
+
+def _plot(name: str, title: str) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=title, plot_legend=rrb.PlotLegend("RightTop"))
+
+
+def _room(record: Record) -> rrb.Spatial3DView:
+    """The room from above one of its long sides, such that the whole fence is in sight."""
+    low, high = np.array(record.header.fence)
+    centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    aside = (0.7, -0.25, 0.45) if high[1] - low[1] > high[0] - low[0] else (-0.25, -0.7, 0.45)
+    tail = rrb.VisibleTimeRange(
+        TIMELINE,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TAIL_SECONDS),
+        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0),
+    )
+    return rrb.Spatial3DView(
+        origin=WORLD,
+        name=record.header.name,
+        overrides={entity: [rrb.VisibleTimeRanges([tail])] for entity in (TAIL, WANTED_TAIL)},
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(
+            position=centre + size * np.array(aside), look_target=centre, eye_up=(0.0, 0.0, 1.0)
+        ),
+    )

@@ -1,0 +1,132 @@
+"""What the plots of a flight show: lines over time, and the limits that they are held against."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.recording.record import Record
+from cfplan.recording.summary import deviation
+
+FULL_COMMAND = 65535  # of a motor, 16 bits
+
+Colour = tuple[int, int, int]
+FLOWN: Colour = (86, 180, 233)
+WANTED: Colour = (230, 159, 0)
+LIMIT: Colour = (226, 74, 74)
+FOUR: tuple[Colour, ...] = ((86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Line:
+    """One curve, or several that share their times."""
+
+    name: str
+    time: NDArray
+    # (N,) s, on the record's clock
+    values: NDArray
+    # (N,) or (N, K)
+    labels: tuple[str, ...]
+    # K of them
+    colours: tuple[Colour, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plot:
+    """One set of axes."""
+
+    name: str
+    title: str
+    lines: tuple[Line, ...]
+    limits: tuple[float, ...]
+    # drawn as level lines; those that are not finite are left out
+
+
+def plots(record: Record) -> tuple[Plot, ...]:
+    """All plots of a flight, in the order in which they are shown."""
+    setpoints, estimates, status = record.setpoints, record.estimates, record.status
+    bounds, planned, motors = record.header.bounds, record.header.plan_limits, motor_thrust(record)
+    off = deviation(record)
+    aged, age = pose_age(record)
+    return (
+        Plot(
+            "deviation",
+            "Deviation, m",
+            (
+                _flown("in_time", off.time, off.in_time, "from the reference in time"),
+                Line("to_path", off.time, off.to_path, ("from the path",), ((150, 150, 150),)),
+            ),
+            (bounds.deviation,),
+        ),
+        Plot(
+            "motor_thrust",
+            "Motor thrust, N",
+            (Line("motors", status.time, motors, ("motor 1", "motor 2", "motor 3", "motor 4"), FOUR),),
+            (planned.motor_thrust_min, planned.motor_thrust_max),
+        ),
+        Plot(
+            "speed",
+            "Speed, m/s",
+            (
+                _flown("flown", estimates.time, _norm(estimates.velocity)),
+                _wanted(setpoints.due, _norm(setpoints.velocity)),
+            ),
+            (bounds.speed,),
+        ),
+        Plot(
+            "body_rate",
+            "Body rate, rad/s",
+            (_flown("flown", status.time, _norm(status.body_rate)), _wanted(setpoints.due, _norm(setpoints.body_rate))),
+            (bounds.body_rate,),
+        ),
+        Plot(
+            "acceleration",
+            "Acceleration, m/s²",
+            (
+                _flown("flown", estimates.time, _norm(estimates.acceleration)),
+                _wanted(setpoints.due, _norm(setpoints.acceleration)),
+            ),
+            (bounds.acceleration,),
+        ),
+        Plot(
+            "battery",
+            "Battery, V",
+            (_flown("voltage", status.time, status.battery_voltage, "voltage"),),
+            (bounds.battery_voltage,),
+        ),
+        Plot("pose_age", "Pose age, ms", (_flown("worst", aged, age * 1e3, "oldest"),), (bounds.pose_age * 1e3,)),
+        Plot(
+            "lateness",
+            "Lateness of setpoints, ms",
+            (_flown("lateness", setpoints.due, (setpoints.time - setpoints.due) * 1e3, "lateness"),),
+            (bounds.lateness * 1e3,),
+        ),
+    )
+
+
+def motor_thrust(record: Record) -> NDArray:
+    """(N, 4) N, from the 16-bit commands of the status messages."""
+    return record.status.motor / FULL_COMMAND * record.header.thrust_at_full_command
+
+
+def pose_age(record: Record) -> tuple[NDArray, NDArray]:
+    """When each pose but the first came (N-1,), and how old the one before it had become by then (N-1,), both s."""
+    return record.poses.received[1:], record.poses.received[1:] - record.poses.time[:-1]
+
+
+def finite_limits(plot: Plot) -> tuple[float, ...]:
+    """Those that can be drawn."""
+    return tuple(limit for limit in plot.limits if math.isfinite(limit))
+
+
+def _flown(name: str, time: NDArray, values: NDArray, label: str = "flown") -> Line:
+    return Line(name, time, values, (label,), (FLOWN,))
+
+
+def _wanted(time: NDArray, values: NDArray) -> Line:
+    return Line("wanted", time, values, ("reference",), (WANTED,))
+
+
+def _norm(vectors: NDArray) -> NDArray:
+    return np.linalg.norm(vectors, axis=1)

@@ -1,0 +1,218 @@
+"""A flight as a rerun recording: room, path and vehicle in 3-D, plots with their limits, phases and events.
+
+Everything is sent as whole columns after the flight; the stream's process never sees any of this. All times are seconds
+since the record's first message, on the one timeline `flight`.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun_cli
+from numpy.typing import NDArray
+
+from cfplan.errors import InputError
+from cfplan.flight.telemetry import Level
+from cfplan.recording import layout
+from cfplan.recording.plots import FLOWN as FLOWN_COLOUR
+from cfplan.recording.plots import LIMIT, Colour, Plot, finite_limits, plots
+from cfplan.recording.plots import WANTED as WANTED_COLOUR
+from cfplan.recording.record import Record
+from cfplan.recording.states import PHASE_COLOURS, SUPERVISOR_COLOURS, supervisor_states
+from cfplan.recording.summary import dropouts, pose_gaps
+from cfplan.recording.summary_text import summary_text
+
+APPLICATION = "cfplan"
+AXIS_LENGTH = 0.2  # m, of the body axes as drawn
+BODY_SCALE = 3.0  # the vehicle is drawn larger than it is, or it could not be seen in its room
+TRACK_RADIUS, TAIL_RADIUS, PATH_RADIUS = 0.004, 0.012, 0.006  # m, of the lines
+FENCE_COLOUR: Colour = (170, 90, 90)
+FLOOR_COLOUR: Colour = (62, 66, 74)
+PATH_COLOUR: Colour = (130, 130, 140)
+LEVEL_NAMES = {Level.INFO: "INFO", Level.WARNING: "WARN", Level.ERROR: "ERROR"}
+
+
+def write_rrd(record: Record, file: Path, *, overwrite: bool = False) -> None:
+    """Write the recording with its blueprint; whole or not at all. Raises InputError where the file cannot be."""
+    if file.exists() and not overwrite:
+        raise InputError("there is a file already", where=str(file), hint="name another file")
+    unfinished = file.with_name(file.name + ".part")
+    try:
+        unfinished.touch()
+        with rr.RecordingStream(APPLICATION) as stream:
+            stream.save(unfinished, default_blueprint=layout.blueprint(record))
+            log_record(stream, record)
+            stream.flush()
+            stream.disconnect()
+        unfinished.replace(file)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise InputError(
+            f"cannot be written ({error.strerror or error})",
+            where=str(file),
+            hint="choose a folder that can be written",
+        ) from error
+
+
+def show(record: Record) -> None:
+    """Open the viewer on the recording; it stays open by itself. Raises InputError where there is no screen."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise InputError("there is no screen to open the viewer on", hint="save the recording: --save flight.rrd")
+    with rr.RecordingStream(APPLICATION) as stream:
+        # not the `rerun` found by name: that is absent where the environment is not activated
+        viewer = Path(rerun_cli.__file__).with_name("rerun")
+        rr.spawn(
+            hide_welcome_screen=True,
+            executable_path=str(viewer),
+            default_blueprint=layout.blueprint(record),
+            recording=stream,
+        )
+        log_record(stream, record)
+        stream.flush()
+
+
+def log_record(stream: rr.RecordingStream, record: Record) -> None:
+    """Send all of a record."""
+    stream.send_recording_name(record.header.name)
+    _log_room(stream, record)
+    _log_vehicle(stream, record)
+    _log_ghost(stream, record)
+    for plot in plots(record):
+        _log_plot(stream, plot, record)
+    _log_states(stream, record)
+    _log_events(stream, record)
+    stream.log(layout.SUMMARY, rr.TextDocument(summary_text(record), media_type=rr.MediaType.MARKDOWN), static=True)
+
+
+def _log_room(stream: rr.RecordingStream, record: Record) -> None:
+    low, high = np.array(record.header.fence)
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[FENCE_COLOUR], fill_mode="MajorWireframe")
+    stream.log(layout.FENCE, box, static=True)
+    floor = rr.LineStrips3D(floor_lines(low, high), colors=[FLOOR_COLOUR], radii=rr.Radius.ui_points(0.5))
+    stream.log(layout.FLOOR, floor, static=True)
+    if len(record.header.path):
+        path = rr.LineStrips3D([record.header.path], colors=[PATH_COLOUR], radii=PATH_RADIUS)
+        stream.log(layout.PATH, path, static=True)
+
+
+def floor_lines(low: NDArray, high: NDArray) -> list[NDArray]:
+    """Lines on the floor, 1 m apart, beneath the box from low to high, both (3,) m."""
+    low, high = np.floor(low), np.ceil(high)
+    xs, ys = np.arange(low[0], high[0] + 0.5), np.arange(low[1], high[1] + 0.5)
+    across = [np.array([[x, low[1], 0.0], [x, high[1], 0.0]]) for x in xs]
+    return across + [np.array([[low[0], y, 0.0], [high[0], y, 0.0]]) for y in ys]
+
+
+def _log_vehicle(stream: rr.RecordingStream, record: Record) -> None:
+    """The vehicle where the poses had it, its track, and its latest stretch as a tail."""
+    poses = record.poses
+    if len(poses.time) == 0:
+        return
+    time = _since_start(record, poses.time)
+    stream.send_columns(
+        layout.BODY,
+        [time],
+        rr.Transform3D.columns(translation=poses.position, quaternion=poses.quaternion),
+        strict=True,
+    )
+    stream.log(layout.BODY, rr.TransformAxes3D(AXIS_LENGTH), static=True)
+    _log_outline(stream, layout.BODY, record, poses.time, FLOWN_COLOUR)
+    stretches = np.split(poses.position, dropouts(pose_gaps(poses.time)) + 1)
+    track = rr.LineStrips3D(stretches, colors=[_dimmed(FLOWN_COLOUR)], radii=TRACK_RADIUS)
+    stream.log(layout.FLOWN, track, static=True)
+    _log_tail(stream, layout.TAIL, record, poses.time, poses.position, FLOWN_COLOUR)
+
+
+def _log_ghost(stream: rr.RecordingStream, record: Record) -> None:
+    """The setpoint that was in force, as a second vehicle, and where it has just been."""
+    setpoints = record.setpoints
+    if len(setpoints.time) == 0:
+        return
+    columns = rr.Transform3D.columns(translation=setpoints.position, quaternion=setpoints.quaternion)
+    stream.send_columns(layout.GHOST, [_since_start(record, setpoints.due)], columns, strict=True)
+    _log_outline(stream, layout.GHOST, record, setpoints.due, WANTED_COLOUR)
+    _log_tail(stream, layout.WANTED_TAIL, record, setpoints.due, setpoints.position, WANTED_COLOUR)
+
+
+def _log_outline(stream: rr.RecordingStream, entity: str, record: Record, times: NDArray, colour: Colour) -> None:
+    """The outline of the vehicle from the first of the times to the last, so that it never stands at the origin."""
+    strips = vehicle_outline(record.header.vehicle.arm * BODY_SCALE)
+    columns = rr.LineStrips3D.columns(
+        strips=strips, colors=[colour] * len(strips), radii=[0.008] * len(strips)
+    ).partition([len(strips), 0])
+    ends = rr.TimeColumn(layout.TIMELINE, duration=np.array([times[0], times[-1]]) - record.start)
+    stream.send_columns(f"{entity}/outline", [ends], columns, strict=True)
+
+
+def vehicle_outline(arm: float) -> list[NDArray]:
+    """Two crossed arms and four rotors in body axes, m; a motor stands at ±arm in x and in y."""
+    angle = np.linspace(0, 2 * np.pi, 25)
+    circle = 0.6 * arm * np.stack([np.cos(angle), np.sin(angle), np.zeros(25)], axis=1)
+    corners = arm * np.array([[1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]], dtype=float)
+    return [corners[[0, 2]], corners[[1, 3]], *(corner + circle for corner in corners)]
+
+
+def _log_tail(
+    stream: rr.RecordingStream, entity: str, record: Record, times: NDArray, positions: NDArray, colour: Colour
+) -> None:
+    """Each step as a short line at its own time; the layout shows those of the last seconds."""
+    steps = np.stack([positions[:-1], positions[1:]], axis=1)
+    stream.log(entity, rr.LineStrips3D.from_fields(colors=[colour], radii=[TAIL_RADIUS]), static=True)
+    if len(steps):
+        columns = rr.LineStrips3D.columns(strips=list(steps))
+        stream.send_columns(entity, [_since_start(record, times[1:])], columns, strict=True)
+
+
+def _log_plot(stream: rr.RecordingStream, plot: Plot, record: Record) -> None:
+    for line in plot.lines:
+        entity = f"{layout.PLOTS}/{plot.name}/{line.name}"
+        style = rr.SeriesLines(
+            colors=line.colours, names=line.labels, widths=[1.5] * len(line.labels), aggregation_policy="MinMax"
+        )
+        stream.log(entity, style, static=True)
+        if len(line.time):
+            values = rr.Scalars.columns(scalars=line.values.reshape(-1))
+            columns = values.partition([len(line.labels)] * len(line.time))
+            stream.send_columns(entity, [_since_start(record, line.time)], columns, strict=True)
+    levels = finite_limits(plot)
+    if levels and record.duration > 0:
+        entity = f"{layout.PLOTS}/{plot.name}/limit"
+        count = len(levels)
+        style = rr.SeriesLines(colors=[LIMIT] * count, names=["limit"] * count, widths=[1.0] * count)
+        stream.log(entity, style, static=True)
+        ends = rr.TimeColumn(layout.TIMELINE, duration=[0.0, record.duration])
+        columns = rr.Scalars.columns(scalars=np.tile(levels, 2)).partition([count] * 2)
+        stream.send_columns(entity, [ends], columns, strict=True)
+
+
+def _log_states(stream: rr.RecordingStream, record: Record) -> None:
+    supervisor = supervisor_states(record.status.supervisor)
+    changes = np.flatnonzero(np.r_[True, supervisor[1:] != supervisor[:-1]]) if len(supervisor) else np.empty(0, int)
+    for entity, time, states, colours in (
+        (layout.PHASES, record.phases.time, record.phases.phase, PHASE_COLOURS),
+        (layout.SUPERVISOR, record.status.time[changes], supervisor[changes], SUPERVISOR_COLOURS),
+    ):
+        style = rr.StateConfiguration(values=list(colours), labels=list(colours), colors=list(colours.values()))
+        stream.log(entity, style, static=True)
+        if len(time):
+            columns = rr.StateChange.columns(state=list(states))
+            stream.send_columns(entity, [_since_start(record, time)], columns, strict=True)
+
+
+def _log_events(stream: rr.RecordingStream, record: Record) -> None:
+    events = record.events
+    if len(events.time):
+        levels = [LEVEL_NAMES.get(level, "INFO") for level in events.level]
+        columns = rr.TextLog.columns(text=list(events.text), level=levels)
+        stream.send_columns(layout.EVENTS, [_since_start(record, events.time)], columns, strict=True)
+
+
+def _since_start(record: Record, times: NDArray) -> rr.TimeColumn:
+    return rr.TimeColumn(layout.TIMELINE, duration=times - record.start)
+
+
+def _dimmed(colour: Colour) -> tuple[int, int, int, int]:
+    return (*colour, 110)

@@ -1,0 +1,205 @@
+"""What a flight came to, in numbers, from its record.
+
+The reference is what was sent: the position of each setpoint at its deadline, straight between them. A pose is compared
+with the reference at the pose's own time (deviation in time) and with the nearest point of the path.
+"""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cfplan.flight.telemetry import Phase
+from cfplan.recording.record import Record
+
+SETTLED = 0.05  # m from the end of the path: close enough to call the flight settled
+DROPOUT = 3.0  # usual intervals between poses: a longer gap is a dropout
+
+
+@dataclass(frozen=True, slots=True)
+class FlightSummary:
+    """NaN where the record cannot tell."""
+
+    travel_time_planned: float
+    # s
+    travel_time_flown: float
+    # s, from the first setpoint of the path until the vehicle stays at its end; NaN where the path was not finished
+    settling: float
+    # s, from the end of the reference until the vehicle stays within SETTLED of the path's end
+    max_deviation: float
+    # m, from the reference in time
+    rms_deviation: float
+    # m
+    max_deviation_to_path: float
+    # m, from the nearest point of the path
+    rms_deviation_to_path: float
+    # m
+    peak_speed: float
+    # m/s, by the vehicle's estimate, along the path
+    peak_body_rate: float
+    # rad/s, norm, along the path
+    lateness_p50: float
+    # s, of all setpoints sent
+    lateness_p99: float
+    # s
+    lateness_max: float
+    # s
+    pose_dropouts: int
+    longest_pose_gap: float
+    # s
+    battery_start: float
+    # V
+    battery_end: float
+    # V
+    duration: float
+    # s, of the whole record
+    truncated: bool
+
+    def to_json(self) -> dict[str, float | int | bool | None]:
+        """For summary.json: what is not known is null."""
+        values = asdict(self)
+        return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in values.items()}
+
+
+class Deviation(NamedTuple):
+    """How far the vehicle was from where it should have been."""
+
+    time: NDArray
+    # (N,) s, of the poses
+    in_time: NDArray
+    # (N,) m, from the reference at that time
+    to_path: NDArray
+    # (N,) m, from the nearest point of the path
+
+
+def summarise(record: Record) -> FlightSummary:
+    """All numbers of one flight."""
+    begin, end = reference_span(record)
+    along = deviation(record, begin, end)
+    settled = settling(record)
+    late = _finite(record.setpoints.time - record.setpoints.due)
+    gaps = pose_gaps(record.poses.time)
+    volts = _finite(record.status.battery_voltage)
+    return FlightSummary(
+        travel_time_planned=record.header.travel_time,
+        travel_time_flown=end - begin + settled,
+        settling=settled,
+        max_deviation=_worst(along.in_time),
+        rms_deviation=_rms(along.in_time),
+        max_deviation_to_path=_worst(along.to_path),
+        rms_deviation_to_path=_rms(along.to_path),
+        peak_speed=_peak(record.estimates.time, record.estimates.velocity, begin, end),
+        peak_body_rate=_peak(record.status.time, record.status.body_rate, begin, end),
+        lateness_p50=_percentile(late, 50),
+        lateness_p99=_percentile(late, 99),
+        lateness_max=_worst(late),
+        pose_dropouts=len(dropouts(gaps)),
+        longest_pose_gap=_worst(gaps),
+        battery_start=float(volts[0]) if len(volts) else math.nan,
+        battery_end=float(volts[-1]) if len(volts) else math.nan,
+        duration=record.duration,
+        truncated=record.truncated,
+    )
+
+
+def reference_span(record: Record) -> tuple[float, float]:
+    """s, the deadlines of the first and the last setpoint of the phase `stream`; NaN where there is none."""
+    due = record.setpoints.due
+    span = record.phase_span(Phase.STREAM)
+    if span is None:
+        return math.nan, math.nan
+    streamed = due[(record.setpoints.time >= span[0]) & (due <= span[1])]
+    return (float(streamed[0]), float(streamed[-1])) if len(streamed) else (math.nan, math.nan)
+
+
+def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -> Deviation:
+    """Of every pose between begin and end that falls in the time of the setpoints."""
+    due = record.setpoints.due
+    if len(due) == 0:
+        return Deviation(np.empty(0), np.empty(0), np.empty(0))
+    time, position = record.poses.time, record.poses.position
+    inside = (time >= max(begin, due[0])) & (time <= min(end, due[-1])) & np.all(np.isfinite(position), axis=1)
+    time, position = time[inside], position[inside]
+    reference = np.stack([np.interp(time, due, axis) for axis in record.setpoints.position.T], axis=1)
+    path = record.header.path[np.all(np.isfinite(record.header.path), axis=1)]
+    path = path if len(path) else record.setpoints.position
+    return Deviation(time, np.linalg.norm(position - reference, axis=1), distance_to_path(position, path))
+
+
+def distance_to_path(points: NDArray, path: NDArray) -> NDArray:
+    """(N,) m from each point (N, 3) to the polyline through path (M, 3).
+
+    Looked for in the segments at the few samples nearest to each point: exact where samples lie close to each other
+    compared with the distance between parts of the path that pass one another, and never too small.
+    """
+    if len(points) == 0:
+        return np.empty(0)
+    nearest = cKDTree(path).query(points, k=range(1, min(8, len(path)) + 1))[1]
+    best = np.full(len(points), np.inf)
+    for first in np.concatenate([nearest, nearest - 1], axis=1).T:
+        a = path[np.clip(first, 0, len(path) - 1)]
+        along = path[np.clip(first + 1, 0, len(path) - 1)] - a
+        length = np.sum(along**2, axis=1)
+        share = np.sum((points - a) * along, axis=1) / np.where(length > 0, length, 1.0)
+        foot = a + np.clip(share, 0, 1)[:, None] * along
+        best = np.minimum(best, np.linalg.norm(points - foot, axis=1))
+    return best
+
+
+def settling(record: Record) -> float:
+    """s after the end of the reference until the vehicle, held at the path's end, stays within SETTLED of it.
+
+    NaN where the path was not finished, where no pose tells, or where the vehicle was still outside at the last.
+    """
+    _, end = reference_span(record)
+    held = record.phase_span(Phase.HOLD)
+    due = record.setpoints.due
+    if not finished(record) or held is None:
+        return math.nan
+    goal = record.setpoints.position[np.flatnonzero(due == end)[0]]
+    after = (record.poses.time >= end) & (record.poses.time <= max(held[1], end))
+    time, position = record.poses.time[after], record.poses.position[after]
+    outside = np.flatnonzero(~(np.linalg.norm(position - goal, axis=1) <= SETTLED))
+    if len(time) == 0 or (len(outside) and outside[-1] == len(time) - 1):
+        return math.nan
+    return float(time[outside[-1] + 1] - end) if len(outside) else 0.0
+
+
+def finished(record: Record) -> bool:
+    """Whether setpoints were sent for the whole planned time."""
+    begin, end = reference_span(record)
+    period = np.median(np.diff(record.setpoints.due)) if len(record.setpoints.due) > 1 else 0.0
+    return bool(end - begin >= record.header.travel_time - 2 * period)
+
+
+def pose_gaps(times: NDArray) -> NDArray:
+    """s between poses, from their stamps."""
+    return np.diff(_finite(times))
+
+
+def dropouts(gaps: NDArray) -> NDArray:
+    """Indices of the gaps that are longer than DROPOUT usual ones."""
+    return np.flatnonzero(gaps > DROPOUT * np.median(gaps)) if len(gaps) else np.empty(0, dtype=int)
+
+
+def _peak(time: NDArray, vectors: NDArray, begin: float, end: float) -> float:
+    return _worst(_finite(np.linalg.norm(vectors[(time >= begin) & (time <= end)], axis=1)))
+
+
+def _finite(values: NDArray) -> NDArray:
+    return values[np.isfinite(values)]
+
+
+def _worst(values: NDArray) -> float:
+    return float(np.max(values)) if len(values) else math.nan
+
+
+def _rms(values: NDArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def _percentile(values: NDArray, share: float) -> float:
+    return float(np.percentile(values, share)) if len(values) else math.nan
