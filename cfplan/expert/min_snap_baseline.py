@@ -1,0 +1,53 @@
+"""The plain baseline: the min-snap path at its own nominal timing, scaled as a whole until it is certified."""
+
+import time
+
+import numpy as np
+
+from cfplan.errors import NotCertifiedError
+from cfplan.expert.slowing import certified_share
+from cfplan.expert.solution import Solution, Status
+from cfplan.expert.spline_profile import profile_through
+from cfplan.expert.yaw_along import yaw_along
+from cfplan.geometry.path import Path
+from cfplan.geometry.yaw import YawMode
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.profile import BoundaryState, SpeedProfile
+
+SAMPLES_PER_UNIT = 200  # of s, where the greatest nominal speed is sought
+
+
+def plan_min_snap(
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    *,
+    nodes: int = 100,
+    yaw: YawMode = YawMode.FIXED,
+    yaw_angle: float = 0.0,
+    start: BoundaryState | None = None,
+    end: BoundaryState | None = None,
+) -> Solution:
+    """h constant, as great as the certificate allows. A boundary state's h would have to be just that one: not met."""
+    begun = time.perf_counter()
+    grid = np.linspace(0.0, path.end, nodes + 1)
+    dense = np.linspace(0.0, path.end, max(1000, int(SAMPLES_PER_UNIT * path.end)))
+    fastest = limits.speed / np.linalg.norm(path(dense, 1), axis=1).max()  # ds/dt that meets the speed limit
+    middles = 0.5 * (grid[1:] + grid[:-1])
+    where = np.sort(np.concatenate([grid, middles]))
+    turning = profile_through(grid, where, np.ones_like(where), yaw_along(path, yaw, yaw_angle)(where))
+    zeros = np.zeros(nodes + 1)
+    profile = SpeedProfile(
+        grid, np.full(nodes + 1, fastest**2), zeros, zeros, zeros[1:], turning.yaw, turning.dyaw, turning.ddyaw
+    )
+    try:
+        share = certified_share(path, profile, airframe, limits)
+    except NotCertifiedError as error:
+        return Solution(Status.INFEASIBLE, None, str(error))
+    stats: dict[str, float | int | str] = {
+        "solver": "scaling",
+        "share": share,
+        "solve_seconds": time.perf_counter() - begun,
+    }
+    return Solution(Status.SOLVED, profile.slowed(share), stats=stats)

@@ -1,0 +1,120 @@
+"""The lower bound is below everything that can be flown, and meets what can be computed by hand."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cfplan.errors import InfeasibleError
+from cfplan.expert.convex import lower_bound, plan_convex
+from cfplan.expert.limit_sets import LIMIT_SETS
+from cfplan.expert.min_snap_baseline import plan_min_snap
+from cfplan.expert.slowing import certified_share
+from cfplan.expert.solution import Status
+from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.path import Path
+from cfplan.geometry.yaw import YawMode
+from cfplan.safety.certificate import certify
+from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.trajectory import Trajectory
+
+pytestmark = pytest.mark.unit
+HARDWARE, SIMULATION = LIMIT_SETS["hardware"], LIMIT_SETS["simulation"]
+
+
+@pytest.fixture(scope="module")
+def wiggly() -> Path:
+    return min_snap([[0, 0, 1], [1.5, 1, 1.4], [3, -0.5, 0.8], [1.2, -1.5, 1.1]])
+
+
+@pytest.mark.parametrize("length", [0.1, 0.8, 3.0, 12.0])
+def test_a_straight_line_takes_its_analytic_time(length):
+    v, a = HARDWARE.limits.speed, HARDWARE.limits.acceleration
+    exact = length / v + v / a if length > v * v / a else 2 * math.sqrt(length / a)
+    line = min_snap([[0, 0, 1], [length, 0, 1]])
+    bound = lower_bound(line, HARDWARE.airframe, HARDWARE.limits)
+    assert bound == pytest.approx(exact, rel=1e-6)
+    assert bound <= exact * (1 + 1e-12)
+
+
+def test_a_straight_climb_is_held_back_by_thrust_and_a_straight_descent_is_not():
+    still = replace(HARDWARE.airframe, drag=(0.0, 0.0))
+    limits = HARDWARE.limits
+    v, brake = limits.speed, limits.acceleration
+    climb = 4 * limits.motor_thrust_max / still.mass - 9.81
+    assert climb < brake
+    exact = 6.0 / v + v / (2 * climb) + v / (2 * brake)
+    bound = lower_bound(min_snap([[0, 0, 0], [0, 0, 6.0]]), still, limits)
+    assert exact * 0.997 <= bound <= exact * (1 + 1e-9)
+
+
+def test_on_a_circle_curvature_sets_the_speed():
+    radius, bounds = 0.4, []
+    for turns in (2, 5):
+        angle = np.linspace(0, 2 * np.pi * turns, 24 * turns + 1)
+        points = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones_like(angle)], axis=1)
+        bounds.append(lower_bound(min_snap(points), HARDWARE.airframe, HARDWARE.limits))
+    steady = math.sqrt(HARDWARE.limits.acceleration * radius)
+    three_turns = bounds[1] - bounds[0]  # starting and stopping take the same in both
+    assert three_turns == pytest.approx(3 * 2 * math.pi * radius / steady, rel=0.01)
+
+
+@pytest.mark.parametrize("set_name", list(LIMIT_SETS))
+def test_nothing_that_is_certified_is_faster_than_the_bound(set_name, wiggly):
+    chosen = LIMIT_SETS[set_name]
+    bound = lower_bound(wiggly, chosen.airframe, chosen.limits)
+    for planner in (plan_convex, plan_min_snap):
+        profile = planner(wiggly, chosen.airframe, chosen.limits).profile
+        share = certified_share(wiggly, profile, chosen.airframe, chosen.limits)
+        assert Trajectory(wiggly, profile.slowed(share), chosen.airframe).duration > bound
+
+
+def test_the_convex_profile_is_near_the_bound_before_it_is_slowed(wiggly):
+    bound = lower_bound(wiggly, HARDWARE.airframe, HARDWARE.limits)
+    solution = plan_convex(wiggly, HARDWARE.airframe, HARDWARE.limits)
+    assert solution.status is Status.SOLVED
+    assert solution.profile is not None
+    duration = Trajectory(wiggly, solution.profile, HARDWARE.airframe).duration
+    assert bound < duration < 1.1 * bound
+
+
+def test_looser_limits_never_raise_the_bound(wiggly):
+    bounds = [
+        lower_bound(wiggly, HARDWARE.airframe, replace(HARDWARE.limits, speed=speed, acceleration=acceleration))
+        for speed, acceleration in ((1.0, 2.0), (2.0, 2.0), (2.0, 5.0), (3.0, 8.0))
+    ]
+    assert bounds == sorted(bounds, reverse=True)
+
+
+def test_drag_holds_the_bound_up_because_it_takes_thrust(wiggly):
+    still = replace(SIMULATION.airframe, drag=(0.0, 0.0))
+    draggy = replace(SIMULATION.airframe, drag=(0.03, 0.03))
+    assert lower_bound(wiggly, draggy, SIMULATION.limits) > lower_bound(wiggly, still, SIMULATION.limits)
+
+
+def test_a_flying_start_takes_less_time_than_a_slow_one():
+    straight = Path(np.array([0.0, 2.0, 4.0]), np.array([[[0.0, 0, 1], [1, 0, 0]], [[4, 0, 1], [1, 0, 0]]]))
+    slow, fast = (BoundaryState(h, 0.0, 0.0, 0.0, 0.0) for h in (0.01, 4.0))
+    times = [lower_bound(straight, HARDWARE.airframe, HARDWARE.limits, start=x, end=x) for x in (slow, fast)]
+    assert times[1] == pytest.approx(4.0 / 2.0, rel=1e-6)
+    assert times[0] > times[1]
+
+
+def test_thrust_below_weight_is_infeasible_in_both_faces(wiggly):
+    limits = replace(HARDWARE.limits, motor_thrust_max=0.07)
+    with pytest.raises(InfeasibleError, match="limits"):
+        lower_bound(wiggly, HARDWARE.airframe, limits)
+    solution = plan_convex(wiggly, HARDWARE.airframe, limits)
+    assert solution.status is Status.INFEASIBLE
+    assert solution.profile is None
+    assert solution.reason
+
+
+@pytest.mark.parametrize("yaw", list(YawMode))
+def test_min_snap_comes_certified_and_touches_a_limit(yaw, wiggly):
+    solution = plan_min_snap(wiggly, HARDWARE.airframe, HARDWARE.limits, yaw=yaw, yaw_angle=0.3)
+    certificate = certify(Trajectory(wiggly, solution.profile, HARDWARE.airframe), HARDWARE.limits)
+    assert certificate.passed
+    assert certificate.worst.share > 0.98
+    assert np.ptp(solution.profile.h) == 0.0
