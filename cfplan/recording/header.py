@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -68,7 +68,10 @@ def header_to_json(header: RecordHeader) -> str:
 
 
 def header_from_json(text: str, *, where: str = "") -> RecordHeader:
-    """Raises InputError where a key is missing or of the wrong kind; keys of later versions are ignored."""
+    """Raises InputError where a key is missing or of the wrong kind.
+
+    So that records outlive versions: keys of later ones are ignored, limits that earlier ones lacked are NaN.
+    """
     try:
         values = json.loads(text)
         return RecordHeader(
@@ -78,7 +81,7 @@ def header_from_json(text: str, *, where: str = "") -> RecordHeader:
             planner=str(values["planner"]),
             vehicle=_airframe(values["vehicle"]),
             thrust_at_full_command=_number(values["thrust_at_full_command"]),
-            plan_limits=PlanLimits(**{f.name: _number(values["plan_limits"][f.name]) for f in fields(PlanLimits)}),
+            plan_limits=PlanLimits(**{f.name: _number(values["plan_limits"].get(f.name)) for f in fields(PlanLimits)}),
             bounds=FlightBounds(**{f.name: _number(values["bounds"].get(f.name)) for f in fields(FlightBounds)}),
             travel_time=_number(values["travel_time"]),
             path=np.array(values["path"], dtype=float).reshape(-1, 3),
@@ -95,7 +98,8 @@ def header_from_json(text: str, *, where: str = "") -> RecordHeader:
 
 
 def _airframe(values: Mapping[str, Any]) -> Airframe:
-    numbers = {f.name: _number(values[f.name]) for f in fields(Airframe) if f.type is float}
+    given = [f for f in fields(Airframe) if f.type is float and (f.name in values or f.default is MISSING)]
+    numbers = {f.name: _number(values[f.name]) for f in given}
     return Airframe(
         name=str(values["name"]),
         inertia=_triple(values["inertia"]),

@@ -113,7 +113,7 @@ def flight_messages(seed: int = 0) -> list[Telemetry]:
     place, velocity, acceleration = reference(wanted - STREAM)
     asked = attitude(acceleration)
     for i, t in enumerate(MONOTONIC + wanted):
-        late = 0.012 if i == 400 else 0.0002 + abs(rng.normal(0, 0.0002))
+        late = {400: 0.012, 401: 0.0025}.get(i, 0.0002 + abs(rng.normal(0, 0.0002)))
         messages.append(
             SetpointSent(
                 t + late, t, min(i, 1000), tuple(place[i]), tuple(velocity[i]), tuple(acceleration[i]),

@@ -1,0 +1,177 @@
+"""A flight's numbers, against flights of which they are known."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize_scalar
+
+from cfplan.recording import record as columns
+from cfplan.recording.record import Record
+from cfplan.recording.states import supervisor_states
+from cfplan.recording.summary import deviation, distance_to_path, dropouts, pose_gaps, settling, summarise
+from cfplan.recording.summary_text import summary_text
+
+BEGIN, TRAVEL, HELD = 100.0, 4.0, 2.0  # s
+SPEED = 0.5  # m/s, along x
+
+
+def straight_flight(header, *, lag=0.0, aside=0.0, end_error=lambda t: 0.0 * t, sent_until=math.inf) -> Record:
+    """A flight along x at SPEED, its end held; poses lag behind by `lag` s, fly `aside` m in y, and end off in z."""
+    due = np.arange(BEGIN, min(BEGIN + TRAVEL + HELD + 1e-9, sent_until), 0.01)
+    where = np.clip(due - BEGIN, 0, TRAVEL) * SPEED
+    zeros = np.zeros_like(due)
+    time = np.arange(BEGIN - 1, BEGIN + TRAVEL + HELD, 0.005) + 0.0012
+    flown = np.clip(time - BEGIN - lag, 0, TRAVEL) * SPEED
+    after = np.where(time >= BEGIN + TRAVEL, end_error(time - BEGIN - TRAVEL), 0.0)
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (len(due), 1))
+    return Record(
+        folder=None,
+        header=dataclasses.replace(
+            header, travel_time=TRAVEL, path=np.array([[0.0, 0.0, 1.0], [TRAVEL * SPEED, 0.0, 1.0]])
+        ),
+        setpoints=columns.Setpoints(
+            due + 0.001, due, np.arange(len(due)), np.stack([where, zeros, zeros + 1], 1), np.zeros((len(due), 3)),
+            np.zeros((len(due), 3)), still, np.zeros((len(due), 3)),
+        ),
+        poses=columns.Poses(
+            time, time + 0.01, np.stack([flown, aside + 0 * time, 1 + after], 1),
+            np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)),
+        ),
+        estimates=columns.Estimates(
+            due, np.zeros((len(due), 3)), np.tile([0.3, 0.4, 0.0], (len(due), 1)), np.zeros((len(due), 3)), still
+        ),
+        status=columns.Status(
+            due, np.tile([1.0, 2.0, 2.0], (len(due), 1)), np.zeros((len(due), 4), int), 4.0 - 0.1 * (due - BEGIN),
+            np.zeros(len(due), int),
+        ),
+        phases=columns.Phases(
+            np.array([BEGIN - 0.5, BEGIN - 0.1, BEGIN + TRAVEL + 0.005, BEGIN + TRAVEL + HELD]),
+            np.array(["arm", "stream", "hold", "land"]),
+        ),
+        events=columns.Events(np.empty(0), np.empty(0, str), np.empty(0, str)),
+        summary={},
+        truncated=False,
+    )  # fmt: skip
+
+
+@given(lag=st.floats(0, 0.3), aside=st.floats(-0.5, 0.5))
+def test_lag_counts_in_time_and_distance_aside_counts_in_both(flight, lag, aside):
+    record = straight_flight(flight.header, lag=lag, aside=aside)
+    summary = summarise(record)
+    assert summary.max_deviation == pytest.approx(math.hypot(SPEED * lag, aside), abs=1e-9)
+    assert summary.max_deviation_to_path == pytest.approx(abs(aside), abs=1e-9)
+    assert summary.rms_deviation_to_path == pytest.approx(abs(aside), abs=1e-9)
+
+
+def test_the_rms_is_that_of_a_known_deviation(flight):
+    along = deviation(straight_flight(flight.header, lag=0.2), BEGIN + 1, BEGIN + 3)
+    np.testing.assert_allclose(along.in_time, 0.1, atol=1e-9)
+    assert summarise(straight_flight(flight.header, lag=0.2)).rms_deviation == pytest.approx(0.1, rel=0.03)
+
+
+def test_a_perfect_flight_takes_its_planned_time(flight):
+    summary = summarise(straight_flight(flight.header))
+    assert (summary.travel_time_planned, summary.settling) == (TRAVEL, 0.0)
+    assert summary.travel_time_flown == pytest.approx(TRAVEL, abs=1e-9)
+
+
+@pytest.mark.parametrize("moment", [0.2, 0.75, 1.5])
+def test_settling_lasts_until_the_vehicle_stays_near_the_end(flight, moment):
+    record = straight_flight(flight.header, end_error=lambda t: np.where(t < moment, 0.08, 0.02))
+    assert settling(record) == pytest.approx(moment, abs=0.006)
+    assert summarise(record).travel_time_flown == pytest.approx(TRAVEL + moment, abs=0.006)
+
+
+def test_a_swing_back_outside_counts_as_not_yet_settled(flight):
+    record = straight_flight(flight.header, end_error=lambda t: np.where((t > 1.0) & (t < 1.2), 0.08, 0.0))
+    assert settling(record) == pytest.approx(1.2, abs=0.006)
+
+
+def test_a_vehicle_that_never_settles_has_no_travel_time(flight):
+    summary = summarise(straight_flight(flight.header, end_error=lambda t: 0.08 + 0 * t))
+    assert math.isnan(summary.settling)
+    assert math.isnan(summary.travel_time_flown)
+
+
+def test_a_path_that_was_not_finished_has_no_travel_time(flight):
+    summary = summarise(straight_flight(flight.header, sent_until=BEGIN + TRAVEL / 2))
+    assert math.isnan(summary.travel_time_flown)
+    assert summary.max_deviation == pytest.approx(0.0, abs=1e-9)
+
+
+def test_peaks_lateness_and_battery_are_those_of_the_streams(flight):
+    summary = summarise(straight_flight(flight.header))
+    assert summary.peak_speed == pytest.approx(0.5)
+    assert summary.peak_body_rate == pytest.approx(3.0)
+    assert summary.lateness_p50 == pytest.approx(0.001)
+    assert summary.battery_start == pytest.approx(4.0)
+    assert summary.battery_end == pytest.approx(4.0 - 0.1 * (TRAVEL + HELD))
+
+
+def test_the_made_up_flight_shows_its_dropout_and_its_late_setpoint(flight):
+    summary = summarise(flight.record)
+    assert summary.pose_dropouts == 1
+    assert summary.longest_pose_gap == pytest.approx(0.16)
+    assert summary.lateness_max == pytest.approx(0.012)
+    assert summary.lateness_p50 < 0.001 < summary.lateness_max
+    reference_speed = np.max(np.linalg.norm(flight.record.setpoints.velocity, axis=1))
+    assert summary.max_deviation == pytest.approx(0.02 * reference_speed, rel=0.15)  # it lags by 30 ms less 10 ms
+
+
+def test_the_made_up_flight_lags_but_keeps_to_its_path(flight):
+    summary = summarise(flight.record)
+    assert summary.max_deviation_to_path < 0.006 < summary.max_deviation  # noise of 1 mm on each axis
+
+
+@given(gap=st.integers(1, 40), place=st.integers(1, 150))
+def test_a_gap_is_a_dropout_from_more_than_three_intervals_on(gap, place):
+    times = np.arange(200) * 0.01
+    kept = np.delete(times, slice(place, place + gap))
+    assert len(dropouts(pose_gaps(kept))) == (1 if gap > 2 else 0)
+
+
+@given(x=st.floats(-2, 2), y=st.floats(-2, 2))
+def test_the_distance_to_a_path_is_that_of_a_numerical_search(x, y):
+    angle = np.linspace(0, np.pi, 200)
+    path = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+
+    def gap(a):
+        return math.dist((x, y), (math.cos(a), math.sin(a)))
+
+    guess = min(angle, key=gap)
+    found = minimize_scalar(gap, bounds=(max(0, guess - 0.1), min(np.pi, guess + 0.1)), options={"xatol": 1e-9})
+    nearest = min(found.fun, gap(0), gap(np.pi))
+    assert distance_to_path(np.array([[x, y, 0.0]]), path)[0] == pytest.approx(nearest, abs=5e-5)
+
+
+def test_a_path_of_one_point_has_a_distance_too():
+    assert distance_to_path(np.array([[3.0, 4.0, 0.0]]), np.zeros((1, 3)))[0] == pytest.approx(5.0)
+
+
+def test_a_record_with_nothing_in_it_has_a_summary_of_unknowns(tmp_path, small_header):
+    from cfplan.recording.reader import read_record
+    from cfplan.recording.writer import RecordWriter
+
+    RecordWriter(tmp_path, small_header).close()
+    record = read_record(tmp_path)
+    values = summarise(record).to_json()
+    assert values["max_deviation"] is None
+    assert values["battery_end"] is None
+    json.dumps(values, allow_nan=False)
+    assert "–" in summary_text(record)
+
+
+def test_the_text_says_that_a_record_was_cut(flight):
+    assert "ends early" not in summary_text(flight.record)
+    assert "ends early" in summary_text(dataclasses.replace(flight.record, truncated=True))
+
+
+def test_the_supervisor_is_named_by_its_gravest_bit():
+    bits = np.array([0, 0b1, 0b11, 0b11011, 0b1011011, 0b10000000, 0b100])
+    wanted = ["not ready", "can be armed", "armed", "flying", "locked", "crashed", "not ready"]
+    assert supervisor_states(bits).tolist() == wanted
