@@ -25,7 +25,7 @@ MOTORS = slice(13, 17)
 STATE_SIZE = 17
 
 # Where each parameter lies in the array that `pack_body` makes.
-_MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, _THRUST_MAX, _LAG, _DRAG, _AXIAL_DRAG, _FLOOR = range(11)
+_MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, THRUST_MAX, _LAG, _DRAG, _AXIAL_DRAG, FLOOR, _REACTION = range(12)
 
 STILL_AIR = np.zeros(3)
 ALL_WELL = np.ones(4)
@@ -43,6 +43,7 @@ def pack_body(airframe: Airframe, *, floor: float = 0.0) -> NDArray:
             airframe.motor_time_constant,
             *airframe.drag,
             floor,
+            airframe.rotor_reaction,
         ],
         dtype=float,
     )
@@ -88,23 +89,26 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
     `efficiency` (4,) is the share of its thrust that each motor really gives, 1 when well.
     """
     lag = min(1.0, TIME_STEP / max(body[_LAG], 1e-9))
-    push = np.empty(4)
+    push, twist = np.empty(4), np.empty(4)
     for motor in range(4):
-        asked = min(max(command[motor], 0.0), body[_THRUST_MAX])
-        state[13 + motor] += (asked - state[13 + motor]) * lag
+        asked = min(max(command[motor], 0.0), body[THRUST_MAX])
+        change = (asked - state[13 + motor]) * lag
+        state[13 + motor] += change
         push[motor] = state[13 + motor] * efficiency[motor]
+        # A rotor that speeds up pushes the body the other way round, as its drag does.
+        twist[motor] = body[_THRUST_TO_TORQUE] * push[motor] + body[_REACTION] * change / TIME_STEP
     thrust = push[0] + push[1] + push[2] + push[3]
 
     # On the floor the ground takes all torque and every force that does not lift the body off it.
     turn = rotation(state[6:10])
-    on_floor = state[2] <= body[_FLOOR]
+    on_floor = state[2] <= body[FLOOR]
     if on_floor and state[5] <= 0.0 and thrust * turn[2, 2] <= body[_MASS] * GRAVITY:
-        _rest(state, body[_FLOOR])
+        _rest(state, body[FLOOR])
         return
 
     torque_x = body[_ARM] * (-push[0] - push[1] + push[2] + push[3])
     torque_y = body[_ARM] * (-push[0] + push[1] + push[2] - push[3])
-    torque_z = body[_THRUST_TO_TORQUE] * (-push[0] + push[1] - push[2] + push[3])
+    torque_z = -twist[0] + twist[1] - twist[2] + twist[3]
     wx, wy, wz = state[10], state[11], state[12]
     jx, jy, jz = body[_JX], body[_JY], body[_JZ]
     state[10] += TIME_STEP * (torque_x + (jy - jz) * wy * wz) / jx
@@ -122,8 +126,8 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
     for axis in range(3):
         state[axis] += TIME_STEP * state[3 + axis]
     _turn(state)
-    if state[2] < body[_FLOOR]:
-        _rest(state, body[_FLOOR])
+    if state[2] < body[FLOOR]:
+        _rest(state, body[FLOOR])
 
 
 @njit(cache=True)

@@ -80,8 +80,8 @@ class MellingerGains:
 
 
 def gains_for(airframe: Airframe) -> MellingerGains:
-    """Default gains with the vehicle's own mass, as the pilot sets them."""
-    return MellingerGains(mass=airframe.mass)
+    """Default gains with the vehicle's own mass and thrust scale, as the pilot sets them."""
+    return MellingerGains(mass=airframe.mass, mass_thrust=airframe.command_per_thrust)
 
 
 @njit(cache=True)

@@ -33,11 +33,18 @@ class Airframe:
     drag: tuple[float, float]
     # N s/m, linear rotor drag in the rotor plane and along the thrust axis
     source: str
+    rotor_reaction: float = 0.0
+    # N m s/N, yaw torque per rate of change of thrust: the inertia of a rotor over the slope of its thrust by its speed
 
     @property
     def hover_thrust(self) -> float:
         """N, what each motor gives in hover."""
         return self.mass * GRAVITY / 4
+
+    @property
+    def command_per_thrust(self) -> float:
+        """16-bit units of each motor's command per N of collective thrust: what ctrlMel.massThrust should be."""
+        return 65535 / (4 * self.motor_thrust_max)
 
     @property
     def mixing(self) -> NDArray:

@@ -6,7 +6,9 @@ Sources:
   firmware   crazyflie-firmware 2026.08: the motor thrust caps, which hold while the battery does (above about 3.1 V)
 
 Where `models` gives rotor dynamics n' = k₁(u − n) + k₂(u² − n²), up and down apart, the time constant here is the mean
-of 1/(k₁ + 2k₂n) of both at the hover speed n: to first order thrust lags as the rotor speed does.
+of 1/(k₁ + 2k₂n) of both at the hover speed n: to first order thrust lags as the rotor speed does. The rotor reaction is
+its prop_inertia over the slope of its rpm2thrust at hover; RotorPy has none. Without it yaw would be unstable under the
+firmware's default gains wherever the time constant exceeds 0.1 s.
 """
 
 import difflib
@@ -45,6 +47,7 @@ AIRFRAMES = MappingProxyType(
                 motor_time_constant=0.105,
                 drag=(0.01351483, 0.01677452),
                 source="drone-models 0.1.0 cf2x_P250, measured with markers; thrust cap of firmware 2026.08",
+                rotor_reaction=3.98e-4,
             ),
             Airframe(
                 name="crazyflie-thrust-upgrade",
@@ -57,6 +60,7 @@ AIRFRAMES = MappingProxyType(
                 motor_time_constant=0.079,
                 drag=(0.01556697, 0.02191672),
                 source="drone-models 0.1.0 cf2x_T350, measured with markers; thrust cap of firmware 2026.08",
+                rotor_reaction=3.89e-4,
             ),
             Airframe(
                 name="crazyflie-2.1-brushless",
@@ -69,6 +73,7 @@ AIRFRAMES = MappingProxyType(
                 motor_time_constant=0.060,
                 drag=(0.02149163, 0.02359736),
                 source="drone-models 0.1.0 cf21B_500, measured with markers; thrust cap of firmware 2026.08",
+                rotor_reaction=2.98e-4,
             ),
         )
     }

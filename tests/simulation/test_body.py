@@ -94,6 +94,16 @@ def test_motors_without_lag_give_at_once_what_they_can_and_no_more():
     assert fly(at_rest([0, 0, 5]), [-1.0, 0.05, 0.15, 9.0], body, 0.001)[MOTORS] == pytest.approx([0, 0.05, 0.15, 0.15])
 
 
+def test_rotors_that_speed_up_turn_the_body_the_other_way_round():
+    """Angular momentum about z: what the rotors gain the body loses."""
+    inertia_over_slope = 4e-4
+    frame = airframe(thrust_to_torque=0.0, rotor_reaction=inertia_over_slope, arm=0.0)
+    thrusts = np.array([0.02, 0.10, 0.03, 0.09])
+    state = fly(at_rest([0, 0, 0]), thrusts, pack_body(frame, floor=NO_FLOOR), 0.07)
+    gained = inertia_over_slope * MOTOR_TORQUE_SIGNS[2] @ state[MOTORS]
+    assert state[12] == pytest.approx(gained / frame.inertia[2])
+
+
 @pytest.mark.parametrize("motor", range(4))
 def test_a_weak_motor_lets_its_corner_sink(motor):
     frame = airframe()
