@@ -3,7 +3,7 @@
 import io
 import json
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.stream_reader import get_chunk_data_stream
 
 from cfplan.errors import InputError
 from cfplan.recording.header import RecordHeader, header_from_json
@@ -22,7 +22,23 @@ from cfplan.recording.topics import FORMAT, METADATA, PROFILE, TOPICS, columns_f
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, EOFError, MemoryError, OverflowError)
+_READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.HEADER: Header.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.FOOTER: Footer.read,
+}
+_DAMAGE = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    EOFError,
+    MemoryError,
+    OverflowError,
+    RecursionError,
+)
 
 
 def read_record(place: Path) -> Record:
@@ -37,7 +53,7 @@ def read_record(place: Path) -> Record:
     topics: dict[int, str] = {}
     payloads: dict[str, list[bytes]] = {topic.name: [] for topic in TOPICS}
     whole = False
-    for entry in _entries(data):
+    for entry in _entries(data, len(MAGIC)):
         match entry:
             case Header(profile=profile) if profile != PROFILE:
                 raise _not_ours(file, f"its profile is '{profile}'")
@@ -102,34 +118,31 @@ def _header(values: Mapping[str, str], file: Path) -> RecordHeader:
     return header_from_json(values.get("header", ""), where=str(file))
 
 
-def _entries(data: bytes) -> Iterator[McapRecord]:
-    """Every MCAP record, those in chunks too, up to the first that is cut off or damaged."""
-    reader = StreamReader(io.BytesIO(data), emit_chunks=True, record_size_limit=len(data))
+def _entries(data: bytes, place: int) -> Iterator[McapRecord]:
+    """The MCAP records that matter from `place` on, those in chunks too, up to the first cut off or damaged."""
     try:
-        for entry in reader.records:
-            if isinstance(entry, Chunk):
-                yield from _chunk_entries(entry)
-            else:
-                yield entry
+        while True:
+            opcode, length = _RECORD.unpack_from(data, place)
+            place += _RECORD.size
+            if place + length > len(data):
+                return
+            if opcode == Opcode.MESSAGE:
+                yield _message(data, place, length)
+            elif opcode in _READERS:
+                entry = _READERS[opcode](ReadDataStream(io.BytesIO(data[place : place + length])))
+                if isinstance(entry, Chunk):
+                    stream, size = get_chunk_data_stream(entry, validate_crc=True)
+                    yield from _entries(stream.read(size), 0)
+                else:
+                    yield entry
+            place += length
     except _DAMAGE:
         return
 
 
-def _chunk_entries(chunk: Chunk) -> Iterator[McapRecord]:
-    """The messages and channels of a chunk; written for speed, as a flight has hundreds of messages a second."""
-    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    data = stream.read(size)
-    place = 0
-    while place < size:
-        opcode, length = _RECORD.unpack_from(data, place)
-        place += _RECORD.size
-        if opcode == Opcode.MESSAGE:
-            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, place)
-            payload = data[place + _MESSAGE.size : place + length]
-            yield Message(channel, log_time, payload, publish_time, sequence)
-        elif opcode == Opcode.CHANNEL:
-            yield Channel.read(ReadDataStream(io.BytesIO(data[place : place + length])))
-        place += length
+def _message(data: bytes, place: int, length: int) -> Message:
+    channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, place)
+    return Message(channel, log_time, data[place + _MESSAGE.size : place + length], publish_time, sequence)
 
 
 def _columns(topic: Any, payloads: list[bytes], file: Path) -> Any:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 import rerun_cli
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ TRACK_RADIUS, TAIL_RADIUS, PATH_RADIUS = 0.004, 0.012, 0.006  # m, of the lines
 FENCE_COLOUR: Colour = (170, 90, 90)
 FLOOR_COLOUR: Colour = (62, 66, 74)
 PATH_COLOUR: Colour = (130, 130, 140)
+_STRIP = pa.list_(pa.field("item", pa.list_(pa.field("item", pa.float32(), nullable=False), 3), nullable=False))
 LEVEL_NAMES = {Level.INFO: "INFO", Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 
 
@@ -159,11 +161,17 @@ def _log_tail(
     stream: rr.RecordingStream, entity: str, record: Record, times: NDArray, positions: NDArray, colour: Colour
 ) -> None:
     """Each step as a short line at its own time; the layout shows those of the last seconds."""
-    steps = np.stack([positions[:-1], positions[1:]], axis=1)
     stream.log(entity, rr.LineStrips3D.from_fields(colors=[colour], radii=[TAIL_RADIUS]), static=True)
-    if len(steps):
-        columns = rr.LineStrips3D.columns(strips=list(steps))
+    if len(times) > 1:
+        columns = rr.LineStrips3D.columns(strips=_steps(positions))
         stream.send_columns(entity, [_since_start(record, times[1:])], columns, strict=True)
+
+
+def _steps(positions: NDArray) -> pa.ListArray:
+    """From each position to the next, as Arrow has strips; rerun's own conversion takes 30 µs a strip."""
+    ends = np.stack([positions[:-1], positions[1:]], axis=1).astype(np.float32)
+    points = pa.FixedSizeListArray.from_arrays(pa.array(ends.reshape(-1)), type=_STRIP.value_type)
+    return pa.ListArray.from_arrays(pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32)), points, type=_STRIP)
 
 
 def _log_plot(stream: rr.RecordingStream, plot: Plot, record: Record) -> None:
