@@ -1,0 +1,57 @@
+"""The command line: one small file a command, wiring only. Whatever is heavy is imported inside the commands."""
+
+import sys
+
+import click
+
+from cfplan import __version__
+from cfplan.cli.check import check
+from cfplan.cli.dataset import dataset
+from cfplan.cli.doctor import doctor
+from cfplan.cli.fly import fly
+from cfplan.cli.output import print_error
+from cfplan.cli.plan import plan
+from cfplan.cli.replay import replay
+from cfplan.cli.sim import sim
+from cfplan.errors import CfplanError
+
+EPILOG = """\b
+Examples:
+  cfplan fly flights/figure8.yaml          fly the virtual Crazyflie
+  cfplan check flights/circle.yaml         is the plan within every limit?
+  cfplan replay records/<flight>           look at a flight in rerun
+
+\b
+Exit codes: 0 ok, 2 usage, 3 infeasible, 4 certificate or dry run failed, 5 preflight failed,
+6 ended by the pilot, 7 ended by a safety rule, 8 link lost."""
+
+
+@click.group(epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__)
+def cfplan() -> None:
+    """Plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
+
+
+for command in (plan, check, sim, fly, replay, dataset, doctor):
+    cfplan.add_command(command)
+
+
+def main() -> None:
+    """Run the command line; a user's mistake ends in one line and an exit code, never in a traceback."""
+    try:
+        result = cfplan.main(standalone_mode=False)
+    except click.exceptions.Exit as ending:
+        sys.exit(ending.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        print("stopped", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:  # the reader of our output went away, as `| head` does
+        sys.stderr.close()
+        sys.exit(0)
+    except CfplanError as error:
+        print_error(error, as_json="--json" in sys.argv)
+        sys.exit(error.exit_code)
+    sys.exit(result if isinstance(result, int) else 0)

@@ -1,0 +1,140 @@
+"""`cfplan dataset`: labelled paths for training."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from cfplan.cli import options
+from cfplan.cli.output import print_json, print_table
+from cfplan.errors import InputError
+
+
+@click.group()
+def dataset() -> None:
+    """Make datasets of paths labelled by the expert, and look into them."""
+
+
+def _box(_: click.Context, __: click.Parameter, text: str) -> tuple[float, ...]:
+    try:
+        sides = tuple(float(side) for side in text.split("x"))
+    except ValueError:
+        sides = ()
+    if len(sides) != 3:
+        raise click.BadParameter(f"{text!r} is not of the form 4.5x8x2")
+    return sides
+
+
+def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
+    try:
+        bounds = tuple(int(bound) for bound in text.split("-"))
+    except ValueError:
+        bounds = ()
+    if len(bounds) != 2:
+        raise click.BadParameter(f"{text!r} is not of the form 3-6")
+    return bounds
+
+
+@dataset.command(epilog="Example: cfplan dataset make datasets/hardware --count 10000 --limits hardware --workers 2")
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.option("--count", type=int, required=True, help="Clean paths.")
+@click.option("--limits", required=True, help="Limit set: hardware (2 m/s) or simulation (5 m/s).")
+@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--box", callback=_box, default="10x10x10", show_default=True, help="Where waypoints are drawn, m.")
+@click.option("--waypoints", callback=_range, default="3-6", show_default=True, help="Least and most a path.")
+@click.option("--nodes", type=int, default=100, show_default=True, help="Grid intervals.")
+@click.option("--yaw", type=click.Choice(["fixed", "tangent", "free"]), default="free", show_default=True)
+@click.option("--epsilon", type=float, default=0.0, help="Perturb copies by at most this at every node, m.")
+@click.option("--copies", type=int, default=0, help="Perturbed copies of each path.")
+@click.option(
+    "--relabel",
+    type=click.Choice(["solve", "keep"]),
+    default="solve",
+    show_default=True,
+    help="Solve each copy, or keep the clean path's label.",
+)
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine.")
+@click.option("--scheduler", help="Label on a Dask cluster instead: tcp://host:port.")
+@options.as_json
+def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **what: Any) -> None:
+    """Make the dataset DIR, or what is still missing of it.
+
+    The same options give the same rows, whatever the number of workers; solves that fail are rows with a reason.
+    """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    from cfplan.expert.limit_sets import LIMIT_SETS
+    from cfplan.geometry.yaw import YawMode
+    from cfplan.learning.dataset import make_dataset
+    from cfplan.learning.dataset_spec import DatasetSpec, Relabel
+
+    if what["limits"] not in LIMIT_SETS:
+        raise InputError(f"no limit set {what['limits']!r}", where="--limits", hint=f"one of {', '.join(LIMIT_SETS)}")
+    spec = DatasetSpec(**what | {"yaw": YawMode(what["yaw"]), "relabel": Relabel(what["relabel"])})
+
+    class _Rate(ProgressColumn):
+        def render(self, task: Task) -> str:
+            return f"{task.speed:.0f} rows/s" if task.speed else "– rows/s"
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _Rate(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True, quiet=as_json)) as progress:
+        task = progress.add_task("labelling", total=spec.rows)
+        make_dataset(
+            folder,
+            spec,
+            workers=workers,
+            scheduler=scheduler,
+            on_rows=lambda rows: progress.advance(task, rows),
+        )
+    if as_json:
+        print_json({"folder": str(folder), "rows": spec.rows})
+    else:
+        click.echo(f"{spec.rows} rows in {folder}; look at them with: cfplan dataset info {folder}")
+
+
+@dataset.command(epilog="Example: cfplan dataset info datasets/hardware")
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@options.as_json
+def info(folder: Path, as_json: bool) -> None:
+    """Show counts, failures, and distributions of length, time, speed and active limits of the dataset DIR."""
+    from cfplan.learning.dataset_info import DISTRIBUTIONS, PERCENTILES, describe
+
+    found = describe(folder)
+    if as_json:
+        print_json(found)
+        return
+    spec = found["spec"]
+    click.echo(
+        f"{folder}: {found['rows']} of {found['rows_wanted']} rows, limits {spec['limits']}, seed {spec['seed']}"
+    )
+    click.echo(f"solved {found['solved']}, failed {found['failed'] or 0}")
+    click.echo(
+        f"certified as they are {found['certified_as_they_are']}, slowed {found['certified_when_slowed']}, "
+        f"never {found['never_certified']}"
+    )
+    rows = []
+    for name, unit in DISTRIBUTIONS.items():
+        values = found["percentiles"][name]
+        rows.append([f"{name.replace('_', ' ')} {unit}".strip(), *(_short(values[str(p)]) for p in PERCENTILES)])
+    print_table("Distributions", ["", *(f"p{p}" for p in PERCENTILES)], rows)
+    active = [[name, f"{100 * share:.1f} %"] for name, share in found["active_limits"].items()]
+    print_table("Limits that are active somewhere on the path", ["limit", "of solved paths"], active)
+
+
+def _short(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"

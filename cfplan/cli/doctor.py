@@ -1,0 +1,84 @@
+"""`cfplan doctor`: is everything there that a flight needs?"""
+
+import platform
+import shutil
+import sys
+from importlib import metadata
+
+import click
+
+from cfplan import __version__
+from cfplan.cli import options
+from cfplan.cli.output import print_json, print_table
+
+NEEDED = ("numpy", "scipy", "numba", "casadi", "cflib", "pydantic", "mcap", "pyarrow", "rerun-sdk")
+OPTIONAL = {
+    "torch": "the learned planner: pip install 'cfplan[learn]'",
+    "toppra": "the convex baseline: pip install 'cfplan[bench]'",
+}
+CRAZYRADIO_USB = {(0x1915, 0x7777): "Crazyradio", (0x35F0, 0xBAD2): "Crazyradio 2.0"}
+
+
+@click.command(epilog="Example: cfplan doctor --json")
+@options.as_json
+def doctor(as_json: bool) -> int:
+    """Show versions, packages, the compiler and the radio, and what is missing."""
+    checks = [_python(), *map(_package, NEEDED), *(_optional(name) for name in OPTIONAL), _compiler(), _radio()]
+    missing = [check for check in checks if check["verdict"] == "missing"]
+    if as_json:
+        print_json({"cfplan": __version__, "checks": checks, "ok": not missing})
+    else:
+        rows = [[str(check[key]) for key in ("name", "found", "verdict", "hint")] for check in checks]
+        print_table(f"cfplan {__version__} on {platform.platform()}", ["", "found", "verdict", "hint"], rows)
+    return 5 if missing else 0
+
+
+def _check(name: str, found: str, verdict: str = "ok", hint: str = "") -> dict[str, str]:
+    return {"name": name, "found": found, "verdict": verdict, "hint": hint}
+
+
+def _python() -> dict[str, str]:
+    return _check("python", platform.python_version(), "ok" if sys.version_info >= (3, 11) else "missing")
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _package(name: str) -> dict[str, str]:
+    version = _version(name)
+    if version is None:
+        return _check(name, "-", "missing", "pip install cfplan")
+    return _check(name, version)
+
+
+def _optional(name: str) -> dict[str, str]:
+    version = _version(name)
+    return _check(name, version or "-", "ok" if version else "optional", "" if version else OPTIONAL[name])
+
+
+def _compiler() -> dict[str, str]:
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        return _check("C compiler", "-", "optional", "without one the expert plans several times slower")
+    return _check("C compiler", compiler)
+
+
+def _radio() -> dict[str, str]:
+    """Look for a Crazyradio on USB, through the library that cflib uses."""
+    try:
+        import usb.core
+
+        found = [
+            name
+            for (vendor, product), name in CRAZYRADIO_USB.items()
+            if usb.core.find(idVendor=vendor, idProduct=product) is not None
+        ]
+    except Exception as error:  # no libusb, no permission: whatever pyusb raises is the finding
+        return _check("radio", "-", "optional", f"USB cannot be read ({error}); sim:// flies without")
+    if not found:
+        return _check("radio", "none", "optional", "plug in a Crazyradio to fly hardware; sim:// flies without")
+    return _check("radio", ", ".join(found))

@@ -1,0 +1,88 @@
+"""What a person sees while the vehicle flies: a line a phase, and a bar along the path."""
+
+import time
+from types import TracebackType
+
+from cfplan.cli.output import Steps
+from cfplan.flight.telemetry import (
+    Event,
+    Level,
+    Phase,
+    PhaseEntered,
+    PoseReceived,
+    SetpointSent,
+    Telemetry,
+    VehicleStatus,
+)
+
+_REFRESH = 0.1  # s
+
+
+class FlightProgress:
+    """Follows the telemetry. On a terminal the bar moves; elsewhere only lines are printed."""
+
+    def __init__(self, *, duration: float, steps: Steps):
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self._quiet = steps.as_json
+        console = Console(stderr=True, quiet=self._quiet)
+        self._bar = Progress(
+            TextColumn("  {task.description:<12}"),
+            BarColumn(),
+            TextColumn("{task.fields[numbers]}"),
+            TimeRemainingColumn(compact=True),
+            console=console,
+            disable=self._quiet or not console.is_terminal,
+            transient=True,
+        )
+        self._task = self._bar.add_task("", total=duration, numbers="")
+        self._console = console
+        self._setpoint: SetpointSent | None = None
+        self._first_index_time = 0.0
+        self._pose: PoseReceived | None = None
+        self._battery = 0.0
+        self._shown = 0.0
+        self._began = time.monotonic()
+
+    def __enter__(self) -> "FlightProgress":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def show(self, message: Telemetry) -> None:
+        """Take a message; draws at most ten times a second."""
+        if isinstance(message, PhaseEntered):
+            self._enter(message)
+        elif isinstance(message, Event) and message.level is not Level.INFO:
+            style = "red" if message.level is Level.ERROR else "yellow"
+            self._bar.console.print(f"  {message.text}", style=style, highlight=False, markup=False)
+        elif isinstance(message, SetpointSent):
+            self._setpoint = message
+        elif isinstance(message, PoseReceived):
+            self._pose = message
+        elif isinstance(message, VehicleStatus):
+            self._battery = message.battery_voltage
+        now = time.monotonic()
+        if now - self._shown > _REFRESH:
+            self._shown = now
+            self._draw()
+
+    def _enter(self, message: PhaseEntered) -> None:
+        elapsed = message.time - self._began
+        self._bar.console.print(f"  {elapsed:6.2f} s  {message.phase}", highlight=False)
+        self._bar.update(self._task, description=str(message.phase))
+        if message.phase is Phase.STREAM:
+            self._first_index_time = message.time
+
+    def _draw(self) -> None:
+        done = self._setpoint.time - self._first_index_time if self._setpoint is not None else 0.0
+        numbers = f"battery {self._battery:.2f} V"
+        if self._pose is not None:
+            x, y, z = self._pose.position
+            numbers = f"({x:+.2f}, {y:+.2f}, {z:.2f}) m  {numbers}"
+        self._bar.update(self._task, completed=done, numbers=numbers)

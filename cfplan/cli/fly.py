@@ -1,0 +1,206 @@
+"""`cfplan fly`: plan, certify, rehearse, fly, record."""
+
+import math
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from cfplan import __version__
+from cfplan.cli import options
+from cfplan.cli.flight_progress import FlightProgress
+from cfplan.cli.output import Steps, print_json, print_table
+from cfplan.cli.rehearsal import PlanOptions, certify_bytes, obtain_plan, rehearse
+from cfplan.errors import CfplanError, ExitCode, InputError
+
+if TYPE_CHECKING:
+    from cfplan.flight.outcome import FlightOutcome
+    from cfplan.flight.poses import PoseSource
+    from cfplan.planning.plan import Plan
+    from cfplan.recording.header import RecordHeader
+    from cfplan.safety.limits import Limits
+
+SIMULATED = "sim://"
+_PATH_SAMPLES = 500  # of the drawn path
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cfplan fly flights/figure8.yaml
+  cfplan fly flights/figure8.yaml --speed 0.3
+
+Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts."""
+)
+@options.path_or_plan
+@options.planning
+@click.option("--uri", default="sim://0", show_default=True, help="The vehicle; sim:// is the virtual Crazyflie.")
+@click.option(
+    "--records",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("records"),
+    show_default=True,
+    help="Folder in which the flight's record gets a folder of its own.",
+)
+@options.as_json
+def fly(
+    path_or_plan: Path,
+    safety_file: Path | None,
+    planner: str,
+    nodes: int | None,
+    speed_share: float | None,
+    uri: str,
+    records: Path,
+    as_json: bool,
+) -> int:
+    """Fly along PATH: plan, certify, rehearse, then take off, stream the flight, land, and keep a record."""
+    steps = Steps(as_json=as_json)
+    plan, limits = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
+    encoded = certify_bytes(plan, limits, steps)
+    rehearsed = rehearse(plan, encoded, limits, steps)
+
+    from cfplan.flight.mission import mission_of
+    from cfplan.flight.process import fly as fly_mission
+    from cfplan.planning.files import save_plan
+    from cfplan.recording.reader import read_record
+    from cfplan.recording.summary import summarise
+    from cfplan.recording.writer import RecordWriter, new_record_folder, write_summary
+
+    with steps.step("stops") as said:
+        mission = mission_of(encoded, limits)
+        said.append(f"a way to stop from each of {len(mission.payloads)} setpoints")
+    with _vehicle(uri, limits) as (drivers, pose_source):
+        folder = new_record_folder(records, plan.name)
+        try:
+            save_plan(plan, folder / "plan.parquet")
+            with (
+                RecordWriter(folder, _header(plan, limits, uri, path_or_plan)) as writer,
+                FlightProgress(duration=mission.duration, steps=steps) as progress,
+            ):
+                outcome = fly_mission(
+                    mission,
+                    uri=uri,
+                    drivers=drivers,
+                    pose_source=pose_source,
+                    on_telemetry=lambda message: (writer.write(message), progress.show(message)),
+                )
+        except CfplanError:
+            steps.say(f"what was recorded: {folder}")
+            raise
+    if writer.failure:
+        steps.failed("record", writer.failure)
+    summary = {"outcome": _outcome_to_dict(outcome), **summarise(read_record(folder)).to_json()}
+    write_summary(folder, summary)
+
+    if as_json:
+        document = {"name": plan.name, "record": str(folder), "plan": plan.to_dict(), **summary}
+        print_json(document | {"dry_run_max_deviation": rehearsed.max_deviation})
+    else:
+        if outcome.checks and outcome.exit_code == ExitCode.PREFLIGHT:
+            _print_checks(outcome)
+        _print_outcome(plan, outcome, summary, rehearsed.max_deviation)
+        click.echo(f"record: {folder}")
+        click.echo(f"replay: cfplan replay {shlex.quote(str(folder))}")
+    if outcome.exit_code is not ExitCode.OK:
+        print(f"{click.style('error:', fg='red')} {outcome.reason}", file=sys.stderr)
+    return int(outcome.exit_code)
+
+
+@contextmanager
+def _vehicle(uri: str, limits: "Limits") -> "Iterator[tuple[list[type], PoseSource]]":
+    """The link drivers and the poses for a URI; for the virtual Crazyflie, its lab too."""
+    if not uri.startswith(SIMULATED):
+        raise InputError(
+            "only the virtual Crazyflie has a source of poses so far",
+            where=uri,
+            hint=f"fly {SIMULATED}0; motion capture for hardware is still to come",
+        )
+    from cfplan.simulation.lab import start_lab
+    from cfplan.simulation.room import RoomPoseSource
+    from cfplan.simulation.sim_driver import SimDriver
+
+    with start_lab(limits.airframe, uri=uri):
+        yield [SimDriver], RoomPoseSource(uri)
+
+
+def _header(plan: "Plan", limits: "Limits", uri: str, source: Path) -> "RecordHeader":
+    import numpy as np
+
+    from cfplan.recording.header import FlightBounds, RecordHeader
+    from cfplan.recording.writer import wall_time_at_zero
+
+    return RecordHeader(
+        name=plan.name,
+        version=__version__,
+        uri=uri,
+        planner=plan.planner,
+        vehicle=limits.airframe,
+        thrust_at_full_command=limits.airframe.motor_thrust_max,
+        plan_limits=limits.plan,
+        bounds=FlightBounds(
+            speed=limits.plan.speed,
+            acceleration=limits.plan.acceleration,
+            body_rate=limits.plan.angular_velocity,
+            deviation=limits.flight.deviation.brake,
+            pose_age=limits.pose.age_warning,
+            battery_voltage=limits.battery.under_load,
+        ),
+        travel_time=plan.trajectory.duration,
+        path=plan.path(np.linspace(0.0, plan.path.end, _PATH_SAMPLES)),
+        fence=(limits.space.low, limits.space.high),
+        wall_time_at_zero=wall_time_at_zero(),
+        provenance={"path file": str(source), "planner": plan.planner},
+    )
+
+
+def _outcome_to_dict(outcome: "FlightOutcome") -> dict[str, Any]:
+    return {
+        "exit_code": int(outcome.exit_code),
+        "reason": outcome.reason,
+        "rung": outcome.rung.name.lower(),
+        "flown": outcome.flown,
+        "settled_after": outcome.settled_after if math.isfinite(outcome.settled_after) else None,
+        "lateness_p99": outcome.lateness.p99,
+        "lateness_max": outcome.lateness.max,
+        "deviation_max": outcome.deviation.max,
+        "deviation_rms": outcome.deviation.rms,
+        "setpoints_skipped": outcome.lateness.skipped,
+        "telemetry_dropped": outcome.telemetry_dropped,
+        "preflight": [
+            {"name": check.name, "value": check.value, "threshold": check.threshold, "passed": check.passed}
+            for check in outcome.checks
+        ],
+    }
+
+
+def _print_checks(outcome: "FlightOutcome") -> None:
+    rows = [
+        [
+            check.name,
+            check.value,
+            check.threshold,
+            "ok" if check.passed else "FAILED",
+            "" if check.passed else check.hint,
+        ]
+        for check in outcome.checks
+    ]
+    print_table("Preflight", ["check", "value", "must be", "verdict", "hint"], rows)
+
+
+def _print_outcome(plan: "Plan", outcome: "FlightOutcome", summary: dict[str, Any], rehearsed: float) -> None:
+    settled = f"{outcome.settled_after:.2f} s" if math.isfinite(outcome.settled_after) else "–"
+    rows = [
+        ["ended", outcome.reason],
+        ["travel time, planned", f"{plan.trajectory.duration:.2f} s"],
+        ["travel time, streamed", f"{outcome.flown:.2f} s"],
+        ["settled after", settled],
+        ["deviation, dry run", f"{100 * rehearsed:.1f} cm max"],
+        ["deviation, flown", f"{100 * outcome.deviation.max:.1f} cm max, {100 * outcome.deviation.rms:.1f} cm rms"],
+        ["lateness of setpoints", f"{1e3 * outcome.lateness.p99:.2f} ms p99, {1e3 * outcome.lateness.max:.2f} ms max"],
+        ["battery", f"{summary['battery_start']} → {summary['battery_end']} V"],
+    ]
+    print_table("Flight", ["", "value"], rows)

@@ -1,0 +1,53 @@
+"""Arguments and options that several commands share."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+
+from cfplan.errors import InputError
+
+SAFETY_FILE = "safety.yaml"
+
+as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
+path_file = click.argument("path_file", metavar="PATH", type=click.Path(path_type=Path))
+path_or_plan = click.argument("path_or_plan", metavar="PATH_OR_PLAN", type=click.Path(path_type=Path))
+
+
+def planning(command: Callable) -> Callable:
+    """What every command that plans takes."""
+    for option in reversed(
+        (
+            click.option(
+                "--safety",
+                "safety_file",
+                type=click.Path(path_type=Path),
+                help=f"Limits to keep; else the nearest {SAFETY_FILE}, from here or from the path file upwards.",
+            ),
+            click.option("--planner", default="expert", show_default=True, help="How to find the speed profile."),
+            click.option("--nodes", type=click.IntRange(4), help="Grid intervals; else chosen from the path's length."),
+            click.option(
+                "--speed",
+                "speed_share",
+                type=click.FloatRange(0, 1, min_open=True),
+                help="Share of the allowed speed to fly at; else the path file's, else 1.",
+            ),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+def find_safety_file(given: Path | None, path_file: Path) -> Path:
+    """The safety.yaml to use: the one given, or the nearest above the working folder or above the path file."""
+    if given is not None:
+        return given
+    for start in (Path.cwd(), path_file.resolve().parent):
+        for folder in (start, *start.parents):
+            if (folder / SAFETY_FILE).is_file():
+                return folder / SAFETY_FILE
+    raise InputError(
+        f"no {SAFETY_FILE} here, above, or above the path file",
+        where=str(path_file),
+        hint="name one with --safety; cfplan's own repository has one to start from",
+    )

@@ -1,0 +1,91 @@
+"""How the commands speak: a line a step for people, one JSON document for scripts."""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import click
+
+from cfplan.errors import CfplanError, ExitCode
+
+
+class Steps:
+    """Prints one line a step, with its number, as each one ends; silent where JSON is asked for."""
+
+    def __init__(self, *, as_json: bool):
+        self.as_json = as_json
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[list[str]]:
+        """Time a step. What the block appends to the list is printed behind the step's name."""
+        started = time.perf_counter()
+        said: list[str] = []
+        try:
+            yield said
+        except CfplanError:
+            self._line("✗", name, "", started)
+            raise
+        self._line("✓", name, ", ".join(said), started)
+
+    def failed(self, name: str, text: str) -> None:
+        """A step that ran to its end and whose verdict is no."""
+        if not self.as_json:
+            click.echo(f"{click.style('✗', fg='red')} {name:<12} {text}")
+
+    def say(self, text: str = "") -> None:
+        """A line that is no step."""
+        if not self.as_json:
+            click.echo(text)
+
+    def _line(self, mark: str, name: str, text: str, started: float) -> None:
+        if self.as_json:
+            return
+        took = f"{(time.perf_counter() - started) * 1e3:.0f} ms"
+        color = "green" if mark == "✓" else "red"
+        click.echo(f"{click.style(mark, fg=color)} {name:<12} {took:>8}  {text}".rstrip())
+
+
+def print_json(document: Any) -> None:
+    """One document on standard output; what is not finite becomes null, as JSON has no word for it."""
+    click.echo(json.dumps(_finite(document), indent=2, ensure_ascii=False))
+
+
+def print_error(error: CfplanError, *, as_json: bool) -> None:
+    """One line on standard error, and the same as JSON on standard output where that was asked for."""
+    print(f"{click.style('error:', fg='red')} {error}", file=sys.stderr)
+    if as_json:
+        code = int(error.exit_code)
+        print_json({"error": error.what, "where": error.where, "hint": error.hint, "exit_code": code})
+
+
+def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
+    """A table; the first column to the left, numbers to the right."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", header_style="bold")
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="left" if index == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, bool | str | int) or value is None:
+        return value
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def exit_with(code: ExitCode) -> None:
+    """End the command with this code."""
+    raise click.exceptions.Exit(int(code))

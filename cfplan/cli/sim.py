@@ -1,0 +1,33 @@
+"""`cfplan sim`: the dry run alone."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from cfplan.cli import options
+from cfplan.cli.output import Steps, print_json, print_table
+from cfplan.cli.rehearsal import PlanOptions, certify_bytes, obtain_plan, rehearse
+
+
+@click.command(epilog="Example: cfplan sim flights/slalom.yaml")
+@options.path_or_plan
+@options.planning
+@options.as_json
+def sim(
+    path_or_plan: Path,
+    safety_file: Path | None,
+    planner: str,
+    nodes: int | None,
+    speed_share: float | None,
+    as_json: bool,
+) -> None:
+    """Rehearse a path or a plan file: its very setpoints, the firmware's controller, a body with drag and motor lag."""
+    steps = Steps(as_json=as_json)
+    plan, limits = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
+    encoded = certify_bytes(plan, limits, steps)
+    result = rehearse(plan, encoded, limits, steps)
+    if as_json:
+        print_json({"name": plan.name, "duration": plan.trajectory.duration, "dry_run": asdict(result)})
+    else:
+        print_table("Dry run", ["", "value"], result.rows())

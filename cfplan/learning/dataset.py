@@ -1,0 +1,195 @@
+"""Datasets on disk: made shard by shard by any number of workers, resumed where they stopped, read back whole.
+
+A folder holds dataset.json, shards/NNNNN.parquet (the rows), and timing/NNNNN.parquet (how long each solve took, which
+no two runs repeat, and which is therefore kept apart from the rows that every run repeats to the byte).
+"""
+
+import io
+import socket
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from cfplan.errors import CfplanError, ExitCode, InputError
+from cfplan.learning.dataset_spec import SPEC_FILE, DatasetSpec, load_spec, require_same
+from cfplan.learning.labels import make_rows
+
+SHARDS, TIMING = "shards", "timing"
+SCHEDULER_PATIENCE = 10  # s
+
+
+class SchedulerError(CfplanError):
+    """The scheduler of a cluster cannot be used."""
+
+    exit_code = ExitCode.USAGE
+
+
+def make_dataset(
+    folder: Path,
+    spec: DatasetSpec,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    on_rows: Callable[[int], None] = lambda _: None,
+) -> DatasetSpec:
+    """Make what is missing of a dataset. `on_rows` hears how many more rows are on disk.
+
+    Stopped at any moment, it loses the shards under way and no more; the next call makes those.
+    Raises InputError where the folder holds another dataset or cannot be written, SchedulerError where the scheduler
+    does not answer within ten seconds.
+    """
+    _prepare(folder, spec)
+    missing = [number for number in range(spec.shards) if not _shard(folder, SHARDS, number).exists()]
+    on_rows(spec.rows - sum(len(spec.shard(number)) for number in missing))
+    with _pool(workers, scheduler) as labelled:
+        for number, rows, timing in labelled(spec, missing):
+            try:
+                _write(_shard(folder, TIMING, number), timing)
+                _write(_shard(folder, SHARDS, number), rows)
+            except OSError as error:
+                raise InputError(
+                    f"cannot write: {error.strerror}",
+                    where=str(folder),
+                    hint="make room and give the same command again: what is there is kept",
+                ) from None
+            on_rows(len(spec.shard(number)))
+    return spec
+
+
+def read_dataset(folder: Path) -> tuple[DatasetSpec, pa.Table]:
+    """All rows there are, in order. Raises InputError where the folder is no dataset or a shard is damaged."""
+    spec = load_spec(folder)
+    return spec, _read(folder, SHARDS)
+
+
+def read_timing(folder: Path) -> pa.Table:
+    """How long each row's solve took, as far as rows are there."""
+    load_spec(folder)
+    return _read(folder, TIMING)
+
+
+def label_shard(spec: DatasetSpec, number: int) -> tuple[int, bytes, bytes]:
+    """A worker's task: the shard's number, and the bytes of its two files."""
+    rows, timing = make_rows(spec, spec.shard(number))
+    return number, _parquet(rows), _parquet(timing)
+
+
+def _prepare(folder: Path, spec: DatasetSpec) -> None:
+    try:
+        for part in (SHARDS, TIMING):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        if (folder / SPEC_FILE).exists():
+            require_same(load_spec(folder), spec, folder)
+        elif any((folder / SHARDS).iterdir()):
+            raise InputError(f"has shards but no {SPEC_FILE}", where=str(folder), hint="give another folder")
+        else:
+            spec.save(folder)
+    except OSError as error:
+        raise InputError(f"cannot be used for a dataset: {error.strerror}", where=str(folder)) from None
+
+
+Labelled = Iterator[tuple[int, bytes, bytes]]
+
+
+@contextmanager
+def _pool(workers: int, scheduler: str | None) -> Iterator[Callable[[DatasetSpec, list[int]], Labelled]]:
+    """Something that labels shards, on this machine or on a cluster, and gives them as they are done."""
+    from joblib import Parallel, delayed, parallel_config
+
+    def run(spec: DatasetSpec, numbers: list[int]) -> Labelled:
+        tasks = (delayed(label_shard)(spec, number) for number in numbers)
+        yield from Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(
+            tasks
+        )
+
+    if scheduler is None:
+        n_jobs = workers
+        with parallel_config(backend="loky", inner_max_num_threads=1):
+            yield run
+        return
+    n_jobs = -1
+    with _client(scheduler) as client, parallel_config(backend="dask", client=client, wait_for_workers_timeout=30):
+        yield run
+
+
+@contextmanager
+def _client(scheduler: str) -> Iterator[object]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise SchedulerError(
+            "Dask is not installed", where=scheduler, hint="pip install 'cfplan[cluster]', here and on the workers"
+        ) from None
+    _require_listening(scheduler)
+    try:
+        client = Client(scheduler, timeout=SCHEDULER_PATIENCE)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise SchedulerError(
+            f"no Dask scheduler answers there ({error})", where=scheduler, hint="start one with `dask scheduler`"
+        ) from None
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def _require_listening(scheduler: str) -> None:
+    """Dask tries for long and logs much where nothing listens; ask first."""
+    parts = urlsplit(scheduler)
+    try:
+        if parts.scheme != "tcp" or parts.hostname is None or parts.port is None:
+            raise ValueError("an address has the form tcp://host:port")
+        # In a thread, because looking up a name has no timeout of its own.
+        lookup = ThreadPoolExecutor(1)
+        lookup.submit(_touch, parts.hostname, parts.port).result(timeout=SCHEDULER_PATIENCE)
+        lookup.shutdown(wait=False)
+    except (OSError, ValueError) as error:  # TimeoutError is an OSError
+        raise SchedulerError(
+            f"no Dask scheduler can be reached there ({error or 'no answer'})",
+            where=scheduler,
+            hint="start one with `dask scheduler`, and workers with `dask worker`",
+        ) from None
+
+
+def _touch(host: str, port: int) -> None:
+    socket.create_connection((host, port), timeout=SCHEDULER_PATIENCE / 2).close()
+
+
+def _shard(folder: Path, part: str, number: int) -> Path:
+    return folder / part / f"{number:05d}.parquet"
+
+
+def _parquet(table: pa.Table) -> bytes:
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer, compression="zstd")
+    return buffer.getvalue()
+
+
+def _write(file: Path, content: bytes) -> None:
+    """Whole or not at all."""
+    temporary = file.with_suffix(".new")
+    try:
+        temporary.write_bytes(content)
+        temporary.replace(file)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _read(folder: Path, part: str) -> pa.Table:
+    files = sorted((folder / part).glob("*.parquet"))
+    if not files:
+        raise InputError("no rows yet", where=str(folder), hint="give `cfplan dataset make` again to go on")
+    tables = []
+    for file in files:
+        try:
+            tables.append(pq.read_table(file))
+        except (OSError, pa.ArrowException) as error:
+            raise InputError(
+                f"damaged ({error})", where=str(file), hint="delete it and give `cfplan dataset make` again"
+            ) from None
+    return pa.concat_tables(tables)

@@ -1,0 +1,112 @@
+"""What a dataset is made of: everything that decides its rows, kept beside them as dataset.json."""
+
+import json
+from dataclasses import asdict, dataclass, fields
+from enum import StrEnum
+from pathlib import Path
+
+from cfplan import __version__
+from cfplan.errors import InputError
+from cfplan.geometry.yaw import YawMode
+
+SPEC_FILE = "dataset.json"
+
+
+class Relabel(StrEnum):
+    """What a perturbed copy of a path is labelled with."""
+
+    SOLVE = "solve"  # its own solution
+    KEEP = "keep"  # the clean path's label, as the paper's noise injection has it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatasetSpec:
+    """Two datasets with equal specs have equal rows, whoever makes them and with however many workers."""
+
+    count: int
+    # clean paths
+    seed: int
+    limits: str
+    # name of a limit set, which names its vehicle too
+    box: tuple[float, float, float] = (10.0, 10.0, 10.0)
+    # m, where waypoints are drawn
+    waypoints: tuple[int, int] = (3, 6)
+    # least and most
+    nodes: int = 100
+    # grid intervals
+    yaw: YawMode = YawMode.FREE
+    epsilon: float = 0.0
+    # m, perturbation of the copies at each node
+    copies: int = 0
+    # perturbed copies of each path
+    relabel: Relabel = Relabel.SOLVE
+    shard_rows: int = 100
+    version: str = __version__
+
+    def __post_init__(self) -> None:
+        low, high = self.waypoints
+        wrong = [
+            ("count", self.count < 1, "at least 1"),
+            ("seed", self.seed < 0, "at least 0"),
+            ("box", len(self.box) != 3 or not all(0 < side < float("inf") for side in self.box), "three lengths in m"),
+            ("waypoints", not 2 <= low <= high, "two or more, least first"),
+            ("nodes", self.nodes < 4, "at least 4"),
+            ("copies", self.copies < 0, "at least 0"),
+            ("epsilon", not 0 <= self.epsilon < float("inf"), "at least 0"),
+            ("epsilon", (self.epsilon > 0) != (self.copies > 0), "given together with copies"),
+            ("shard_rows", self.shard_rows < 1, "at least 1"),
+        ]
+        for name, is_wrong, allowed in wrong:
+            if is_wrong:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be {allowed}", where="dataset")
+
+    @property
+    def rows(self) -> int:
+        """Clean paths and their copies."""
+        return self.count * (1 + self.copies)
+
+    @property
+    def shards(self) -> int:
+        """How many files the rows fill."""
+        return -(-self.rows // self.shard_rows)
+
+    def shard(self, number: int) -> range:
+        """The rows of one file."""
+        return range(number * self.shard_rows, min(self.rows, (number + 1) * self.shard_rows))
+
+    def save(self, folder: Path) -> None:
+        """Write dataset.json, whole or not at all."""
+        temporary = folder / f".{SPEC_FILE}.new"
+        temporary.write_text(json.dumps(asdict(self), indent=2) + "\n")
+        temporary.replace(folder / SPEC_FILE)
+
+
+def load_spec(folder: Path) -> DatasetSpec:
+    """The spec of a dataset folder. Raises InputError where there is none or it cannot be read."""
+    file = folder / SPEC_FILE
+    if not file.is_file():
+        raise InputError(
+            f"no {SPEC_FILE} there", where=str(folder), hint="make a dataset with `cfplan dataset make DIR`"
+        )
+    try:
+        content = json.loads(file.read_text())
+        known = {field.name for field in fields(DatasetSpec)}
+        if not isinstance(content, dict) or set(content) != known:
+            raise ValueError(f"its keys are not those of cfplan {__version__}")
+        content |= {"box": tuple(content["box"]), "waypoints": tuple(content["waypoints"])}
+        return DatasetSpec(**content | {"yaw": YawMode(content["yaw"]), "relabel": Relabel(content["relabel"])})
+    except (ValueError, TypeError, UnicodeDecodeError) as error:
+        raise InputError(f"not a dataset description: {error}", where=str(file)) from None
+
+
+def require_same(existing: DatasetSpec, wanted: DatasetSpec, folder: Path) -> None:
+    """Refuse to mix rows of two kinds in one folder, naming what differs. More rows of the same kind are no mix."""
+    different = [
+        f"{field.name} {getattr(existing, field.name)} there, {getattr(wanted, field.name)} here"
+        for field in fields(DatasetSpec)
+        if getattr(existing, field.name) != getattr(wanted, field.name)
+    ]
+    if different:
+        raise InputError(
+            f"holds another dataset: {'; '.join(different)}", where=str(folder), hint="give another folder"
+        )

@@ -1,0 +1,151 @@
+"""One row of a dataset: a path from its seed, and the expert's answer to it."""
+
+from dataclasses import asdict
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from cfplan.errors import CfplanError
+from cfplan.expert.limit_sets import LIMIT_SETS
+from cfplan.expert.reduced import plan_reduced
+from cfplan.expert.slowing import certified_share
+from cfplan.expert.solution import Solution, Status
+from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.path import Path
+from cfplan.geometry.random_paths import perturbed, random_waypoints
+from cfplan.learning.dataset_spec import DatasetSpec, Relabel
+from cfplan.safety.certificate import certify
+from cfplan.vehicle.trajectory import Trajectory
+
+ACTIVE_SHARE = 0.98
+# of a limit: what reaches this much of it somewhere is counted as active
+
+_NUMBERS = pa.list_(pa.float64())
+SCHEMA = pa.schema(
+    [
+        ("row", pa.int64()),
+        ("path", pa.int64()),  # number of the clean path
+        ("copy", pa.int32()),  # 0 the clean path, then its perturbed copies
+        ("seed", pa.int64()),
+        ("vehicle", pa.string()),
+        ("limits", pa.string()),  # the set's name; its numbers are in the file's metadata
+        ("version", pa.string()),  # of cfplan
+        ("breaks", _NUMBERS),  # (M+1,)
+        ("coefficients", _NUMBERS),  # (M, D, 3), rows first
+        ("length", pa.float64()),  # m
+        ("end", pa.float64()),  # S of the grid 0, S/N, …, S
+        ("nodes", pa.int32()),  # N intervals
+        ("h", _NUMBERS),  # (N+1,)
+        ("dh", _NUMBERS),
+        ("ddh", _NUMBERS),
+        ("dddh", _NUMBERS),  # (N,)
+        ("yaw", _NUMBERS),  # (N+1,) rad
+        ("dyaw", _NUMBERS),
+        ("ddyaw", _NUMBERS),  # (N,)
+        ("status", pa.string()),  # name of a Status
+        ("reason", pa.string()),
+        ("solver", pa.string()),
+        ("iterations", pa.int32()),
+        ("travel_time", pa.float64()),  # s, before slowing
+        ("peak_speed", pa.float64()),  # m/s
+        ("certified_share", pa.float64()),  # of its speed at which the dense certificate passes; 1 as it stands
+        ("active_limits", pa.list_(pa.string())),
+    ]
+)
+TIMING_SCHEMA = pa.schema([("row", pa.int64()), ("solve_seconds", pa.float64())])
+
+
+def make_rows(spec: DatasetSpec, rows: range) -> tuple[pa.Table, pa.Table]:
+    """Label these rows. What was measured rather than computed, the solve times, is a table of its own.
+
+    Nothing outside `spec` and the row's number decides a row, so that any worker makes the same.
+    """
+    labelled = [_row(spec, row) for row in rows]
+    metadata = {"cfplan.limits": repr(asdict(LIMIT_SETS[spec.limits].limits)), "cfplan.version": spec.version}
+    table = pa.Table.from_pylist([row for row, _ in labelled], schema=SCHEMA.with_metadata(metadata))
+    timing = [{"row": row["row"], "solve_seconds": seconds} for row, seconds in labelled]
+    return table, pa.Table.from_pylist(timing, schema=TIMING_SCHEMA)
+
+
+def clean_path(spec: DatasetSpec, number: int) -> Path:
+    """The path of that number, from the dataset's seed."""
+    half = np.array(spec.box) / 2
+    return min_snap(random_waypoints(_seed(spec, number, 0), np.array([-half, half]), spec.waypoints))
+
+
+def row_path(spec: DatasetSpec, row: int) -> Path:
+    """The path of a row: a clean one, or a perturbed copy of one."""
+    number, copy = divmod(row, 1 + spec.copies)
+    path = clean_path(spec, number)
+    return path if copy == 0 else perturbed(path, spec.epsilon, _seed(spec, number, copy))
+
+
+def _seed(spec: DatasetSpec, number: int, copy: int) -> np.random.SeedSequence:
+    return np.random.SeedSequence(spec.seed, spawn_key=(number, copy))
+
+
+def _row(spec: DatasetSpec, row: int) -> tuple[dict[str, Any], float]:
+    number, copy = divmod(row, 1 + spec.copies)
+    chosen = LIMIT_SETS[spec.limits]
+    content: dict[str, Any] = {
+        "row": row, "path": number, "copy": copy, "seed": spec.seed, "vehicle": chosen.airframe.name,
+        "limits": chosen.name, "version": spec.version, "nodes": spec.nodes,
+    }  # fmt: skip
+    try:
+        path = row_path(spec, row)
+        path.check()
+        content |= {"breaks": path.breaks, "coefficients": path.coefficients.ravel()}
+        content |= {"length": path.length, "end": path.end}
+        kept = copy > 0 and spec.relabel is Relabel.KEEP
+        solution = _clean_solution(spec, number) if kept else _solve(spec, path)
+        content |= _label(path, solution, chosen.name)
+        seconds = float(solution.stats.get("solve_seconds", np.nan))
+    except CfplanError as error:
+        content |= {"status": "PATH", "reason": str(error)}
+        seconds = np.nan
+    return {name: content.get(name) for name in SCHEMA.names}, seconds
+
+
+def _solve(spec: DatasetSpec, path: Path) -> Solution:
+    chosen = LIMIT_SETS[spec.limits]
+    return plan_reduced(path, chosen.airframe, chosen.limits, nodes=spec.nodes, yaw=spec.yaw)
+
+
+@lru_cache(maxsize=1)
+def _clean_solution(spec: DatasetSpec, number: int) -> Solution:
+    """The clean path's label, for its copies, which follow it row by row."""
+    return _solve(spec, clean_path(spec, number))
+
+
+def _label(path: Path, solution: Solution, limits: str) -> dict[str, Any]:
+    profile = solution.profile
+    label = {
+        "status": solution.status.name,
+        "reason": solution.reason,
+        "solver": str(solution.stats.get("solver", "")),
+        "iterations": int(solution.stats.get("iterations", 0)),
+    }
+    if solution.status is not Status.SOLVED or profile is None:
+        return label
+    chosen = LIMIT_SETS[limits]
+    trajectory = Trajectory(path, profile, chosen.airframe)
+    certificate = certify(trajectory, chosen.limits)
+    label |= {name: getattr(profile, name) for name in ("h", "dh", "ddh", "dddh", "yaw", "dyaw", "ddyaw")}
+    return label | {
+        "travel_time": trajectory.duration,
+        "peak_speed": certificate.margins[0].worst,
+        "certified_share": 1.0 if certificate.passed else _share(path, solution, limits),
+        "active_limits": [margin.name for margin in certificate.margins if margin.share >= ACTIVE_SHARE],
+    }
+
+
+def _share(path: Path, solution: Solution, limits: str) -> float:
+    """0 where no slowing helps."""
+    chosen = LIMIT_SETS[limits]
+    assert solution.profile is not None
+    try:
+        return certified_share(path, solution.profile, chosen.airframe, chosen.limits)
+    except CfplanError:
+        return 0.0
