@@ -98,9 +98,12 @@ def _pieces(points: NDArray, times: NDArray, rest: bool) -> NDArray:
     """(K-1, 8, 3): each segment about its left end."""
     derivatives = _waypoint_derivatives(points, times, rest)
     powers = times[:, None] ** np.arange(4)
-    values = np.concatenate([points[:, None], derivatives], axis=1)  # (K, 4, 3)
-    ends = np.concatenate([values[:-1] * powers[..., None], values[1:] * powers[..., None]], axis=1)
-    return (_HERMITE @ ends) / times[:, None, None] ** np.arange(8)[:, None]
+    left = np.concatenate([np.zeros((len(times), 1, 3)), derivatives[:-1]], axis=1)  # (K-1, 4, 3)
+    right = np.concatenate([np.diff(points, axis=0)[:, None], derivatives[1:]], axis=1)
+    ends = np.concatenate([left * powers[..., None], right * powers[..., None]], axis=1)
+    table = (_HERMITE @ ends) / times[:, None, None] ** np.arange(8)[:, None]
+    table[:, 0] = points[:-1]  # added last: far from the origin it would cost the short segments their digits
+    return table
 
 
 def _waypoint_derivatives(points: NDArray, times: NDArray, rest: bool) -> NDArray:

@@ -22,6 +22,7 @@ def reversed_pieces(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArra
 
 def end_values(durations: NDArray, table: NDArray, orders: int = 5) -> tuple[NDArray, NDArray]:
     """(M, orders, 3) twice: derivatives of each piece at its left and its right end."""
+    table = padded(table, max(orders, table.shape[1]))
     factorials = np.array([factorial(k) for k in range(orders)], dtype=float)[:, None]
     return table[:, :orders] * factorials, shifted(table, durations)[:, :orders] * factorials
 

@@ -1,8 +1,10 @@
 """Paths from seeds: random waypoints, and paths near a given one."""
 
+from math import factorial
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import BSpline, PPoly
+from scipy.interpolate import BSpline
 
 from cfplan.errors import InputError
 from cfplan.geometry.path import Path
@@ -101,5 +103,5 @@ def _in_ball(random: np.random.Generator, count: int, radius: float) -> NDArray:
 def _spline_pieces(knots: NDArray, control: NDArray) -> NDArray:
     """(M, 6, 3): the clamped B-spline's polynomials about their left knots."""
     clamped = np.concatenate([np.repeat(knots[0], _DEGREE), knots, np.repeat(knots[-1], _DEGREE)])
-    pieces = PPoly.from_spline(BSpline(clamped, control, _DEGREE))
-    return pieces.c[::-1, _DEGREE : _DEGREE + len(knots) - 1].transpose(1, 0, 2)
+    spline = BSpline(clamped, control, _DEGREE)
+    return np.stack([spline(knots[:-1], order) / factorial(order) for order in range(_DEGREE + 1)], axis=1)

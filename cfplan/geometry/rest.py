@@ -31,8 +31,9 @@ def with_rest_ends(durations: NDArray, table: NDArray) -> Path:
     s is scaled so that the mean of |γ'| is 1: whatever speed a source had, s is again in nominal seconds at 1 m/s.
     """
     durations, table = _at_nominal_speed(durations, table)
+    half = durations.sum() / 2
     for _ in range(2):  # the start, then the end as the start of the way back
-        durations, table = _with_rest_start(durations, table)
+        durations, table = _with_rest_start(durations, table, half)
         durations, table = reversed_pieces(durations, table)
     return rest_path(durations, table)
 
@@ -80,22 +81,22 @@ def _at_nominal_speed(durations: NDArray, table: NDArray) -> tuple[NDArray, NDAr
     return durations * stretch, table / stretch ** np.arange(table.shape[1])[:, None]
 
 
-def _with_rest_start(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
+def _with_rest_start(durations: NDArray, table: NDArray, most: float) -> tuple[NDArray, NDArray]:
     start = end_values(durations[:1], table[:1])[0][0]
     moving = np.linalg.norm(start[1:4], axis=-1) > _NEGLIGIBLE
     if moving.any():
-        return _warped(durations, table, 3 if moving[0] else 1)
+        return _warped(durations, table, 3 if moving[0] else 1, most)
     change = np.zeros((1, 5, 3))
     change[0, 1:4] = -start[1:4]
     return durations, _changed(durations, table, change, np.zeros((1, 5, 3)), slice(0, 1))
 
 
-def _warped(durations: NDArray, table: NDArray, flatness: int) -> tuple[NDArray, NDArray]:
-    """The pieces with their start re-timed by σ."""
+def _warped(durations: NDArray, table: NDArray, flatness: int, most: float) -> tuple[NDArray, NDArray]:
+    """The pieces with their start re-timed by σ, which uses up `most` of their time at most."""
     sigma = _warp(flatness)
     reach = np.polynomial.polynomial.polyval(1.0, sigma)  # σ(L) / L
     breaks = np.concatenate([[0.0], np.cumsum(durations)])
-    length = min(WARP, breaks[-1] / 2 / reach)
+    length = min(WARP, most / reach)
     u = np.linspace(0.0, 1.0, _WARP_PIECES + 1)
     inner = breaks[(breaks > 1e-9) & (breaks < length * reach * (1 - 1e-9))]
     joints = _inverse(sigma, inner / length)
@@ -114,10 +115,10 @@ def _warped(durations: NDArray, table: NDArray, flatness: int) -> tuple[NDArray,
         local[0] = 0.0
         pieces.append(composed(outer, local, _TERMS))
 
-    after = int(np.searchsorted(breaks, length * reach, side="right")) - 1
-    rest = table[after:].copy()
-    rest_durations = durations[after:].copy()
-    cut = length * reach - breaks[after]
+    joint = length * reach
+    after = int(np.searchsorted(breaks, joint + 1e-9 * breaks[-1], side="right")) - 1
+    cut = max(joint - breaks[after], 0.0)
+    rest, rest_durations = table[after:].copy(), durations[after:].copy()
     rest[0] = shifted(rest[:1], np.array([cut]))[0]
     rest_durations[0] -= cut
     count = max(_TERMS, table.shape[1])

@@ -106,7 +106,8 @@ def _composed(text: str, file: str) -> yaml.Node:
         finally:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
-        raise InputError(_one_line(error.problem or error.context or "not YAML"), where=_mark(file, error)) from None
+        said = [part for part in (error.context, error.problem) if part]
+        raise InputError(_one_line(", ".join(said) or "not YAML"), where=_mark(file, error)) from None
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         raise InputError(f"the character {error.character!r} is not allowed in YAML", where=f"{file}:{line}") from None
@@ -176,33 +177,32 @@ def _checked_text(text: str, where: str) -> str:
 
 
 def _input_error(error: ValidationError, model: type[BaseModel], places: Places) -> InputError:
-    """The first mistake in the order of the file."""
+    """The first mistake in the order of the file, unknown keys before what may be missing because of them."""
     found = [_named(details, model, places) for details in error.errors(include_url=False, include_context=False)]
-    line_and_column, what, hint = min(found, key=lambda mistake: mistake[0])
-    where = f"{places.file}:{line_and_column[0]}:{line_and_column[1]}"
+    _, (line, column), what, hint = min(found, key=lambda mistake: mistake[:2])
     more = len(found) - 1
-    return InputError(what + (f" ({more} more)" if more else ""), where=where, hint=hint)
+    return InputError(what + (f" ({more} more)" if more else ""), where=f"{places.file}:{line}:{column}", hint=hint)
 
 
-def _named(details: Any, model: type[BaseModel], places: Places) -> tuple[tuple[int, int], str, str]:
-    """Place, sentence and hint of one of pydantic's errors."""
+def _named(details: Any, model: type[BaseModel], places: Places) -> tuple[int, tuple[int, int], str, str]:
+    """Rank, place, sentence and hint of one of pydantic's errors."""
     location = _location(details["loc"], places)
     name = _spoken(location)
-    kind = details["type"]
-    if kind == "extra_forbidden":
+    place = places.values.get(location, (1, 1))
+    if details["type"] == "extra_forbidden":
         owner = _model_at(model, location[:-1])
         hint = _known(owner, str(location[-1])) if owner else ""
-        return places.keys.get(location, (1, 1)), f"unknown key {name!r}", hint
-    place = places.values.get(location, (1, 1))
-    if kind == "missing":
-        missing = details["loc"][-1]
-        return place, f"the key {str(missing)!r} is missing" + (f" in {name}" if name else ""), ""
+        return 0, places.keys.get(location, (1, 1)), f"unknown key {name!r}", hint
+    if details["type"] == "missing":
+        missing = str(details["loc"][-1])
+        return 2, place, f"the key {missing!r} is missing" + (f" in {name}" if name else ""), ""
     message = _one_line(details["msg"].removeprefix("Value error, "))
+    if not message.startswith("Input "):
+        return 1, place, f"{name}: {message}" if name else message, ""
     value = details["input"]
-    shown = f", not {value!r}" if isinstance(value, int | float | str | None) and len(repr(value)) <= 40 else ""
-    if message.startswith("Input"):
-        return place, f"{name or 'the file'} {message.removeprefix('Input ')}{shown}", ""
-    return place, f"{name}: {message}" if name else message, ""
+    shown = json.dumps(value, ensure_ascii=False) if isinstance(value, int | float | str | None) else ""
+    unlike = f", not {shown}" if 0 < len(shown) <= 40 else ""
+    return 1, place, f"{name or 'the file'} {message.removeprefix('Input ')}{unlike}", ""
 
 
 def _location(parts: tuple[str | int, ...], places: Places) -> Location:
@@ -217,7 +217,7 @@ def _location(parts: tuple[str | int, ...], places: Places) -> Location:
 def _spoken(location: Location) -> str:
     text = ""
     for part in location:
-        text += f"[{part + 1}]" if isinstance(part, int) else f".{part}" if text else part
+        text += f" item {part + 1}" if isinstance(part, int) else f".{part}" if text else part
     return text
 
 

@@ -1,0 +1,218 @@
+"""path.yaml: what it can ask for, what is refused, and the flights that come with cfplan."""
+
+import math
+import pathlib
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cfplan.errors import InputError
+from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.path_file import PathFile, load_path_file
+from cfplan.geometry.yaw import YawMode
+
+FLIGHTS = sorted((pathlib.Path(__file__).parents[2] / "flights").glob("*.yaml"))
+CORNERS = [[0, 0, 1], [1, 0, 1], [1, 1, 1.2], [0, 1, 1]]
+SQUARE = [*CORNERS, [0, 0, 1]]
+
+
+@pytest.fixture
+def load(tmp_path):
+    def run(content: str | dict, **files: str) -> PathFile:
+        for name, text in files.items():
+            (tmp_path / f"{name}.csv").write_text(text)
+        file = tmp_path / "path.yaml"
+        file.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+        return load_path_file(file)
+
+    return run
+
+
+def test_waypoints_alone_are_enough(load, tmp_path):
+    flight = load({"waypoints": CORNERS})
+    assert flight.name == "path"
+    assert (flight.yaw, flight.yaw_angle, flight.speed, flight.laps) == (YawMode.FIXED, 0.0, 1.0, 1)
+    assert flight.source == tmp_path / "path.yaml"
+    np.testing.assert_array_equal(flight.waypoints, CORNERS)
+    expected = min_snap(CORNERS)
+    np.testing.assert_array_equal(flight.path([0.3, 2.0]), expected([0.3, 2.0]))
+
+
+@pytest.mark.parametrize(
+    ("yaw", "mode", "angle"),
+    [
+        ("tangent", YawMode.TANGENT, 0.0),
+        ("free", YawMode.FREE, 0.0),
+        ("fixed", YawMode.FIXED, 0.0),
+        ({"mode": "fixed", "angle_deg": -45}, YawMode.FIXED, -math.pi / 4),
+        ({"mode": "tangent"}, YawMode.TANGENT, 0.0),
+    ],
+)
+def test_yaw_in_its_long_and_short_form(load, yaw, mode, angle):
+    flight = load({"waypoints": CORNERS, "yaw": yaw})
+    assert flight.yaw is mode
+    assert flight.yaw_angle == pytest.approx(angle)
+
+
+def test_laps_flow_through_the_start_without_a_stop(load):
+    flight = load({"waypoints": SQUARE, "laps": 3})
+    assert len(flight.waypoints) == 13
+    passes = flight.path.breaks[[4, 8]]
+    np.testing.assert_allclose(flight.path(passes), [CORNERS[0]] * 2, atol=1e-9)
+    assert np.linalg.norm(flight.path(passes, 1), axis=1).min() > 0.5
+
+
+def test_place_turns_the_path_about_the_origin_then_moves_it(load):
+    here = load({"waypoints": CORNERS})
+    there = load({"waypoints": CORNERS, "place": {"x": 2, "z": 0.5, "yaw_deg": 90}})
+    x, y, z = here.path(1.5)
+    np.testing.assert_allclose(there.path(1.5), [2 - y, x, z + 0.5], atol=1e-12)
+    np.testing.assert_allclose(there.waypoints[1], [2, 1, 1.5], atol=1e-12)
+    assert there.yaw_angle == pytest.approx(math.pi / 2)
+
+
+def test_a_fixed_yaw_turns_with_the_place_and_stays_within_half_a_turn(load):
+    flight = load({"waypoints": CORNERS, "yaw": {"mode": "fixed", "angle_deg": 170}, "place": {"yaw_deg": 20}})
+    assert flight.yaw_angle == pytest.approx(math.radians(-170))
+
+
+@pytest.mark.parametrize("separator", [",", ";", " ", "\t", ", "])
+def test_points_come_from_a_file_however_they_are_separated(load, separator):
+    text = f"x{separator}y{separator}z\n# a comment\n\n" + "".join(
+        separator.join(map(str, point)) + "\n" for point in CORNERS
+    )
+    flight = load({"points": "knots.csv"}, knots=text)
+    np.testing.assert_array_equal(flight.waypoints, CORNERS)
+    np.testing.assert_allclose(flight.path(flight.path.breaks), CORNERS, atol=1e-12)
+
+
+def test_hundreds_of_points_keep_their_shape(load):
+    angle = np.linspace(0, 2 * np.pi, 500)
+    circle = np.column_stack([np.cos(angle), np.sin(angle), 1 + 0 * angle])
+    text = "\n".join(",".join(f"{v:.6f}" for v in point) for point in circle)
+    flight = load({"points": "circle.csv", "laps": 2}, circle=text)
+    points = flight.path(np.linspace(0, flight.path.end, 3000))
+    np.testing.assert_allclose(np.linalg.norm(points[:, :2], axis=1), 1.0, atol=1e-3)
+    assert flight.path.length == pytest.approx(4 * np.pi, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("name: x\n", ":1:1: one of waypoints, points, polynomials is needed"),
+        ("points: a.csv\nwaypoints: [[0,0,1],[1,0,1]]\n", ":2:1: only one of waypoints and points may be given"),
+        ("waypoints: []\n", ":1:12: a path needs two waypoints at least, not 0"),
+        ("waypoints: [[0,0,1]]\n", ":1:12: a path needs two waypoints at least, not 1"),
+        ("waypoints: [[0,0,1],[1,1]]\n", ":1:21: waypoint 2 has 2 numbers, not x, y, z"),
+        ("waypoints: [[0,0,1],[1,1,1,1]]\n", ":1:21: waypoint 2 has 4 numbers, not x, y, z"),
+        ("waypoints:\n- [0,0,1]\n- [0,0,1]\n", ":3:3: waypoints 1 and 2 are 0.0000 m apart"),
+        ("waypoints:\n- [0,0,1]\n- [1,0,1]\n- [1,0.005,1]\n", ":4:3: waypoints 2 and 3 are 0.0050 m apart"),
+        ("waypoints:\n- [0,0,1]\n- [1,.nan,1]\n", ":3:6: a finite number is needed, not .nan"),
+        ("waypoints:\n- [0,0,1]\n- [1,1e30,1]\n", ":3:3: coordinates must be numbers within"),
+        ("waypoints: [[0,0,1],[1,0,1],[0,0,1]]\n", ":1:12: the path comes to a stop inside"),
+        ("waypoints: [[0,0,1],[1,0,1]]\nlaps: 2\n", ":2:7: 2 laps need a closed path, but the last point is 1.000 m"),
+        ("waypoints: [[0,0,1],[1,0,1]]\nlaps: 0\n", ":2:7: laps should be greater than or equal to 1, not 0"),
+        ("waypoints: [[0,0,1],[1,0,1]]\nspeed: 0\n", ":2:8: speed should be greater than 0, not 0"),
+        ("waypoints: [[0,0,1],[1,0,1]]\nspeed: 1.01\n", ":2:8: speed should be less than or equal to 1, not 1.01"),
+        ("waypoints: [[0,0,1],[1,0,1]]\nyaw: left\n", ":2:6: yaw should be 'fixed', 'tangent' or 'free'"),
+        ("waypoints: [[0,0,1],[1,0,1]]\nyaw: {mode: free, angle_deg: 9}\n", ":2:19: angle_deg is for mode fixed only"),
+        ("waypoints: [[0,0,1],[1,0,1]]\nyaws: free\n", ":2:1: unknown key 'yaws' (hint: did you mean 'yaw'?"),
+        ("points: gone.csv\n", "gone.csv: no such file"),
+        ("polynomials: .\n", "a folder, not a file"),
+        ("points: short.csv\n", "short.csv:2: the row has 2 numbers, not 3 (hint: each row is x, y, z)"),
+        ("points: one.csv\n", "one.csv: a path needs two points at least, not 1"),
+        ("points: twice.csv\n", "twice.csv:4: waypoints 2 and 3 are 0.0000 m apart"),
+        ("points: words.csv\n", "words.csv: no rows of numbers"),
+        ("polynomials: one.csv\n", "one.csv:1: the row has 3 numbers, not 33"),
+    ],
+)
+def test_each_mistake_is_named_with_its_place(load, content, message):
+    with pytest.raises(InputError) as caught:
+        load(content, short="0,0,1\n0,1\n", one="1,2,3\n", twice="0,0,1\n1,0,1\n\n1,0,1\n", words="x,y,z\n")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+numbers = st.floats() | st.integers(-3, 3) | st.floats(-3, 3)
+points = st.lists(st.lists(numbers, min_size=3, max_size=3) | st.lists(numbers, max_size=4), max_size=6)
+contents = st.fixed_dictionaries(
+    {},
+    optional={
+        "name": st.text() | numbers,
+        "waypoints": points | st.text(),
+        "points": st.sampled_from(["knots.csv", "..", "", "x\0y"]) | st.text(),
+        "polynomials": st.just("knots.csv") | st.text(),
+        "yaw": st.sampled_from([*YawMode]).map(str) | st.dictionaries(st.sampled_from(["mode", "angle_deg"]), numbers),
+        "laps": st.integers(-1, 5),
+        "speed": numbers,
+        "place": st.dictionaries(st.sampled_from(["x", "y", "z", "yaw_deg"]), numbers),
+    },
+)
+anything = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def loaded_or_refused(load, content: str | dict, **files: str) -> None:
+    try:
+        flight = load(content, **files)
+    except InputError as refusal:
+        said = str(refusal)
+    else:
+        s = np.linspace(0, flight.path.end, 20)
+        assert all(np.isfinite(flight.path(s, order)).all() for order in range(5))
+        return
+    assert "\n" not in said
+
+
+@anything
+@given(contents)
+def test_any_content_is_a_path_or_refused(load, content):
+    loaded_or_refused(load, content, knots="0,0,1\n1,0,1\n")
+
+
+@anything
+@given(points.filter(lambda rows: len(rows) > 1))
+def test_any_waypoints_are_a_path_or_refused(load, waypoints):
+    loaded_or_refused(load, {"waypoints": waypoints})
+
+
+@anything
+@given(st.text() | st.text(alphabet="0123456789.,;-+e \n\tnaif#"))
+def test_any_points_file_is_a_path_or_refused(load, text):
+    loaded_or_refused(load, {"points": "knots.csv"}, knots=text.encode(errors="replace").decode())
+
+
+@anything
+@given(st.lists(st.lists(st.floats(-1e3, 1e3) | st.floats(), min_size=33, max_size=33), max_size=3))
+def test_any_polynomial_file_is_a_path_or_refused(load, rows):
+    text = "\n".join(",".join(map(str, row)) for row in rows)
+    loaded_or_refused(load, {"polynomials": "rows.csv"}, rows=text)
+
+
+def test_there_are_flights_of_every_kind():
+    names = {file.stem for file in FLIGHTS}
+    assert names >= {"line", "circle", "figure8", "loop3d", "slalom", "random"}
+    flights = [load_path_file(file) for file in FLIGHTS]
+    assert {flight.yaw for flight in flights} == set(YawMode)
+    texts = [file.read_text() for file in FLIGHTS]
+    assert all(any(f"\n{key}:" in text for text in texts) for key in ("waypoints", "points", "polynomials", "laps"))
+
+
+@pytest.mark.parametrize("file", FLIGHTS, ids=lambda file: file.stem)
+def test_a_flight_keeps_its_distance_from_the_walls_of_the_room(file):
+    flight = load_path_file(file)
+    x, y, z = np.abs(flight.path(np.linspace(0, flight.path.end, 5000)) - [0, 0, 1]).max(axis=0)
+    assert (x, y, z) <= (1.8, 3.5, 0.6)
+
+
+@pytest.mark.parametrize("file", FLIGHTS, ids=lambda file: file.stem)
+def test_a_flight_is_smooth_and_at_rest_at_its_ends(file):
+    path = load_path_file(file).path
+    inner = path.breaks[1:-1]
+    for order in range(5):
+        largest = np.abs(path(np.linspace(0, path.end, 2000), order)).max()
+        np.testing.assert_allclose(path(np.nextafter(inner, 0), order), path(inner, order), atol=1e-6 * largest)
+    for order in (1, 2, 3):
+        assert not path([0.0, path.end], order).any()
