@@ -10,12 +10,15 @@ r falls as a smoothstep, so the braking deceleration is at most 1.5 v₀ / durat
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from cfplan.flight.encoding import command_quaternion, controller_attitude
 from cfplan.flight.packets import FullStateSetpoints, decode, encode
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.trajectory import hopf_quaternion
 
 DURATION = 0.8  # s, from full speed to rest: 3.75 m/s² from 2 m/s on top of the turn's own
+_GRAVITY = np.array([0.0, 0.0, GRAVITY])
 
 
 def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION) -> NDArray:
@@ -36,22 +39,28 @@ def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION) -> 
 
     velocity = at(reference.velocity)
     acceleration = clock_rate[:, None] ** 2 * at(reference.acceleration) + slowing[:, None] * velocity
-    yaw = np.unwrap(2.0 * np.arctan2(reference.quaternion[:, 2], reference.quaternion[:, 3]))  # Hopf: no tilt in it
-    axis = acceleration + np.array([0.0, 0.0, GRAVITY])
-    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    force = acceleration + _GRAVITY
+    axis = force / np.linalg.norm(force, axis=-1, keepdims=True)
     shape = (len(payloads), steps + 1)
-    quaternion = hopf_quaternion(axis.reshape(-1, 3), at(yaw[:, None]).reshape(-1)).reshape(*shape, 4)
-    body_rate = _turn_rates(quaternion, rate)
+    attitude = hopf_quaternion(axis.reshape(-1, 3), at(_hopf_yaw(reference)[:, None]).reshape(-1))
+    body_rate = _turn_rates(attitude.reshape(*shape, 4), rate)
     body_rate[:, -1] = 0.0  # the vehicle may be left with the last setpoint
     return encode(
         FullStateSetpoints(
             position=at(reference.position).reshape(-1, 3),
             velocity=(clock_rate[:, None] * velocity).reshape(-1, 3),
             acceleration=acceleration.reshape(-1, 3),
-            quaternion=quaternion.reshape(-1, 4),
+            quaternion=command_quaternion(attitude),
             body_rate=body_rate.reshape(-1, 3),
         )
     ).reshape(*shape, -1)
+
+
+def _hopf_yaw(reference: FullStateSetpoints) -> NDArray:
+    """(N,) rad, not wrapped: yaw of the attitudes that the controller makes of the setpoints, less their tilt."""
+    made = controller_attitude(reference.acceleration + _GRAVITY, reference.quaternion)
+    quaternion = Rotation.from_matrix(made).as_quat()
+    return np.unwrap(2.0 * np.arctan2(quaternion[:, 2], quaternion[:, 3]))
 
 
 def _turn_rates(quaternion: NDArray, rate: float) -> NDArray:

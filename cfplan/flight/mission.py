@@ -3,18 +3,18 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.brake import encode_stops
+from cfplan.flight.encoding import RATE, EncodedFlight
 from cfplan.flight.packets import decode
 from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
 
-RATE = 100.0  # Hz, of setpoints
 # How far the vehicle's filter trusts poses: what Crazyswarm2 flies with. The large one cures yaw trouble.
 EXTERNAL_POSITION_STD = 1e-3  # m
 EXTERNAL_ATTITUDE_STD = 5e-2  # rad
-PEAK_TO_MEAN_SPEED = 35 / 16  # of the on-board commander's polynomials
 _SHORTEST = 1.5  # s, of any manoeuvre of the on-board commander
 
 
@@ -27,10 +27,12 @@ class Mission:
     stops: NDArray
     # (N, M, 29) uint8, a way to stop from each setpoint, as brake.encode_stops gives it
     limits: Limits
+    lead: float = 0.0
+    # s by which each setpoint is ahead of the trajectory at its time
+    hold_time: float = 1.0
+    # s that the vehicle hovers behind the last setpoint before it is handed back
     rate: float = RATE
     # Hz
-    hold_time: float = 1.5
-    # s that the vehicle hovers at the end before it is handed back
 
     @property
     def start(self) -> tuple[Triple, float]:
@@ -41,6 +43,12 @@ class Mission:
     def end(self) -> tuple[Triple, float]:
         """Position, m, and yaw, rad, of the last setpoint as the vehicle decodes it."""
         return _place(self.payloads[-1:])
+
+    @property
+    def motion_ends(self) -> float:
+        """s from the first setpoint to the first of those that only hover at the end."""
+        moving = np.flatnonzero(np.any(decode(self.payloads).velocity != 0.0, axis=1))
+        return float(moving[-1] + 1) / self.rate if len(moving) else 0.0
 
     @property
     def duration(self) -> float:
@@ -59,14 +67,15 @@ class Mission:
             "stabilizer.estimator": self.limits.firmware.estimator,
             "stabilizer.controller": self.limits.firmware.controller,
             "ctrlMel.mass": self.limits.airframe.mass,
+            "ctrlMel.massThrust": self.limits.airframe.command_per_thrust,
             "locSrv.extPosStdDev": EXTERNAL_POSITION_STD,
             "locSrv.extQuatStdDev": EXTERNAL_ATTITUDE_STD,
         }
 
 
-def mission_of(payloads: NDArray, limits: Limits, *, hold_time: float = 1.5) -> Mission:
-    """The mission that flies these setpoints, (N, 29) uint8 at 100 Hz; stops are made for each of them."""
-    return Mission(payloads, encode_stops(payloads, RATE), limits, hold_time=hold_time)
+def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0) -> Mission:
+    """The mission that flies these setpoints; stops are made for each of them."""
+    return Mission(encoded.payloads, encode_stops(encoded.payloads, RATE), limits, encoded.lead, hold_time)
 
 
 def manoeuvre_time(distance: float, mean_speed: float) -> float:

@@ -100,9 +100,7 @@ class Pilot:
         self._pose_fault = ""
         self._pace: Pace
         self._off_plan: list[tuple[float, float]] = []
-        # (s from the first setpoint, m) of each pose while the plan is streamed
-        self._after_plan: list[tuple[float, float]] = []
-        # (s from the last, m) of each pose in the hover behind it
+        # (s from the first setpoint, m) of each pose in the stream and the hover behind it
         self._stopped_at = 0.0
 
     def fly(self) -> FlightOutcome:
@@ -118,6 +116,8 @@ class Pilot:
                 if not self._connected or not self._checks:
                     raise
                 exit_code, reason = error.exit_code, str(error)
+            except LinkLost:
+                raise
             except Exception as error:  # a fault of this program must not end in the air
                 trip = Trip(Rung.LAND, ExitCode.ENDED_BY_SAFETY, f"fault in the pilot: {error!r}")
                 if not self._airborne:
@@ -362,6 +362,8 @@ class Pilot:
                 return first.exit_code, ", then ".join(texts)
             except Tripped as graver:
                 trip = graver.trip
+            except LinkLost:
+                raise
             except Exception as error:  # only cutting is left when landing breaks
                 if trip.rung is Rung.CUT:
                     raise
@@ -438,11 +440,8 @@ class Pilot:
         if self._stream is not self._plan or pose.time < self._plan.start:
             return
         elapsed = pose.time - self._plan.start
-        distance = math.dist(pose.position, self._plan.position(pose.time))
-        if pose.time <= self._plan.end:
-            self._off_plan.append((elapsed, distance))
-        else:
-            self._after_plan.append((pose.time - self._plan.end, distance))
+        distance = math.dist(pose.position, self._plan.position(pose.time - self._mission.lead))
+        self._off_plan.append((elapsed, distance))
 
     def _keep_watch(self, now: float, late: float) -> None:
         link = self._link
@@ -454,7 +453,7 @@ class Pilot:
             order=self._orders.worst,
             main_gone=self._orders.gone,
             pose=pose,
-            wanted=stream.position(pose.time) if stream is not None and pose is not None else None,
+            wanted=stream.position(pose.time - self._mission.lead) if stream is not None and pose is not None else None,
             estimate=link.estimate,
             status=link.status,
             late=late if stream is not None else 0.0,
@@ -533,10 +532,10 @@ class Pilot:
         self._enter(Phase.CLOSED)
 
     def _outcome(self, exit_code: ExitCode, reason: str) -> FlightOutcome:
-        start = self._plan.start
-        stopped = self._stopped_at or self._now()
+        start, ends = self._plan.start, self._mission.motion_ends + self._mission.lead
+        moved = min((self._stopped_at or self._now()) - start, ends) if start else 0.0
         last = self._freshness.last
-        end_position: Triple = last.position if last is not None else (math.nan, math.nan, math.nan)
+        nowhere: Triple = (math.nan, math.nan, math.nan)
         return FlightOutcome(
             exit_code=exit_code,
             reason=reason,
@@ -544,9 +543,9 @@ class Pilot:
             checks=self._checks,
             phases=tuple(self._phases),
             first_setpoint=start,
-            flown=min(stopped, self._plan.end) - start if start else 0.0,
+            flown=moved,
             lateness=Lateness.of(self._late, self._skipped),
-            deviation=Deviation.of(self._off_plan),
-            settled_after=settle_time(self._after_plan, SETTLED_WITHIN),
-            end_position=end_position,
+            deviation=Deviation.of([sample for sample in self._off_plan if sample[0] <= ends]),
+            settled_after=settle_time([(t - ends, off) for t, off in self._off_plan if t > ends], SETTLED_WITHIN),
+            end_position=last.position if last is not None else nowhere,
         )

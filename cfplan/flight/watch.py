@@ -124,7 +124,7 @@ class Watch:
                 yield _rung(limits.deviation, deviation, f"{deviation:.2f} m from the setpoint")
         if seen.estimate is None or seen.status is None:
             return
-        if seen.pose is not None:
+        if seen.pose is not None and seen.now - seen.pose.time <= self._limits.pose.age_warning:
             apart = math.dist(seen.pose.position, seen.estimate.position)
             if apart > DISAGREEMENT_FACTOR * self._limits.pose.agreement:
                 yield _safety(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")

@@ -1,0 +1,304 @@
+"""A vehicle without dynamics behind the link's face, on a clock that only moves when the pilot sleeps."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from cfplan.flight.brake import encode_stops
+from cfplan.flight.keys import Order
+from cfplan.flight.link import GO_TO, LAND, TAKE_OFF
+from cfplan.flight.mission import Mission
+from cfplan.flight.packets import FullStateSetpoints, decode, encode
+from cfplan.flight.pilot import Pilot
+from cfplan.flight.poses import Pose
+from cfplan.flight.telemetry import Estimate, Event, Phase, PhaseEntered, Telemetry, VehicleStatus
+from cfplan.safety.limits import (
+    BatteryLimits,
+    FirmwareSettings,
+    FlightLimits,
+    GroundManoeuvres,
+    Ladder,
+    Limits,
+    PlanLimits,
+    PoseLimits,
+)
+from cfplan.safety.space import Space
+from cfplan.vehicle.airframes import AIRFRAMES
+
+ARMED, CAN_FLY, FLYING, LOCKED, ON_BOARD = 1 << 1, 1 << 3, 1 << 4, 1 << 6, 1 << 8
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+def make_limits() -> Limits:
+    name = next(iter(AIRFRAMES))
+    return Limits(
+        vehicle=name,
+        airframe=AIRFRAMES[name],
+        plan=PlanLimits(2.0, 5.0, 8.0, 0.52, 0.015, 0.11, 4.9),
+        flight=FlightLimits(
+            deviation=Ladder(0.3, 0.6, 1.0),
+            fence=Ladder(0.0, 0.1, 0.5),
+            speed=Ladder(3.0, 4.0, 6.0),
+            acceleration=Ladder(10.0, 15.0, 30.0),
+            angular_velocity=Ladder(10.0, 15.0, 30.0),
+            patience=0.1,
+        ),
+        space=Space((-3.0, -3.0, 0.0), (3.0, 3.0, 2.0), 0.2),
+        battery=BatteryLimits(at_rest=3.9, under_load=3.2, under_load_seconds=1.0, endurance=240.0),
+        pose=PoseLimits(
+            rate=100.0, rate_min=50.0, latency=0.01, age_warning=0.05, age_brake=0.15, age_land=0.5, jump=0.1,
+            agreement=0.03, yaw_agreement=0.1,
+        ),
+        firmware=FirmwareSettings(controller=2, estimator=2, oldest=(2025, 9, 1)),
+        ground=GroundManoeuvres(take_off_height=0.5, take_off_speed=0.5, go_to_speed=0.5, land_speed=0.4),
+    )  # fmt: skip
+
+
+def make_payloads(distance: float = 2.0, duration: float = 2.0, height: float = 1.0) -> np.ndarray:
+    """A straight flight along x, from rest to rest, with its yaw turning by 0.5 rad."""
+    u = np.linspace(0.0, 1.0, round(duration * 100) + 1)
+    along = distance * (35 * u**4 - 84 * u**5 + 70 * u**6 - 20 * u**7)
+    speed = distance * (140 * u**3 - 420 * u**4 + 420 * u**5 - 140 * u**6) / duration
+    slope = distance * (420 * u**2 - 1680 * u**3 + 2100 * u**4 - 840 * u**5) / duration**2
+    yaw = 0.5 * along / distance
+    zero = np.zeros_like(u)
+    return encode(
+        FullStateSetpoints(
+            position=np.stack([along - distance / 2, zero, zero + height], axis=1),
+            velocity=np.stack([speed, zero, zero], axis=1),
+            acceleration=np.stack([slope, zero, zero], axis=1),
+            quaternion=np.stack([zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1),
+            body_rate=np.zeros((len(u), 3)),
+        )
+    )
+
+
+@dataclass
+class FakeOrders:
+    worst: Order | None = None
+    gone: bool = False
+
+
+@dataclass
+class World:
+    """The clock, the vehicle as its link shows it, and motion capture, in one."""
+
+    now: float = 100.0
+    position: tuple[float, float, float] = (0.0, 0.5, 0.02)
+    yaw: float = 0.0
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    voltage: float = 4.1
+    firmware: str = "2026.08"
+    protocol: int = 12
+    uri: str = "fake://0"
+    lost: str = ""
+    round_trip: float = 0.002
+    refuses: dict[int, int] = field(default_factory=dict)
+    parameters: dict[str, float] = field(default_factory=dict)
+    stubborn: dict[str, float] = field(default_factory=dict)
+    replies: dict[int, int] = field(default_factory=dict)
+    extra_bits: int = 0
+    pose_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    poses_frozen: bool = False
+    poses_stopped: bool = False
+    logs_stopped: bool = False
+    push: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    messages: list[Telemetry] = field(default_factory=list)
+    forwarded: list[tuple[float, ...]] = field(default_factory=list)
+    calls: list[str] = field(default_factory=list)
+    events: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
+    orders: FakeOrders = field(default_factory=FakeOrders)
+    motors_off_in_the_air: float = 0.0
+    armed: bool = False
+    closed: bool = False
+    stopped: bool = False
+
+    def __post_init__(self) -> None:
+        self._on_board, self._curve, self._stopping = True, None, -math.inf
+        self._poses: list[Pose] = []
+        self._count = 0
+        self._motors_off_since = -math.inf
+        self.estimate: Estimate | None = None
+        self.status: VehicleStatus | None = None
+        self.position_variance = (1e-5, 1e-5, 1e-5)
+        self._logging = False
+
+    # The clock.
+
+    def clock(self) -> float:
+        return self.now
+
+    def sleep(self, duration: float) -> None:
+        end = self.now + duration
+        while self.now < end - 1e-12:
+            step = min(0.005, end - self.now)
+            self.now += step
+            self._move(step)
+
+    def when(self, phase: Phase, after: float, action: Callable[[], None]) -> None:
+        """Do something so long after a phase was entered."""
+        self._triggers = [*getattr(self, "_triggers", []), (phase, after, action)]
+
+    def report(self, message: Telemetry) -> None:
+        self.messages.append(message)
+        if isinstance(message, PhaseEntered):
+            for phase, after, action in getattr(self, "_triggers", []):
+                if phase is message.phase:
+                    self.events.append((self.now + after, action))
+
+    @property
+    def phases(self) -> list[Phase]:
+        return [message.phase for message in self.messages if isinstance(message, PhaseEntered)]
+
+    @property
+    def said(self) -> str:
+        return "\n".join(message.text for message in self.messages if isinstance(message, Event))
+
+    def _move(self, step: float) -> None:
+        for moment, action in [event for event in self.events if event[0] <= self.now]:
+            self.events.remove((moment, action))
+            action()
+        before = self.position
+        if self._on_board and self._curve is not None:
+            start, end, began, duration, landing = self._curve
+            share = min(1.0, (self.now - began) / duration)
+            self.position = tuple(a + share * (b - a) for a, b in zip(start, end, strict=True))
+            if landing and share == 1.0:
+                self._curve = None
+        flying = self.position[2] > 0.05
+        if self.motors_on:
+            self._motors_off_since = math.inf
+        elif self._motors_off_since == math.inf:
+            self._motors_off_since = self.now
+        if flying and not self.motors_on:
+            self.motors_off_in_the_air += step
+        self.position = tuple(a + b * step for a, b in zip(self.position, self.push, strict=True))
+        self.velocity = tuple((a - b) / step for a, b in zip(self.position, before, strict=True))
+        self._count += 1
+        if self._count % 2 == 0:
+            self._sense()
+
+    @property
+    def motors_on(self) -> bool:
+        return not self.stopped and (not self._on_board or self._curve is not None)
+
+    def _sense(self) -> None:
+        wobble = 0.0 if self.poses_frozen else 1e-5 * (self._count % 7)
+        place = tuple(a + b + wobble for a, b in zip(self.position, self.pose_shift, strict=True))
+        turn = (0.0, 0.0, math.sin(self.yaw / 2), math.cos(self.yaw / 2))
+        if self.poses_frozen and self._poses_last is not None:
+            place = self._poses_last
+        if not self.poses_stopped:
+            self._poses.append(Pose(self.now - 0.005, self.now, place, turn))
+            self._poses_last = place
+        if self._logging and not self.logs_stopped:
+            flying = self.motors_on or self.now - self._motors_off_since < 2.0
+            bits = (ARMED if self.armed else 0) | CAN_FLY | (FLYING if flying else 0) | self.extra_bits
+            bits |= ON_BOARD if self._on_board and self._curve is not None else 0
+            self.estimate = Estimate(self.now, self.position, self.velocity, (0.0, 0.0, 0.0), turn)
+            self.status = VehicleStatus(self.now, (0.0, 0.0, 0.0), (0, 0, 0, 0), self.voltage, bits)
+
+    # The pose source.
+
+    def open(self) -> None:
+        self._poses.clear()
+
+    def poses(self) -> list[Pose]:
+        came, self._poses = self._poses, []
+        return came
+
+    # The link.
+
+    def send(self, packet) -> None:
+        self._on_board, self._curve = False, None
+        state = decode(np.frombuffer(bytes(packet.data), dtype=np.uint8))
+        self.position = tuple(state.position[0].tolist())
+
+    def send_pose(self, position, quaternion) -> None:
+        self.forwarded.append((self.now, *position))
+
+    def set_parameter(self, name: str, value: float) -> float:
+        self.parameters[name] = self.stubborn.get(name, value)
+        return self.parameters[name]
+
+    def start_logs(self) -> None:
+        self._logging = True
+
+    def stop_variance_log(self) -> None:
+        self.calls.append("variance log off")
+
+    def release_priority(self) -> None:
+        self.calls.append("release")
+        self._on_board = True
+
+    def arm(self, do_arm: bool) -> None:
+        self.calls.append("arm" if do_arm else "disarm")
+        self.armed = do_arm
+
+    def emergency_stop(self) -> None:
+        self.calls.append("emergency stop")
+        self.stopped, self.armed = True, False
+
+    def take_off(self, height: float, duration: float) -> None:
+        self._command(TAKE_OFF, "take off", (*self.position[:2], height), duration)
+
+    def go_to(self, position, yaw: float, duration: float) -> None:
+        self._command(GO_TO, "go to", tuple(position), duration)
+
+    def land(self, height: float, duration: float) -> None:
+        self._command(LAND, "land", (*self.position[:2], height), duration)
+
+    def stop_motors(self) -> None:
+        self.calls.append("stop")
+        self._curve = None
+
+    def _command(self, number: int, name: str, end, duration: float) -> None:
+        self.calls.append(name)
+        self.replies[number] = self.refuses.get(number, 0)
+        if not self.replies[number]:
+            self._curve = (self.position, end, self.now, duration, number == LAND)
+
+    def close(self) -> None:
+        self.calls.append("close")
+        self.closed = True
+
+    _poses_last = None
+
+
+@pytest.fixture
+def world() -> World:
+    return World()
+
+
+@pytest.fixture
+def mission() -> Mission:
+    payloads = make_payloads()
+    return Mission(payloads, encode_stops(payloads, 100.0), make_limits())
+
+
+@pytest.fixture
+def limits() -> Limits:
+    return make_limits()
+
+
+@pytest.fixture
+def fly(world, mission):
+    """Flies the mission, with other limits where given."""
+
+    def flight(**changes):
+        flown = replace(mission, limits=replace(mission.limits, **changes))
+        pilot = Pilot(
+            flown,
+            connect=lambda waiting: world,
+            source=world,
+            report=world.report,
+            orders=world.orders,
+            clock=world.clock,
+            sleep=world.sleep,
+        )
+        return pilot.fly()
+
+    return flight
