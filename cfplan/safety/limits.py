@@ -1,6 +1,10 @@
-"""What safety.yaml allows."""
+"""What safety.yaml allows: `plan` binds planned motion, `flight` binds measured motion."""
 
 from dataclasses import dataclass
+from pathlib import Path
+
+from cfplan.safety.space import Space
+from cfplan.vehicle.airframe import Airframe
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,3 +25,121 @@ class PlanLimits:
     # N, each motor, the reserve for feedback taken off
     specific_thrust_min: float
     # m/s², collective thrust over mass
+
+
+@dataclass(frozen=True, slots=True)
+class Ladder:
+    """From which measured value on the pilot brakes to a hover, lands, cuts the motors."""
+
+    brake: float
+    land: float
+    cut: float
+
+
+@dataclass(frozen=True, slots=True)
+class FlightLimits:
+    """What binds measured motion."""
+
+    deviation: Ladder
+    # m, from where the setpoint is
+    fence: Ladder
+    # m, beyond the space less its margin; the floor is no fence
+    speed: Ladder
+    # m/s
+    acceleration: Ladder
+    # m/s², gravity not counted
+    angular_velocity: Ladder
+    # rad/s
+    patience: float
+    # s, for which speed, acceleration and angular velocity must last before they count
+
+
+@dataclass(frozen=True, slots=True)
+class BatteryLimits:
+    """A cell must last from take-off to landing."""
+
+    at_rest: float
+    # V, least before take-off
+    under_load: float
+    # V, land below
+    under_load_seconds: float
+    # s, over which the loaded voltage is averaged
+    endurance: float
+    # s in the air
+
+
+@dataclass(frozen=True, slots=True)
+class PoseLimits:
+    """What is asked of motion capture."""
+
+    rate: float
+    # Hz, expected
+    rate_min: float
+    # Hz, least before take-off
+    latency: float
+    # s, from the camera to this computer, by which poses are dated back
+    age_warning: float
+    # s
+    age_brake: float
+    # s
+    age_land: float
+    # s
+    jump: float
+    # m, between a pose and where the last ones led, at most
+    agreement: float
+    # m, between pose and the vehicle's own estimate, at most
+    yaw_agreement: float
+    # rad
+
+
+@dataclass(frozen=True, slots=True)
+class FirmwareSettings:
+    """What the pilot sets on the vehicle and reads back."""
+
+    controller: int
+    # stabilizer.controller
+    estimator: int
+    # stabilizer.estimator
+    oldest: tuple[int, ...]
+    # the oldest firmware that may fly
+
+
+@dataclass(frozen=True, slots=True)
+class GroundManoeuvres:
+    """How the pilot takes off, goes to the start, and lands."""
+
+    take_off_height: float
+    # m
+    take_off_speed: float
+    # m/s, mean
+    go_to_speed: float
+    # m/s, mean
+    land_speed: float
+    # m/s, mean
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Everything of safety.yaml."""
+
+    vehicle: str
+    airframe: Airframe
+    plan: PlanLimits
+    flight: FlightLimits
+    space: Space
+    battery: BatteryLimits
+    pose: PoseLimits
+    firmware: FirmwareSettings
+    ground: GroundManoeuvres
+
+
+def load_limits(file: Path | str) -> Limits:
+    """safety.yaml, strictly validated and with its vehicle found.
+
+    Raises:
+        InputError: unknown keys, limits that are not positive, that contradict each other, that make hovering
+            impossible or that allow more than the vehicle can do; with `file:line:column`.
+    """
+    from cfplan.safety.limits_file import read_limits  # pydantic takes its time to import
+
+    return read_limits(file)

@@ -1,4 +1,4 @@
-"""Airframes by name, each number with its source.
+"""Airframes by name, each number with its source, and one's own by a file.
 
 Sources:
   RotorPy    `rotorpy.vehicles.crazyflie_params` and `crazyfliebrushless_params` of RotorPy 3.0.0
@@ -81,10 +81,16 @@ AIRFRAMES = MappingProxyType(
 
 
 def load_airframe(name_or_file: str | Path) -> Airframe:
-    """The airframe of that name. Raises InputError."""
+    """The airframe of that name, or the one that a YAML file describes. Raises InputError."""
     text = str(name_or_file)
     if text in AIRFRAMES:
         return AIRFRAMES[text]
+    if isinstance(name_or_file, Path) or text.endswith((".yaml", ".yml")):
+        from cfplan.vehicle.airframe_file import read_airframe  # pydantic takes its time to import
+
+        return read_airframe(text)
     near = difflib.get_close_matches(text, AIRFRAMES, n=1)
     guess = f"did you mean {near[0]}? " if near else ""
-    raise InputError(f"unknown vehicle {text!r}", hint=f"{guess}known: {', '.join(AIRFRAMES)}")
+    raise InputError(
+        f"unknown vehicle {text!r}", hint=f"{guess}known: {', '.join(AIRFRAMES)}, or a .yaml file of your own"
+    )

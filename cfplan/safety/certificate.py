@@ -1,0 +1,197 @@
+"""The proof before take-off: no limit is exceeded anywhere on a trajectory, between samples included.
+
+The trajectory is cut at the grid points of its profile and at the breaks of its path, so that every piece is smooth,
+and each piece is sampled from end to end, closed: at least ten points, and never further apart than a millisecond of
+flight. Both sides of a grid point are thus seen, where h''' and ψ'' jump. Between two samples a smooth quantity exceeds
+the larger of them by at most an eighth of its second difference there; that is added, twice over, to every worst value.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.safety.limits import PlanLimits
+from cfplan.safety.space import Space
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.trajectory import FullState, Trajectory, state_at
+
+TIME_STEP = 1e-3  # s, the most between two samples
+LEAST_POINTS = 11  # of a piece, its ends included
+_ALLOWANCE = 2.0 / 8.0  # of the second difference
+
+
+@dataclass(frozen=True, slots=True)
+class Margin:
+    """How near the trajectory comes to one limit, at the worst."""
+
+    name: str
+    unit: str
+    worst: float
+    # with the allowance for what lies between samples
+    limit: float
+    share: float
+    # of the limit; for a least thrust, of the way from hover down to it; NaN where a value is not finite
+    time: float
+    # s
+    s: float
+    position: tuple[float, float, float]
+    # m
+
+    @property
+    def passed(self) -> bool:
+        """False for NaN too."""
+        return self.share <= 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """Every limit with its margin. Holds for this trajectory and these limits, nothing else."""
+
+    margins: tuple[Margin, ...]
+    duration: float
+    # s
+    samples: int
+
+    @property
+    def passed(self) -> bool:
+        """Whether no limit is exceeded anywhere."""
+        return all(margin.passed for margin in self.margins)
+
+    @property
+    def worst(self) -> Margin:
+        """The margin with the largest share; one that is not a number before all others."""
+        return max(self.margins, key=lambda margin: np.inf if np.isnan(margin.share) else margin.share)
+
+    def rows(self) -> list[tuple[str, str, str, str, str, str]]:
+        """For a table: limit, worst value, allowed, share, time, place."""
+        return [
+            (
+                margin.name,
+                f"{margin.worst:.3f} {margin.unit}",
+                f"{margin.limit:.3f} {margin.unit}",
+                f"{100 * margin.share:.1f} %",
+                f"{margin.time:.3f} s",
+                "({:.2f}, {:.2f}, {:.2f}) m".format(*margin.position),
+            )
+            for margin in self.margins
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "passed": self.passed,
+            "duration": self.duration,
+            "samples": self.samples,
+            "margins": [{**asdict(margin), "passed": margin.passed} for margin in self.margins],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class _Quantity:
+    """What must not rise above 1 as a share; `sign` is -1 where the limit is a least value."""
+
+    name: str
+    unit: str
+    sign: int
+    values: NDArray
+    # (N,) or (k, N) where k must keep the same limit
+    limit: float
+    at_rest: float
+    # what it is in hover, which counts as share 0
+
+
+def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Certificate:
+    """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
+    s, interval, first = _samples(trajectory)
+    with np.errstate(all="ignore"):
+        state = state_at(trajectory.path, trajectory.profile, trajectory.airframe, s, time=s, interval=interval)
+        margins = tuple(
+            _margin(quantity, trajectory, state, first) for quantity in _quantities(state, trajectory, limits, space)
+        )
+    return Certificate(margins=margins, duration=trajectory.duration, samples=len(s))
+
+
+def _quantities(
+    state: FullState, trajectory: Trajectory, limits: PlanLimits, space: Space | None
+) -> Iterator[_Quantity]:
+    hover = trajectory.airframe.hover_thrust
+    tilt = np.arctan2(np.hypot(state.thrust_axis[:, 0], state.thrust_axis[:, 1]), state.thrust_axis[:, 2])
+    motors = state.motor_thrust.T
+    yield _Quantity("speed", "m/s", 1, _norm(state.velocity), limits.speed, 0.0)
+    yield _Quantity("acceleration", "m/s²", 1, _norm(state.acceleration), limits.acceleration, 0.0)
+    yield _Quantity("angular velocity", "rad/s", 1, _norm(state.body_rate), limits.angular_velocity, 0.0)
+    yield _Quantity("tilt", "rad", 1, tilt, limits.tilt, 0.0)
+    yield _Quantity("motor thrust, most", "N", 1, motors, limits.motor_thrust_max, 0.0)
+    yield _Quantity("motor thrust, least", "N", -1, motors, limits.motor_thrust_min, hover)
+    yield _Quantity("specific thrust, least", "m/s²", -1, state.specific_thrust, limits.specific_thrust_min, GRAVITY)
+    if space is not None:
+        low, high = np.array(space.low), np.array(space.high)
+        middle, half = (low + high) / 2, (high - low) / 2
+        # The walls of one axis after the other; the least of the distances is kept.
+        distance = (half - np.abs(state.position - middle)).T
+        yield _Quantity("distance to the walls", "m", -1, distance, space.margin, float(half.min()))
+
+
+def _norm(vectors: NDArray) -> NDArray:
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+
+
+def _margin(quantity: _Quantity, trajectory: Trajectory, state: FullState, first: NDArray) -> Margin:
+    rows = np.atleast_2d(quantity.sign * quantity.values)
+    bounds = _between(rows, first)
+    index = int(np.argmax(bounds)) % bounds.shape[1]  # argmax takes the first NaN for the largest
+    worst = quantity.sign * float(bounds[:, index].max())
+    room = quantity.limit - quantity.at_rest
+    share = (worst - quantity.at_rest) / room if room * quantity.sign > 0 else np.inf
+    place = float(state.s[index])
+    x, y, z = (float(v) for v in state.position[index])
+    return Margin(
+        name=quantity.name,
+        unit=quantity.unit,
+        worst=worst,
+        limit=quantity.limit,
+        share=max(0.0, share) if np.isfinite(worst) else float("nan"),
+        time=float(trajectory.time_at(place)),
+        s=place,
+        position=(x, y, z),
+    )
+
+
+def _samples(trajectory: Trajectory) -> tuple[NDArray, NDArray, NDArray]:
+    """s, (N,), the profile's interval of each, and whether it is the first of its piece."""
+    timing, path = trajectory.timing, trajectory.path
+    edges = np.union1d(timing.s, path.breaks)
+    edges = edges[np.r_[True, np.diff(edges) > 1e-12 * edges[-1]]]
+    edges[-1] = timing.s[-1]
+    middle = (edges[:-1] + edges[1:]) / 2
+    interval = timing.interval[np.searchsorted(timing.s, middle) - 1]
+    slowest = np.sqrt(np.minimum(*(trajectory.profile.at(side, interval).h for side in (edges[:-1], edges[1:]))))
+    needed = np.diff(edges) / (TIME_STEP * slowest)
+    counts = np.maximum(np.ceil(needed).astype(int) + 1, LEAST_POINTS)
+    starts = np.cumsum(counts) - counts
+    piece = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(counts.sum()) - starts[piece]) / (counts[piece] - 1)
+    s = edges[piece] + share * (edges[piece + 1] - edges[piece])
+    # The last sample of a piece must fall on its own side of a break of the path.
+    lasts = starts + counts - 1
+    s[lasts] = np.nextafter(edges[1:], -np.inf)
+    s[-1] = edges[-1]
+    first = np.zeros(len(s), dtype=bool)
+    first[starts] = True
+    return s, interval[piece], first
+
+
+def _between(rows: NDArray, first: NDArray) -> NDArray:
+    """(k, N): each sample's value, plus what may rise above it towards its neighbours in the same piece."""
+    last = np.r_[first[1:], True]
+    sag = np.zeros_like(rows)
+    sag[:, 1:-1] = 2.0 * rows[:, 1:-1] - rows[:, :-2] - rows[:, 2:]
+    starts, ends = np.flatnonzero(first), np.flatnonzero(last)
+    sag[:, starts], sag[:, ends] = sag[:, starts + 1], sag[:, ends - 1]
+    near = np.maximum(sag, 0.0)
+    near[:, 1:] = np.maximum(near[:, 1:], np.where(first[1:], 0.0, sag[:, :-1]))
+    near[:, :-1] = np.maximum(near[:, :-1], np.where(last[:-1], 0.0, sag[:, 1:]))
+    return rows + _ALLOWANCE * near

@@ -1,0 +1,242 @@
+"""safety.yaml, read strictly: every mistake is named with its line and column."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from cfplan.errors import CfplanError, InputError
+from cfplan.geometry.yaml_source import Places, read_yaml_with_places
+from cfplan.safety.limits import (
+    BatteryLimits,
+    FirmwareSettings,
+    FlightLimits,
+    GroundManoeuvres,
+    Ladder,
+    Limits,
+    PlanLimits,
+    PoseLimits,
+)
+from cfplan.safety.space import Space
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.airframes import load_airframe
+
+LARGEST_IN_PACKET = 32.767  # m, m/s, m/s², rad/s: what a setpoint's 16 bits of thousandths hold
+
+Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
+Encodable = Annotated[float, Field(gt=0.0, le=LARGEST_IN_PACKET)]
+Share = Annotated[float, Field(gt=0.0, lt=0.5)]
+Voltage = Annotated[float, Field(ge=2.5, le=4.35)]
+Coordinate = Annotated[float, Field(ge=-LARGEST_IN_PACKET, le=LARGEST_IN_PACKET)]
+Corner = tuple[Coordinate, Coordinate, Coordinate]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class _Plan(_Section):
+    speed: Encodable
+    acceleration: Encodable
+    angular_velocity: Encodable
+    tilt_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
+    motor_reserve: Share
+    specific_thrust: Positive
+
+
+class _Ladder(_Section):
+    brake: Positive
+    land: Positive
+    cut: Positive
+
+
+class _Flight(_Section):
+    deviation: _Ladder
+    fence: _Ladder
+    speed: _Ladder
+    acceleration: _Ladder
+    angular_velocity: _Ladder
+    patience: Annotated[float, Field(gt=0.0, le=1.0)]
+
+
+class _Space(_Section):
+    low: Corner
+    high: Corner
+    margin: Positive
+
+
+class _Battery(_Section):
+    at_rest: Voltage
+    under_load: Voltage
+    under_load_seconds: Annotated[float, Field(gt=0.0, le=10.0)]
+    endurance: Annotated[float, Field(gt=0.0, le=3600.0)]
+
+
+class _Pose(_Section):
+    rate: Positive
+    rate_min: Positive
+    latency: Annotated[float, Field(ge=0.0, le=0.2)]
+    age_warning: Annotated[float, Field(gt=0.0, le=1.0)]
+    age_brake: Annotated[float, Field(gt=0.0, le=1.0)]
+    age_land: Annotated[float, Field(gt=0.0, le=2.0)]
+    jump: Annotated[float, Field(gt=0.0, le=1.0)]
+    agreement: Annotated[float, Field(gt=0.0, le=1.0)]
+    yaw_agreement_deg: Annotated[float, Field(gt=0.0, le=90.0)]
+
+
+class _Firmware(_Section):
+    controller: Annotated[int, Field(ge=1, le=6)]
+    estimator: Annotated[int, Field(ge=1, le=3)]
+    oldest: Annotated[str, StringConstraints(pattern=r"^\d{4}\.\d{1,2}(\.\d{1,3})?$")]
+
+
+class _Ground(_Section):
+    take_off_height: Annotated[float, Field(gt=0.0, le=5.0)]
+    take_off_speed: Annotated[float, Field(gt=0.0, le=1.0)]
+    go_to_speed: Annotated[float, Field(gt=0.0, le=2.0)]
+    land_speed: Annotated[float, Field(gt=0.0, le=1.0)]
+
+
+class _SafetyFile(_Section):
+    vehicle: Annotated[str, Field(min_length=1, max_length=200)]
+    plan: _Plan
+    flight: _Flight
+    space: _Space
+    battery: _Battery
+    pose: _Pose
+    firmware: _Firmware
+    ground: _Ground
+
+
+Kind = TypeVar("Kind")
+
+
+def _made(kind: type[Kind], section: _Section, **others: Any) -> Kind:
+    """A dataclass from the section with the same keys; `others` replace what the file says differently."""
+    values = {name: getattr(section, name) for name in type(section).model_fields if name not in others}
+    ladders = {name: Ladder(v.brake, v.land, v.cut) for name, v in values.items() if isinstance(v, _Ladder)}
+    return kind(**{**values, **ladders, **others})
+
+
+def read_limits(file: Path | str) -> Limits:
+    """See load_limits."""
+    content, places = read_yaml_with_places(file, _SafetyFile)
+    _check_order(content, places)
+    airframe = _vehicle(content.vehicle, Path(file).parent, places)
+    pose = content.pose.model_dump()
+    yaw_agreement = math.radians(pose.pop("yaw_agreement_deg"))
+    limits = Limits(
+        vehicle=content.vehicle,
+        airframe=airframe,
+        plan=_plan_limits(content.plan, airframe),
+        flight=_made(FlightLimits, content.flight),
+        space=_made(Space, content.space),
+        battery=_made(BatteryLimits, content.battery),
+        pose=PoseLimits(**pose, yaw_agreement=yaw_agreement),
+        firmware=_made(FirmwareSettings, content.firmware, oldest=tuple(map(int, content.firmware.oldest.split(".")))),
+        ground=_made(GroundManoeuvres, content.ground),
+    )
+    _check_vehicle_can(limits, places)
+    return limits
+
+
+def _vehicle(name: str, folder: Path, places: Places) -> Airframe:
+    try:
+        return load_airframe(folder / name if name.endswith((".yaml", ".yml")) else name)
+    except CfplanError as error:
+        if error.where:
+            raise
+        raise InputError(error.what, where=places.where("vehicle"), hint=error.hint) from None
+
+
+def _plan_limits(plan: _Plan, airframe: Airframe) -> PlanLimits:
+    reserve = plan.motor_reserve * (airframe.motor_thrust_max - airframe.motor_thrust_min)
+    return PlanLimits(
+        speed=plan.speed,
+        acceleration=plan.acceleration,
+        angular_velocity=plan.angular_velocity,
+        tilt=math.radians(plan.tilt_deg),
+        motor_thrust_min=airframe.motor_thrust_min + reserve,
+        motor_thrust_max=airframe.motor_thrust_max - reserve,
+        specific_thrust_min=plan.specific_thrust,
+    )
+
+
+def _check_order(content: _SafetyFile, places: Places) -> None:
+    """What must be less than what, within the file alone."""
+    for name in ("deviation", "fence", "speed", "acceleration", "angular_velocity"):
+        ladder = getattr(content.flight, name)
+        if not ladder.brake < ladder.land < ladder.cut:
+            raise InputError(
+                f"flight.{name} must rise from brake over land to cut", where=places.where("flight", name, "brake")
+            )
+    for name in ("speed", "acceleration", "angular_velocity"):
+        planned, abort = getattr(content.plan, name), getattr(content.flight, name).brake
+        if planned >= abort:
+            raise InputError(
+                f"plan.{name} ({planned:g}) is not below flight.{name}.brake ({abort:g})",
+                where=places.where("plan", name),
+                hint="a flight as planned would be broken off; plan slower",
+            )
+    for axis, (low, high) in enumerate(zip(content.space.low, content.space.high, strict=True)):
+        if not high - low > 2 * content.space.margin:
+            raise InputError(
+                f"the space from {low:g} to {high:g} m leaves no room within a margin of {content.space.margin:g} m",
+                where=places.where("space", "high", axis),
+            )
+    if not content.battery.under_load < content.battery.at_rest:
+        raise InputError(
+            "battery.under_load must be below battery.at_rest", where=places.where("battery", "under_load")
+        )
+    pose = content.pose
+    if not pose.age_warning < pose.age_brake < pose.age_land:
+        raise InputError("pose ages must rise from warning over brake to land", where=places.where("pose", "age_brake"))
+    if not pose.rate_min <= pose.rate:
+        raise InputError("pose.rate_min is above pose.rate", where=places.where("pose", "rate_min"))
+    if not 1.0 / pose.rate < pose.age_warning:
+        raise InputError(
+            f"at {pose.rate:g} Hz every pose grows older than pose.age_warning",
+            where=places.where("pose", "age_warning"),
+        )
+    height = content.ground.take_off_height
+    if not content.space.low[2] + content.space.margin <= height <= content.space.high[2] - content.space.margin:
+        raise InputError(
+            f"a take-off to {height:g} m ends outside the space or within its margin",
+            where=places.where("ground", "take_off_height"),
+        )
+
+
+def _check_vehicle_can(limits: Limits, places: Places) -> None:
+    """The vehicle must hover within the limits, and no limit may allow more than the vehicle can do."""
+    airframe, plan = limits.airframe, limits.plan
+    hover = airframe.hover_thrust
+    if not plan.motor_thrust_min < hover < plan.motor_thrust_max:
+        raise InputError(
+            f"{airframe.name} cannot hover: each motor needs {hover:.3f} N, plan.motor_reserve leaves it "
+            f"{plan.motor_thrust_min:.3f} to {plan.motor_thrust_max:.3f} N",
+            where=places.where("plan", "motor_reserve"),
+            hint="lower the reserve, or choose a stronger vehicle",
+        )
+    if not plan.specific_thrust_min < GRAVITY:
+        raise InputError(
+            f"hovering is impossible with a specific thrust of at least {plan.specific_thrust_min:g} m/s²; it is "
+            f"{GRAVITY} m/s² in hover",
+            where=places.where("plan", "specific_thrust"),
+            hint="half of that keeps clear of the firmware's tumble rule",
+        )
+    strongest = 4 * plan.motor_thrust_max / airframe.mass
+    steepest = math.acos(GRAVITY / strongest)
+    if plan.tilt > steepest:
+        raise InputError(
+            f"{airframe.name} cannot hold its height beyond a tilt of {math.degrees(steepest):.1f}°",
+            where=places.where("plan", "tilt_deg"),
+            hint="allow no more than the vehicle can do",
+        )
+    level = math.sqrt(strongest**2 - GRAVITY**2)
+    if plan.acceleration > level:
+        raise InputError(
+            f"{airframe.name} cannot accelerate at more than {level:.1f} m/s² and hold its height",
+            where=places.where("plan", "acceleration"),
+            hint="allow no more than the vehicle can do",
+        )

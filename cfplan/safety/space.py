@@ -1,0 +1,65 @@
+"""The room to fly in."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cfplan.errors import InfeasibleError
+from cfplan.geometry.path import Path
+
+_SAMPLES = 33  # of each piece of a path
+_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, slots=True)
+class Space:
+    """A box, and the distance that plans keep from its walls."""
+
+    low: tuple[float, float, float]
+    # m
+    high: tuple[float, float, float]
+    # m
+    margin: float
+    # m, positive
+
+    def beyond(self, positions: ArrayLike) -> NDArray:
+        """(N, 3) m: how far each coordinate lies beyond the box less its margin; negative inside."""
+        points = np.asarray(positions, dtype=float)
+        return np.maximum(np.array(self.low) + self.margin - points, points - (np.array(self.high) - self.margin))
+
+
+def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None, where: str = "") -> None:
+    """Refuse a path that leaves the space or its margin anywhere, at waypoints or between them.
+
+    Raises:
+        InfeasibleError: naming the first waypoint at fault, else the worst place, and by how much.
+    """
+    if waypoints is not None:
+        for number, point in enumerate(np.asarray(waypoints, dtype=float), start=1):
+            if not np.all(space.beyond(point) <= 0.0):
+                _refuse(space, point, f"waypoint {number}", where)
+    s = (path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)).reshape(-1)
+    points = path(s)
+    # Between two samples a coordinate exceeds both by at most step² / 8 of its second derivative.
+    bend = np.abs(path(s, 2)).reshape(-1, _SAMPLES, 3).max(axis=1)
+    step = np.diff(path.breaks) / (_SAMPLES - 1)
+    between = np.repeat(step[:, None] ** 2 / 8 * bend, _SAMPLES, axis=0)
+    worst = int(np.argmax((space.beyond(points) + between).max(axis=1)))
+    if not np.all(space.beyond(points[worst]) + between[worst] <= 0.0):
+        _refuse(space, points[worst], f"the path at s = {s[worst]:.2f} of {path.end:.2f}", where)
+
+
+def _refuse(space: Space, point: NDArray, what: str, where: str) -> None:
+    beyond = space.beyond(point)
+    axis = int(np.argmax(np.where(np.isfinite(beyond), beyond, np.inf)))
+    wall = space.low[axis] if point[axis] < (space.low[axis] + space.high[axis]) / 2 else space.high[axis]
+    x, y, z = point
+    outside = beyond[axis] - space.margin
+    far = f"{outside:.3f} m outside the space" if outside > 0 else f"{-outside:.3f} m from the wall"
+    raise InfeasibleError(
+        f"{what}, ({x:.3f}, {y:.3f}, {z:.3f}) m, is {far} {_AXES[axis]} = {wall:g} m, "
+        f"{max(beyond[axis], 0.0):.3f} m too far with the margin of {space.margin:g} m",
+        where=where,
+        hint="move or place the path, or correct `space` in safety.yaml if the room is larger",
+    )

@@ -1,0 +1,53 @@
+"""An airframe of one's own, by a YAML file with the fields and units of Airframe."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cfplan.errors import InputError
+from cfplan.geometry.yaml_source import read_yaml_with_places
+from cfplan.vehicle.airframe import Airframe
+
+Inertia = Annotated[float, Field(gt=0.0, le=1.0)]
+Drag = Annotated[float, Field(ge=0.0, le=10.0)]
+
+
+class _AirframeFile(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    name: Annotated[str, Field(min_length=1, max_length=100)]
+    mass: Annotated[float, Field(gt=0.0, le=10.0)]
+    inertia: tuple[Inertia, Inertia, Inertia]
+    arm: Annotated[float, Field(gt=0.0, le=1.0)]
+    thrust_to_torque: Annotated[float, Field(gt=0.0, le=1.0)]
+    motor_thrust_min: Annotated[float, Field(ge=0.0, le=100.0)]
+    motor_thrust_max: Annotated[float, Field(gt=0.0, le=100.0)]
+    motor_time_constant: Annotated[float, Field(gt=0.0, le=1.0)]
+    drag: tuple[Drag, Drag]
+    source: Annotated[str, Field(min_length=1, max_length=1000)]
+    rotor_reaction: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+
+
+def read_airframe(file: Path | str) -> Airframe:
+    """The airframe that a file describes.
+
+    Raises:
+        InputError: with `file:line:column`, also for one that cannot hover.
+    """
+    content, places = read_yaml_with_places(file, _AirframeFile)
+    airframe = Airframe(**content.model_dump())
+    if not airframe.motor_thrust_min < airframe.hover_thrust < airframe.motor_thrust_max:
+        raise InputError(
+            f"it cannot hover: each motor needs {airframe.hover_thrust:.3g} N and gives "
+            f"{airframe.motor_thrust_min:g} to {airframe.motor_thrust_max:g} N",
+            where=places.where("motor_thrust_max"),
+            hint="masses are in kg, thrusts in N for one motor",
+        )
+    jx, jy, jz = sorted(airframe.inertia)
+    if jz > jx + jy:
+        raise InputError(
+            "no rigid body has these moments of inertia: one exceeds the sum of the others",
+            where=places.where("inertia"),
+        )
+    return airframe
