@@ -1,0 +1,187 @@
+"""The lab's own process: runs the virtual Crazyflie and the room in real time, against absolute deadlines."""
+
+import gc
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from multiprocessing.connection import Connection
+
+import numpy as np
+
+from cfplan.simulation.lab import CLOSE, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME, TRUTH
+from cfplan.simulation.room import SUBSCRIBE, SUBSCRIPTION_LASTS, MotionCapture, RoomSettings
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
+from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
+from cfplan.simulation.virtual_crazyflie.wire import NULL_PACKET, Port, pack
+from cfplan.vehicle.airframe import Airframe
+
+_STEP = 2  # ms between wakes
+_RECORD_PERIOD = 10  # ms
+_MOST_BEHIND = 0.25  # s that a stall may be caught up with; beyond, simulated time is lost
+_SILENCE = 2.0  # s after which a client has gone
+_LARGEST_DATAGRAM = 64
+
+_Address = tuple[str, int]
+
+
+class Recorder:
+    """The truth, a row every 10 ms, in an array that doubles."""
+
+    def __init__(self) -> None:
+        self._rows = np.empty((6000, ROW_SIZE))
+        self._count = 0
+
+    def note(self, time: float, vehicle: VirtualCrazyflie) -> None:
+        """Write a row."""
+        if self._count == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+        row, loop = self._rows[self._count], vehicle.stabilizer.loop
+        row[TIME], row[STATE], row[MOTORS] = time, loop.truth, loop.motors
+        row[OFF_IN_AIR], row[SUPERVISOR] = loop.counts[OFF_IN_AIR_TICKS], vehicle.supervisor.state
+        self._count += 1
+
+    def rows(self) -> bytes:
+        """All of it."""
+        return self._rows[: self._count].tobytes()
+
+
+class LabLoop:
+    """Vehicle, room and sockets on one clock."""
+
+    def __init__(self, airframe: Airframe, vehicle: VehicleSettings, room: RoomSettings):
+        self.vehicle = VirtualCrazyflie(airframe, vehicle)
+        self.capture = MotionCapture(room)
+        self.record = Recorder()
+        self.link, self.poses = _adjacent_sockets()
+        self.port: int = self.link.getsockname()[1]
+        self._client: _Address | None = None
+        self._heard = 0.0
+        self._subscribers: dict[_Address, float] = {}
+        self._origin = 0.0
+
+    def run(self, control: Connection) -> None:
+        """Until told to end, or until whoever started this has gone."""
+        parent = os.getppid()
+        sources: list[int] = [self.link.fileno(), self.poses.fileno(), control.fileno()]
+        self._origin = time.monotonic() - self.vehicle.tick / 1000
+        while os.getppid() == parent:
+            due = min(self._origin + (self.vehicle.tick + _STEP) / 1000, self.capture.next_due)
+            wait = max(0.0, due - time.monotonic())
+            readable = select.select(sources, [], [], wait)[0]
+            self._catch_up()
+            if sources[0] in readable:
+                self._read_link()
+            if sources[1] in readable:
+                self._read_subscriptions()
+            if sources[2] in readable and not self._obey(control):
+                return
+
+    def _catch_up(self) -> None:
+        now = time.monotonic()
+        if now - self._origin - self.vehicle.tick / 1000 > _MOST_BEHIND:
+            self._origin = now - self.vehicle.tick / 1000
+        target = int((now - self._origin) * 1000)
+        while self.vehicle.tick < target:
+            tick = self.vehicle.tick
+            if tick >= self.capture.next_tick:
+                self.capture.look(self._origin + tick / 1000, self.vehicle.stabilizer.loop.truth)
+            if tick % _RECORD_PERIOD == 0:
+                self.record.note(self._origin + tick / 1000, self.vehicle)
+            stop = min(target, self.capture.next_tick, tick + _RECORD_PERIOD - tick % _RECORD_PERIOD)
+            self.vehicle.advance(stop - tick)
+        self._send_out(now)
+
+    def _send_out(self, now: float) -> None:
+        packets = self.vehicle.sent()
+        if self._client is not None and now - self._heard > _SILENCE:
+            self._client = None
+        if self._client is not None:
+            for packet in packets:
+                self.link.sendto(packet, self._client)
+        for packet in self.capture.ready(now):
+            for address, renewed in list(self._subscribers.items()):
+                if now - renewed > SUBSCRIPTION_LASTS:
+                    del self._subscribers[address]
+                else:
+                    self.poses.sendto(packet, address)
+
+    def _read_link(self) -> None:
+        for packet, sender in _datagrams(self.link):
+            if packet == NULL_PACKET:  # a scan, or a driver that looks whether anyone is there
+                self.link.sendto(pack(Port.LINK, 3, b""), sender)
+                continue
+            self._client, self._heard = sender, time.monotonic()
+            self.vehicle.receive(packet)
+        self._send_out(time.monotonic())
+
+    def _read_subscriptions(self) -> None:
+        for packet, sender in _datagrams(self.poses):
+            if packet == SUBSCRIBE:
+                self._subscribers[sender] = time.monotonic()
+            else:
+                self._subscribers.pop(sender, None)
+
+    def _obey(self, control: Connection) -> bool:
+        try:
+            request = control.recv()
+        except (EOFError, OSError):  # whoever started this has gone
+            return False
+        if request == TRUTH:
+            control.send((self.record.rows(), self.vehicle.supervisor.ever_locked))
+        return request != CLOSE
+
+
+def _datagrams(source: socket.socket) -> list[tuple[bytes, _Address]]:
+    found = []
+    while True:
+        try:
+            found.append(source.recvfrom(_LARGEST_DATAGRAM))
+        except BlockingIOError:
+            return found
+
+
+def _adjacent_sockets() -> tuple[socket.socket, socket.socket]:
+    """Two UDP sockets on the loopback, the second one port above the first."""
+    while True:
+        first = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        first.bind(("127.0.0.1", 0))
+        second = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            second.bind(("127.0.0.1", first.getsockname()[1] + 1))
+        except (OSError, OverflowError):
+            first.close()
+            second.close()
+            continue
+        first.setblocking(False)
+        second.setblocking(False)
+        return first, second
+
+
+def serve(control: Connection) -> None:
+    """Make the lab that the other side asks for, say on which port it listens, and run it."""
+    loop = LabLoop(*control.recv())
+    _warm_up(loop.vehicle)
+    gc.collect()
+    gc.freeze()
+    control.send(loop.port)
+    loop.run(control)
+
+
+def _warm_up(vehicle: VirtualCrazyflie) -> None:
+    """Compile, and let the supervisor pass its checks, before anyone looks."""
+    vehicle.advance(200)
+    vehicle.sent()
+
+
+def main() -> None:
+    """`python -m cfplan.simulation.lab_process FD`: the other end of FD is whoever started this."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the pilot's to handle; the vehicle stays there to land
+    serve(Connection(int(sys.argv[1])))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,279 @@
+"""The on-board planner (CRTP port 8): take-off, landing and go-to as septics, and uploaded polynomials.
+
+Idle, it asks for nothing, which is motors off, every 10 ms at the lowest priority: the null-setpoint gap.
+"""
+
+import errno
+import math
+from dataclasses import dataclass
+from enum import Enum, auto
+from struct import error, unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.simulation.mellinger import ON_BOARD
+from cfplan.simulation.virtual_crazyflie.setpoints import (
+    ACCELERATION,
+    BODY_RATE,
+    POSITION,
+    VELOCITY,
+    YAW,
+    Setpoint,
+)
+from cfplan.vehicle.airframe import GRAVITY
+
+(
+    _SET_GROUP_MASK, _TAKE_OFF, _LAND, _STOP, _GO_TO, _START, _DEFINE, _TAKE_OFF_2, _LAND_2, _TAKE_OFF_BY_SPEED,
+    _LAND_BY_SPEED, _SPIRAL, _GO_TO_2, _START_2,
+) = range(14)  # fmt: skip
+_PLANNER_BUSY = 1
+_DEFINITIONS = 31
+_IN_MEMORY, _UNCOMPRESSED = 1, 0
+_PIECE_BYTES = 132  # 4 × 8 coefficients and a duration, float32
+
+# The upper half of a septic on [0, 1] from what is left of value and derivatives 1 to 3 at its end.
+_UPPER = np.linalg.inv(
+    np.array([[1, 1, 1, 1], [4, 5, 6, 7], [12, 20, 30, 42], [24, 60, 120, 210]], dtype=float),
+)
+_ORDERS = np.arange(8)
+
+
+class Planner(Enum):
+    """What the planner does."""
+
+    IDLE = auto()
+    FLYING = auto()
+    LANDING = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """Where the planner wants the vehicle at one moment. Columns x, y, z, yaw."""
+
+    position: NDArray
+    # (4,)
+    velocity: NDArray
+    # (4,)
+    acceleration: NDArray
+    # (4,)
+    jerk: NDArray
+    # (4,)
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    duration: float
+    # s
+    coefficients: NDArray
+    # (8, 4) ascending powers of time, s; columns x, y, z, yaw
+
+    def at(self, time: float) -> Goal:
+        rows = []
+        coefficients = self.coefficients
+        for _ in range(4):
+            rows.append(time ** _ORDERS[: len(coefficients)] @ coefficients)
+            coefficients = coefficients[1:] * _ORDERS[1 : len(coefficients), None]
+        return Goal(*rows)
+
+    def stretched(self, factor: float) -> "_Piece":
+        return _Piece(self.duration * factor, self.coefficients / factor ** _ORDERS[:, None])
+
+    def reversed(self) -> "_Piece":
+        """The same curve backwards, again from time zero on."""
+        shift = np.array([[math.comb(j, i) * self.duration ** max(j - i, 0) for j in range(8)] for i in range(8)])
+        return _Piece(self.duration, (shift @ self.coefficients) * (-1.0) ** _ORDERS[:, None])
+
+    def moved(self, offset: NDArray) -> "_Piece":
+        coefficients = self.coefficients.copy()
+        coefficients[0] += offset
+        return _Piece(self.duration, coefficients)
+
+
+def septic(duration: float, start: Goal, end: Goal) -> _Piece:
+    """The polynomial between two states in `duration`, without jerk at either end."""
+    scale = duration ** np.arange(3)
+    lower = np.zeros((4, 4))
+    lower[0], lower[1], lower[2] = start.position, start.velocity * scale[1], start.acceleration * scale[2] / 2
+    rest = np.stack(
+        [
+            end.position - lower.sum(axis=0),
+            end.velocity * scale[1] - lower[1] - 2 * lower[2],
+            end.acceleration * scale[2] - 2 * lower[2],
+            np.zeros(4),
+        ]
+    )
+    return _Piece(duration, np.vstack([lower, _UPPER @ rest]) / duration ** _ORDERS[:, None])
+
+
+def _at_rest(position: NDArray) -> Goal:
+    return Goal(position, np.zeros(4), np.zeros(4), np.zeros(4))
+
+
+def _wrapped(angle: float) -> float:
+    return math.remainder(angle, 2 * math.pi)
+
+
+class HighLevelCommander:
+    """Carries out commands one at a time; `follow` tells it where the vehicle is while it is idle."""
+
+    def __init__(self, memory: bytearray):
+        self.state = Planner.IDLE
+        self._memory = memory
+        self._pieces: list[_Piece] = []
+        self._begin = 0.0
+        self._last = _at_rest(np.zeros(4))
+        self._group_mask = 0
+        self._definitions: dict[int, tuple[int, int]] = {}
+
+    def stop(self) -> None:
+        """Go idle at once."""
+        self.state = Planner.IDLE
+
+    def finished(self, time: float) -> bool:
+        """Whether the last curve has been flown to its end."""
+        return time - self._begin >= sum(piece.duration for piece in self._pieces)
+
+    def follow(self, position: NDArray, velocity: NDArray, yaw: float) -> None:
+        """The vehicle's estimated state, from which the next curve starts."""
+        self._last = Goal(np.append(position, yaw), np.append(velocity, 0.0), np.zeros(4), np.zeros(4))
+
+    def setpoint(self, time: float) -> Setpoint:
+        """What to do now, asked every 10 ms."""
+        if self.state is Planner.LANDING and self.finished(time):
+            self.state = Planner.IDLE
+        if self.state is Planner.IDLE:
+            return Setpoint()
+        goal = self._goal(time)
+        self._last = goal
+        setpoint = Setpoint(mode=ON_BOARD.copy())
+        setpoint.values[POSITION] = goal.position[:3]
+        setpoint.values[VELOCITY] = goal.velocity[:3]
+        setpoint.values[ACCELERATION] = goal.acceleration[:3]
+        setpoint.values[BODY_RATE] = _body_rate(goal)
+        setpoint.values[YAW] = goal.position[3]
+        return setpoint
+
+    def _goal(self, time: float) -> Goal:
+        elapsed = time - self._begin
+        for piece in self._pieces:
+            if elapsed <= piece.duration:
+                return piece.at(elapsed)
+            elapsed -= piece.duration
+        return _at_rest(self._pieces[-1].at(self._pieces[-1].duration).position)
+
+    def receive(self, payload: bytes, time: float, *, blocked: bool) -> bytes:
+        """Carry out a command; the answer has the return code in its fourth byte."""
+        code = self._command(payload[0], payload[1:], time, blocked) if payload else errno.ENOEXEC
+        return payload[:3].ljust(3, b"\0") + bytes((code,))
+
+    def _command(self, command: int, data: bytes, time: float, blocked: bool) -> int:
+        try:
+            if command == _SET_GROUP_MASK:
+                self._group_mask = data[0]
+                return 0
+            if command == _DEFINE:
+                return self._define(*unpack("<BBBIB", data))
+            if command == _STOP:
+                if self._mine(data[0]):
+                    self.stop()
+                return 0
+            if command in (_SPIRAL, _TAKE_OFF_BY_SPEED, _LAND_BY_SPEED) or command > _START_2:
+                return errno.ENOEXEC
+            if blocked:
+                return errno.EBUSY
+            return self._move(command, data, time) if self._mine(data[0]) else 0
+        except (error, IndexError):  # a length that no client sends
+            return errno.ENOEXEC
+
+    def _mine(self, group: int) -> bool:
+        return group == 0 or bool(group & self._group_mask)
+
+    def _move(self, command: int, data: bytes, time: float) -> int:
+        if command in (_TAKE_OFF, _LAND):
+            _, height, duration = unpack("<Bff", data)
+            return self._climb(command == _LAND, height, 0.0, duration, time)
+        if command in (_TAKE_OFF_2, _LAND_2):
+            _, height, yaw, keep_yaw, duration = unpack("<Bff?f", data)
+            return self._climb(command == _LAND_2, height, self._last.position[3] if keep_yaw else yaw, duration, time)
+        if command == _GO_TO:
+            _, relative, *place, duration = unpack("<B?fffff", data)
+            return self._go_to(relative, False, np.array(place), duration, time)
+        if command == _GO_TO_2:
+            _, relative, linear, *place, duration = unpack("<B??fffff", data)
+            return self._go_to(relative, linear, np.array(place), duration, time)
+        if command == _START:
+            _, relative, backwards, number, scale = unpack("<B??Bf", data)
+            return self._start(number, relative, False, backwards, scale, time)
+        _, relative, relative_yaw, backwards, number, scale = unpack("<B???Bf", data)
+        return self._start(number, relative, relative_yaw, backwards, scale, time)
+
+    def _climb(self, landing: bool, height: float, yaw: float, duration: float, time: float) -> int:
+        if self.state is Planner.LANDING if landing else self.state is not Planner.IDLE:
+            return _PLANNER_BUSY
+        target = self._last.position.copy()
+        target[2] = height
+        return self._fly(_at_rest(self._last.position), target, yaw, duration, time, landing=landing)
+
+    def _go_to(self, relative: bool, linear: bool, place: NDArray, duration: float, time: float) -> int:
+        here = self._last if self.state is Planner.IDLE else self._goal(time)
+        target = place + here.position if relative else place.copy()
+        if linear:
+            distance = target - here.position
+            distance[3] = _wrapped(distance[3])
+            steady = distance / max(duration, 1e-3)
+            still = np.zeros(4)
+            here = Goal(here.position, steady, still, still)
+            end = Goal(here.position + distance, steady, still, still)
+            return self._begin_at(septic(max(duration, 1e-3), here, end), time, Planner.FLYING)
+        return self._fly(here, target, target[3], duration, time, landing=False)
+
+    def _fly(self, here: Goal, target: NDArray, yaw: float, duration: float, time: float, *, landing: bool) -> int:
+        start = here.position.copy()
+        start[3] = _wrapped(start[3])
+        end = target.copy()
+        end[3] = start[3] + _wrapped(yaw - start[3])
+        curve = septic(max(duration, 1e-3), Goal(start, here.velocity, here.acceleration, here.jerk), _at_rest(end))
+        return self._begin_at(curve, time, Planner.LANDING if landing else Planner.FLYING)
+
+    def _begin_at(self, curve: _Piece, time: float, state: Planner) -> int:
+        self._pieces, self._begin, self.state = [curve], time, state
+        return 0
+
+    def _define(self, number: int, place: int, kind: int, offset: int, count: int) -> int:
+        if number >= _DEFINITIONS or place != _IN_MEMORY or kind != _UNCOMPRESSED:
+            return errno.ENOEXEC
+        if not count or offset + count * _PIECE_BYTES > len(self._memory):
+            return errno.ENOEXEC
+        self._definitions[number] = offset, count
+        return 0
+
+    def _start(
+        self, number: int, relative: bool, relative_yaw: bool, backwards: bool, scale: float, time: float
+    ) -> int:
+        if number not in self._definitions or not scale > 0:
+            return errno.ENOEXEC
+        offset, count = self._definitions[number]
+        table = np.frombuffer(self._memory, "<f4", count * _PIECE_BYTES // 4, offset).reshape(count, 33).astype(float)
+        pieces = [_Piece(row[32], row[:32].reshape(4, 8).T).stretched(scale) for row in table]
+        if backwards:
+            pieces = [piece.reversed() for piece in reversed(pieces)]
+        if relative:
+            shift = self._last.position - pieces[0].coefficients[0]
+            shift[3] = _wrapped(shift[3]) if relative_yaw else 0.0
+            pieces = [piece.moved(shift) for piece in pieces]
+        self._pieces, self._begin, self.state = pieces, time, Planner.FLYING
+        return 0
+
+
+def _body_rate(goal: Goal) -> NDArray:
+    """(3,) rad/s, of the attitude that the goal's acceleration, jerk and yaw ask for."""
+    force = goal.acceleration[:3] + np.array([0.0, 0.0, GRAVITY])
+    size = np.sqrt(force @ force)
+    z = force / size
+    yaw = goal.position[3]
+    y = np.cross(z, [np.cos(yaw), np.sin(yaw), 0.0])
+    y /= np.sqrt(y @ y)
+    x = np.cross(y, z)
+    tip = (goal.jerk[:3] - (goal.jerk[:3] @ z) * z) / size
+    return np.array([-tip @ y, tip @ x, z[2] * goal.velocity[3]])

@@ -1,0 +1,141 @@
+"""Log blocks: the table of variables, and packets of their values at set periods (CRTP port 5)."""
+
+import errno
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from struct import calcsize, unpack_from
+from struct import pack as bytes_of
+
+from cfplan.simulation.virtual_crazyflie.catalogue import LOG_VARIABLES
+from cfplan.simulation.virtual_crazyflie.toc import Toc, Variable, make_toc, read_catalogue
+
+_TYPES = {
+    "u8": (1, "B"), "u16": (2, "H"), "u32": (3, "I"), "i8": (4, "b"), "i16": (5, "h"), "i32": (6, "i"), "f32": (7, "f"),
+}  # fmt: skip
+_FORMATS = dict(_TYPES.values()) | {8: "e"}
+_FLOATING = "fe"
+_TYPE_MASK = 0x0F
+_TOC, _SETTINGS, DATA_CHANNEL = range(3)
+_CREATE, _APPEND, _DELETE, _START, _STOP, _RESET, _CREATE_2, _APPEND_2, _START_2 = range(9)
+_NO_VARIABLE = 0xFFFF  # an address in memory instead; there is none to read here
+
+MOST_BLOCKS = 16
+MOST_VARIABLES = 128
+MOST_BYTES = 26
+
+Getter = Callable[[], float]
+
+
+def log_toc() -> Toc:
+    """The table of all log variables."""
+    variables = [Variable(group, name, *_TYPES[kind]) for group, kind, name in read_catalogue(LOG_VARIABLES)]
+    return make_toc(tuple(variables), trailer=bytes((MOST_BLOCKS, MOST_VARIABLES)))
+
+
+@dataclass(slots=True)
+class _Block:
+    formats: list[str] = field(default_factory=list)
+    getters: list[Getter] = field(default_factory=list)
+    period: int = 0
+    # ms; 0 while it is stopped
+    due: int = 0
+    # tick of the next packet
+
+    @property
+    def size(self) -> int:
+        return sum(calcsize("<" + layout) for layout in self.formats)
+
+
+def _nothing() -> float:
+    return 0
+
+
+class LogBlocks:
+    """Blocks as a client makes them. `getters` give the values, by name; a variable without one stays zero."""
+
+    def __init__(self, getters: Mapping[str, Getter]):
+        self.toc = log_toc()
+        known = self.toc.index()
+        unknown = set(getters) - set(known)
+        if unknown:
+            raise KeyError(f"not in the table: {sorted(unknown)}")
+        self._getters = [getters.get(entry.full_name, _nothing) for entry in self.toc.variables]
+        self._blocks: dict[int, _Block] = {}
+
+    def receive(self, channel: int, payload: bytes, tick: int) -> bytes | None:
+        """The payload that answers, on the same channel; None where the firmware is silent."""
+        if channel == _TOC:
+            return self.toc.answer(payload)
+        if channel != _SETTINGS or not payload:
+            return None
+        command, block, rest = payload[0], payload[1] if len(payload) > 1 else 0, payload[2:]
+        return bytes((command, block, self._command(command, block, rest, tick)))
+
+    def _command(self, command: int, number: int, rest: bytes, tick: int) -> int:
+        if command == _RESET:
+            self._blocks.clear()
+            return 0
+        if command == _CREATE_2:
+            if number in self._blocks:
+                return errno.EEXIST
+            if len(self._blocks) >= MOST_BLOCKS:
+                return errno.ENOMEM
+            self._blocks[number] = _Block()
+            return self._append(self._blocks[number], rest)
+        if command not in (_APPEND_2, _DELETE, _START, _STOP, _START_2):
+            return errno.ENOEXEC
+        if number not in self._blocks:
+            return errno.ENOENT
+        block = self._blocks[number]
+        if command == _APPEND_2:
+            return self._append(block, rest)
+        if command == _DELETE:
+            del self._blocks[number]
+        elif command == _STOP:
+            block.period = 0
+        elif command == _START and rest:
+            block.period = rest[0] * 10
+            block.due = tick + block.period
+        elif command == _START_2 and len(rest) >= 2:
+            block.period = unpack_from("<H", rest)[0]
+            block.due = tick + block.period
+        return 0
+
+    def _append(self, block: _Block, settings: bytes) -> int:
+        for offset in range(0, len(settings) - 2, 3):
+            code, number = unpack_from("<BH", settings, offset)
+            layout = _FORMATS.get(code & _TYPE_MASK)
+            if layout is None or number == _NO_VARIABLE or number >= len(self._getters):
+                return errno.ENOENT
+            if block.size + calcsize("<" + layout) > MOST_BYTES:
+                return errno.E2BIG
+            if sum(len(each.getters) for each in self._blocks.values()) >= MOST_VARIABLES:
+                return errno.ENOMEM
+            block.formats.append(layout)
+            block.getters.append(self._getters[number])
+        return 0
+
+    def due(self, tick: int) -> list[bytes]:
+        """The payloads, on DATA_CHANNEL, of the blocks whose time has come."""
+        ready = [(number, block) for number, block in self._blocks.items() if self._is_due(block, tick)]
+        return [self._sample(number, block, tick) for number, block in ready]
+
+    @staticmethod
+    def _is_due(block: _Block, tick: int) -> bool:
+        if not block.period or tick < block.due:
+            return False
+        block.due = max(block.due + block.period, tick + 1)
+        return True
+
+    @staticmethod
+    def _sample(number: int, block: _Block, tick: int) -> bytes:
+        head = bytes_of("<BI", number, tick)[:4]
+        return head + b"".join(_encode(layout, get()) for layout, get in zip(block.formats, block.getters, strict=True))
+
+
+def _encode(layout: str, value: float) -> bytes:
+    """A value as the wire has it; what does not fit is cut to the type's bits, as in C."""
+    if layout in _FLOATING:
+        return bytes_of("<" + layout, value)
+    size = calcsize("<" + layout)
+    return (int(value) & ((1 << 8 * size) - 1)).to_bytes(size, "little")

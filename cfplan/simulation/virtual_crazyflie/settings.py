@@ -1,0 +1,38 @@
+"""What a virtual Crazyflie is made of and how it starts."""
+
+from dataclasses import dataclass, field
+
+from cfplan.simulation.virtual_crazyflie.services import FIRMWARE_VERSION, PROTOCOL_VERSION
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """What is wrong with the inertial sensors; of the size that a flying Crazyflie shows after its low-pass filters."""
+
+    gyro_noise: float = 0.02
+    # rad/s, standard deviation of a sample
+    gyro_bias: float = 0.002
+    # rad/s, standard deviation of what calibration leaves
+    acceleration_noise: float = 0.5
+    # m/s², standard deviation of a sample
+    acceleration_bias: float = 0.1
+    # m/s², standard deviation
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleSettings:
+    """How the vehicle stands there when it is switched on."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # m; its height is that of the floor
+    yaw: float = 0.0
+    # rad
+    auto_arming: bool = True
+    # brushed vehicles arm themselves; brushless ones wait for a request
+    charge: float = 1.0
+    # share of the battery's capacity
+    sensors: Sensors = field(default_factory=Sensors)
+    protocol: int = PROTOCOL_VERSION
+    firmware: str = FIRMWARE_VERSION
+    seed: int = 1
+    # of the sensors' noise

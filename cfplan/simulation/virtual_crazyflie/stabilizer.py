@@ -1,0 +1,148 @@
+"""The inner loop: sensors and body at 1 kHz, controller at 500 Hz on the estimate, compiled.
+
+Nothing but the sensors and the recorder sees the true state; the controller flies on what the filter believes.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from cfplan.simulation.body import ALL_WELL, STILL_AIR, TIME_STEP, at_rest, pack_body, rotation, step_body
+from cfplan.simulation.estimator import Filter, estimate, new_filter, reset, step_filter
+from cfplan.simulation.mellinger import FULL_COMMAND, MEMORY_SIZE, distribute_power, level_out, step_mellinger
+from cfplan.simulation.virtual_crazyflie.setpoints import Setpoint
+from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+
+# Where each flag lies in the array that `run` fills.
+OFF_TICKS, OFF_IN_AIR_TICKS, RESETS = range(3)
+
+IN_AIR = 0.02  # m above the floor
+_NOISE_ROWS = 8191  # ms after which the sensors' noise repeats; a prime, so that it beats with nothing
+
+
+class Loop(NamedTuple):
+    """Everything that the compiled loop reads and changes, in place."""
+
+    truth: NDArray
+    # (17,) the body's state, see `body`
+    kalman: Filter
+    belief: NDArray
+    # (13,) estimated position, velocity, quaternion; body rate as measured
+    acceleration: NDArray
+    # (3,) m/s², specific force as measured, body axes
+    memory: NDArray
+    # (10,) of the controller
+    control: NDArray
+    # (4,)
+    motors: NDArray
+    # (4,) 16-bit commands
+    counts: NDArray
+    # OFF_TICKS, OFF_IN_AIR_TICKS, RESETS
+    noise: NDArray
+    # (8191, 6) gyroscope rad/s, accelerometer m/s², biases included
+    wind: NDArray
+    # (3,) m/s
+    efficiency: NDArray
+    # (4,) share of its thrust that each motor gives
+
+
+class Stabilizer:
+    """The vehicle below the commander. `prior` and `gains` are arrays that parameters may change in flight."""
+
+    def __init__(self, airframe: Airframe, settings: VehicleSettings, prior: NDArray, gains: NDArray):
+        position = np.array(settings.position, dtype=float)
+        self.body = pack_body(airframe, floor=float(position[2]))
+        self.prior, self.gains = prior, gains
+        self.loop = Loop(
+            truth=at_rest(position, settings.yaw),
+            kalman=new_filter(prior),
+            belief=np.zeros(13),
+            acceleration=np.array([0.0, 0.0, GRAVITY]),
+            memory=np.zeros(MEMORY_SIZE),
+            control=np.zeros(4),
+            motors=np.zeros(4),
+            counts=np.zeros(3, dtype=np.int64),
+            noise=_sensor_noise(settings.sensors, settings.seed),
+            wind=STILL_AIR.copy(),
+            efficiency=ALL_WELL.copy(),
+        )
+        estimate(self.loop.kalman, self.loop.belief)
+        self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N
+
+    def reset_controller(self) -> None:
+        """Forget the integrals, as when another controller is chosen."""
+        self.loop.memory[:] = 0.0
+
+    def reset_estimator(self) -> None:
+        """Let the filter begin anew, at the place that its parameters name."""
+        reset(self.loop.kalman, self.prior)
+
+    def run(
+        self, tick: int, ticks: int, setpoint: Setpoint, poses: NDArray, *, allowed: bool, level: bool, flying: bool
+    ) -> None:
+        """Carry on from `tick` by `ticks` of 1 ms; `poses` (n, 9) as in `estimator`."""
+        values, mode = setpoint.values, setpoint.mode
+        if level:
+            values, mode = values.copy(), mode.copy()
+            level_out(values, mode)
+        _run(
+            self.loop, self.body, self.gains, self.prior, values, mode, poses, tick, ticks,
+            allowed, flying, self._per_command,
+        )  # fmt: skip
+
+
+def _sensor_noise(sensors: Sensors, seed: int) -> NDArray:
+    chance = np.random.default_rng(seed)
+    noise = np.empty((_NOISE_ROWS, 6))
+    noise[:, :3] = chance.normal(chance.normal(0, sensors.gyro_bias, 3), sensors.gyro_noise, (_NOISE_ROWS, 3))
+    noise[:, 3:] = chance.normal(
+        chance.normal(0, sensors.acceleration_bias, 3), sensors.acceleration_noise, (_NOISE_ROWS, 3)
+    )
+    return noise
+
+
+@njit(cache=True)
+def _run(
+    loop: Loop,
+    body: NDArray,
+    gains: NDArray,
+    prior: NDArray,
+    setpoint: NDArray,
+    mode: NDArray,
+    poses: NDArray,
+    tick: int,
+    ticks: int,
+    allowed: bool,
+    flying: bool,
+    per_command: float,
+) -> None:
+    floor = body[10]
+    gyro = np.empty(3)
+    for now in range(tick, tick + ticks):
+        noise = loop.noise[now % len(loop.noise)]
+        gyro[:] = loop.truth[10:13] + noise[0:3]
+        loop.belief[10:13] = gyro
+        fresh = poses if now == tick else poses[:0]
+        measured = loop.acceleration + noise[3:6]
+        if not step_filter(loop.kalman, prior, gyro, measured, fresh, now, flying):
+            loop.counts[2] += 1
+        estimate(loop.kalman, loop.belief)
+
+        if now % 2 == 0:
+            step_mellinger(loop.control, loop.memory, gains, setpoint, mode, loop.belief)
+            distribute_power(loop.control, loop.motors)
+        if not allowed:
+            loop.motors[:] = 0.0
+        if np.all(loop.motors == 0.0):
+            loop.counts[0] += 1
+            if loop.truth[2] > floor + IN_AIR:
+                loop.counts[1] += 1
+
+        before = loop.truth[3:6].copy()
+        step_body(loop.truth, loop.motors * per_command, body, loop.wind, loop.efficiency)
+        force = (loop.truth[3:6] - before) / TIME_STEP
+        force[2] += GRAVITY
+        loop.acceleration[:] = rotation(loop.truth[6:10]).T @ force

@@ -1,0 +1,263 @@
+"""The virtual Crazyflie: packets go in and come out, time goes on when it is told to. No threads, no clock."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.simulation.virtual_crazyflie.battery import Battery
+from cfplan.simulation.virtual_crazyflie.commander import Commander, Priority
+from cfplan.simulation.virtual_crazyflie.defaults import (
+    COMPLEMENTARY,
+    DEFAULTS,
+    GAIN_PARAMETERS,
+    KALMAN,
+    PRIOR_PARAMETERS,
+)
+from cfplan.simulation.virtual_crazyflie.high_level import HighLevelCommander, Planner
+from cfplan.simulation.virtual_crazyflie.localization import Localization
+from cfplan.simulation.virtual_crazyflie.log_blocks import DATA_CHANNEL, LogBlocks
+from cfplan.simulation.virtual_crazyflie.measures import getters
+from cfplan.simulation.virtual_crazyflie.parameters import Parameters
+from cfplan.simulation.virtual_crazyflie.services import Memories, answer_link, answer_platform
+from cfplan.simulation.virtual_crazyflie.setpoints import AttitudeSetpoints, FirmwareAssert, Setpoint, decode_setpoint
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_crazyflie.stabilizer import Stabilizer
+from cfplan.simulation.virtual_crazyflie.supervisor import PERIOD as SUPERVISOR_PERIOD
+from cfplan.simulation.virtual_crazyflie.supervisor import Supervisor
+from cfplan.simulation.virtual_crazyflie.wire import LARGEST_PAYLOAD, Port, pack
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+
+COMMANDER_PERIOD = 10  # ticks of 1 ms between looks at planner and log blocks
+
+_SETPOINT_CHANNEL, _META_CHANNEL = 0, 1
+_NOTIFY_SETPOINT_STOP = 0
+_SUPERVISOR_INFO, _SUPERVISOR_COMMAND = 0, 1
+_ARM, _RECOVER, _EMERGENCY_STOP, _KEEP_ALIVE, _BITFIELD = 1, 2, 3, 4, 12
+_RESPONSE = 0x80
+_LEGACY_ARM, _LEGACY_RECOVER = 1, 2  # platform commands
+_NO_POSES = np.zeros((0, 9))
+
+
+class VirtualCrazyflie:
+    """A vehicle of this airframe, switched on at tick 0."""
+
+    def __init__(self, airframe: Airframe, settings: VehicleSettings | None = None):
+        self.settings = settings or VehicleSettings()
+        self.tick = 0
+        self.parameters = Parameters(DEFAULTS)
+        self.stabilizer = Stabilizer(
+            airframe,
+            self.settings,
+            prior=np.array([self.parameters[name] for name in PRIOR_PARAMETERS]),
+            gains=np.array([self.parameters[name] for name in GAIN_PARAMETERS]),
+        )
+        self.supervisor = Supervisor(auto_arming=self.settings.auto_arming, say=self.say)
+        self.memories = Memories()
+        self.planner = HighLevelCommander(self.memories.trajectory)
+        self.commander = Commander(self.planner.stop)
+        self.localization = Localization()
+        self.battery = Battery(self.settings.charge)
+        self.setpoint = Setpoint()  # what the controller is given
+        self._attitude_setpoints = AttitudeSetpoints()
+        self._out: list[bytes] = []
+        self.log = LogBlocks(getters(self))
+        self._watch_parameters()
+
+    def sent(self) -> list[bytes]:
+        """The packets sent since the last call."""
+        packets, self._out = self._out, []
+        return packets
+
+    def say(self, text: str) -> None:
+        """Print a line on the console."""
+        line = text.encode() + b"\n"
+        for start in range(0, len(line), LARGEST_PAYLOAD):
+            self._send(Port.CONSOLE, 0, line[start : start + LARGEST_PAYLOAD])
+
+    def advance(self, ticks: int) -> None:
+        """Let `ticks` milliseconds go by."""
+        end = self.tick + ticks
+        while self.tick < end:
+            if self.tick % COMMANDER_PERIOD == 0:
+                self._command()
+            step = min(end - self.tick, COMMANDER_PERIOD - self.tick % COMMANDER_PERIOD)
+            self._stabilize(step)
+            self.tick += step
+
+    def receive(self, packet: bytes) -> None:
+        """Take a packet; what answers it is in `sent`."""
+        if not packet:
+            return
+        port, channel, payload = packet[0] >> 4, packet[0] & 3, packet[1 : 1 + LARGEST_PAYLOAD]
+        answer: bytes | None = None
+        if port == Port.LINK:
+            answer = answer_link(channel, payload)
+        elif port == Port.PLATFORM:
+            answer = self._platform(channel, payload)
+        elif port == Port.LOG:
+            answer = self.log.receive(channel, payload, self.tick)
+        elif port == Port.PARAMETERS:
+            answer = self.parameters.receive(channel, payload)
+        elif port == Port.MEMORY:
+            answer = self.memories.receive(channel, payload)
+        elif port == Port.HIGH_LEVEL:
+            answer = self.planner.receive(payload, self.tick / 1000, blocked=not self.supervisor.can_fly)
+        elif port == Port.SUPERVISOR:
+            answer = self._supervise(channel, payload)
+        elif port == Port.LOCALIZATION:
+            self._localize(channel, payload)
+        elif port in (Port.SETPOINT, Port.ATTITUDE_SETPOINT):
+            self._take_setpoint(Port(port), channel, payload)
+        if answer is not None:
+            self._send(Port(port), channel, answer)
+
+    def info(self) -> int:
+        """The bits of supervisor.info."""
+        return self.supervisor.info(
+            planner_active=self.planner.state is not Planner.IDLE,
+            planner_finished=self.planner.finished(self.tick / 1000),
+        )
+
+    def _send(self, port: Port, channel: int, payload: bytes) -> None:
+        self._out.append(pack(port, channel, payload))
+
+    def _command(self) -> None:
+        """The slower loops: planner and log blocks at 100 Hz, supervisor at 25 Hz."""
+        loop = self.stabilizer.loop
+        can_fly = self.supervisor.can_fly
+        if can_fly:
+            if self.planner.state is Planner.IDLE:
+                self._tell_planner()
+            wanted = self.planner.setpoint(self.tick / 1000)
+            self.commander.offer(wanted, Priority.HIGH_LEVEL, self.tick)
+        if self.tick % SUPERVISOR_PERIOD == 0:
+            self.supervisor.update(
+                self.tick, self.commander.setpoint.tick if can_fly else 0, self.acceleration / GRAVITY, loop.motors
+            )
+        self.battery.drain(float(loop.truth[13:17].sum()), COMMANDER_PERIOD / 1000)
+        for payload in self.log.due(self.tick):
+            self._send(Port.LOG, DATA_CHANNEL, payload)
+
+    @property
+    def acceleration(self) -> NDArray:
+        """(3,) m/s², specific force in body axes as low-pass filtered measurement."""
+        return self.stabilizer.loop.acceleration
+
+    def _stabilize(self, ticks: int) -> None:
+        supervisor = self.supervisor
+        self.setpoint = self.commander.setpoint if supervisor.motors_allowed else Setpoint()
+        poses = self.localization.take(self.parameters["locSrv.extPosStdDev"], self.parameters["locSrv.extQuatStdDev"])
+        self.stabilizer.run(
+            self.tick,
+            ticks,
+            self.setpoint,
+            poses if self.parameters["stabilizer.estimator"] == KALMAN else _NO_POSES,
+            allowed=supervisor.motors_allowed,
+            level=supervisor.levels_out,
+            flying=supervisor.is_flying,
+        )
+
+    def _tell_planner(self) -> None:
+        belief = self.stabilizer.loop.belief
+        x, y, z, w = belief[6:10]
+        self.planner.follow(
+            belief[0:3].copy(), belief[3:6].copy(), float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+        )
+
+    def _take_setpoint(self, port: Port, channel: int, payload: bytes) -> None:
+        setpoint: Setpoint | None = None
+        try:
+            if port is Port.ATTITUDE_SETPOINT and channel == _SETPOINT_CHANNEL:
+                first = self.commander.priority is Priority.DISABLE
+                setpoint = self._attitude_setpoints.decode(payload, first=first)
+            elif port is Port.SETPOINT and payload and channel == _SETPOINT_CHANNEL:
+                setpoint = decode_setpoint(payload)
+            elif port is Port.SETPOINT and payload and channel == _META_CHANNEL:
+                self._meta(payload)
+        except FirmwareAssert as why:
+            self.say(f"Assert failed: {why}")
+            self.supervisor.lock()
+        if setpoint is not None:
+            self.commander.offer(setpoint, Priority.RADIO, self.tick)
+
+    def _meta(self, payload: bytes) -> None:
+        if payload[0] != _NOTIFY_SETPOINT_STOP:
+            return
+        if len(payload) != 5:
+            raise FirmwareAssert(f"notify setpoint stop with {len(payload) - 1} bytes")
+        self._tell_planner()
+        self.commander.relax()
+
+    def _localize(self, channel: int, payload: bytes) -> None:
+        self.localization.receive(channel, payload, self.tick)
+        if self.localization.emergency_stop:
+            self.supervisor.emergency_stop()
+        if self.localization.kept_alive:
+            self.localization.kept_alive = False
+            self.supervisor.keep_alive(self.tick)
+
+    def _platform(self, channel: int, payload: bytes) -> bytes | None:
+        if channel == 0 and payload[:1] == bytes((_LEGACY_ARM,)) and len(payload) >= 2:
+            done = self.supervisor.request_arming(bool(payload[1]))
+            return bytes((_LEGACY_ARM, done, self.supervisor.armed))
+        if channel == 0 and payload[:1] == bytes((_LEGACY_RECOVER,)):
+            done = self.supervisor.request_recovery()
+            return bytes((_LEGACY_RECOVER, done, not self.supervisor.crashed))
+        return answer_platform(channel, payload, protocol=self.settings.protocol, firmware=self.settings.firmware)
+
+    def _supervise(self, channel: int, payload: bytes) -> bytes | None:
+        if not payload:
+            return None
+        command = payload[0]
+        head = bytes((command | _RESPONSE,))
+        if channel == _SUPERVISOR_INFO:
+            bits = self.info()
+            if command == _BITFIELD:
+                return head + bits.to_bytes(2, "little")
+            return head + bytes((bits >> (command - 1) & 1,)) if 1 <= command < _BITFIELD else None
+        if channel != _SUPERVISOR_COMMAND:
+            return None
+        if command == _ARM and len(payload) >= 2:
+            done = self.supervisor.request_arming(bool(payload[1]))
+            return head + bytes((done, self.supervisor.armed))
+        if command == _RECOVER:
+            done = self.supervisor.request_recovery()
+            return head + bytes((done, not self.supervisor.crashed))
+        if command == _EMERGENCY_STOP:
+            self.supervisor.emergency_stop()
+        elif command == _KEEP_ALIVE:
+            self.supervisor.keep_alive(self.tick)
+        return None
+
+    def _watch_parameters(self) -> None:
+        def fill(array: NDArray, place: int):
+            return lambda value: array.__setitem__(place, value)
+
+        watch = self.parameters.watch
+        for place, name in enumerate(GAIN_PARAMETERS):
+            watch(name, fill(self.stabilizer.gains, place))
+        for place, name in enumerate(PRIOR_PARAMETERS):
+            watch(name, fill(self.stabilizer.prior, place))
+        supervised = self.supervisor.settings
+        watch("supervisor.tmblChckEn", lambda value: setattr(supervised, "tumble_check", bool(value)))
+        watch("supervisor.prefltTimeout", lambda value: setattr(supervised, "preflight_timeout", int(value)))
+        watch("supervisor.landedTimeout", lambda value: setattr(supervised, "landed_timeout", int(value)))
+        watch("supervisor.crashDetectGs", lambda value: setattr(supervised, "crash_detection", value))
+        watch("stabilizer.stop", lambda value: setattr(supervised, "stop", bool(value)))
+        watch("stabilizer.controller", self._choose_controller)
+        watch("stabilizer.estimator", self._choose_estimator)
+        watch("kalman.resetEstimation", self._reset_estimation)
+
+    def _choose_controller(self, value: float) -> None:
+        if value == 0:
+            self.parameters["stabilizer.controller"] = DEFAULTS["stabilizer.controller"]
+        self.stabilizer.reset_controller()
+
+    def _choose_estimator(self, value: float) -> None:
+        if value not in (COMPLEMENTARY, KALMAN):
+            self.parameters["stabilizer.estimator"] = COMPLEMENTARY
+        self.stabilizer.reset_estimator()
+
+    def _reset_estimation(self, value: float) -> None:
+        if value:
+            self.stabilizer.reset_estimator()
+            self.parameters["kalman.resetEstimation"] = 0
