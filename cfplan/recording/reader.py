@@ -56,7 +56,7 @@ def read_record(place: Path) -> Record:
     for entry in _entries(data, len(MAGIC)):
         match entry:
             case Header(profile=profile) if profile != PROFILE:
-                raise _not_ours(file, f"its profile is '{profile}'")
+                raise _not_ours(file, f"its profile is {profile[:40]!r}")
             case Metadata(name=name, metadata=values) if name == METADATA:
                 header = _header(values, file)
             case Channel(id=number, topic=name):
@@ -111,7 +111,7 @@ def _not_ours(file: Path, reason: str) -> InputError:
 def _header(values: Mapping[str, str], file: Path) -> RecordHeader:
     if values.get("format") != FORMAT:
         raise InputError(
-            f"the record has format {values.get('format')}, this version reads {FORMAT}",
+            f"the record has format {values.get('format', '')[:20]!r}, this version reads {FORMAT!r}",
             where=str(file),
             hint="use the version of cfplan that wrote it, or a newer one",
         )

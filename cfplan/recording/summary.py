@@ -1,7 +1,7 @@
 """What a flight came to, in numbers, from its record.
 
-The reference is what was sent: the position of each setpoint at its deadline, straight between them. A pose is compared
-with the reference at the pose's own time (deviation in time) and with the nearest point of the path.
+The reference is what was sent: the position of each setpoint at its reference time, straight between them. A pose is
+compared with the reference at the pose's own time (deviation in time) and with the nearest point of the path.
 """
 
 import math
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cfplan.flight.telemetry import Phase
-from cfplan.recording.record import Record
+from cfplan.recording.record import Record, Setpoints
 
 SETTLED = 0.05  # m from the end of the path: close enough to call the flight settled
 DROPOUT = 3.0  # usual intervals between poses: a longer gap is a dropout
@@ -115,15 +115,26 @@ def reference_span(record: Record) -> tuple[float, float]:
     return (float(streamed[0]), float(streamed[-1])) if len(streamed) else (math.nan, math.nan)
 
 
+def reference_times(setpoints: Setpoints) -> NDArray:
+    """(N,) s, when the vehicle should have been at each setpoint.
+
+    That is its deadline, but for one sent so late that the pilot sent the state of a later deadline in its place.
+    """
+    if len(setpoints.due) < 2:
+        return setpoints.due
+    period = np.median(np.diff(setpoints.due))
+    return setpoints.due + np.round((setpoints.time - setpoints.due) / period) * period
+
+
 def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -> Deviation:
     """Of every pose between begin and end that falls in the time of the setpoints."""
-    due = record.setpoints.due
-    if len(due) == 0:
+    wanted = reference_times(record.setpoints)
+    if len(wanted) == 0:
         return Deviation(np.empty(0), np.empty(0), np.empty(0))
     time, position = record.poses.time, record.poses.position
-    inside = (time >= max(begin, due[0])) & (time <= min(end, due[-1])) & np.all(np.isfinite(position), axis=1)
+    inside = (time >= max(begin, wanted[0])) & (time <= min(end, wanted[-1])) & np.all(np.isfinite(position), axis=1)
     time, position = time[inside], position[inside]
-    reference = np.stack([np.interp(time, due, axis) for axis in record.setpoints.position.T], axis=1)
+    reference = np.stack([np.interp(time, wanted, axis) for axis in record.setpoints.position.T], axis=1)
     path = record.header.path[np.all(np.isfinite(record.header.path), axis=1)]
     path = path if len(path) else record.setpoints.position
     return Deviation(time, np.linalg.norm(position - reference, axis=1), distance_to_path(position, path))
@@ -169,10 +180,14 @@ def settling(record: Record) -> float:
 
 
 def finished(record: Record) -> bool:
-    """Whether setpoints were sent for the whole planned time."""
+    """Whether the whole plan was sent; a stop on the way is encoded apart, with indices of its own."""
     begin, end = reference_span(record)
-    period = np.median(np.diff(record.setpoints.due)) if len(record.setpoints.due) > 1 else 0.0
-    return bool(end - begin >= record.header.travel_time - 2 * period)
+    due, index = record.setpoints.due, record.setpoints.index
+    if len(due) < 2 or math.isnan(end):
+        return False
+    period = float(np.median(np.diff(due)))
+    least = record.header.travel_time - 2 * period
+    return end - begin >= least and bool(index[due == end][0] * period >= least)
 
 
 def pose_gaps(times: NDArray) -> NDArray:

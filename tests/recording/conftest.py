@@ -110,14 +110,16 @@ def flight_messages(seed: int = 0) -> list[Telemetry]:
             VehicleStatus(t, tuple(rate[i]), tuple(int(m) for m in motors[i]), voltage[i], 0b11011 if flying[i] else 1)
         )
     wanted = np.arange(STREAM, STREAM + TRAVEL + HOLD, 0.01)
-    place, velocity, acceleration = reference(wanted - STREAM)
+    late = 0.0002 + np.abs(rng.normal(0, 0.0002, len(wanted)))
+    late[400:402] = 0.012, 0.0025
+    rows = np.round((wanted - STREAM + late) * 100).astype(int)  # a late packet carries the state of its own time
+    place, velocity, acceleration = reference(rows / 100)
     asked = attitude(acceleration)
     for i, t in enumerate(MONOTONIC + wanted):
-        late = {400: 0.012, 401: 0.0025}.get(i, 0.0002 + abs(rng.normal(0, 0.0002)))
         messages.append(
             SetpointSent(
-                t + late, t, min(i, 1000), tuple(place[i]), tuple(velocity[i]), tuple(acceleration[i]),
-                tuple(asked[i]), (0.0, 0.0, 0.0),
+                t + late[i], t, int(min(rows[i], 100 * TRAVEL)), tuple(place[i]), tuple(velocity[i]),
+                tuple(acceleration[i]), tuple(asked[i]), (0.0, 0.0, 0.0),
             )
         )  # fmt: skip
     entries = [

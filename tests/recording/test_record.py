@@ -347,7 +347,7 @@ def with_a_header_of(text):
         (lambda path: path.write_bytes(b"\x89MCAP0\r\n"), "before its header"),
         (lambda path: path.write_bytes(b"\x89MC"), "before its header"),
         (foreign_mcap, "profile is 'ros2'"),
-        (of_a_later_format, "format 99"),
+        (of_a_later_format, "format '99'"),
         (with_a_header_of("{}"), "header cannot be read"),
         (with_a_header_of("["), "header cannot be read"),
         (with_a_header_of("[" * 100_000), "header cannot be read"),

@@ -104,6 +104,24 @@ def test_a_path_that_was_not_finished_has_no_travel_time(flight):
     assert summary.max_deviation == pytest.approx(0.0, abs=1e-9)
 
 
+def test_a_setpoint_sent_late_with_the_state_of_its_own_time_is_no_deviation(flight):
+    record = straight_flight(flight.header)
+    setpoints = record.setpoints
+    time, position = setpoints.time.copy(), setpoints.position.copy()
+    time[150], position[150] = setpoints.due[151] + 0.002, setpoints.position[151]
+    late = dataclasses.replace(record, setpoints=dataclasses.replace(setpoints, time=time, position=position))
+    assert summarise(late).max_deviation == pytest.approx(0.0, abs=1e-9)
+    assert summarise(late).lateness_max == pytest.approx(0.012)
+
+
+def test_a_stop_on_the_way_does_not_finish_the_path_however_long_it_takes(flight):
+    record = straight_flight(flight.header)
+    index = record.setpoints.index.copy()
+    index[390:] -= 390  # the stop, encoded apart
+    stopped = dataclasses.replace(record, setpoints=dataclasses.replace(record.setpoints, index=index))
+    assert math.isnan(summarise(stopped).travel_time_flown)
+
+
 def test_peaks_lateness_and_battery_are_those_of_the_streams(flight):
     summary = summarise(straight_flight(flight.header))
     assert summary.peak_speed == pytest.approx(0.5)
