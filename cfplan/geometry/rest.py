@@ -1,7 +1,7 @@
 """Rest at both ends, and continuity, for paths whose source has neither to the letter.
 
 A source that moves at its ends, or only stops there, is re-timed: p(σ(s)) with σ = s, shifted, away from the ends and
-σ' = L·I_u(a, 5) near them, where u = s / L and I is the regularised incomplete beta function. That is a polynomial,
+σ' = I_u(a, 5) near them, where u = s / L and I is the regularised incomplete beta function. That is a polynomial,
 monotone, C⁵ where it meets σ' = 1, and with σ' ~ s^a at the end; a = 3 takes γ', γ'', γ''' to 0 from any motion and
 a = 1 from rest with an acceleration. The curve in space stays as it is. The composition is again kept as piecewise
 polynomials: on pieces this short its Taylor series reaches the limit of double precision in a few terms.
@@ -97,13 +97,7 @@ def _warped(durations: NDArray, table: NDArray, flatness: int, most: float) -> t
     reach = np.polynomial.polynomial.polyval(1.0, sigma)  # σ(L) / L
     breaks = np.concatenate([[0.0], np.cumsum(durations)])
     length = min(WARP, most / reach)
-    u = np.linspace(0.0, 1.0, _WARP_PIECES + 1)
-    inner = breaks[(breaks > 1e-9) & (breaks < length * reach * (1 - 1e-9))]
-    joints = _inverse(sigma, inner / length)
-    if len(joints):  # pieces far shorter than the others would cost digits
-        apart = np.abs(u[:, None] - joints).min(axis=1) > 0.25 / _WARP_PIECES
-        apart[[0, -1]] = True
-        u = np.sort(np.concatenate([u[apart], joints]))
+    u = _warp_grid(sigma, breaks / length)
 
     pieces = []
     for start in u[:-1]:
@@ -126,6 +120,18 @@ def _warped(durations: NDArray, table: NDArray, flatness: int, most: float) -> t
         np.concatenate([np.diff(u) * length, rest_durations]),
         np.concatenate([padded(np.array(pieces), count), padded(rest, count)]),
     )
+
+
+def _warp_grid(sigma: NDArray, breaks: NDArray) -> NDArray:
+    """u from 0 to 1 between the pieces of the re-timed stretch, at every break (in units of L) that lies in it."""
+    u = np.linspace(0.0, 1.0, _WARP_PIECES + 1)
+    reach = np.polynomial.polynomial.polyval(1.0, sigma)
+    joints = _inverse(sigma, breaks[(breaks > 0.0) & (breaks < reach * (1 - 1e-9))])
+    if not len(joints):
+        return u
+    apart = np.abs(u[:, None] - joints).min(axis=1) > 0.25 / _WARP_PIECES  # far shorter pieces would cost digits
+    apart[[0, -1]] = True
+    return np.sort(np.concatenate([u[apart], joints]))
 
 
 def _warp(flatness: int) -> NDArray:
