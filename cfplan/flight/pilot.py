@@ -74,12 +74,12 @@ class Pilot:
         source: PoseSource,
         report: Callable[[Telemetry], None],
         orders: OrdersFrom,
-        before_arming: Callable[[], None] = lambda: None,
+        quieten: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
         self._mission, self._connect, self._source = mission, connect, source
-        self._report, self._orders, self._before_arming = report, orders, before_arming
+        self._report, self._orders, self._quieten = report, orders, quieten
         self._limits, self._now, self._sleep = mission.limits, clock, sleep
         self._plan = Stream(mission.payloads, mission.rate)
         self._watch = Watch(mission.limits)
@@ -147,10 +147,10 @@ class Pilot:
         self._until(lambda: self._link.estimate is not None and self._link.status is not None, 3.0)
         if self._link.estimate is None or self._link.status is None:
             raise InputError("the vehicle sends no log", where=self._link.uri, hint="restart the vehicle")
+        self._quieten()
         self._feed()
         self._converge()
         self._preflight(parameters)
-        self._before_arming()
         self._enter(Phase.ARM)
         self._restart_pace()
         self._floor = self._pose().position[2]

@@ -167,7 +167,7 @@ def _run(
             source=pose_source,
             report=report,
             orders=orders,
-            before_arming=_quieten,
+            quieten=_quieten,
         )
         last = pilot.fly()
     except CfplanError as error:
