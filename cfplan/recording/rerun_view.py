@@ -64,7 +64,7 @@ def show(record: Record) -> None:
         raise InputError("there is no screen to open the viewer on", hint="save the recording: --save flight.rrd")
     with rr.RecordingStream(APPLICATION) as stream:
         # not the `rerun` found by name: that is absent where the environment is not activated
-        viewer = Path(rerun_cli.__file__).with_name("rerun")
+        viewer = Path(rerun_cli.__file__).with_name("rerun.exe" if sys.platform == "win32" else "rerun")
         rr.spawn(
             hide_welcome_screen=True,
             executable_path=str(viewer),

@@ -106,13 +106,23 @@ def summarise(record: Record) -> FlightSummary:
 
 
 def reference_span(record: Record) -> tuple[float, float]:
-    """s, the deadlines of the first and the last setpoint of the phase `stream`; NaN where there is none."""
-    due = record.setpoints.due
+    """s, from the first deadline of the phase `stream` over the planned time, at most until its last deadline.
+
+    What is streamed longer is the hover behind the end of the path. NaN where nothing was streamed.
+    """
+    due = _streamed(record)
+    if len(due) == 0:
+        return math.nan, math.nan
+    begin = float(due[0])
+    return begin, min(begin + record.header.travel_time, float(due[-1]))
+
+
+def _streamed(record: Record) -> NDArray:
+    """The deadlines of the phase `stream`."""
     span = record.phase_span(Phase.STREAM)
     if span is None:
-        return math.nan, math.nan
-    streamed = due[(record.setpoints.time >= span[0]) & (due <= span[1])]
-    return (float(streamed[0]), float(streamed[-1])) if len(streamed) else (math.nan, math.nan)
+        return np.empty(0)
+    return record.setpoints.due[(record.setpoints.time >= span[0]) & (record.setpoints.due <= span[1])]
 
 
 def reference_times(setpoints: Setpoints) -> NDArray:
@@ -167,10 +177,9 @@ def settling(record: Record) -> float:
     """
     _, end = reference_span(record)
     held = record.phase_span(Phase.HOLD)
-    due = record.setpoints.due
     if not finished(record) or held is None:
         return math.nan
-    goal = record.setpoints.position[np.flatnonzero(due == end)[0]]
+    goal = record.setpoints.position[np.searchsorted(record.setpoints.due, _streamed(record)[-1])]
     after = (record.poses.time >= end) & (record.poses.time <= max(held[1], end))
     time, position = record.poses.time[after], record.poses.position[after]
     outside = np.flatnonzero(~(np.linalg.norm(position - goal, axis=1) <= SETTLED))
@@ -181,13 +190,13 @@ def settling(record: Record) -> float:
 
 def finished(record: Record) -> bool:
     """Whether the whole plan was sent; a stop on the way is encoded apart, with indices of its own."""
-    begin, end = reference_span(record)
-    due, index = record.setpoints.due, record.setpoints.index
-    if len(due) < 2 or math.isnan(end):
+    due = _streamed(record)
+    if len(due) < 2:
         return False
     period = float(np.median(np.diff(due)))
+    last = int(record.setpoints.index[np.searchsorted(record.setpoints.due, due[-1])])
     least = record.header.travel_time - 2 * period
-    return end - begin >= least and bool(index[due == end][0] * period >= least)
+    return bool(due[-1] - due[0] >= least and last * period >= least)
 
 
 def pose_gaps(times: NDArray) -> NDArray:

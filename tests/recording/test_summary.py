@@ -20,7 +20,9 @@ BEGIN, TRAVEL, HELD = 100.0, 4.0, 2.0  # s
 SPEED = 0.5  # m/s, along x
 
 
-def straight_flight(header, *, lag=0.0, aside=0.0, end_error=lambda t: 0.0 * t, sent_until=math.inf) -> Record:
+def straight_flight(
+    header, *, lag=0.0, aside=0.0, end_error=lambda t: 0.0 * t, sent_until=math.inf, hover=0.0
+) -> Record:
     """A flight along x at SPEED, its end held; poses lag behind by `lag` s, fly `aside` m in y, and end off in z."""
     due = np.arange(BEGIN, min(BEGIN + TRAVEL + HELD + 1e-9, sent_until), 0.01)
     where = np.clip(due - BEGIN, 0, TRAVEL) * SPEED
@@ -29,6 +31,7 @@ def straight_flight(header, *, lag=0.0, aside=0.0, end_error=lambda t: 0.0 * t, 
     flown = np.clip(time - BEGIN - lag, 0, TRAVEL) * SPEED
     after = np.where(time >= BEGIN + TRAVEL, end_error(time - BEGIN - TRAVEL), 0.0)
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(due), 1))
+    last = BEGIN + TRAVEL + hover + 0.005  # s, when the pilot goes from streaming to holding
     return Record(
         folder=None,
         header=dataclasses.replace(
@@ -50,7 +53,7 @@ def straight_flight(header, *, lag=0.0, aside=0.0, end_error=lambda t: 0.0 * t, 
             np.zeros(len(due), int),
         ),
         phases=columns.Phases(
-            np.array([BEGIN - 0.5, BEGIN - 0.1, BEGIN + TRAVEL + 0.005, BEGIN + TRAVEL + HELD]),
+            np.array([BEGIN - 0.5, BEGIN - 0.1, last, BEGIN + TRAVEL + HELD]),
             np.array(["arm", "stream", "hold", "land"]),
         ),
         events=columns.Events(np.empty(0), np.empty(0, str), np.empty(0, str)),
@@ -78,6 +81,13 @@ def test_a_perfect_flight_takes_its_planned_time(flight):
     summary = summarise(straight_flight(flight.header))
     assert (summary.travel_time_planned, summary.settling) == (TRAVEL, 0.0)
     assert summary.travel_time_flown == pytest.approx(TRAVEL, abs=1e-9)
+
+
+def test_the_hover_streamed_behind_the_end_is_no_travel_time(flight):
+    record = straight_flight(flight.header, hover=0.8, end_error=lambda t: np.where(t < 0.3, 0.08, 0.02))
+    summary = summarise(record)
+    assert summary.settling == pytest.approx(0.3, abs=0.006)
+    assert summary.travel_time_flown == pytest.approx(TRAVEL + 0.3, abs=0.006)
 
 
 @pytest.mark.parametrize("moment", [0.2, 0.75, 1.5])
