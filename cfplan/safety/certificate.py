@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.safety.limits import PlanLimits
@@ -140,10 +141,8 @@ def _norm(vectors: NDArray) -> NDArray:
 
 
 def _margin(quantity: _Quantity, trajectory: Trajectory, state: FullState, first: NDArray) -> Margin:
-    rows = np.atleast_2d(quantity.sign * quantity.values)
-    bounds = _between(rows, first)
-    index = int(np.argmax(bounds)) % bounds.shape[1]  # argmax takes the first NaN for the largest
-    worst = quantity.sign * float(bounds[:, index].max())
+    index, peak = _peak(np.ascontiguousarray(np.atleast_2d(quantity.sign * quantity.values)), first)
+    worst = quantity.sign * peak
     room = quantity.limit - quantity.at_rest
     share = (worst - quantity.at_rest) / room if room * quantity.sign > 0 else np.inf
     place = float(state.s[index])
@@ -184,14 +183,28 @@ def _samples(trajectory: Trajectory) -> tuple[NDArray, NDArray, NDArray]:
     return s, interval[piece], first
 
 
-def _between(rows: NDArray, first: NDArray) -> NDArray:
-    """(k, N): each sample's value, plus what may rise above it towards its neighbours in the same piece."""
-    last = np.r_[first[1:], True]
-    sag = np.zeros_like(rows)
-    sag[:, 1:-1] = 2.0 * rows[:, 1:-1] - rows[:, :-2] - rows[:, 2:]
-    starts, ends = np.flatnonzero(first), np.flatnonzero(last)
-    sag[:, starts], sag[:, ends] = sag[:, starts + 1], sag[:, ends - 1]
-    near = np.maximum(sag, 0.0)
-    near[:, 1:] = np.maximum(near[:, 1:], np.where(first[1:], 0.0, sag[:, :-1]))
-    near[:, :-1] = np.maximum(near[:, :-1], np.where(last[:-1], 0.0, sag[:, 1:]))
-    return rows + _ALLOWANCE * near
+@njit(cache=True)
+def _peak(rows: NDArray, first: NDArray) -> tuple[int, float]:
+    """Index of the largest of (k, N) values, and that value with what may rise above it between samples.
+
+    NaN counts as larger than everything.
+    """
+    size = rows.shape[1]
+    index, peak = 0, -np.inf
+    for row in rows:
+        sag = 0.0  # of the sample before
+        for n in range(size):
+            starts, ends = first[n], n + 1 == size or first[n + 1]
+            middle = n + 1 if starts else n - 1 if ends else n  # a second difference needs both neighbours
+            here = 2.0 * row[middle] - row[middle - 1] - row[middle + 1]
+            rise = max(here, 0.0) if starts else max(here, sag, 0.0)
+            # Between this sample and the one before, and between it and the next, its own sag is in both.
+            bound = row[n] + _ALLOWANCE * rise
+            if not starts:
+                bound = max(bound, row[n - 1] + _ALLOWANCE * rise)
+            if not bound <= peak:
+                index, peak = n, bound
+                if np.isnan(bound):
+                    return index, peak
+            sag = here
+    return index, peak

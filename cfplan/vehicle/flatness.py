@@ -1,17 +1,36 @@
 """The flatness map: path derivatives, speed profile and yaw to the full state and the motor thrusts.
 
-Written once, in plain arithmetic on the components of vectors, so that numpy arrays (trajectory, certificate)
-and CasADi symbols (expert) go through the same equations. Equations: DESIGN section 4; body rates of the Hopf
-fibration after Watterson and Kumar, "Control of quadrotors using the Hopf fibration on SO(3)" (2017); drag after
-Faessler, Franchi and Scaramuzza (2018), exact here because drag is equal along body x and y.
+Written once, in plain arithmetic on the components of vectors, so that numbers compiled by numba (trajectory,
+certificate) and CasADi symbols (expert) go through the same equations. Equations:
+DESIGN section 4; body rates of the Hopf fibration after Watterson and Kumar, "Control of quadrotors using the Hopf
+fibration on SO(3)" (2017); drag after Faessler, Franchi and Scaramuzza (2018), exact here because drag is equal along
+body x and y.
 """
 
+import math
 from typing import Any, NamedTuple
 
-from cfplan.vehicle.airframe import GRAVITY, MOTOR_TORQUE_SIGNS, Airframe
+import numpy as np
+from numba import njit
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from cfplan.geometry.path import Path
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.profile import SpeedProfile
 
 Scalar = Any  # float, NDArray or casadi.SX
 Vector = tuple[Scalar, Scalar, Scalar]
+
+
+class Body(NamedTuple):
+    """What the map needs of an airframe, in a form that compiles; fields as in Airframe."""
+
+    mass: Scalar
+    inertia: Vector
+    arm: Scalar
+    thrust_to_torque: Scalar
+    drag: tuple[Scalar, Scalar]
 
 
 class Flat(NamedTuple):
@@ -35,22 +54,35 @@ class Flat(NamedTuple):
     # N
 
 
-def _combine(*terms: tuple[Scalar, Vector]) -> Vector:
-    x, y, z = (sum(weight * vector[axis] for weight, vector in terms) for axis in range(3))
-    return x, y, z
+@register_jitable
+def _scaled(a: Scalar, u: Vector) -> Vector:
+    return a * u[0], a * u[1], a * u[2]
 
 
+@register_jitable
+def _sum2(a: Scalar, u: Vector, b: Scalar, v: Vector) -> Vector:
+    return a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2]
+
+
+@register_jitable
+def _sum3(a: Scalar, u: Vector, b: Scalar, v: Vector, c: Scalar, w: Vector) -> Vector:
+    return a * u[0] + b * v[0] + c * w[0], a * u[1] + b * v[1] + c * w[1], a * u[2] + b * v[2] + c * w[2]
+
+
+@register_jitable
 def _dot(a: Vector, b: Vector) -> Scalar:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+@register_jitable
 def motion(d1: Vector, d2: Vector, h: Scalar, dh: Scalar) -> tuple[Vector, Vector]:
     """Velocity and acceleration from γ', γ'', h, h'."""
-    return _combine((h**0.5, d1)), _combine((h, d2), (0.5 * dh, d1))
+    return _scaled(h**0.5, d1), _sum2(h, d2, 0.5 * dh, d1)
 
 
+@register_jitable
 def flat_state(
-    airframe: Airframe,
+    airframe: Airframe | Body,
     derivatives: tuple[Vector, Vector, Vector, Vector],
     h: tuple[Scalar, Scalar, Scalar, Scalar],
     yaw: tuple[Scalar, Scalar, Scalar],
@@ -66,25 +98,25 @@ def flat_state(
     speed = h0**0.5  # ds/dt
 
     velocity, acceleration = motion(d1, d2, h0, h1)
-    acceleration_ds = _combine((h0, d3), (1.5 * h1, d2), (0.5 * h2, d1))
-    acceleration_dds = _combine((h0, d4), (2.5 * h1, d3), (2.0 * h2, d2), (0.5 * h3, d1))
-    jerk = _combine((speed, acceleration_ds))
-    snap = _combine((h0, acceleration_dds), (0.5 * h1, acceleration_ds))
+    acceleration_ds = _sum3(h0, d3, 1.5 * h1, d2, 0.5 * h2, d1)
+    acceleration_dds = _sum2(1.0, _sum3(h0, d4, 2.5 * h1, d3, 2.0 * h2, d2), 0.5 * h3, d1)
+    jerk = _scaled(speed, acceleration_ds)
+    snap = _sum2(h0, acceleration_dds, 0.5 * h1, acceleration_ds)
 
     # Force over mass that the rotors must give: drag along body x and y is that of the whole velocity, and what
     # drag along the thrust axis differs by only changes the collective thrust.
     drag, axial_drag = airframe.drag[0] / airframe.mass, airframe.drag[1] / airframe.mass
-    force = _combine((1.0, acceleration), (drag, velocity))
+    force = _sum2(1.0, acceleration, drag, velocity)
     force = (force[0], force[1], force[2] + GRAVITY)
-    force_dt = _combine((1.0, jerk), (drag, acceleration))
-    force_ddt = _combine((1.0, snap), (drag, jerk))
+    force_dt = _sum2(1.0, jerk, drag, acceleration)
+    force_ddt = _sum2(1.0, snap, drag, jerk)
 
     norm = _dot(force, force) ** 0.5
-    axis = _combine((1.0 / norm, force))
+    axis = _scaled(1.0 / norm, force)
     norm_dt = _dot(axis, force_dt)
-    axis_dt = _combine((1.0 / norm, force_dt), (-norm_dt / norm, axis))
+    axis_dt = _sum2(1.0 / norm, force_dt, -norm_dt / norm, axis)
     norm_ddt = _dot(axis, force_ddt) + norm * _dot(axis_dt, axis_dt)
-    axis_ddt = _combine((1.0 / norm, force_ddt), (-2.0 * norm_dt / norm, axis_dt), (-norm_ddt / norm, axis))
+    axis_ddt = _sum3(1.0 / norm, force_ddt, -2.0 * norm_dt / norm, axis_dt, -norm_ddt / norm, axis)
     specific_thrust = norm + (axial_drag - drag) * _dot(axis, velocity)
 
     psi, psi_ds, psi_dds = yaw
@@ -120,15 +152,103 @@ def flat_state(
     )
 
 
-def motor_thrusts(airframe: Airframe, collective: Scalar, torque: Vector) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+@register_jitable
+def motor_thrusts(
+    airframe: Airframe | Body, collective: Scalar, torque: Vector
+) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Thrust of motors 1 to 4, N, that gives the collective thrust, N, and the torque, N m."""
     roll, pitch, yaw = (
         torque[0] / (4.0 * airframe.arm),
         torque[1] / (4.0 * airframe.arm),
         torque[2] / (4.0 * airframe.thrust_to_torque),
     )
-    one, two, three, four = (
-        0.25 * collective + float(sx) * roll + float(sy) * pitch + float(sz) * yaw
-        for sx, sy, sz in MOTOR_TORQUE_SIGNS.T
+    share = 0.25 * collective  # the signs are those of MOTOR_TORQUE_SIGNS
+    return (
+        share - roll - pitch - yaw,
+        share - roll + pitch + yaw,
+        share + roll + pitch - yaw,
+        share + roll - pitch + yaw,
     )
-    return one, two, three, four
+
+
+COLUMNS: dict[str, slice | int] = {
+    "position": slice(0, 3), "velocity": slice(3, 6), "acceleration": slice(6, 9), "jerk": slice(9, 12),
+    "snap": slice(12, 15), "thrust_axis": slice(15, 18), "body_rate": slice(18, 21),
+    "angular_acceleration": slice(21, 24), "torque": slice(24, 27), "motor_thrust": slice(27, 31),
+    "quaternion": slice(31, 35), "yaw": 35, "specific_thrust": 36,
+}  # fmt: skip
+WIDTH = 37
+
+
+def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray, interval: NDArray) -> NDArray:
+    """(N, WIDTH), laid out as COLUMNS says: position, the full state, and the attitude at each s, (N,).
+
+    `interval` tells whose polynomials of the profile hold; a break of the path belongs to the piece on its right.
+    """
+    out = np.empty((len(s), WIDTH))
+    (jx, jy, jz), (planar, axial) = airframe.inertia, airframe.drag
+    body = Body(
+        float(airframe.mass), (float(jx), float(jy), float(jz)), float(airframe.arm),
+        float(airframe.thrust_to_torque), (float(planar), float(axial)),
+    )  # fmt: skip
+    piece = np.clip(np.searchsorted(path.breaks, s, side="right") - 1, 0, len(path.breaks) - 2)
+    offset = s - np.where(piece == len(path.breaks) - 2, path.breaks[-1], path.breaks[piece])
+    _fill(
+        out, body, path.coefficients, piece, offset, s - profile.s[interval], interval,
+        profile.h, profile.dh, profile.ddh, profile.dddh, profile.yaw, profile.dyaw, profile.ddyaw,
+    )  # fmt: skip
+    return out
+
+
+# Here and not in a file of its own, because numba's cache only notices changes of the file that a function stands in.
+@njit(cache=True, error_model="numpy")
+def _fill(
+    out: NDArray, body: Body, coefficients: NDArray, pieces: NDArray, offsets: NDArray, places: NDArray,
+    intervals: NDArray, h: NDArray, dh: NDArray, ddh: NDArray, dddh: NDArray, yaw: NDArray, dyaw: NDArray,
+    ddyaw: NDArray,
+) -> None:  # fmt: skip
+    power = coefficients.shape[1]
+    for n in range(len(out)):
+        table, x = coefficients[pieces[n]], offsets[n]
+        # Horner's scheme for the value and four derivatives over their factorials
+        p0 = p1 = p2 = p3 = p4 = (0.0, 0.0, 0.0)
+        for k in range(power - 1, -1, -1):
+            p4, p3, p2, p1 = _sum2(x, p4, 1.0, p3), _sum2(x, p3, 1.0, p2), _sum2(x, p2, 1.0, p1), _sum2(x, p1, 1.0, p0)
+            p0 = _sum2(x, p0, 1.0, (table[k, 0], table[k, 1], table[k, 2]))
+        i, x = intervals[n], places[n]
+        psi = yaw[i] + x * (dyaw[i] + x * ddyaw[i] / 2)
+        flat = flat_state(
+            body,
+            (p1, _scaled(2.0, p2), _scaled(6.0, p3), _scaled(24.0, p4)),
+            (
+                h[i] + x * (dh[i] + x * (ddh[i] / 2 + x * dddh[i] / 6)),
+                dh[i] + x * (ddh[i] + x * dddh[i] / 2),
+                ddh[i] + x * dddh[i],
+                dddh[i],
+            ),
+            (psi, dyaw[i] + x * ddyaw[i], ddyaw[i]),
+            math.cos,
+            math.sin,
+        )
+        row = out[n]
+        for k in range(3):
+            row[k] = p0[k]
+            row[3 + k] = flat.velocity[k]
+            row[6 + k] = flat.acceleration[k]
+            row[9 + k] = flat.jerk[k]
+            row[12 + k] = flat.snap[k]
+            row[15 + k] = flat.thrust_axis[k]
+            row[18 + k] = flat.body_rate[k]
+            row[21 + k] = flat.angular_acceleration[k]
+            row[24 + k] = flat.torque[k]
+        for k in range(4):
+            row[27 + k] = flat.motor_thrust[k]
+        # The least turn from the vertical to the thrust axis, after a turn by yaw.
+        a, b, c = flat.thrust_axis
+        cos, sin, norm = math.cos(psi / 2), math.sin(psi / 2), math.sqrt(2.0 * (1.0 + c))
+        row[31] = (a * sin - b * cos) / norm
+        row[32] = (a * cos + b * sin) / norm
+        row[33] = sin * norm / 2
+        row[34] = cos * norm / 2
+        row[35] = psi
+        row[36] = flat.specific_thrust

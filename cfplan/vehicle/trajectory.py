@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from cfplan.errors import NotCertifiedError
 from cfplan.geometry.path import Path
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.flatness import flat_state
+from cfplan.vehicle.flatness import COLUMNS, flat_states
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import Timing, measure
 
@@ -106,43 +106,10 @@ def state_at(
     interval: NDArray | None = None,
 ) -> FullState:
     """The full state at s, (N,), by the polynomials of `interval` where given (see SpeedProfile.at)."""
-    sample = profile.at(s, interval)
-    position = path(s)
-    derivatives = [path(s, order) for order in (1, 2, 3, 4)]
-    flat = flat_state(
-        airframe,
-        tuple((d[:, 0], d[:, 1], d[:, 2]) for d in derivatives),  # type: ignore[arg-type]
-        (sample.h, sample.dh, sample.ddh, sample.dddh),
-        (sample.yaw, sample.dyaw, sample.ddyaw),
-        np.cos,
-        np.sin,
-    )
-    axis = np.stack(flat.thrust_axis, axis=-1)
-    return FullState(
-        time=time,
-        s=s,
-        position=position,
-        velocity=np.stack(flat.velocity, axis=-1),
-        acceleration=np.stack(flat.acceleration, axis=-1),
-        jerk=np.stack(flat.jerk, axis=-1),
-        snap=np.stack(flat.snap, axis=-1),
-        quaternion=hopf_quaternion(axis, sample.yaw),
-        yaw=sample.yaw,
-        body_rate=np.stack(flat.body_rate, axis=-1),
-        angular_acceleration=np.stack(flat.angular_acceleration, axis=-1),
-        torque=np.stack(flat.torque, axis=-1),
-        specific_thrust=flat.specific_thrust,
-        thrust_axis=axis,
-        motor_thrust=np.stack(flat.motor_thrust, axis=-1),
-    )
-
-
-def hopf_quaternion(axis: NDArray, yaw: NDArray) -> NDArray:
-    """(N, 4) x y z w: the least turn from the vertical to `axis`, (N, 3) unit, after a turn by yaw, (N,)."""
-    a, b, c = axis[:, 0], axis[:, 1], axis[:, 2]
-    cos, sin = np.cos(yaw / 2), np.sin(yaw / 2)
-    norm = np.sqrt(2.0 * (1.0 + c))
-    return np.stack([(-b * cos + a * sin) / norm, (a * cos + b * sin) / norm, sin * norm / 2, cos * norm / 2], axis=-1)
+    if interval is None:
+        interval = profile.interval(s)
+    table = flat_states(airframe, path, profile, s, interval)
+    return FullState(time=time, s=s, **{name: table[:, columns] for name, columns in COLUMNS.items()})
 
 
 def _hover(state: FullState, rows: NDArray, airframe: Airframe) -> None:
@@ -151,4 +118,5 @@ def _hover(state: FullState, rows: NDArray, airframe: Airframe) -> None:
     state.specific_thrust[rows] = GRAVITY
     state.motor_thrust[rows] = airframe.hover_thrust
     state.thrust_axis[rows] = (0.0, 0.0, 1.0)
-    state.quaternion[rows] = hopf_quaternion(state.thrust_axis[rows], state.yaw[rows])
+    half = state.yaw[rows] / 2
+    state.quaternion[rows] = np.stack([0.0 * half, 0.0 * half, np.sin(half), np.cos(half)], axis=-1)
