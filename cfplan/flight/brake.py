@@ -3,7 +3,7 @@
 From the setpoint that is due, the clock of the trajectory runs slower and slower until it stands: the vehicle brakes
 on the path itself, where it was certified to be, and ends level at rest. With r the rate of that clock,
 
-    v = r v₀,   a = r² a₀ + ṙ v₀,   attitude from a + g and yaw,   body rates from the turn between attitudes.
+    v = r v₀,   a = r² a₀ + ṙ v₀,   attitude from a + g and heading,   body rates from the turn between attitudes.
 
 r falls as a smoothstep, so the braking deceleration is at most 1.5 v₀ / duration.
 """
@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cfplan.flight.encoding import command_quaternion, controller_attitude
+from cfplan.flight.encoding import RATE_LEAD, command_quaternion, controller_attitude
 from cfplan.flight.packets import FullStateSetpoints, decode, encode
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.trajectory import hopf_quaternion
 
 DURATION = 0.8  # s, from full speed to rest: 3.75 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
@@ -39,11 +38,13 @@ def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION) -> 
 
     velocity = at(reference.velocity)
     acceleration = clock_rate[:, None] ** 2 * at(reference.acceleration) + slowing[:, None] * velocity
-    force = acceleration + _GRAVITY
-    axis = force / np.linalg.norm(force, axis=-1, keepdims=True)
+    turn = at(np.unwrap(_heading(reference.quaternion))[:, None])[..., 0].reshape(-1)
+    zero = np.zeros_like(turn)
+    headed = np.stack([zero, zero, np.sin(turn / 2), np.cos(turn / 2)], axis=1)
+    made = controller_attitude(acceleration.reshape(-1, 3) + _GRAVITY, headed)
+    attitude = Rotation.from_matrix(made).as_quat()
     shape = (len(payloads), steps + 1)
-    attitude = hopf_quaternion(axis.reshape(-1, 3), at(_hopf_yaw(reference)[:, None]).reshape(-1))
-    body_rate = _turn_rates(attitude.reshape(*shape, 4), rate)
+    body_rate = _ahead(_turn_rates(attitude.reshape(*shape, 4), rate), RATE_LEAD * rate)
     body_rate[:, -1] = 0.0  # the vehicle may be left with the last setpoint
     return encode(
         FullStateSetpoints(
@@ -56,11 +57,18 @@ def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION) -> 
     ).reshape(*shape, -1)
 
 
-def _hopf_yaw(reference: FullStateSetpoints) -> NDArray:
-    """(N,) rad, not wrapped: yaw of the attitudes that the controller makes of the setpoints, less their tilt."""
-    made = controller_attitude(reference.acceleration + _GRAVITY, reference.quaternion)
-    quaternion = Rotation.from_matrix(made).as_quat()
-    return np.unwrap(2.0 * np.arctan2(quaternion[:, 2], quaternion[:, 3]))
+def _heading(quaternion: NDArray) -> NDArray:
+    """(N,) rad, all that the controller takes from quaternions (N, 4)."""
+    x, y, z, w = quaternion.T
+    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _ahead(values: NDArray, by: float) -> NDArray:
+    """(..., M, 3) rows from `by` rows later on; the last holds."""
+    place = np.minimum(np.arange(values.shape[-2]) + by, values.shape[-2] - 1.0)
+    row = place.astype(int)
+    after = np.minimum(row + 1, values.shape[-2] - 1)
+    return values[..., row, :] + (place - row)[:, None] * (values[..., after, :] - values[..., row, :])
 
 
 def _turn_rates(quaternion: NDArray, rate: float) -> NDArray:

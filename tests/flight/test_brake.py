@@ -64,7 +64,8 @@ def test_body_rates_are_those_of_the_attitudes_that_the_controller_makes(circle)
     made = controller_attitude(stop.acceleration + np.array([0.0, 0.0, GRAVITY]), stop.quaternion)
     turn = np.swapaxes(made[:-8], 1, 2) @ made[8:]  # over 80 ms, so that the quaternion's rounding is small
     rate = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
-    assert rate / 2.0 / 0.08 == pytest.approx(stop.body_rate[4:-4], abs=0.35)
+    ahead = (stop.body_rate[3:-5] + stop.body_rate[2:-6]) / 2.0  # sent 15 ms ahead
+    assert rate / 2.0 / 0.08 == pytest.approx(ahead, abs=0.35)
 
 
 def test_a_stop_at_the_end_of_the_plan_does_not_run_past_it(circle):

@@ -1,0 +1,66 @@
+"""A vehicle that cannot be reached is an error with a hint, soon."""
+
+import time
+
+import pytest
+from cflib.crtp.crtpdriver import CRTPDriver
+from cflib.crtp.exceptions import WrongUriType
+
+from cfplan.errors import LinkError
+from cfplan.flight.link import connect
+
+
+class SilentDriver(CRTPDriver):
+    """Connects, and then nothing ever comes."""
+
+    needs_resending = False
+
+    def connect(self, uri, statistics, error):
+        if not uri.startswith("silent://"):
+            raise WrongUriType("not mine")
+
+    def send_packet(self, packet):
+        pass
+
+    def receive_packet(self, wait=0):
+        time.sleep(max(wait, 0.0))
+
+    def close(self):
+        pass
+
+
+class BrokenDriver(SilentDriver):
+    """Cannot even open."""
+
+    def connect(self, uri, statistics, error):
+        if not uri.startswith("broken://"):
+            raise WrongUriType("not mine")
+        raise OSError("the wire is cut")
+
+
+@pytest.mark.parametrize(
+    ("uri", "what"),
+    [
+        ("silent://0", "nothing answers"),
+        ("broken://0", "the wire is cut"),
+        ("nonsense", "No driver found"),
+        ("radio://0/80/2M/E7E7E7E7E7", "cannot connect"),
+        ("udp://127.0.0.1:9", "cannot connect|nothing answers"),
+    ],
+)
+def test_an_unreachable_uri_is_refused_within_five_seconds(uri, what):
+    began = time.monotonic()
+    with pytest.raises(LinkError, match=what) as caught:
+        connect(uri, lambda message: None, [SilentDriver, BrokenDriver])
+    assert time.monotonic() - began < 5.0
+    assert caught.value.where == uri
+    assert caught.value.hint
+    assert "\n" not in str(caught.value)
+
+
+def test_waiting_can_be_given_up():
+    def give_up():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        connect("silent://0", lambda message: None, [SilentDriver], waiting=give_up)
