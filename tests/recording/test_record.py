@@ -11,7 +11,7 @@ from datetime import datetime
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -23,6 +23,7 @@ from cfplan.recording.reader import read_record
 from cfplan.recording.topics import TOPICS, columns_from_json, message_to_json
 from cfplan.recording.writer import RecordWriter, new_record_folder
 
+patiently = settings(deadline=None)  # files and threads take as long as a busy machine lets them
 STREAMS = [(topic.stream, topic.message) for topic in TOPICS]
 
 
@@ -148,6 +149,7 @@ def read_or_error(file):
         return error
 
 
+@patiently
 @given(cut=st.data())
 def test_a_file_cut_anywhere_gives_its_whole_chunks_or_an_error(several_chunks, tmp_path_factory, cut):
     data, steps = several_chunks
@@ -165,6 +167,7 @@ def test_a_file_cut_anywhere_gives_its_whole_chunks_or_an_error(several_chunks, 
         np.testing.assert_array_equal(record.phases.time, np.arange(len(record.phases.time), dtype=float))
 
 
+@patiently
 @given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
 def test_a_damaged_byte_never_gives_wrong_messages(several_chunks, tmp_path_factory, place, bits):
     data = bytearray(several_chunks[0])
@@ -233,6 +236,7 @@ class FullDisk:
 HEADER_SIZE = 2000  # bytes, more than the header takes
 
 
+@patiently
 @given(room=st.integers(0, 500))
 def test_a_disk_without_room_for_the_header_is_an_error_before_the_flight(tmp_path_factory, room):
     folder = tmp_path_factory.mktemp("full")
@@ -241,6 +245,7 @@ def test_a_disk_without_room_for_the_header_is_an_error_before_the_flight(tmp_pa
     assert list(folder.iterdir()) == []
 
 
+@patiently
 @given(room=st.integers(0, 40_000))
 def test_a_full_disk_is_told_once_and_leaves_a_readable_record(tmp_path_factory, room):
     folder = tmp_path_factory.mktemp("full")
@@ -362,6 +367,7 @@ def test_what_is_no_record_is_an_error_of_one_line_with_place(tmp_path, write, w
     assert str(place) in caught.value.where
 
 
+@patiently
 @given(data=st.binary(max_size=200), magic=st.booleans())
 def test_arbitrary_bytes_are_an_error_never_a_crash(tmp_path_factory, data, magic):
     file = tmp_path_factory.mktemp("bytes") / "flight.mcap"

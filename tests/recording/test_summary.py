@@ -6,15 +6,17 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from cfplan.recording import record as columns
+from cfplan.recording.reader import read_record
 from cfplan.recording.record import Record
 from cfplan.recording.states import supervisor_states
 from cfplan.recording.summary import deviation, distance_to_path, dropouts, pose_gaps, settling, summarise
 from cfplan.recording.summary_text import summary_text
+from cfplan.recording.writer import RecordWriter
 
 BEGIN, TRAVEL, HELD = 100.0, 4.0, 2.0  # s
 SPEED = 0.5  # m/s, along x
@@ -62,6 +64,7 @@ def straight_flight(
     )  # fmt: skip
 
 
+@settings(deadline=None)
 @given(lag=st.floats(0, 0.3), aside=st.floats(-0.5, 0.5))
 def test_lag_counts_in_time_and_distance_aside_counts_in_both(flight, lag, aside):
     record = straight_flight(flight.header, lag=lag, aside=aside)
@@ -182,9 +185,6 @@ def test_a_path_of_one_point_has_a_distance_too():
 
 
 def test_a_record_with_nothing_in_it_has_a_summary_of_unknowns(tmp_path, small_header):
-    from cfplan.recording.reader import read_record
-    from cfplan.recording.writer import RecordWriter
-
     RecordWriter(tmp_path, small_header).close()
     record = read_record(tmp_path)
     values = summarise(record).to_json()
