@@ -57,7 +57,11 @@ def encode(setpoints: FullStateSetpoints) -> NDArray:
 
 
 def decode(payloads: NDArray) -> FullStateSetpoints:
-    """What the vehicle will read from the payloads, (N, 29) uint8."""
+    """What the vehicle will read from the payloads, (N, 29) uint8.
+
+    Encoding that again may give other bytes that read alike: a zero in the quaternion has two signs, and of two
+    components that tie for the largest either may be left out.
+    """
     rows = np.ascontiguousarray(payloads, dtype=np.uint8).reshape(-1).view(_WIRE)
     return FullStateSetpoints(
         position=rows["position"] / 1000.0,
@@ -82,8 +86,9 @@ def compress_quaternion(quaternion: NDArray) -> NDArray:
     """(N, 4) x y z w, not zero, to (N,) u32: 2 bits name the largest component, 3 × (sign, 9 bits) give the others."""
     q = np.asarray(quaternion, dtype=float)
     norm = np.linalg.norm(q, axis=1, keepdims=True)
-    if not np.all(np.isfinite(norm) & (norm > 0)):
-        raise NotCertifiedError("a quaternion is zero or not finite", where="setpoints")
+    bad = ~(np.isfinite(norm) & (norm > 0))
+    if np.any(bad):
+        raise NotCertifiedError("the quaternion is zero or not finite", where=f"setpoint {int(np.argmax(bad))}")
     q = q / norm
     rows = np.arange(len(q))
     largest = np.argmax(np.abs(q), axis=1)
