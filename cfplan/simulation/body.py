@@ -139,11 +139,11 @@ def _turn(state: NDArray) -> None:
     share = 0.5 * TIME_STEP if half < 1e-9 else np.sin(half) / rate
     rx, ry, rz, rw = wx * share, wy * share, wz * share, np.cos(half)
     x, y, z, w = state[6], state[7], state[8], state[9]
-    state[6] = w * rx + x * rw + y * rz - z * ry
-    state[7] = w * ry - x * rz + y * rw + z * rx
-    state[8] = w * rz + x * ry - y * rx + z * rw
-    state[9] = w * rw - x * rx - y * ry - z * rz
-    state[6:10] /= np.sqrt(np.sum(state[6:10] ** 2))
+    norm = np.sqrt((x * x + y * y + z * z + w * w) * (rx * rx + ry * ry + rz * rz + rw * rw))
+    state[6] = (w * rx + x * rw + y * rz - z * ry) / norm
+    state[7] = (w * ry - x * rz + y * rw + z * rx) / norm
+    state[8] = (w * rz + x * ry - y * rx + z * rw) / norm
+    state[9] = (w * rw - x * rx - y * ry - z * rz) / norm
 
 
 @njit(cache=True)

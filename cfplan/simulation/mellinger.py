@@ -106,12 +106,13 @@ def step_mellinger(
     control: NDArray, memory: NDArray, gains: NDArray, setpoint: NDArray, mode: NDArray, state: NDArray
 ) -> None:
     """One step of the controller, every CONTROL_PERIOD: writes `control` and carries `memory` on."""
-    error = setpoint[0:3] - state[0:3]
-    velocity_error = setpoint[3:6] - state[3:6]
-    memory[0:3] += error * CONTROL_PERIOD
-    memory[0] = _clamp(memory[0], gains[_I_RANGE_XY])
-    memory[1] = _clamp(memory[1], gains[_I_RANGE_XY])
-    memory[2] = _clamp(memory[2], gains[_I_RANGE_Z])
+    pull = np.empty(3)  # force that the errors of position call for
+    for axis in range(3):
+        kp, kd = (gains[_KP_XY], gains[_KD_XY]) if axis < 2 else (gains[_KP_Z], gains[_KD_Z])
+        ki, i_range = (gains[_KI_XY], gains[_I_RANGE_XY]) if axis < 2 else (gains[_KI_Z], gains[_I_RANGE_Z])
+        error = setpoint[axis] - state[axis]
+        memory[axis] = _clamp(memory[axis] + error * CONTROL_PERIOD, i_range)
+        pull[axis] = kp * error + kd * (setpoint[3 + axis] - state[3 + axis]) + ki * memory[axis]
 
     yaw = 0.0
     if mode[MODE_YAW] == VELOCITY_MODE:
@@ -128,20 +129,16 @@ def step_mellinger(
     if manual and not by_position:
         desired = _attitude(setpoint[16], -setpoint[17], yaw)
     else:
-        force = np.zeros(3)
-        force[2] = gains[_MASS] * GRAVITY
-        force[2] += gains[_KP_Z] * error[2] + gains[_KD_Z] * velocity_error[2] + gains[_KI_Z] * memory[2]
+        force_x, force_y, force_z = 0.0, 0.0, gains[_MASS] * GRAVITY + pull[2]
         if by_position:
-            force += gains[_MASS] * setpoint[6:9]
-            for axis in range(2):
-                force[axis] += (
-                    gains[_KP_XY] * error[axis] + gains[_KD_XY] * velocity_error[axis] + gains[_KI_XY] * memory[axis]
-                )
+            force_x = gains[_MASS] * setpoint[6] + pull[0]
+            force_y = gains[_MASS] * setpoint[7] + pull[1]
+            force_z += gains[_MASS] * setpoint[8]
         else:
             # Level out: the firmware keeps height and the direction that it points in.
             yaw = euler_yaw(state[6:10])
-        thrust = force[0] * turn[0, 2] + force[1] * turn[1, 2] + force[2] * turn[2, 2]
-        desired = _thrust_frame(force, yaw)
+        thrust = force_x * turn[0, 2] + force_y * turn[1, 2] + force_z * turn[2, 2]
+        desired = _thrust_frame(force_x, force_y, force_z, yaw)
 
     # Roll, pitch and yaw errors; pitch counts nose up, which is negative about the body's y axis.
     tilt_x = _along(desired, 2, turn, 1) - _along(turn, 2, desired, 1)
@@ -200,25 +197,23 @@ def _along(a: NDArray, i: int, b: NDArray, j: int) -> float:
 def _attitude(roll: float, pitch: float, yaw: float) -> NDArray:
     """Rotation of Euler angles ZYX."""
     cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
+    frame = np.empty((3, 3))
+    frame[0, 0], frame[0, 1], frame[0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
+    frame[1, 0], frame[1, 1], frame[1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
+    frame[2, 0], frame[2, 1], frame[2, 2] = -sp, cp * sr, cp * cr
+    return frame
 
 
 @njit(cache=True)
-def _thrust_frame(force: NDArray, yaw: float) -> NDArray:
-    """Rotation whose z axis is along the force and whose x axis lies over the direction of yaw."""
-    z = force / np.sqrt(np.sum(force**2))
-    y = np.array([-z[2] * np.sin(yaw), z[2] * np.cos(yaw), z[0] * np.sin(yaw) - z[1] * np.cos(yaw)])
-    y /= np.sqrt(np.sum(y**2))
+def _thrust_frame(x: float, y: float, z: float, yaw: float) -> NDArray:
+    """Rotation whose z axis is along a force and whose x axis lies over the direction of yaw."""
+    norm = np.sqrt(x * x + y * y + z * z)
+    zx, zy, zz = x / norm, y / norm, z / norm
+    yx, yy, yz = -zz * np.sin(yaw), zz * np.cos(yaw), zx * np.sin(yaw) - zy * np.cos(yaw)
+    norm = np.sqrt(yx * yx + yy * yy + yz * yz)
+    yx, yy, yz = yx / norm, yy / norm, yz / norm
     frame = np.empty((3, 3))
-    frame[0, 0] = y[1] * z[2] - y[2] * z[1]
-    frame[1, 0] = y[2] * z[0] - y[0] * z[2]
-    frame[2, 0] = y[0] * z[1] - y[1] * z[0]
-    frame[:, 1] = y
-    frame[:, 2] = z
+    frame[0, 0], frame[1, 0], frame[2, 0] = yy * zz - yz * zy, yz * zx - yx * zz, yx * zy - yy * zx
+    frame[0, 1], frame[1, 1], frame[2, 1] = yx, yy, yz
+    frame[0, 2], frame[1, 2], frame[2, 2] = zx, zy, zz
     return frame

@@ -1,0 +1,182 @@
+"""The flight before the flight: the very bytes that will be sent, flown by the simulated vehicle.
+
+It starts in hover at the start, receives each payload when it is due and hovers on the last one; the controller sees
+the true state. What it does is held against the limits from which on the pilot would interfere.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
+from scipy.spatial import cKDTree
+
+from cfplan.errors import NotCertifiedError
+from cfplan.flight.encoding import EncodedFlight
+from cfplan.flight.packets import decode
+from cfplan.safety.limits import FlightLimits
+from cfplan.simulation.body import TIME_STEP, hovering
+from cfplan.simulation.closed_loop import PERFECT, ClosedLoop, EstimateErrors, fly_setpoints
+from cfplan.simulation.mellinger import FULL_COMMAND, gains_for
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.trajectory import Trajectory
+
+SETTLING = 1.0  # s simulated after the last payload, which the vehicle keeps
+SETTLED = 0.02  # m, nearer than this to the end it has arrived
+ARRIVED = 0.05  # m, and no farther than this may it be at last
+_STRIDE = 5  # ms between the moments at which places are compared
+_NO_FLOOR = -np.inf  # a flight that sinks to the ground shows as a deviation
+_HINT = "plan with lower limits, or check mass, thrust and motor lag of the airframe"
+
+
+@dataclass(frozen=True, slots=True)
+class DryRun:
+    """What came of it."""
+
+    reason: str
+    # why it failed; empty when it passed
+    deviation: float
+    # m, worst distance from where the trajectory is at that time
+    deviation_time: float
+    # s, when that was
+    deviation_rms: float
+    # m, while it moves
+    path_distance: float
+    # m, worst distance from the path, whenever it is there
+    final_error: float
+    # m, from the end of the path when the simulation ends
+    settle_time: float
+    # s, from the end of the motion until it stays within SETTLED; inf when it never does
+    speed: float
+    # m/s, highest that lasts for the limits' patience
+    acceleration: float
+    # m/s², likewise
+    angular_velocity: float
+    # rad/s, likewise
+    saturation: float
+    # share of the time for which the motor that fares worst is at either end of its range
+    real_time_factor: float
+    # simulated seconds a second
+    loop: ClosedLoop
+    # the whole flight
+
+    @property
+    def passed(self) -> bool:
+        """Whether the bytes may fly."""
+        return not self.reason
+
+    def require_passed(self) -> None:
+        """Raise NotCertifiedError where it failed."""
+        if self.reason:
+            raise NotCertifiedError(self.reason, where="dry run", hint=_HINT)
+
+
+def dry_run(
+    encoded: EncodedFlight,
+    trajectory: Trajectory,
+    airframe: Airframe,
+    limits: FlightLimits,
+    *,
+    told: Airframe | None = None,
+    delay: float = 0.0,
+    estimate: EstimateErrors = PERFECT,
+) -> DryRun:
+    """Fly the payloads on `airframe`; compare with `trajectory`.
+
+    `told` is the airframe that the controller believes in, the same where not given; `delay`, s, makes every setpoint
+    late. The real-time factor counts everything but the compilation at the first call ever.
+    """
+    start = trajectory.at(0.0)
+    fly = partial(
+        fly_setpoints,
+        decode(encoded.payloads),
+        encoded.times,
+        airframe,
+        hovering(airframe, start.position, float(start.yaw)),
+        gains=gains_for(told or airframe),
+        floor=_NO_FLOOR,
+        delay=delay,
+        estimate=estimate,
+    )
+    fly(duration=0.0)  # compiles where need be
+    begun = time.perf_counter()
+    loop = fly(duration=encoded.duration + SETTLING)
+    run = _judge(loop, trajectory, limits)
+    return replace(run, real_time_factor=loop.time[-1] / (time.perf_counter() - begun))
+
+
+def stress(
+    encoded: EncodedFlight, trajectory: Trajectory, airframe: Airframe, limits: FlightLimits
+) -> dict[str, DryRun]:
+    """The same bytes on vehicles, and over a link, that are not quite what the plan takes them for."""
+    slow = replace(airframe, motor_time_constant=1.25 * airframe.motor_time_constant)
+    heavy, light = replace(airframe, mass=1.05 * airframe.mass), replace(airframe, mass=0.95 * airframe.mass)
+    noisy = EstimateErrors(latency=0.010, position_noise=0.002, velocity_noise=0.03)
+    return {
+        "5 % heavier": dry_run(encoded, trajectory, heavy, limits, told=airframe),
+        "5 % lighter": dry_run(encoded, trajectory, light, limits, told=airframe),
+        "motors lag by a quarter more": dry_run(encoded, trajectory, slow, limits),
+        "setpoints 20 ms late": dry_run(encoded, trajectory, airframe, limits, delay=0.020),
+        "estimate 10 ms late and noisy": dry_run(encoded, trajectory, airframe, limits, estimate=noisy),
+    }
+
+
+def _judge(loop: ClosedLoop, trajectory: Trajectory, limits: FlightLimits) -> DryRun:
+    times, positions = loop.time[::_STRIDE], loop.position[::_STRIDE]
+    wanted = trajectory.at(times).position
+    error = np.linalg.norm(positions - wanted, axis=1)
+    error = np.where(np.isfinite(error), error, np.inf)
+    known = np.isfinite(positions).all(axis=1)
+    nearest = np.where(known, cKDTree(wanted).query(np.where(known[:, None], positions, 0.0))[0], np.inf)
+    moving = times <= trajectory.duration
+    late = np.flatnonzero(~moving & (error > SETTLED))
+    settled = times[late[-1]] - trajectory.duration if len(late) else 0.0
+    speed = np.linalg.norm(loop.velocity, axis=1)
+    acceleration = np.linalg.norm(np.diff(loop.velocity, axis=0), axis=1) / TIME_STEP
+    turning = np.linalg.norm(loop.body_rate, axis=1)
+    at_its_end = np.mean((loop.commands <= 0) | (loop.commands >= FULL_COMMAND), axis=0)
+    worst = int(np.argmax(error))
+    run = DryRun(
+        reason="",
+        deviation=float(error[worst]),
+        deviation_time=float(times[worst]),
+        deviation_rms=float(np.sqrt(np.mean(error[moving] ** 2))),
+        path_distance=float(nearest.max()),
+        final_error=float(error[-1]),
+        settle_time=float(np.inf if error[-1] > SETTLED else settled),
+        speed=_lasting(speed, limits.patience),
+        acceleration=_lasting(acceleration, limits.patience),
+        angular_velocity=_lasting(turning, limits.patience),
+        saturation=float(at_its_end.max()),
+        real_time_factor=np.inf,
+        loop=loop,
+    )
+    return replace(run, reason=_fault(run, limits))
+
+
+def _fault(run: DryRun, limits: FlightLimits) -> str:
+    """The first reason not to fly, or nothing. Where NaN came out, the deviation is infinite."""
+    if not run.deviation < limits.deviation.brake:
+        return (
+            f"the vehicle strays {run.deviation:.2f} m from the trajectory at {run.deviation_time:.2f} s; "
+            f"from {limits.deviation.brake:g} m on the pilot brakes"
+        )
+    for name, value, unit, limit in (
+        ("speed", run.speed, "m/s", limits.speed.brake),
+        ("acceleration", run.acceleration, "m/s²", limits.acceleration.brake),
+        ("angular velocity", run.angular_velocity, "rad/s", limits.angular_velocity.brake),
+    ):
+        if not value < limit:
+            return f"{name} reaches {value:.2f} {unit}; from {limit:g} {unit} on the pilot brakes"
+    if not run.final_error <= ARRIVED:
+        return f"the vehicle is {run.final_error:.2f} m from the end of the path {SETTLING:g} s after the last setpoint"
+    return ""
+
+
+def _lasting(values: NDArray, patience: float) -> float:
+    """The highest value that is not fallen short of for `patience`, s."""
+    window = max(1, round(patience / TIME_STEP))
+    values = np.where(np.isfinite(values), values, np.inf)
+    return float(minimum_filter1d(values, min(window, len(values)), mode="nearest").max())
