@@ -16,6 +16,7 @@ from cfplan.errors import InfeasibleError
 from cfplan.expert.convex_profile import smooth_profile, window
 from cfplan.expert.convex_rows import Rows, inner_rows, outer_rows
 from cfplan.expert.convex_stations import Stations, stations
+from cfplan.expert.slowing import least_slowed
 from cfplan.expert.solution import Solution, Status
 from cfplan.expert.yaw_along import yaw_along
 from cfplan.geometry.path import Path
@@ -24,6 +25,8 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
 
+WINDOW_SHARES = (0.25, 0.5, 1.0)
+# of the width at which a jump of acceleration takes the whole of a limit; wider rounds tight corners off too much
 Boundary = tuple[float | None, float | None]
 # m²/s² at the start and the end of the path, None where it is free
 
@@ -86,13 +89,13 @@ def plan_convex(
         speeds = _solved(at, inner_rows(at, airframe, limits, fastest), boundary)
     except InfeasibleError as error:
         return Solution(Status.INFEASIBLE, None, str(error))
-    half_width = window(airframe, limits)
-    profile = smooth_profile(path, at, speeds, half_width, nodes, yaw_along(path, yaw, yaw_angle))
-    stats: dict[str, float | int | str] = {
-        "solver": "copp-py",
-        "stations": len(at.s),
-        "solve_seconds": time.perf_counter() - begun,
-    }
+    along = yaw_along(path, yaw, yaw_angle)
+    width = window(airframe, limits)
+    profiles = (smooth_profile(path, at, speeds, share * width, nodes, along) for share in WINDOW_SHARES)
+    profile = least_slowed(path, profiles, airframe, limits)
+    stats: dict[str, float | int | str] = {"solver": "copp-py", "solve_seconds": time.perf_counter() - begun}
+    if profile is None:
+        return Solution(Status.NOT_CONVERGED, None, "no smoothing of the solution stays above h = 0", stats)
     return Solution(Status.SOLVED, profile, stats=stats)
 
 
@@ -120,9 +123,7 @@ def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
     constraints.add_constraint_1st(ceiling[:, None], 0)
     constraints.add_constraint_2nd(rows.first, rows.second, most, 0)
     solver: Any = copp_py.solver.topp2_ra  # its stubs do not export Problem
-    return solver.Problem(
-        constraints, idx_s_interval=(0, len(at.length) - 1), a_boundary=(ends[0], ends[1])
-    )
+    return solver.Problem(constraints, idx_s_interval=(0, len(at.length) - 1), a_boundary=(ends[0], ends[1]))
 
 
 def _reachable_top(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:

@@ -20,8 +20,6 @@ from cfplan.vehicle.profile import SpeedProfile
 SAMPLES_PER_INTERVAL = 8
 TIME_STEPS_PER_WINDOW = 200
 H_STIFFNESS = 1e-4
-WINDOW_SHARE = 0.5
-# of the width at which a jump would take the whole of a limit; wider rounds tight corners off too much
 
 
 def window(airframe: Airframe, limits: PlanLimits) -> float:
@@ -34,7 +32,7 @@ def window(airframe: Airframe, limits: PlanLimits) -> float:
     turning = 4 * airframe.arm * max(spare, 1e-3) / max(airframe.inertia[:2])
     most = min(limits.acceleration, 4 * limits.motor_thrust_max / airframe.mass)
     rate, acceleration = GRAVITY * limits.angular_velocity, GRAVITY * turning
-    return WINDOW_SHARE * max(2 * most / rate, (4 * most / acceleration) ** 0.5)
+    return max(2 * most / rate, (4 * most / acceleration) ** 0.5)
 
 
 def smooth_profile(
