@@ -5,7 +5,7 @@ the true state. What it does is held against the limits from which on the pilot 
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import numpy as np
@@ -66,6 +66,26 @@ class DryRun:
     def passed(self) -> bool:
         """Whether the bytes may fly."""
         return not self.reason
+
+    def summary(self) -> dict[str, bool | float | str]:
+        """Everything but the flight itself, for a file."""
+        figures = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "loop"}
+        return {"passed": self.passed, **figures}
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Everything but the flight itself, for people."""
+        return [
+            ("verdict", self.reason or "passed"),
+            ("deviation in time", f"{100 * self.deviation:.1f} cm at {self.deviation_time:.2f} s"),
+            ("deviation in time, rms", f"{100 * self.deviation_rms:.1f} cm"),
+            ("distance to the path", f"{100 * self.path_distance:.1f} cm"),
+            ("error at the end", f"{100 * self.final_error:.1f} cm, settled after {self.settle_time:.2f} s"),
+            ("speed", f"{self.speed:.2f} m/s"),
+            ("acceleration", f"{self.acceleration:.2f} m/s²"),
+            ("angular velocity", f"{self.angular_velocity:.2f} rad/s"),
+            ("time at a motor's limit", f"{100 * self.saturation:.1f} %"),
+            ("faster than real time", f"{self.real_time_factor:.0f} times"),
+        ]
 
     def require_passed(self) -> None:
         """Raise NotCertifiedError where it failed."""

@@ -1,5 +1,6 @@
 """The dry run lets good bytes fly and says what is wrong with the others."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -72,6 +73,15 @@ def test_what_it_reports_is_what_the_vehicle_did(good, trajectory):
     assert good.speed <= np.linalg.norm(loop.velocity, axis=1).max()
     assert loop.position[0] == pytest.approx(trajectory.path(0.0))
     assert loop.velocity[0] == pytest.approx(0.0)
+
+
+def test_it_can_be_written_down_and_read(good):
+    kept = json.loads(json.dumps(good.summary()))
+    assert kept["passed"] is True
+    assert kept["deviation"] == good.deviation
+    assert "loop" not in kept
+    assert dict(good.rows())["verdict"] == "passed"
+    assert f"{100 * good.deviation:.1f} cm" in dict(good.rows())["deviation in time"]
 
 
 def test_making_up_for_drag_and_sending_body_rates_both_pay(good, encoded, trajectory):
