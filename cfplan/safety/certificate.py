@@ -21,6 +21,7 @@ from cfplan.vehicle.trajectory import FullState, Trajectory, state_at
 
 TIME_STEP = 1e-3  # s, the most between two samples
 LEAST_POINTS = 11  # of a piece, its ends included
+WALLS = "distance to the walls"
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
 
 
@@ -133,7 +134,7 @@ def _quantities(
         middle, half = (low + high) / 2, (high - low) / 2
         # The walls of one axis after the other; the least of the distances is kept.
         distance = (half - np.abs(state.position - middle)).T
-        yield _Quantity("distance to the walls", "m", -1, distance, space.margin, float(half.min()))
+        yield _Quantity(WALLS, "m", -1, distance, space.margin, float(half.min()))
 
 
 def _norm(vectors: NDArray) -> NDArray:
@@ -167,13 +168,15 @@ def _samples(trajectory: Trajectory) -> tuple[NDArray, NDArray, NDArray]:
     edges[-1] = timing.s[-1]
     middle = (edges[:-1] + edges[1:]) / 2
     interval = timing.interval[np.searchsorted(timing.s, middle) - 1]
-    slowest = np.sqrt(np.minimum(*(trajectory.profile.at(side, interval).h for side in (edges[:-1], edges[1:]))))
-    needed = np.diff(edges) / (TIME_STEP * slowest)
+    width = np.diff(edges)
+    inside = [trajectory.profile.at(edges[:-1] + share * width, interval).h for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    slowest = np.sqrt(np.min(inside, axis=0))
+    needed = width / (TIME_STEP * slowest)
     counts = np.maximum(np.ceil(needed).astype(int) + 1, LEAST_POINTS)
     starts = np.cumsum(counts) - counts
     piece = np.repeat(np.arange(len(counts)), counts)
     share = (np.arange(counts.sum()) - starts[piece]) / (counts[piece] - 1)
-    s = edges[piece] + share * (edges[piece + 1] - edges[piece])
+    s = edges[piece] + share * width[piece]
     # The last sample of a piece must fall on its own side of a break of the path.
     lasts = starts + counts - 1
     s[lasts] = np.nextafter(edges[1:], -np.inf)

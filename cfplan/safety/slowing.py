@@ -1,0 +1,102 @@
+"""Slowing as a whole: the last resort, which ends certified because motion tends to hover as h tends to 0."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfplan.errors import InfeasibleError, NotCertifiedError
+from cfplan.safety.certificate import WALLS, Certificate, certify
+from cfplan.safety.limits import PlanLimits
+from cfplan.safety.space import Space
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.trajectory import Trajectory
+
+RESOLUTION = 1e-4  # of the share that is sought
+LEAST_SHARE = 1e-3  # slower than this is no flight
+_AIM = RESOLUTION / 2  # below a limit, so that the search ends from the passing side
+_TRIALS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Slowed:
+    """A certified trajectory, and how much slower it is than what was asked for."""
+
+    trajectory: Trajectory
+    certificate: Certificate
+    share: float
+    # of the speed everywhere, 1 where nothing had to change
+
+
+def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Slowed:
+    """The trajectory itself where it passes, else at the largest share of its speed that does, within RESOLUTION.
+
+    Raises:
+        InfeasibleError: no share passes, because hovering or the path itself breaks a limit; says which.
+        NotCertifiedError: the trajectory is not a number somewhere.
+    """
+    certificate = certify(trajectory, limits, space)
+    if certificate.passed:
+        return Slowed(trajectory, certificate, 1.0)
+    if np.isnan(certificate.worst.share):
+        raise NotCertifiedError(f"{certificate.worst.name} is not a number", where=f"s = {certificate.worst.s:.4g}")
+    _check_hover(trajectory, limits)
+    _check_place(certificate)
+
+    # False position between hover and what failed, in the square of the share: so rise accelerations.
+    low, low_excess = 0.0, _hover_share(trajectory, limits) - 1.0
+    high, high_excess = 1.0, certificate.worst.share - 1.0
+    best: Slowed | None = None
+    for trial in range(_TRIALS):
+        square = low + (high - low) * (low_excess + _AIM) / (low_excess - high_excess)
+        if trial % 3 == 2 or not low < square < high:
+            square = (low + high) / 2.0
+        slower = Trajectory(trajectory.path, trajectory.profile.slowed(square**0.5), trajectory.airframe)
+        certificate = certify(slower, limits, space)
+        if certificate.passed:
+            low, low_excess = square, certificate.worst.share - 1.0
+            best = Slowed(slower, certificate, square**0.5)
+            if low_excess > -RESOLUTION:
+                break
+        else:
+            high, high_excess = square, certificate.worst.share - 1.0
+        if high < LEAST_SHARE**2 or (best is not None and high - low <= 2.0 * RESOLUTION * high):
+            break
+    if best is None:
+        raise InfeasibleError(
+            f"{certificate.worst.name} exceeds its limit however slow the flight",
+            where="({:.2f}, {:.2f}, {:.2f}) m".format(*certificate.worst.position),
+            hint="loosen that limit or change the path there",
+        )
+    return best
+
+
+def _hover_share(trajectory: Trajectory, limits: PlanLimits) -> float:
+    """The worst share that remains as the speed tends to 0; as Margin counts, only the most thrust has any."""
+    return trajectory.airframe.hover_thrust / limits.motor_thrust_max
+
+
+def _check_hover(trajectory: Trajectory, limits: PlanLimits) -> None:
+    hover = trajectory.airframe.hover_thrust
+    if not limits.motor_thrust_min < hover < limits.motor_thrust_max:
+        raise InfeasibleError(
+            f"hovering takes {hover:.3g} N a motor, allowed are {limits.motor_thrust_min:.3g} to "
+            f"{limits.motor_thrust_max:.3g} N",
+            where="motor thrust",
+            hint="choose a stronger vehicle or a smaller reserve",
+        )
+    if not limits.specific_thrust_min < GRAVITY:
+        raise InfeasibleError(
+            f"hovering gives {GRAVITY} m/s², at least {limits.specific_thrust_min:g} are asked",
+            where="specific thrust",
+            hint="half of that keeps clear of the firmware's tumble rule",
+        )
+
+
+def _check_place(certificate: Certificate) -> None:
+    for margin in certificate.margins:
+        if margin.name == WALLS and not margin.passed:
+            raise InfeasibleError(
+                f"the path comes within {margin.worst:.3f} m of the walls, the margin is {margin.limit:g} m",
+                where="({:.2f}, {:.2f}, {:.2f}) m".format(*margin.position),
+                hint="move or place the path",
+            )
