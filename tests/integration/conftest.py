@@ -1,0 +1,97 @@
+"""A short flight, and a way to fly it: real cflib, real processes, real time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.flight.brake import encode_stops
+from cfplan.flight.mission import Mission
+from cfplan.flight.outcome import FlightOutcome
+from cfplan.flight.packets import FullStateSetpoints, encode
+from cfplan.flight.process import fly
+from cfplan.flight.telemetry import Event, Phase, PhaseEntered, Telemetry
+from cfplan.safety.limits import GroundManoeuvres, Limits, load_limits
+from cfplan.simulation.lab import Lab, Truth, start_lab
+from cfplan.simulation.room import RoomPoseSource
+from cfplan.simulation.sim_driver import SimDriver
+
+SAFETY_FILE = Path(__file__).parents[2] / "safety.yaml"
+
+
+def short_payloads(distance: float = 1.5, duration: float = 2.5, height: float = 0.6) -> np.ndarray:
+    """Straight along x from rest to rest with a peak of 1.3 m/s, then half a second of hover."""
+    u = np.linspace(0.0, 1.0, round(duration * 100) + 1)
+    along = distance * (35 * u**4 - 84 * u**5 + 70 * u**6 - 20 * u**7)
+    speed = distance * (140 * u**3 - 420 * u**4 + 420 * u**5 - 140 * u**6) / duration
+    slope = distance * (420 * u**2 - 1680 * u**3 + 2100 * u**4 - 840 * u**5) / duration**2
+    zero = np.zeros_like(u)
+    moving = encode(
+        FullStateSetpoints(
+            position=np.stack([along - distance / 2, zero, zero + height], axis=1),
+            velocity=np.stack([speed, zero, zero], axis=1),
+            acceleration=np.stack([slope, zero, zero], axis=1),
+            quaternion=np.stack([zero, zero, zero, zero + 1.0], axis=1),
+            body_rate=np.zeros((len(u), 3)),
+        )
+    )
+    return np.concatenate([moving, np.repeat(moving[-1:], 50, axis=0)])
+
+
+@pytest.fixture(scope="session")
+def limits() -> Limits:
+    quick = GroundManoeuvres(take_off_height=0.5, take_off_speed=0.4, go_to_speed=0.6, land_speed=0.4)
+    return replace(load_limits(SAFETY_FILE), ground=quick)
+
+
+@pytest.fixture(scope="session")
+def mission(limits) -> Mission:
+    payloads = short_payloads()
+    return Mission(payloads, encode_stops(payloads, 100.0), limits, hold_time=0.5)
+
+
+@dataclass
+class Flight:
+    """What a flight left behind."""
+
+    outcome: FlightOutcome
+    telemetry: list[Telemetry]
+    truth: Truth
+
+    def of(self, kind: type) -> list[Telemetry]:
+        return [message for message in self.telemetry if isinstance(message, kind)]
+
+    @property
+    def phases(self) -> list[Phase]:
+        return [message.phase for message in self.of(PhaseEntered)]
+
+    @property
+    def said(self) -> list[str]:
+        return [message.text for message in self.of(Event)]
+
+
+@pytest.fixture(scope="session")
+def fly_in(mission):
+    """Flies in a lab, and lets `react` see each message as it comes."""
+
+    def flight(lab: Lab, react: Callable[[Telemetry], None] = lambda _: None) -> Flight:
+        telemetry: list[Telemetry] = []
+
+        def note(message: Telemetry) -> None:
+            telemetry.append(message)
+            react(message)
+
+        source = RoomPoseSource(lab.number)
+        outcome = fly(mission, uri=lab.uri, drivers=[SimDriver], pose_source=source, on_telemetry=note)
+        return Flight(outcome, telemetry, lab.truth())
+
+    return flight
+
+
+@pytest.fixture(scope="module")
+def lab(limits):
+    """One lab for the flights that leave its vehicle fit to fly."""
+    with start_lab(limits.airframe) as running:
+        yield running
