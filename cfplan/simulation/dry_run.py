@@ -67,10 +67,12 @@ class DryRun:
         """Whether the bytes may fly."""
         return not self.reason
 
-    def summary(self) -> dict[str, bool | float | str]:
-        """Everything but the flight itself, for a file."""
+    def summary(self) -> dict[str, bool | float | str | None]:
+        """Everything but the flight itself, for a file; what has no finite value is None, as JSON knows no infinity."""
         figures = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "loop"}
-        return {"passed": self.passed, **figures}
+        return {"passed": self.passed} | {
+            name: value if isinstance(value, str) or np.isfinite(value) else None for name, value in figures.items()
+        }
 
     def rows(self) -> list[tuple[str, str]]:
         """Everything but the flight itself, for people."""

@@ -140,6 +140,7 @@ def test_numbers_that_are_none_fail_it(encoded, trajectory):
     assert not run.passed
     assert run.deviation == np.inf
     assert run.path_distance == np.inf
+    assert json.dumps(run.summary(), allow_nan=False)
 
 
 def test_other_masses_lags_and_delays_are_tried_too(good, encoded, trajectory):
