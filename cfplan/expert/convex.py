@@ -16,7 +16,7 @@ from cfplan.errors import InfeasibleError
 from cfplan.expert.convex_profile import smooth_profile, window
 from cfplan.expert.convex_rows import Rows, inner_rows, outer_rows
 from cfplan.expert.convex_stations import Stations, stations
-from cfplan.expert.slowing import least_slowed
+from cfplan.expert.least_slowed import least_slowed
 from cfplan.expert.solution import Solution, Status
 from cfplan.expert.yaw_along import yaw_along
 from cfplan.geometry.path import Path

@@ -4,16 +4,17 @@ import time
 
 import numpy as np
 
-from cfplan.errors import NotCertifiedError
-from cfplan.expert.slowing import certified_share
+from cfplan.errors import InfeasibleError, NotCertifiedError
 from cfplan.expert.solution import Solution, Status
 from cfplan.expert.spline_profile import profile_through
 from cfplan.expert.yaw_along import yaw_along
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.safety.limits import PlanLimits
+from cfplan.safety.slowing import slow_until_certified
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
+from cfplan.vehicle.trajectory import Trajectory
 
 SAMPLES_PER_UNIT = 200  # of s, where the greatest nominal speed is sought
 
@@ -42,12 +43,12 @@ def plan_min_snap(
         grid, np.full(nodes + 1, fastest**2), zeros, zeros, zeros[1:], turning.yaw, turning.dyaw, turning.ddyaw
     )
     try:
-        share = certified_share(path, profile, airframe, limits)
-    except NotCertifiedError as error:
+        slowed = slow_until_certified(Trajectory(path, profile, airframe), limits)
+    except (InfeasibleError, NotCertifiedError) as error:
         return Solution(Status.INFEASIBLE, None, str(error))
     stats: dict[str, float | int | str] = {
         "solver": "scaling",
-        "share": share,
+        "share": slowed.share,
         "solve_seconds": time.perf_counter() - begun,
     }
-    return Solution(Status.SOLVED, profile.slowed(share), stats=stats)
+    return Solution(Status.SOLVED, slowed.trajectory.profile, stats=stats)

@@ -9,7 +9,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.expert.slowing import least_slowed
+from cfplan.expert.least_slowed import least_slowed
 from cfplan.expert.solution import Solution, Status
 from cfplan.expert.spline_profile import profile_through
 from cfplan.expert.toppquad_problem import H_LEAST, ROWS, STEP_ROWS, VARIABLES, Program, program

@@ -10,12 +10,12 @@ from cfplan.errors import InfeasibleError
 from cfplan.expert.convex import lower_bound, plan_convex
 from cfplan.expert.limit_sets import LIMIT_SETS
 from cfplan.expert.min_snap_baseline import plan_min_snap
-from cfplan.expert.slowing import certified_share
 from cfplan.expert.solution import Status
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.safety.certificate import certify
+from cfplan.safety.slowing import slow_until_certified
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -66,8 +66,8 @@ def test_nothing_that_is_certified_is_faster_than_the_bound(set_name, wiggly):
     bound = lower_bound(wiggly, chosen.airframe, chosen.limits)
     for planner in (plan_convex, plan_min_snap):
         profile = planner(wiggly, chosen.airframe, chosen.limits).profile
-        share = certified_share(wiggly, profile, chosen.airframe, chosen.limits)
-        assert Trajectory(wiggly, profile.slowed(share), chosen.airframe).duration > bound
+        slowed = slow_until_certified(Trajectory(wiggly, profile, chosen.airframe), chosen.limits)
+        assert slowed.trajectory.duration > bound
 
 
 def test_the_convex_profile_is_near_the_bound_before_it_is_slowed(wiggly):

@@ -9,13 +9,12 @@ from scipy.spatial.transform import Rotation
 from cfplan.expert import toppquad_problem
 from cfplan.expert.convex import lower_bound
 from cfplan.expert.limit_sets import LIMIT_SETS
-from cfplan.expert.slowing import certified_share
 from cfplan.expert.solution import Solution, Status
 from cfplan.expert.toppquad import plan_toppquad
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
-from cfplan.safety.certificate import certify
+from cfplan.safety.slowing import slow_until_certified
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
@@ -90,11 +89,10 @@ def test_yaw_starts_in_the_first_quarter_turn(free):
 
 
 def test_slowed_it_is_certified_and_no_faster_than_the_bound(free, path):
-    share = certified_share(path, free.profile, HARDWARE.airframe, HARDWARE.limits)
-    flight = Trajectory(path, free.profile.slowed(share), HARDWARE.airframe)
-    assert certify(flight, HARDWARE.limits).passed
+    slowed = slow_until_certified(Trajectory(path, free.profile, HARDWARE.airframe), HARDWARE.limits)
+    assert slowed.certificate.passed
     bound = lower_bound(path, HARDWARE.airframe, HARDWARE.limits)
-    assert bound < flight.duration < 1.5 * bound
+    assert bound < slowed.trajectory.duration < 1.5 * bound
 
 
 def test_fixed_yaw_stays_where_it_was_told(path):
