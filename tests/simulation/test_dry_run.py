@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.encoding import check_bytes, encode_trajectory
@@ -91,6 +92,17 @@ def test_making_up_for_drag_and_sending_body_rates_both_pay(good, encoded, traje
     for worse in (without_drag, without_rates):
         other = dry_run(replace(encoded, payloads=encode(worse)), trajectory, AIRFRAME, LIMITS)
         assert other.deviation_rms > 1.5 * good.deviation_rms
+
+
+def test_the_quaternion_that_is_sent_keeps_the_heading_and_the_planned_one_would_not(good, encoded, trajectory):
+    def heading_error(run):
+        planned = Rotation.from_quat(trajectory.at(run.loop.time).quaternion)
+        return np.abs((planned.inv() * Rotation.from_quat(run.loop.quaternion)).as_rotvec(degrees=True)[:, 2]).max()
+
+    planned = replace(encoded.decoded, quaternion=trajectory.at(encoded.times).quaternion)
+    other = dry_run(replace(encoded, payloads=encode(planned)), trajectory, AIRFRAME, LIMITS)
+    assert heading_error(good) < 1.0
+    assert heading_error(other) > 3.0
 
 
 def test_the_bytes_are_flown_and_not_the_trajectory(encoded, trajectory):
