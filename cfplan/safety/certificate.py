@@ -8,7 +8,7 @@ the larger of them by at most an eighth of its second difference there; that is 
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,6 +20,7 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.trajectory import FullState, Trajectory, state_at
 
 TIME_STEP = 1e-3  # s, the most between two samples
+BATCH = 20_000  # samples at a time, about
 LEAST_POINTS = 11  # of a piece, its ends included
 WALLS = "distance to the walls"
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
@@ -105,15 +106,47 @@ class _Quantity:
     # what it is in hover, which counts as share 0
 
 
+class _Peak(NamedTuple):
+    """The worst of one quantity."""
+
+    quantity: _Quantity
+    value: float
+    # its sign times the value
+    s: float
+    position: NDArray
+
+
+class _Pieces(NamedTuple):
+    """Stretches of the trajectory on which everything is smooth, (K,) each."""
+
+    left: NDArray
+    right: NDArray
+    interval: NDArray
+    counts: NDArray
+    # samples, ends included
+
+
 def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Certificate:
     """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
-    s, interval, first = _samples(trajectory)
-    with np.errstate(all="ignore"):
-        state = state_at(trajectory.path, trajectory.profile, trajectory.airframe, s, time=s, interval=interval)
-        margins = tuple(
-            _margin(quantity, trajectory, state, first) for quantity in _quantities(state, trajectory, limits, space)
-        )
-    return Certificate(margins=margins, duration=trajectory.duration, samples=len(s))
+    pieces = _pieces(trajectory)
+    ends = np.cumsum(pieces.counts)
+    worst: dict[str, _Peak] = {}
+    for batch in np.split(np.arange(len(ends)), np.flatnonzero(np.diff(ends // BATCH)) + 1):
+        s, interval, first = _samples(pieces, batch)
+        with np.errstate(all="ignore"):
+            state = state_at(trajectory.path, trajectory.profile, trajectory.airframe, s, time=s, interval=interval)
+            for quantity in _quantities(state, trajectory, limits, space):
+                index, value = _peak(np.ascontiguousarray(np.atleast_2d(quantity.sign * quantity.values)), first)
+                known = worst.get(quantity.name)
+                if known is None or not value <= known.value:  # NaN is worse than everything and stays
+                    worst[quantity.name] = known if known and np.isnan(known.value) else _Peak(
+                        quantity, value, float(s[index]), state.position[index]
+                    )  # fmt: skip
+    return Certificate(
+        margins=tuple(_margin(peak, trajectory) for peak in worst.values()),
+        duration=trajectory.duration,
+        samples=int(ends[-1]),
+    )
 
 
 def _quantities(
@@ -141,46 +174,47 @@ def _norm(vectors: NDArray) -> NDArray:
     return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
-def _margin(quantity: _Quantity, trajectory: Trajectory, state: FullState, first: NDArray) -> Margin:
-    index, peak = _peak(np.ascontiguousarray(np.atleast_2d(quantity.sign * quantity.values)), first)
-    worst = quantity.sign * peak
+def _margin(peak: _Peak, trajectory: Trajectory) -> Margin:
+    quantity = peak.quantity
+    worst = quantity.sign * peak.value
     room = quantity.limit - quantity.at_rest
     share = (worst - quantity.at_rest) / room if room * quantity.sign > 0 else np.inf
-    place = float(state.s[index])
-    x, y, z = (float(v) for v in state.position[index])
+    x, y, z = (float(v) for v in peak.position)
     return Margin(
         name=quantity.name,
         unit=quantity.unit,
         worst=worst,
         limit=quantity.limit,
         share=max(0.0, share) if np.isfinite(worst) else float("nan"),
-        time=float(trajectory.time_at(place)),
-        s=place,
+        time=float(trajectory.time_at(peak.s)),
+        s=peak.s,
         position=(x, y, z),
     )
 
 
-def _samples(trajectory: Trajectory) -> tuple[NDArray, NDArray, NDArray]:
-    """s, (N,), the profile's interval of each, and whether it is the first of its piece."""
+def _pieces(trajectory: Trajectory) -> _Pieces:
+    """Cut at the grid points, at the breaks of the path, and where the timing was refined because h changes fast."""
     timing, path = trajectory.timing, trajectory.path
     edges = np.union1d(timing.s, path.breaks)
     edges = edges[np.r_[True, np.diff(edges) > 1e-12 * edges[-1]]]
     edges[-1] = timing.s[-1]
-    middle = (edges[:-1] + edges[1:]) / 2
-    interval = timing.interval[np.searchsorted(timing.s, middle) - 1]
     width = np.diff(edges)
+    interval = timing.interval[np.searchsorted(timing.s, edges[:-1] + width / 2) - 1]
     inside = [trajectory.profile.at(edges[:-1] + share * width, interval).h for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    slowest = np.sqrt(np.min(inside, axis=0))
-    needed = width / (TIME_STEP * slowest)
+    needed = width / (TIME_STEP * np.sqrt(np.min(inside, axis=0)))
     counts = np.maximum(np.ceil(needed).astype(int) + 1, LEAST_POINTS)
+    return _Pieces(edges[:-1], edges[1:], interval, counts)
+
+
+def _samples(pieces: _Pieces, batch: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """s, (N,), the profile's interval of each, and whether it is the first of its piece."""
+    left, right, interval, counts = (values[batch] for values in pieces)
     starts = np.cumsum(counts) - counts
     piece = np.repeat(np.arange(len(counts)), counts)
-    share = (np.arange(counts.sum()) - starts[piece]) / (counts[piece] - 1)
-    s = edges[piece] + share * width[piece]
+    share = (np.arange(len(piece)) - starts[piece]) / (counts[piece] - 1)
+    s = left[piece] + share * (right - left)[piece]
     # The last sample of a piece must fall on its own side of a break of the path.
-    lasts = starts + counts - 1
-    s[lasts] = np.nextafter(edges[1:], -np.inf)
-    s[-1] = edges[-1]
+    s[starts + counts - 1] = np.nextafter(right, -np.inf)
     first = np.zeros(len(s), dtype=bool)
     first[starts] = True
     return s, interval[piece], first

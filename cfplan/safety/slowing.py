@@ -12,7 +12,7 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.trajectory import Trajectory
 
 RESOLUTION = 1e-4  # of the share that is sought
-LEAST_SHARE = 1e-3  # slower than this is no flight
+LEAST_SHARE = 3e-3  # slower than this is no flight
 _AIM = RESOLUTION / 2  # below a limit, so that the search ends from the passing side
 _TRIALS = 60
 
@@ -50,7 +50,10 @@ def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Spac
         square = low + (high - low) * (low_excess + _AIM) / (low_excess - high_excess)
         if trial % 3 == 2 or not low < square < high:
             square = (low + high) / 2.0
-        slower = Trajectory(trajectory.path, trajectory.profile.slowed(square**0.5), trajectory.airframe)
+        try:
+            slower = Trajectory(trajectory.path, trajectory.profile.slowed(square**0.5), trajectory.airframe)
+        except NotCertifiedError:  # longer than any flight, so there is none
+            break
         certificate = certify(slower, limits, space)
         if certificate.passed:
             low, low_excess = square, certificate.worst.share - 1.0

@@ -13,6 +13,7 @@ from cfplan.errors import NotCertifiedError
 from cfplan.vehicle.profile import SpeedProfile
 
 TOLERANCE = 1e-12  # s, of each piece
+LONGEST = 3600.0  # s, beyond which a profile is a mistake
 _SPLITS = 40  # halvings of an interval before its speed counts as zero
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = (_NODES + 1.0) / 2.0, _WEIGHTS / 2.0
@@ -72,6 +73,9 @@ def measure(profile: SpeedProfile) -> Timing:
         raise NotCertifiedError("the speed falls to almost zero", where=f"s = {left[0]:.6g}")
     left, right, interval, duration = (np.concatenate([piece[k] for piece in pieces]) for k in range(4))
     order = np.argsort(left)
+    total = float(duration.sum())
+    if not total <= LONGEST:
+        raise NotCertifiedError(f"the speed profile takes {total:.0f} s, longer than any flight")
     return Timing(
         profile=profile,
         s=np.r_[left[order], right[order[-1]]],
