@@ -1,0 +1,71 @@
+"""What a measurement was made on, and the one thread that it may use. Imports nothing heavy: call one_thread first."""
+
+import os
+import platform
+import sys
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from cfplan import __version__
+from cfplan.errors import InputError
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+PACKAGES = ("casadi", "copp-py", "numba", "numpy", "scipy", "torch")
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Enough to know what a time means."""
+
+    processor: str
+    cores: int
+    # those that this process may use
+    system: str
+    python: str
+    cfplan: str
+    packages: dict[str, str]
+    threads: dict[str, str]
+    # the environment's word on threads, "" where unset
+
+
+def one_thread() -> None:
+    """Ask numerical libraries for one thread each.
+
+    Raises:
+        InputError: one of them is loaded already with another number, and would not listen any more.
+    """
+    late = "numpy" in sys.modules and any(os.environ.get(name) != "1" for name in THREADS[:2])
+    if late:
+        raise InputError("numpy is loaded with several threads already", hint="set OMP_NUM_THREADS=1 before starting")
+    for name in THREADS:
+        os.environ[name] = "1"
+
+
+def this_machine() -> Machine:
+    """The one that runs this."""
+    packages = {}
+    for name in PACKAGES:
+        try:
+            packages[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return Machine(
+        processor=_processor(),
+        cores=cores,
+        system=f"{platform.system()} {platform.release()}",
+        python=platform.python_version(),
+        cfplan=__version__,
+        packages=packages,
+        threads={name: os.environ.get(name, "") for name in THREADS},
+    )
+
+
+def _processor() -> str:
+    file = Path("/proc/cpuinfo")
+    if file.is_file():
+        for line in file.read_text(errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
