@@ -29,12 +29,12 @@ def check(
     from cfplan.cli.certificate_table import print_certificate
 
     steps = Steps(as_json=as_json)
-    plan, limits = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
+    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
     if as_json:
-        print_json(plan.to_dict())
+        print_json(flight.to_dict())
     else:
-        print_certificate(plan.certificate)
-    if not plan.certificate.passed:
+        print_certificate(flight.plan.certificate)
+    if not flight.plan.certificate.passed:
         return int(ExitCode.NOT_CERTIFIED)
-    certify_bytes(plan, limits, steps)
+    certify_bytes(flight, steps)
     return 0

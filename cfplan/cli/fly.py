@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,13 +14,13 @@ from cfplan import __version__
 from cfplan.cli import options
 from cfplan.cli.flight_progress import FlightProgress
 from cfplan.cli.output import Steps, print_json, print_table
-from cfplan.cli.rehearsal import PlanOptions, certify_bytes, obtain_plan, rehearse
+from cfplan.cli.rehearsal import PlannedFlight, PlanOptions, certify_bytes, obtain_plan, rehearse
 from cfplan.errors import CfplanError, ExitCode, InputError
 
 if TYPE_CHECKING:
     from cfplan.flight.outcome import FlightOutcome
     from cfplan.flight.poses import PoseSource
-    from cfplan.planning.plan import Plan
+    from cfplan.flight.telemetry import Telemetry
     from cfplan.recording.header import RecordHeader
     from cfplan.safety.limits import Limits
 
@@ -59,9 +59,9 @@ def fly(
 ) -> int:
     """Fly along PATH: plan, certify, rehearse, then take off, stream the flight, land, and keep a record."""
     steps = Steps(as_json=as_json)
-    plan, limits = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
-    encoded = certify_bytes(plan, limits, steps)
-    rehearsed = rehearse(plan, encoded, limits, steps)
+    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
+    encoded = certify_bytes(flight, steps)
+    rehearsed = rehearse(flight, encoded, steps)
 
     from cfplan.flight.mission import mission_of
     from cfplan.flight.process import fly as fly_mission
@@ -71,14 +71,14 @@ def fly(
     from cfplan.recording.writer import RecordWriter, new_record_folder, write_summary
 
     with steps.step("stops") as said:
-        mission = mission_of(encoded, limits)
+        mission = mission_of(encoded, flight.limits)
         said.append(f"a way to stop from each of {len(mission.payloads)} setpoints")
-    with _vehicle(uri, limits) as (drivers, pose_source):
-        folder = new_record_folder(records, plan.name)
+    with _vehicle(uri, flight.limits) as (drivers, pose_source):
+        folder = new_record_folder(records, flight.name)
         try:
-            save_plan(plan, folder / "plan.parquet")
+            save_plan(flight.plan, folder / "plan.parquet", {"name": flight.name, "path file": str(path_or_plan)})
             with (
-                RecordWriter(folder, _header(plan, limits, uri, path_or_plan)) as writer,
+                RecordWriter(folder, _header(flight, uri, path_or_plan)) as writer,
                 FlightProgress(duration=mission.duration, steps=steps) as progress,
             ):
                 outcome = fly_mission(
@@ -86,7 +86,7 @@ def fly(
                     uri=uri,
                     drivers=drivers,
                     pose_source=pose_source,
-                    on_telemetry=lambda message: (writer.write(message), progress.show(message)),
+                    on_telemetry=_both(writer.write, progress.show),
                 )
         except CfplanError:
             steps.say(f"what was recorded: {folder}")
@@ -97,17 +97,27 @@ def fly(
     write_summary(folder, summary)
 
     if as_json:
-        document = {"name": plan.name, "record": str(folder), "plan": plan.to_dict(), **summary}
-        print_json(document | {"dry_run_max_deviation": rehearsed.max_deviation})
+        document = {"record": str(folder), "plan": flight.to_dict(), **summary}
+        print_json(document | {"dry_run_max_deviation": rehearsed.deviation})
     else:
         if outcome.checks and outcome.exit_code == ExitCode.PREFLIGHT:
             _print_checks(outcome)
-        _print_outcome(plan, outcome, summary, rehearsed.max_deviation)
+        _print_outcome(flight, outcome, summary, rehearsed.deviation)
         click.echo(f"record: {folder}")
         click.echo(f"replay: cfplan replay {shlex.quote(str(folder))}")
     if outcome.exit_code is not ExitCode.OK:
         print(f"{click.style('error:', fg='red')} {outcome.reason}", file=sys.stderr)
     return int(outcome.exit_code)
+
+
+def _both(first: "Callable[[Telemetry], None]", second: "Callable[[Telemetry], None]") -> "Callable[[Telemetry], None]":
+    """Tell two listeners."""
+
+    def tell(message: "Telemetry") -> None:
+        first(message)
+        second(message)
+
+    return tell
 
 
 @contextmanager
@@ -123,18 +133,19 @@ def _vehicle(uri: str, limits: "Limits") -> "Iterator[tuple[list[type], PoseSour
     from cfplan.simulation.room import RoomPoseSource
     from cfplan.simulation.sim_driver import SimDriver
 
-    with start_lab(limits.airframe, uri=uri):
-        yield [SimDriver], RoomPoseSource(uri)
+    with start_lab(limits.airframe) as lab:
+        yield [SimDriver], RoomPoseSource(lab.number)
 
 
-def _header(plan: "Plan", limits: "Limits", uri: str, source: Path) -> "RecordHeader":
+def _header(flight: PlannedFlight, uri: str, source: Path) -> "RecordHeader":
     import numpy as np
 
     from cfplan.recording.header import FlightBounds, RecordHeader
     from cfplan.recording.writer import wall_time_at_zero
 
+    plan, limits = flight.plan, flight.limits
     return RecordHeader(
-        name=plan.name,
+        name=flight.name,
         version=__version__,
         uri=uri,
         planner=plan.planner,
@@ -191,11 +202,11 @@ def _print_checks(outcome: "FlightOutcome") -> None:
     print_table("Preflight", ["check", "value", "must be", "verdict", "hint"], rows)
 
 
-def _print_outcome(plan: "Plan", outcome: "FlightOutcome", summary: dict[str, Any], rehearsed: float) -> None:
+def _print_outcome(flight: PlannedFlight, outcome: "FlightOutcome", summary: dict[str, Any], rehearsed: float) -> None:
     settled = f"{outcome.settled_after:.2f} s" if math.isfinite(outcome.settled_after) else "–"
     rows = [
         ["ended", outcome.reason],
-        ["travel time, planned", f"{plan.trajectory.duration:.2f} s"],
+        ["travel time, planned", f"{flight.plan.trajectory.duration:.2f} s"],
         ["travel time, streamed", f"{outcome.flown:.2f} s"],
         ["settled after", settled],
         ["deviation, dry run", f"{100 * rehearsed:.1f} cm max"],

@@ -4,13 +4,15 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import click
 
 from cfplan.errors import CfplanError, ExitCode
+
+_FILE_WIDTH = 120  # characters, of tables that go to a file or a pipe
 
 
 class Steps:
@@ -62,17 +64,22 @@ def print_error(error: CfplanError, *, as_json: bool) -> None:
         print_json({"error": error.what, "where": error.where, "hint": error.hint, "exit_code": code})
 
 
-def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
+def print_table(title: str, columns: list[str], rows: Sequence[Sequence[str]]) -> None:
     """A table; the first column to the left, numbers to the right."""
+    from rich import box
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=title, title_justify="left", header_style="bold")
+    table = Table(title=title, title_justify="left", header_style="bold", box=box.SIMPLE_HEAD)
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index == 0 else "right")
     for row in rows:
-        table.add_row(*row)
-    Console().print(table)
+        table.add_row(*map(Text, row))
+    console = Console()
+    if not console.is_terminal:
+        console.width = _FILE_WIDTH
+    console.print(table)
 
 
 def _finite(value: Any) -> Any:

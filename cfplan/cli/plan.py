@@ -7,6 +7,7 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json
 from cfplan.cli.rehearsal import PlanOptions, obtain_plan
+from cfplan.errors import InputError
 
 
 @click.command(epilog="Example: cfplan plan flights/circle.yaml -o circle.parquet")
@@ -29,14 +30,16 @@ def plan(
     from cfplan.cli.certificate_table import print_certificate
 
     steps = Steps(as_json=as_json)
-    made, _ = obtain_plan(path_file, PlanOptions(safety_file, planner, nodes, speed_share), steps)
+    flight = obtain_plan(path_file, PlanOptions(safety_file, planner, nodes, speed_share), steps)
     if output is not None:
         from cfplan.planning.files import save_plan
 
         with steps.step("save") as said:
-            save_plan(made, output, overwrite=force)
+            if output.exists() and not force:
+                raise InputError("there is a file already", where=str(output), hint="give --force to overwrite it")
+            save_plan(flight.plan, output, {"name": flight.name, "path file": str(path_file)})
             said.append(str(output))
     if as_json:
-        print_json(made.to_dict() | ({"file": str(output)} if output else {}))
+        print_json(flight.to_dict() | ({"file": str(output)} if output else {}))
     else:
-        print_certificate(made.certificate)
+        print_certificate(flight.plan.certificate)

@@ -1,6 +1,5 @@
 """`cfplan sim`: the dry run alone."""
 
-from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -24,10 +23,10 @@ def sim(
 ) -> None:
     """Rehearse a path or a plan file: its very setpoints, the firmware's controller, a body with drag and motor lag."""
     steps = Steps(as_json=as_json)
-    plan, limits = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
-    encoded = certify_bytes(plan, limits, steps)
-    result = rehearse(plan, encoded, limits, steps)
+    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
+    encoded = certify_bytes(flight, steps)
+    result = rehearse(flight, encoded, steps)
     if as_json:
-        print_json({"name": plan.name, "duration": plan.trajectory.duration, "dry_run": asdict(result)})
+        print_json(flight.to_dict() | {"dry_run": result.summary()})
     else:
         print_table("Dry run", ["", "value"], result.rows())

@@ -10,13 +10,14 @@ import pyarrow as pa
 from cfplan.errors import CfplanError
 from cfplan.expert.limit_sets import LIMIT_SETS
 from cfplan.expert.reduced import plan_reduced
-from cfplan.expert.slowing import certified_share
 from cfplan.expert.solution import Solution, Status
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import perturbed, random_waypoints
 from cfplan.learning.dataset_spec import DatasetSpec, Relabel
 from cfplan.safety.certificate import certify
+from cfplan.safety.limits import PlanLimits
+from cfplan.safety.slowing import slow_until_certified
 from cfplan.vehicle.trajectory import Trajectory
 
 ACTIVE_SHARE = 0.98
@@ -136,16 +137,14 @@ def _label(path: Path, solution: Solution, limits: str) -> dict[str, Any]:
     return label | {
         "travel_time": trajectory.duration,
         "peak_speed": certificate.margins[0].worst,
-        "certified_share": 1.0 if certificate.passed else _share(path, solution, limits),
+        "certified_share": 1.0 if certificate.passed else _certified_share(trajectory, chosen.limits),
         "active_limits": [margin.name for margin in certificate.margins if margin.share >= ACTIVE_SHARE],
     }
 
 
-def _share(path: Path, solution: Solution, limits: str) -> float:
-    """0 where no slowing helps."""
-    chosen = LIMIT_SETS[limits]
-    assert solution.profile is not None
+def _certified_share(trajectory: Trajectory, limits: PlanLimits) -> float:
+    """Of its speed; 0 where no slowing helps."""
     try:
-        return certified_share(path, solution.profile, chosen.airframe, chosen.limits)
+        return slow_until_certified(trajectory, limits).share
     except CfplanError:
         return 0.0
