@@ -25,6 +25,10 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
 
+BOUND_SPACING, BOUND_TURN = 0.005, 0.004
+# m and rad between stations: what discretisation costs the bound falls with both, to 0.3 % of time at 2 m/s
+PLAN_SPACING, PLAN_TURN = 0.03, 0.03
+# coarser, as what the planner makes of it is certified and not proven
 WINDOW_SHARES = (0.25, 0.5, 1.0)
 # of the width at which a jump of acceleration takes the whole of a limit; wider rounds tight corners off too much
 Boundary = tuple[float | None, float | None]
@@ -49,7 +53,7 @@ def lower_bound(
     Raises:
         InfeasibleError: not even these limits can be met.
     """
-    at = stations(path)
+    at = stations(path, spacing=BOUND_SPACING, turn=BOUND_TURN)
     top = _outer_top(at, airframe, limits, _boundary(path, start, end))
     return float(np.sum(_least_times(at, top, limits)))
 
@@ -83,9 +87,9 @@ def plan_convex(
     """The convex problem from inside, made smooth. Of a boundary state only h is met, and only roughly."""
     begun = time.perf_counter()
     boundary = _boundary(path, start, end)
-    at = stations(path)
+    at = stations(path, spacing=PLAN_SPACING, turn=PLAN_TURN)
+    fastest = np.full(len(at.length), limits.speed)
     try:
-        fastest = _fastest(at, _outer_top(at, airframe, limits, boundary), limits)
         speeds = _solved(at, inner_rows(at, airframe, limits, fastest), boundary)
     except InfeasibleError as error:
         return Solution(Status.INFEASIBLE, None, str(error))

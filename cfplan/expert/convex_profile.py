@@ -56,9 +56,10 @@ def _averaged(length: NDArray, b: NDArray, half_width: float) -> tuple[NDArray, 
     step = half_width / TIME_STEPS_PER_WINDOW
     time = np.arange(-TIME_STEPS_PER_WINDOW, int(np.ceil(duration[-1] / step)) + TIME_STEPS_PER_WINDOW + 1) * step
     law = np.interp(time, duration, speed)  # acceleration is constant between stations: speed is linear in time
-    triangle = np.convolve(np.ones(TIME_STEPS_PER_WINDOW), np.ones(TIME_STEPS_PER_WINDOW))
-    padded = np.pad(law, TIME_STEPS_PER_WINDOW - 1, mode="edge")
-    smooth = np.convolve(padded, triangle / triangle.sum(), mode="valid")
+    smooth = np.pad(law, TIME_STEPS_PER_WINDOW - 1, mode="edge")
+    for _ in range(2):  # a box averaged by a box is a triangle
+        total = np.concatenate([[0.0], np.cumsum(smooth)])
+        smooth = (total[TIME_STEPS_PER_WINDOW:] - total[:-TIME_STEPS_PER_WINDOW]) / TIME_STEPS_PER_WINDOW
     gone = np.concatenate([[0.0], np.cumsum(0.5 * (smooth[1:] + smooth[:-1])) * step])
     gone -= half_width * speed[0]  # a flight that does not start from rest was on its way before
     return gone * (length[-1] + half_width * speed[-1]) / gone[-1], smooth

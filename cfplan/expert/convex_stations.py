@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 
-SAMPLES_PER_UNIT = 1_000  # fine samples per unit of s, a second at 1 m/s: 1 mm where the path is at nominal speed
-SAMPLES_MIN, SAMPLES_MAX = 2_000, 200_000
-STATION_SPACING = 0.005  # m, at most
-STATION_TURN = 0.004  # rad, turn between stations, where curvature is not that of a rest end
+SAMPLES_PER_STATION = 5  # fine samples between stations at nominal speed, 1 m/s
+SAMPLES_MIN, SAMPLES_MAX = 2_000, 500_000
 STATION_GROWTH = 0.05  # of the distance from the path's nearer end: curvature is unbounded at a rest end
 FIRST_STATION = 1e-5  # m from an end
 SWING = 0.2
@@ -54,9 +52,9 @@ class Stations:
     # (M,)
 
 
-def stations(path: Path) -> Stations:
-    """The path's stations: close where it turns and towards its ends, graded in between."""
-    samples = int(np.clip(SAMPLES_PER_UNIT * path.end, SAMPLES_MIN, SAMPLES_MAX))
+def stations(path: Path, *, spacing: float, turn: float) -> Stations:
+    """At most `spacing`, m, apart and `turn`, rad, of the path's direction; closer towards its ends."""
+    samples = int(np.clip(SAMPLES_PER_STATION * path.end / spacing, SAMPLES_MIN, SAMPLES_MAX))
     # Graded towards both ends, so that a rest end's first micrometres are resolved.
     x = np.linspace(0.0, 1.0, samples + 1)
     s = path.end * (x - np.sin(2 * np.pi * x) / (2 * np.pi) * 0.9)
@@ -64,9 +62,8 @@ def stations(path: Path) -> Stations:
     total = length[-1]
     distance = np.minimum(length, total - length) + FIRST_STATION
     # Near a rest end curvature grows as distance to the power of -3/4 while b grows as distance: κb vanishes there.
-    density = np.maximum(1 / STATION_SPACING, 1 / (STATION_GROWTH * distance))
-    turn = np.minimum(curvature, 1 / distance) / STATION_TURN
-    density = np.maximum(density, turn)
+    density = np.maximum(1 / spacing, 1 / (STATION_GROWTH * distance))
+    density = np.maximum(density, np.minimum(curvature, 1 / distance) / turn)
     count = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(length))])
     wanted = np.linspace(0.0, count[-1], int(np.ceil(count[-1])) + 1)
     chosen = np.unique(np.concatenate([[0], np.searchsorted(count, wanted[1:-1]), [samples]]))

@@ -5,6 +5,7 @@ flatness, as the paper recovers them, so whatever the solver believed of them do
 """
 
 import time
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,11 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile import BoundaryState
 
 NODES_LEAST = 8
-MAX_ITERATIONS = 2000
-MAX_SECONDS = 60.0
+MAX_ITERATIONS = 1000
+MAX_SECONDS = 30.0
+# of one attempt
 GUESS_SPEEDS = (1.0, 0.5)
-# ds/dt of the min-snap timing to start from, tried in turn: 1 is the paper's, which solved 98 % of its paths
+# ds/dt of the min-snap timing to start from: the paper's, which solved 98 % of its paths, and one for a second attempt
 END_NODES = 2
 END_SHARE = 0.5
 H_STIFFNESSES = (1e-2, 1e-1, 1.0, 10.0, 100.0)
@@ -45,7 +47,7 @@ def plan_toppquad(
 ) -> Solution:
     """Solve the paper's problem over `nodes` intervals. Free yaw starts in [0, π/2].
 
-    Of a boundary state h, h' and yaw are met: the problem's states have no more.
+    Of a boundary state h and h' are met, and yaw at the start: the problem's states have no more.
     """
     if nodes < NODES_LEAST:
         return Solution(Status.NOT_CONVERGED, None, f"{nodes} intervals are too few, take {NODES_LEAST} at least")
@@ -53,35 +55,37 @@ def plan_toppquad(
     prepared = program(nodes + 1, airframe, MAX_ITERATIONS, MAX_SECONDS)
     built = time.perf_counter()
     grid = np.linspace(0.0, path.end, nodes + 1)
+    if start is not None and yaw is YawMode.FREE:
+        yaw_angle = start.yaw
     angles = yaw_along(path, yaw, yaw_angle)(grid)
-    bounds = _bounds(prepared, path, grid, airframe, limits, yaw, start, end)
+    asked = _bounds(path, grid, airframe, limits, yaw, start, end)
+    held = _bounds(path, grid, airframe, limits, YawMode.FIXED, start, end)
+    guesses = [_guess(path, grid, airframe, angles, _guessed_h(path, grid, limits, speed)) for speed in GUESS_SPEEDS]
+    parameters = _parameters(path, grid, angles)
+
+    attempts = [_solve(prepared, guesses[0], parameters, asked)]
+    if not attempts[-1].solved:
+        # With yaw held the problem is far easier, and what it finds is a good guess, and no wrong answer, for free yaw.
+        attempts.append(_solve(prepared, guesses[1], parameters, held))
+        if attempts[-1].solved and yaw is YawMode.FREE:
+            attempts.append(_solve(prepared, attempts[-1].x, parameters, asked))
+    found = next((attempt for attempt in reversed(attempts) if attempt.solved), attempts[0])
+    solved = time.perf_counter()
     stats: dict[str, float | int | str] = {
         "solver": "IPOPT",
         "build_seconds": built - begun,
-        "tries": 0,
-        "iterations": 0,
+        "solve_seconds": solved - built,
+        "tries": len(attempts),
+        "iterations": sum(attempt.iterations for attempt in attempts),
+        "said": found.said,
     }
-    reason = ""
-    for speed in GUESS_SPEEDS:
-        guess = _guess(path, grid, airframe, angles, _guessed_h(path, grid, limits, speed))
-        answer = prepared.solver(x0=guess.ravel(), p=_parameters(path, grid, angles), **bounds)
-        report = prepared.solver.stats()
-        stats["tries"] = int(stats["tries"]) + 1
-        stats["iterations"] = int(stats["iterations"]) + int(report["iter_count"])
-        reason = str(report["return_status"])
-        if report["success"]:
-            break
-    solved = time.perf_counter()
-    stats["solve_seconds"] = solved - built
-    stats["said"] = reason
-    if not report["success"]:
-        status = Status.INFEASIBLE if "Infeasible" in reason else Status.NOT_CONVERGED
-        return Solution(status, None, f"IPOPT: {reason}", stats)
-    x = np.array(answer["x"]).reshape(nodes + 1, VARIABLES)
+    if not found.solved:
+        status = Status.INFEASIBLE if "Infeasible" in found.said else Status.NOT_CONVERGED
+        return Solution(status, None, f"IPOPT: {found.said}", stats)
     if yaw is YawMode.FREE:
-        angles = np.unwrap(2 * np.arctan2(x[:, 4], x[:, 5]), period=4 * np.pi)
+        angles = np.unwrap(2 * np.arctan2(found.x[:, 4], found.x[:, 5]), period=4 * np.pi)
     profiles = (
-        profile_through(grid, grid, x[:, 0], angles, h_stiffness=stiffness, yaw_stiffness=YAW_STIFFNESS)
+        profile_through(grid, grid, found.x[:, 0], angles, h_stiffness=stiffness, yaw_stiffness=YAW_STIFFNESS)
         for stiffness in H_STIFFNESSES
     )
     profile = least_slowed(path, profiles, airframe, limits)
@@ -91,6 +95,23 @@ def plan_toppquad(
     return Solution(Status.SOLVED, profile, stats=stats)
 
 
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    x: NDArray
+    # (N+1, 16)
+    solved: bool
+    said: str
+    # by the solver
+    iterations: int
+
+
+def _solve(prepared: Program, guess: NDArray, parameters: NDArray, bounds: dict[str, NDArray]) -> _Attempt:
+    answer = prepared.solver(x0=guess.ravel(), p=parameters, **bounds)
+    report = prepared.solver.stats()
+    x = np.array(answer["x"]).reshape(prepared.nodes, VARIABLES)
+    return _Attempt(x, bool(report["success"]), str(report["return_status"]), int(report["iter_count"]))
+
+
 def _parameters(path: Path, grid: NDArray, angles: NDArray) -> NDArray:
     half = angles[:, None] / 2
     columns = np.concatenate([path(grid, 1), path(grid, 2), np.cos(half), np.sin(half)], axis=1)
@@ -98,7 +119,6 @@ def _parameters(path: Path, grid: NDArray, angles: NDArray) -> NDArray:
 
 
 def _bounds(
-    prepared: Program,
     path: Path,
     grid: NDArray,
     airframe: Airframe,
@@ -108,7 +128,7 @@ def _bounds(
     end: BoundaryState | None,
 ) -> dict[str, NDArray]:
     """lbx, ubx, lbg, ubg."""
-    count = prepared.nodes
+    count = len(grid)
     low, high = np.full((count, VARIABLES), -np.inf), np.full((count, VARIABLES), np.inf)
     square = np.maximum(np.sum(path(grid, 1) ** 2, axis=1), 1e-12)
     low[:, 0], high[:, 0] = H_LEAST, np.maximum(limits.speed**2 / square, 2 * H_LEAST)
@@ -122,16 +142,13 @@ def _bounds(
     rows_low[:, 8], rows_low[:, 9] = np.cos(limits.tilt), limits.specific_thrust_min
     if yaw is not YawMode.FREE:
         rows_low[:, 10] = rows_high[:, 10] = 0.0
-    elif start is None:
+    elif start is not None:
+        rows_low[0, 10] = rows_high[0, 10] = 0.0
+    else:
         low[0, 4], low[0, 5], rows_low[0, 11] = 0.0, 0.0, 0.0  # z ≥ 0, w ≥ 0 and z ≤ w: yaw in [0, π/2]
     for index, state in ((0, start), (-1, end)):
         if state is not None:
             low[index, :2] = high[index, :2] = (state.h, state.dh)
-            if index == 0:
-                half = state.yaw / 2
-                slack = 1e-9  # z and w themselves are bound: a level start has no other freedom
-                low[0, 4:6] = np.array([np.sin(half), np.cos(half)]) - slack
-                high[0, 4:6] = np.array([np.sin(half), np.cos(half)]) + slack
     steps = np.zeros((count - 1) * STEP_ROWS)
     return {
         "lbx": low.ravel(),
