@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cfplan.errors import CfplanError, InputError
-from cfplan.expert.convex import lower_bound
+from cfplan.errors import InputError
 from cfplan.expert.limit_sets import BOXES, LIMIT_SETS, LimitSet
 from cfplan.expert.solution import Planner
 from cfplan.geometry.yaw import YawMode
@@ -21,12 +20,11 @@ from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.trials import (
     BAD_PATH,
     Trial,
-    failed_trial,
     find_box,
     find_limit_set,
+    path_trials,
     quantiles,
     random_path,
-    run_trial,
 )
 
 PLANNERS = ("expert", "toppquad", "convex", "min-snap")
@@ -145,7 +143,7 @@ def bench(
             for box in boxes:
                 trials = measured.setdefault((box, limit_set.name), [])
                 for seed in range(first_seed, first_seed + paths):
-                    trials += _all_planners(found, seed, box, limit_set, nodes, yaw)
+                    trials += path_trials(found, seed, box, limit_set, nodes=nodes, yaw=yaw)
                     done += 1
                     progress(done, total)
     except KeyboardInterrupt:
@@ -178,21 +176,6 @@ def _warm_up(planners: dict[str, Planner], chosen: LimitSet, nodes: int, yaw: Ya
     path = random_path(seed, next(iter(BOXES)))
     for planner in planners.values():
         planner(path, chosen.airframe, chosen.limits, nodes=nodes, yaw=yaw)
-
-
-def _all_planners(
-    planners: dict[str, Planner], seed: int, box: str, chosen: LimitSet, nodes: int, yaw: YawMode
-) -> list[Trial]:
-    try:
-        path = random_path(seed, box)
-        path.check()
-        bound = lower_bound(path, chosen.airframe, chosen.limits)
-    except CfplanError as error:
-        return [failed_trial(name, seed, BAD_PATH, str(error)) for name in planners]
-    return [
-        run_trial(name, planner, path, seed, chosen, nodes=nodes, yaw=yaw, bound=bound)
-        for name, planner in planners.items()
-    ]
 
 
 def _row(box: str, limits: str, name: str, trials: Iterable[Trial]) -> Row:

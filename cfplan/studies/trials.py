@@ -1,12 +1,13 @@
 """One planner on one path: how long it took, how fast its flight is, and what the certificate says of it."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from cfplan.errors import CfplanError, InputError
+from cfplan.expert.convex import lower_bound
 from cfplan.expert.limit_sets import BOXES, LIMIT_SETS, LimitSet
 from cfplan.expert.solution import Planner, Status
 from cfplan.geometry.min_snap import min_snap
@@ -86,6 +87,22 @@ def find_limit_set(name: str) -> LimitSet:
     if name not in LIMIT_SETS:
         raise InputError(f"unknown limit set {name!r}", hint=f"known: {', '.join(LIMIT_SETS)}")
     return LIMIT_SETS[name]
+
+
+def path_trials(
+    planners: Mapping[str, Planner], seed: int, box: str, chosen: LimitSet, *, nodes: int, yaw: YawMode
+) -> list[Trial]:
+    """Every planner's trial on the random path of that seed; a path with a cusp is a bad one for all."""
+    try:
+        path = random_path(seed, box)
+        path.check()
+        bound = lower_bound(path, chosen.airframe, chosen.limits)
+    except CfplanError as error:
+        return [failed_trial(name, seed, BAD_PATH, str(error)) for name in planners]
+    return [
+        run_trial(name, planner, path, seed, chosen, nodes=nodes, yaw=yaw, bound=bound)
+        for name, planner in planners.items()
+    ]
 
 
 def run_trial(

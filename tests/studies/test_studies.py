@@ -1,0 +1,141 @@
+"""Studies count what happened, on the same paths, and can be stopped; their numbers survive JSON."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from cfplan.errors import InputError
+from cfplan.expert.solution import Solution, Status
+from cfplan.planning import planners
+from cfplan.studies import bench as bench_module
+from cfplan.studies import feasibility, scaling
+from cfplan.studies.bench import bench
+from cfplan.studies.machine import this_machine
+from cfplan.studies.trials import quantiles, random_path
+
+pytestmark = pytest.mark.unit
+SMALL = {"boxes": ["4.5x8x2"], "limit_sets": ["hardware"], "planners": ["convex", "min-snap"]}
+
+
+@pytest.fixture(scope="module")
+def small():
+    return bench(paths=2, nodes=60, command="cfplan bench --paths 2", **SMALL)
+
+
+def test_every_planner_meets_the_same_paths_and_the_same_bound(small):
+    by_planner = {
+        name: [(trial["seed"], trial["bound"]) for trial in small.trials if trial["planner"] == name]
+        for name in SMALL["planners"]
+    }
+    assert by_planner["convex"] == by_planner["min-snap"]
+    assert len(by_planner["convex"]) == 2
+
+
+def test_certified_flights_are_no_faster_than_planned_nor_than_the_bound(small):
+    for trial in small.trials:
+        assert trial["certified_time"] >= trial["planned_time"] * (1 - 1e-12)
+        assert trial["certified_time"] > trial["bound"]
+    for row in small.rows:
+        assert row.paths == row.certified == 2
+        assert row.gap[0] > 0
+
+
+def test_what_is_slowed_is_what_broke_a_limit(small):
+    for trial in small.trials:
+        slowed = trial["certified_time"] > trial["planned_time"] * (1 + 1e-9)
+        assert slowed == (trial["worst_share"] > 1.0)
+
+
+def test_a_run_is_reproduced_by_its_seed_but_for_times(small):
+    again = bench(paths=2, nodes=60, **SMALL)
+    assert [row.flight for row in again.rows] == [row.flight for row in small.rows]
+
+
+def test_the_result_survives_json_and_names_command_and_machine(small):
+    document = json.loads(json.dumps(small.to_dict()))
+    assert document["command"] == "cfplan bench --paths 2"
+    assert document["machine"]["cores"] >= 1
+    assert len(document["trials"]) == 4
+    for _title, columns, rows in small.tables():
+        assert all(len(row) == len(columns) for row in rows)
+
+
+def test_a_failing_planner_is_counted_with_its_reason(monkeypatch):
+    def never(*_arguments, **_options):
+        return Solution(Status.NOT_CONVERGED, None, "gave up")
+
+    monkeypatch.setattr(bench_module, "find_planner", lambda name: never)
+    result = bench(paths=1, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=["min-snap"])
+    assert result.rows[0].certified == 0
+    assert result.trials[0]["reason"] == "gave up"
+    assert math.isnan(result.rows[0].flight)
+    assert all(isinstance(text, str) for text in result.rows[0].texts())
+
+
+def test_an_interrupt_keeps_what_is_measured(monkeypatch):
+    calls = []
+    true = planners.find_planner("min-snap")
+
+    def stopping(*arguments, **options):
+        calls.append(1)
+        if len(calls) > 3:  # warming up, then two paths
+            raise KeyboardInterrupt
+        return true(*arguments, **options)
+
+    monkeypatch.setattr(bench_module, "find_planner", lambda name: stopping)
+    result = bench(paths=5, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=["min-snap"])
+    assert result.interrupted
+    assert result.rows[0].paths == 2
+
+
+def test_feasibility_shares_its_paths_out_and_keeps_failures():
+    result = feasibility.dense_feasibility(
+        paths=2, boxes=["4.5x8x2"], limit_sets=["hardware", "simulation"], planner="convex", nodes=60
+    )
+    assert [group.paths for group in result.groups] == [1, 1]
+    for group in result.groups:
+        assert group.certified == group.paths
+        assert group.unslowed + sum(failure["limits"] == group.limits for failure in result.failures) == group.paths
+    assert all(len(row) == len(columns) for _title, columns, rows in result.tables() for row in rows)
+
+
+def test_scaling_grows_the_path_with_the_grid():
+    result = scaling.scaling(sizes=(50, 100), repeats=1, planner="min-snap")
+    assert [size.nodes for size in result.sizes] == [50, 100]
+    assert result.sizes[1].length > 1.4 * result.sizes[0].length
+    assert result.sizes[0].against_first == 1.0
+
+
+@pytest.mark.parametrize("length", [20.0, 200.0, 600.0])
+def test_paths_come_in_the_length_that_was_asked_for(length):
+    path = scaling.path_of_length(length, "10x10x10", 3)
+    assert length <= path.length < 1.05 * length + 15.0
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"paths": 0},
+        {"boxes": ["3x3x3"]},
+        {"limit_sets": ["mild"]},
+        {"planners": ["oracle"]},
+    ],
+)
+def test_wrong_arguments_are_input_errors(wrong):
+    with pytest.raises(InputError):
+        bench(**wrong)
+
+
+def test_quantiles_pass_over_what_is_not_finite():
+    assert quantiles([3.0, float("nan"), 1.0, 2.0])[0] == 2.0
+    assert np.isnan(quantiles([])).all()
+
+
+def test_random_paths_come_from_their_seed():
+    np.testing.assert_array_equal(random_path(3, "10x10x10").coefficients, random_path(3, "10x10x10").coefficients)
+
+
+def test_the_machine_knows_its_packages():
+    assert {"numpy", "casadi"} <= set(this_machine().packages)
