@@ -1,0 +1,1 @@
+"""Poses from a motion capture system: `source.pose_source` for a flight, `feed.Feed` for whoever wants every body."""

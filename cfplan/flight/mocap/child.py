@@ -1,0 +1,125 @@
+"""The process in which a driver runs; what it says goes through a pipe.
+
+A driver may hang without ever giving the interpreter back, so no thread and no signal handler of Python's can end it:
+the kernel's own alarm does, which is set anew before every step.
+"""
+
+import os
+import pickle
+import signal
+import struct
+import sys
+import time
+
+from cfplan.errors import CfplanError, InputError, LinkError
+from cfplan.flight.mocap.datastream_client import DataStreamClient
+from cfplan.flight.mocap.frames import Driver, Frame, Scene, Stage
+from cfplan.flight.mocap.sdk import SdkDriver
+from cfplan.flight.mocap.uri import MocapUri, parse_uri
+
+HEAD = struct.Struct("<I")  # bytes of the pickled message behind it
+CONNECT_ALARM = 3.0  # s to resolve the name, connect, and get the first frame's promise
+FRAME_ALARM = 1.5  # s between frames
+_TRY_AGAIN = 0.1  # s
+
+Message = Frame | Scene | Stage | CfplanError
+
+
+def driver_of(uri: MocapUri) -> Driver:
+    """The driver of a system."""
+    if uri.system == "vicon":
+        return DataStreamClient(uri.host, uri.port, str(uri))
+    return SdkDriver(uri)
+
+
+class Outlet:
+    """The writing end."""
+
+    def __init__(self, descriptor: int, subject: str):
+        self._descriptor, self._subject = descriptor, subject
+
+    def say(self, message: Message) -> None:
+        """Send a message. Raises BrokenPipeError where nobody listens any more."""
+        data = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
+        data = HEAD.pack(len(data)) + data
+        while data:
+            data = data[os.write(self._descriptor, data) :]
+
+    def frame(self, frame: Frame) -> None:
+        """Send a frame, or of it only the body that is asked for."""
+        if self._subject:
+            bodies = tuple(body for body in frame.bodies if body.name == self._subject)
+            hidden = () if bodies else (self._subject,)
+            frame = Frame(frame.received, bodies, hidden, frame.number, frame.rate, frame.latency)
+        self.say(frame)
+
+
+def run(uri: MocapUri, outlet: Outlet, *, again: bool) -> None:
+    """Connect and pass frames on; where a stream is lost that once was there, connect again, for ever.
+
+    `again` says that it was there already, for an earlier process.
+    """
+    while True:
+        driver = driver_of(uri)
+        try:
+            again = _stream(driver, uri, outlet) or again
+        except LinkError as lost:
+            if not again:
+                outlet.say(lost)
+                return
+            outlet.say(Stage(f"trying again: {lost.what}"))
+        except CfplanError as error:
+            outlet.say(error)
+            return
+        finally:
+            driver.close()
+        time.sleep(_TRY_AGAIN)
+
+
+def _stream(driver: Driver, uri: MocapUri, outlet: Outlet) -> bool:
+    """Until the stream is lost; whether there was one. Raises LinkError where there was none."""
+    _alarm(CONNECT_ALARM)
+    outlet.say(Stage(f"connecting to {uri.address}"))
+    driver.connect()
+    _alarm(FRAME_ALARM)
+    outlet.say(Stage("connected, waiting for a frame"))
+    told: Scene | None = None
+    frames = 0
+    while True:
+        try:
+            frame = driver.wait()
+        except LinkError as lost:
+            if not frames:
+                raise
+            outlet.say(Stage(lost.what))
+            return True
+        _alarm(FRAME_ALARM)
+        frames += 1
+        scene = driver.scene()
+        if scene is not None and scene is not told:
+            told = scene
+            outlet.say(scene)
+        outlet.frame(frame)
+
+
+def _alarm(seconds: float) -> None:
+    """From now on the kernel ends this process after so long."""
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+
+
+def main() -> None:
+    """`python -m cfplan.flight.mocap.child FD URI SUBJECT AGAIN`: frames go to FD; SUBJECT "" means every body."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever started this
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    descriptor, text, subject, again = sys.argv[1:]
+    outlet = Outlet(int(descriptor), subject)
+    try:
+        run(parse_uri(text, subject_needed=False), outlet, again=again == "again")
+    except BrokenPipeError:
+        return
+    except Exception as error:  # whatever a driver raises must be read by somebody
+        outlet.say(InputError(f"fault in the driver: {error!r}", where=text))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""A motion capture system's frames, read from a child process without ever waiting for it."""
+
+import os
+import pickle
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import Self
+
+from cfplan.errors import CfplanError, LinkError
+from cfplan.flight.mocap.child import CONNECT_ALARM, FRAME_ALARM, HEAD, Message
+from cfplan.flight.mocap.frames import Stage
+from cfplan.flight.mocap.uri import MocapUri
+
+_CHUNK = 1 << 16  # bytes
+_LOOK = 0.05  # s between looks at the child
+_SILENT = CONNECT_ALARM + 1.0  # s without a word, after which a child is killed that even the kernel's alarm spared
+_BACKOFF = 0.2  # s before a new child
+
+
+class Feed:
+    """Frames of one system, of the body that the URI names or of all. A context manager."""
+
+    def __init__(self, uri: MocapUri):
+        self._uri = uri
+        self._process: subprocess.Popen | None = None
+        self._descriptor = -1
+        self._buffer = bytearray()
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._keeper: threading.Thread | None = None
+        self._heard = 0.0
+        self.stage = "starting"
+        # the last that was heard of where the driver is
+        self.restarts = 0
+
+    def start(self) -> None:
+        """Start the child. Its first failure is found by `failure`."""
+        self._spawn("first")
+
+    def keep(self) -> None:
+        """From now on, in the background: a child that dies or hangs is replaced, for as long as the feed is open."""
+        self._keeper = threading.Thread(target=self._keep, name="mocap keeper", daemon=True)
+        self._keeper.start()
+
+    def messages(self) -> list[Message]:
+        """All that came since the last call; never waits."""
+        with self._lock:
+            if self._descriptor < 0:
+                return []
+            try:
+                while data := os.read(self._descriptor, _CHUNK):
+                    self._buffer += data
+                    self._heard = time.monotonic()
+            except BlockingIOError:
+                pass
+            found: list[Message] = []
+            while len(self._buffer) >= HEAD.size:
+                (size,) = HEAD.unpack_from(self._buffer)
+                end = HEAD.size + size
+                if len(self._buffer) < end:
+                    break
+                found.append(pickle.loads(self._buffer[HEAD.size : end]))
+                del self._buffer[:end]
+        for message in found:
+            if isinstance(message, Stage):
+                self.stage = message.text
+            elif not isinstance(message, CfplanError):
+                self.stage = "streaming"
+        return found
+
+    def failure(self) -> CfplanError | None:
+        """Why the child died, where it did without a word."""
+        code = self._process.poll() if self._process is not None else 0
+        if code is None:
+            return None
+        if code == -signal.SIGALRM:
+            if self.stage.startswith("connecting") and not _is_address(self._uri.host) and self._uri.system != "vrpn":
+                hint = f"is {self._uri.host!r} the right name, and is the system running there?"
+            elif self.stage.startswith("connecting"):
+                hint = "is the system running there, and is this computer in its network?"
+            else:
+                hint = "is the system live and streaming?"
+            limit = CONNECT_ALARM if self.stage.startswith("connecting") else FRAME_ALARM
+            return LinkError(f"no answer within {limit:g} s ({self.stage})", where=str(self._uri), hint=hint)
+        return LinkError(f"the driver's process died (exit code {code}, {self.stage})", where=str(self._uri))
+
+    def close(self) -> None:
+        """End; may be called twice."""
+        self._closed.set()
+        if self._keeper is not None:
+            self._keeper.join()
+            self._keeper = None
+        self._end_child()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def child_id(self) -> int | None:
+        """The child's process id, None where there is none."""
+        return self._process.pid if self._process is not None else None
+
+    def _spawn(self, again: str) -> None:
+        reading, writing = os.pipe()
+        os.set_blocking(reading, False)
+        command = [sys.executable, "-m", "cfplan.flight.mocap.child", str(writing), str(self._uri)]
+        try:
+            process = subprocess.Popen(
+                [*command, self._uri.subject, again],
+                pass_fds=(writing,),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,  # the vendors' libraries chat
+            )
+        except BaseException:
+            os.close(reading)
+            raise
+        finally:
+            os.close(writing)
+        with self._lock:
+            self._process, self._descriptor, self._buffer = process, reading, bytearray()
+            self._heard = time.monotonic()
+
+    def _end_child(self) -> None:
+        with self._lock:
+            if self._descriptor >= 0:
+                os.close(self._descriptor)
+                self._descriptor = -1
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+    def _keep(self) -> None:
+        while not self._closed.wait(_LOOK):
+            if self._process is not None and self._process.poll() is None and not self._is_silent():
+                continue
+            self._end_child()
+            if self._closed.wait(_BACKOFF):
+                return
+            self.restarts += 1
+            try:
+                self._spawn("again")
+            except OSError:  # no memory, no processes left: later, perhaps
+                continue
+
+    def _is_silent(self) -> bool:
+        """Whether the child says nothing; what it said and nobody has read yet counts."""
+        if time.monotonic() - self._heard < _SILENT:
+            return False
+        return not select.select([self._descriptor], [], [], 0)[0]
+
+
+def _is_address(host: str) -> bool:
+    return ":" in host or host.replace(".", "").isdigit()

@@ -1,0 +1,114 @@
+"""The vendors' own clients, through the `motioncapture` package.
+
+They tell neither frame number nor latency, and they hang: Vicon's holds the interpreter while it looks for a server,
+spins when the server goes away, and is silent about a subject whose segment bears another name. So this runs only in
+a process that can be killed, and what can be looked at beforehand is.
+"""
+
+import math
+import time
+from typing import TYPE_CHECKING
+
+from cfplan.errors import CfplanError, InputError, LinkError
+from cfplan.flight.mocap.datastream_client import DataStreamClient, open_connection
+from cfplan.flight.mocap.frames import Body, Frame, Scene
+from cfplan.flight.mocap.uri import MocapUri
+
+if TYPE_CHECKING:
+    import motioncapture
+
+_SCENE_TIMEOUT = 0.5  # s to hear of the subjects
+
+
+class SdkDriver:
+    """A Driver."""
+
+    def __init__(self, uri: MocapUri):
+        self._uri = uri
+        self._client: motioncapture.MotionCapture | None = None
+        self._scene: Scene | None = None
+        self._names: set[str] = set()
+
+    def connect(self) -> None:
+        """Raises InputError where the package is missing, LinkError where nobody answers. May hang."""
+        try:
+            import motioncapture
+        except ImportError as why:
+            raise InputError(
+                "the package motioncapture is not installed",
+                where=str(self._uri),
+                hint="pip install 'cfplan[mocap]'" + ("; or use vicon://, which does without" * self._is_vicon),
+            ) from why
+        if self._is_vicon:
+            self._scene = self._look_at_scene()
+        elif self._uri.system == "qualisys":
+            open_connection(
+                self._uri.host, self._uri.port, str(self._uri), "is Qualisys Track Manager running there, in real time?"
+            ).close()
+        try:
+            self._client = motioncapture.connect(self._uri.system.removesuffix("-sdk"), self._settings())
+        except RuntimeError as why:
+            raise LinkError(str(why), where=str(self._uri), hint="is the system running there?") from why
+
+    def wait(self) -> Frame:
+        """The next frame. May hang."""
+        if self._client is None:
+            raise LinkError("the stream is closed", where=str(self._uri))
+        try:
+            self._client.waitForNextFrame()
+            received = time.monotonic()
+            seen = self._client.rigidBodies
+        except RuntimeError as why:
+            raise LinkError(str(why), where=str(self._uri)) from why
+        bodies = tuple(_body(name, body) for name, body in seen.items())
+        known = {subject.name for subject in self._scene.subjects} if self._scene else self._names
+        self._names |= seen.keys()
+        return Frame(received, bodies, tuple(sorted(known - seen.keys())))
+
+    def scene(self) -> Scene | None:
+        """What Vicon knows; of the others only what was seen so far, which says nothing of what was not."""
+        return self._scene
+
+    def close(self) -> None:
+        """Nothing: the package cannot disconnect, the end of the process does."""
+        self._client = None
+
+    @property
+    def _is_vicon(self) -> bool:
+        return self._uri.system == "vicon-sdk"
+
+    def _settings(self) -> dict[str, str]:
+        host, port = self._uri.host, str(self._uri.port)
+        return {
+            # The misspelling is the package's; it turns the cloud of unlabelled markers off.
+            "vicon-sdk": {"hostname": f"{host}:{port}", "enable_pointclout": "0"},
+            "qualisys": {"hostname": host, "port": port, "enable_pointclout": "0"},
+            "optitrack": {"hostname": host, "port_command": port},
+            "vrpn": {"hostname": f"{host}:{port}"},
+        }[self._uri.system]
+
+    def _look_at_scene(self) -> Scene | None:
+        """The subjects and their segments, which Vicon's own client does not tell."""
+        client = DataStreamClient(self._uri.host, self._uri.port, str(self._uri))
+        try:
+            client.connect()
+            end = time.monotonic() + _SCENE_TIMEOUT
+            while time.monotonic() < end and client.scene() is None:
+                client.wait()
+            return client.scene()
+        except CfplanError:
+            if client.connected:  # a dialect that only the vendor's client understands
+                return None
+            raise
+        finally:
+            client.close()
+
+
+def _body(name: str, body: "motioncapture.RigidBody") -> Body:
+    x, y, z = (float(value) for value in body.position)
+    turn = body.rotation
+    quaternion = (float(turn.x), float(turn.y), float(turn.z), float(turn.w))
+    norm = math.sqrt(math.fsum(value * value for value in quaternion))  # single precision leaves it a little off 1
+    if abs(norm - 1.0) < 1e-3:
+        quaternion = (turn.x / norm, turn.y / norm, turn.z / norm, turn.w / norm)
+    return Body(name, (x, y, z), quaternion)

@@ -1,0 +1,201 @@
+"""The pilot's poses from a motion capture system."""
+
+import difflib
+import math
+import time
+from collections import Counter
+
+from cfplan.errors import CfplanError, InputError, LinkError
+from cfplan.flight.mocap.clock import FrameClock
+from cfplan.flight.mocap.feed import Feed
+from cfplan.flight.mocap.frames import Frame, Scene
+from cfplan.flight.mocap.sorting import Sorter, Verdict
+from cfplan.flight.mocap.uri import MocapUri, parse_uri
+from cfplan.flight.poses import Pose
+from cfplan.safety.limits import PoseLimits
+
+OPEN_WITHIN = 4.5  # s
+_RATE_SLACK = 1.2  # over the expected rate may so much be forwarded; more only burdens the radio
+_FARTHEST = 30.0  # m; no lab is larger, and a lab in millimetres is
+_MOST_TILT = math.radians(45)  # of a vehicle that stands on the floor
+_ENOUGH = 5  # good poses to believe in a body
+
+
+def pose_source(uri: str, limits: PoseLimits) -> "MocapSource":
+    """The poses of the body that a URI names. Raises InputError on a URI that is none."""
+    return MocapSource(parse_uri(uri, subject_needed=True), limits)
+
+
+class MocapSource:
+    """A PoseSource; goes to another process before it is opened.
+
+    Only good poses come out, dated back to when they were taken. A stream that is lost comes back by itself; until
+    then there is silence.
+    """
+
+    def __init__(self, uri: MocapUri, limits: PoseLimits):
+        self._uri, self._limits = uri, limits
+        self._feed: Feed | None = None
+        self._first: list[Pose] = []
+        self._begin()
+
+    def _begin(self) -> None:
+        self._sorter = Sorter(self._limits.jump)
+        self._clock = FrameClock(self._limits.latency)
+        self._scene: Scene | None = None
+        self._next = -math.inf
+        self.fault = ""
+        # why there is silence; "" while good poses come
+
+    @property
+    def counts(self) -> "Counter[Verdict]":
+        """How many poses were what."""
+        return self._sorter.counts
+
+    def open(self) -> None:
+        """Connect, and see the body upright and in metres. Raises a CfplanError within 5 s where that cannot be."""
+        self._begin()
+        deadline = time.monotonic() + OPEN_WITHIN
+        self._feed = Feed(self._uri)
+        try:
+            self._feed.start()
+            while len(self._first) < _ENOUGH:
+                self._first += self._read()
+                self._check_subject()
+                failure = self._feed.failure()
+                if failure is not None:
+                    self._first += self._read()  # its last words say more
+                    raise failure
+                if time.monotonic() > deadline:
+                    raise self._nothing_came()
+                time.sleep(0.005)
+            for pose in self._first:
+                _check_looks(pose, str(self._uri))
+        except BaseException:
+            self.close()
+            raise
+        self._feed.keep()
+
+    def poses(self) -> list[Pose]:
+        """The good ones that came since the last call."""
+        if self._feed is None:
+            return []
+        found, self._first = self._first, []
+        try:
+            return found + self._read()
+        except CfplanError as error:  # a child that was started again does not find its server: another will try
+            self.fault = error.what
+            return found
+
+    def close(self) -> None:
+        """End the child."""
+        if self._feed is not None:
+            self._feed.close()
+            self._feed = None
+        self._first = []
+
+    def _read(self) -> list[Pose]:
+        assert self._feed is not None
+        found, error = [], None
+        for message in self._feed.messages():
+            if isinstance(message, CfplanError):
+                error = message
+            elif isinstance(message, Scene):
+                self._scene = message
+            elif isinstance(message, Frame):
+                pose = self._sort(message)
+                if pose is not None:
+                    found.append(pose)
+        if error is not None:
+            raise error
+        return found
+
+    def _sort(self, frame: Frame) -> Pose | None:
+        body = next(iter(frame.bodies), None)
+        taken = self._clock.taken(frame.received, frame.number, frame.rate, frame.latency)
+        verdict = self._sorter.sort(taken, body, frame.number)
+        if verdict is not Verdict.GOOD or body is None:
+            self.fault = str(verdict)
+            return None
+        self.fault = ""
+        if taken < self._next:
+            return None
+        period = 1 / (self._limits.rate * _RATE_SLACK)
+        self._next = max(self._next, taken - period) + period
+        return Pose(taken, frame.received, body.position, body.quaternion)
+
+    # What is wrong, in words.
+
+    def _check_subject(self) -> None:
+        """Raises InputError as soon as it is clear that this body will never be seen."""
+        if self._scene is None:
+            return
+        subjects = {subject.name: subject for subject in self._scene.subjects}
+        subject = subjects.get(self._uri.subject)
+        if subject is None:
+            raise InputError(
+                f"there is no body named {self._uri.subject!r}",
+                where=str(self._uri),
+                hint=_suggestion(self._uri.subject, list(subjects)),
+            )
+        if self._uri.system == "vicon-sdk" and subject.name not in subject.segments:
+            raise InputError(
+                f"the segment of {subject.name!r} is named {' and '.join(map(repr, subject.segments)) or 'nothing'}",
+                where=str(self._uri),
+                hint=f"Vicon's own client sees only a segment named as its body: rename it to {subject.name!r}, "
+                "or use vicon://, which takes the root segment",
+            )
+
+    def _nothing_came(self) -> CfplanError:
+        assert self._feed is not None
+        counts = self.counts
+        total = counts.total()
+        where = str(self._uri)
+        if not total:
+            return LinkError(
+                f"no frame within {OPEN_WITHIN:g} s ({self._feed.stage})",
+                where=where,
+                hint="is the system live and streaming, and is this computer in its network?",
+            )
+        worst, count = counts.most_common(1)[0]
+        hints = {
+            Verdict.OCCLUDED: "are its markers in view, and is its name right? `cfplan mocap` lists what is there",
+            Verdict.FROZEN: "is the system paused, or playing nothing?",
+            Verdict.REPEATED: "is the system paused?",
+            Verdict.BROKEN: "calibrate the body anew",
+            Verdict.JUMPED: "are two bodies' markers alike, or do reflections look like markers?",
+            Verdict.FLIPPED: "make the pattern of its markers less symmetric",
+        }
+        return InputError(
+            f"no good pose of {self._uri.subject!r} within {OPEN_WITHIN:g} s: {count} of {total} {worst}",
+            where=where,
+            hint=hints.get(worst, "too few frames: is the rate of the cameras right?"),
+        )
+
+
+def _check_looks(pose: Pose, where: str) -> None:
+    """Raises InputError where poses are in millimetres or another axis is up."""
+    farthest = max(map(abs, pose.position))
+    if farthest > _FARTHEST:
+        raise InputError(
+            f"the body is {farthest:.0f} m from the origin: millimetres taken as metres?",
+            where=where,
+            hint="let the system send metres",
+        )
+    x, y = pose.quaternion[:2]
+    upright = 1.0 - 2.0 * (x * x + y * y)  # of the body's z axis, its z
+    if upright < math.cos(_MOST_TILT):
+        tilt = math.degrees(math.acos(max(-1.0, upright)))
+        raise InputError(
+            f"the body is tilted by {tilt:.0f}° before take-off: is y up instead of z?",
+            where=where,
+            hint="set the system to z up, and define the body anew with the vehicle level and pointing along x",
+        )
+
+
+def _suggestion(name: str, there: list[str]) -> str:
+    if not there:
+        return "nothing is defined or enabled there"
+    close = difflib.get_close_matches(name, there, 1)
+    meant = f"did you mean {close[0]!r}? " if close else ""
+    return f"{meant}there are: {', '.join(sorted(there))}"

@@ -1,0 +1,100 @@
+"""What can go wrong with motion capture, each for a time and by a size."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from cfplan.errors import InputError
+from cfplan.flight.telemetry import Quaternion, Triple
+
+Seen = tuple[Triple, Quaternion]  # position m, body→world x y z w
+
+
+class FaultKind(StrEnum):
+    """What goes wrong."""
+
+    OCCLUDE = "occlude"  # the body is not seen
+    STALL = "stall"  # no packet comes; frames go on being counted
+    FREEZE = "freeze"  # new frames with the old pose
+    REPEAT = "repeat"  # the same frame again and again
+    JUMP = "jump"  # the pose is off by `size` m along x
+    FLIP = "flip"  # the body is turned by `size` rad about its own z
+    BREAK = "break"  # the pose is not a number
+    SWAP = "swap"  # two bodies bear each other's names
+    DELAY = "delay"  # packets come `size` s later
+    CLOSE = "close"  # connections are reset and new ones refused
+
+
+_SIZES = {FaultKind.JUMP: 1.0, FaultKind.FLIP: math.pi, FaultKind.DELAY: 0.2}
+
+
+@dataclass(frozen=True, slots=True)
+class ViconFault:
+    """One fault."""
+
+    kind: FaultKind
+    start: float = 0.0
+    # s since the server's start, or since it was injected
+    duration: float = math.inf
+    # s
+    size: float | None = None
+    # in the unit of its kind; None for the usual one
+    subject: str | None = None
+    # None: every body
+
+    def __post_init__(self) -> None:
+        if math.isnan(self.start) or not self.duration > 0 or (self.size is not None and not math.isfinite(self.size)):
+            raise InputError(f"{self} makes no sense", hint="a fault has a start, a positive duration and a size")
+
+    @property
+    def strength(self) -> float:
+        """The size, or the usual one."""
+        return _SIZES.get(self.kind, 0.0) if self.size is None else self.size
+
+
+class Faults:
+    """The faults of one server, and what they make of what the cameras see."""
+
+    def __init__(self) -> None:
+        self._all: list[tuple[float, float, ViconFault]] = []
+        self._held: dict[str, Seen] = {}
+
+    def add(self, fault: ViconFault, now: float) -> None:
+        """A fault whose start counts from now."""
+        self._all.append((now + fault.start, now + fault.start + fault.duration, fault))
+
+    def acting(self, kind: FaultKind, time: float, subject: str | None = None) -> ViconFault | None:
+        """A fault of this kind that acts on this body at this time."""
+        for start, end, fault in self._all:
+            if fault.kind is kind and start <= time < end and fault.subject in (None, subject):
+                return fault
+        return None
+
+    def seen(self, time: float, truth: Mapping[str, Seen]) -> dict[str, Seen]:
+        """What the cameras make of where the bodies are; without those that they do not see."""
+        names = list(truth)
+        if len(names) > 1 and self.acting(FaultKind.SWAP, time):
+            truth = dict(truth) | {names[0]: truth[names[1]], names[1]: truth[names[0]]}
+        shown: dict[str, Seen] = {}
+        for name, (position, quaternion) in truth.items():
+            if self.acting(FaultKind.OCCLUDE, time, name):
+                continue
+            if self.acting(FaultKind.FREEZE, time, name) and name in self._held:
+                position, quaternion = self._held[name]
+            else:
+                self._held[name] = position, quaternion
+            if jump := self.acting(FaultKind.JUMP, time, name):
+                position = (position[0] + jump.strength, position[1], position[2])
+            if flip := self.acting(FaultKind.FLIP, time, name):
+                quaternion = _turned_about_z(quaternion, flip.strength)
+            if self.acting(FaultKind.BREAK, time, name):
+                position, quaternion = (math.nan,) * 3, (math.nan,) * 4
+            shown[name] = position, quaternion
+        return shown
+
+
+def _turned_about_z(quaternion: Quaternion, angle: float) -> Quaternion:
+    x, y, z, w = quaternion
+    s, c = math.sin(angle / 2), math.cos(angle / 2)
+    return x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s
