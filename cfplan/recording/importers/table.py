@@ -1,0 +1,69 @@
+"""The formats that can be read, told apart by what a file holds, whatever its name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from cfplan.errors import InputError
+from cfplan.recording.importers import crazyswarm_csv, ros_bag, tlog, usd_log, vicon_csv
+from cfplan.recording.importers.mocap_log import MocapLog
+from cfplan.recording.importers.vicon_csv import Rotations
+
+_HEAD = 4096  # bytes by which a file is told
+
+
+@dataclass(frozen=True, slots=True)
+class Importer:
+    """One format."""
+
+    name: str
+    recognises: Callable[[Path, bytes], bool]
+    # from the place and its first bytes; none where the place is a folder
+    read: Callable[[Path], MocapLog]
+
+
+IMPORTERS = (
+    Importer("Crazyflie microSD log", usd_log.recognises, usd_log.read),
+    Importer("ROS bag", ros_bag.recognises, ros_bag.read),
+    Importer("MAVLink .tlog", tlog.recognises, tlog.read),
+    Importer("crazyswarm2 CSV", crazyswarm_csv.recognises, crazyswarm_csv.read),
+    Importer("Vicon CSV", vicon_csv.recognises, vicon_csv.read),
+)
+
+
+def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
+    """The log in a file or in a bag's folder; `rotations` says what a Vicon CSV's three angles are if it does not.
+
+    Raises:
+        InputError: not there, empty, of no known format, damaged, or without any pose.
+    """
+    file = Path(file)
+    importer = find_importer(file)
+    if importer is None:
+        known = ", ".join(importer.name for importer in IMPORTERS)
+        raise InputError("of no format that is known", where=str(file), hint=f"known are: a cfplan record, {known}")
+    try:
+        log = vicon_csv.read(file, rotations) if importer.read is vicon_csv.read else importer.read(file)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", where=str(file)) from error
+    if not any(subject.seen.any() for subject in log.subjects):
+        raise InputError("there is no pose in it", where=str(file), hint="; ".join(log.notes))
+    return log
+
+
+def find_importer(file: Path) -> Importer | None:
+    """The importer that knows the file; None where none does. Raises InputError where it is absent or empty."""
+    head = b""
+    if not file.is_dir():
+        try:
+            with file.open("rb") as stream:
+                head = stream.read(_HEAD)
+        except FileNotFoundError:
+            raise InputError("no such file", where=str(file)) from None
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"cannot be read ({getattr(error, 'strerror', None) or error})", where=str(file)
+            ) from error
+        if not head:
+            raise InputError("the file is empty", where=str(file))
+    return next((importer for importer in IMPORTERS if importer.recognises(file, head)), None)

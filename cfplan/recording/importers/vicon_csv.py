@@ -1,0 +1,252 @@
+"""Vicon Tracker's and Nexus's CSV: sections of frames at a fixed rate, a subject every few columns.
+
+The file is mapped, not read: a block of lines at a time is turned into numbers, so that its size hardly matters.
+"""
+
+import mmap
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import csv
+from scipy.spatial.transform import Rotation
+
+from cfplan.errors import InputError
+from cfplan.recording.importers.mocap_log import MocapLog, Subject, ascending, unit_quaternions
+from cfplan.recording.importers.vicon_header import Group, Rotations, Section, read_head
+
+FORMAT = "Vicon CSV"
+LARGEST_ROOM = 100.0  # m from the origin; beyond it the unit is wrong
+_BLOCK = 1 << 24  # bytes turned into numbers at a time
+_HEAD_LINES = 5
+_BEGIN = re.compile(rb"[\s,;\"]*[A-Za-z][\w ]*\"?[,;\t ]*\r?\n\"?[\d.,]+\"?[,;\t ]*\r?\n")
+_FRAME = re.compile(rb"(?m)^\"?frame\"?[,;\t]\"?sub ?frame", re.IGNORECASE)
+_BLANK = re.compile(rb"\n[ \t,;\r]*\n")
+_CONTENT = re.compile(rb"[^\s,;]")
+_NO_NUMBER = ["", " ", "NaN", "nan", "-nan", "NA", "-nan(ind)"]
+
+
+@dataclass(slots=True)
+class _Rows:
+    """The numbers of one section, as they come."""
+
+    section: Section
+    blocks: list[NDArray] = field(default_factory=list)
+
+
+def recognises(file: Path, head: bytes) -> bool:
+    """By a section's name and rate on the first two lines, or by the columns Frame and Sub Frame."""
+    head = head.removeprefix(b"\xef\xbb\xbf")
+    return bool(head) and (_BEGIN.match(head) is not None or _FRAME.search(head) is not None)
+
+
+def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
+    """Every subject of every section; markers too, as positions without orientation.
+
+    `rotations` says what three angles are where the header does not; without it they are taken as helical.
+
+    Raises InputError where a head, a unit or a number is wrong; a last line that is cut off only ends the log.
+    """
+    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        reading = _Reading(data, file, rotations)
+        parts = reading.sections()
+        return _log(parts, reading, file)
+
+
+class _Reading:
+    """One pass through a mapped file."""
+
+    def __init__(self, data: mmap.mmap, file: Path, rotations: Rotations | None):
+        self.data, self.file, self.rotations = data, file, rotations
+        self.truncated = False
+
+    def sections(self) -> list[_Rows]:
+        """All of the file, in order."""
+        parts: list[_Rows] = []
+        for begin, end in self._stretches():
+            if parts and self.data[begin : begin + 1] in b'0123456789-"':  # a blank line between frames
+                self._append(parts[-1], begin, end)
+                continue
+            lines, place = self._lines(begin, end)
+            section = read_head(lines, where=self.place(begin), rotations=self.rotations)
+            parts.append(_Rows(section))
+            self._append(parts[-1], place, end)
+        return parts
+
+    def place(self, offset: int) -> str:
+        """`file:line` of a byte."""
+        starts = range(0, offset, _BLOCK)
+        lines = sum(self.data[start : min(start + _BLOCK, offset)].count(b"\n") for start in starts)
+        return f"{self.file}:{lines + 1}"
+
+    def _stretches(self) -> Iterator[tuple[int, int]]:
+        """What stands between blank lines."""
+        offset = 3 if self.data[:3] == b"\xef\xbb\xbf" else 0
+        while (first := _CONTENT.search(self.data, offset)) is not None:
+            begin = max(self.data.rfind(b"\n", offset, first.start()) + 1, offset)
+            blank = _BLANK.search(self.data, first.start())
+            end = blank.start() + 1 if blank else len(self.data)
+            yield begin, end
+            offset = end
+
+    def _lines(self, begin: int, end: int) -> tuple[list[str], int]:
+        """The lines of a head, and where its frames begin. A line of subjects may be blank but for one: not split."""
+        lines: list[str] = []
+        while len(lines) < _HEAD_LINES and begin < end:
+            after = self.data.find(b"\n", begin, end) + 1 or end
+            lines.append(self.data[begin:after].decode("utf-8", errors="replace").rstrip("\r\n"))
+            begin = after
+        return lines, begin
+
+    def _append(self, rows: _Rows, begin: int, end: int) -> None:
+        """Turn the frames from begin to end into numbers, a block at a time."""
+        if begin >= end or not rows.section.groups:
+            return
+        first_line = self.data[begin : self.data.find(b"\n", begin, end) + 1 or end]
+        delimiter = rows.section.delimiter
+        width = first_line.count(delimiter.encode()) + 1
+        point = "," if delimiter == ";" and b"," in first_line else "."
+        wanted = [rows.section.frame_column, *_columns(rows.section)]
+        if max(wanted) >= width:
+            if self._cut_off(begin, end):
+                return
+            raise InputError(f"{width} cells where the columns are {rows.section.headings}", where=self.place(begin))
+        while begin < end:
+            after = end if end - begin <= _BLOCK else self.data.rfind(b"\n", begin, begin + _BLOCK) + 1
+            if after <= begin:
+                raise InputError("a line is too long", where=self.place(begin))
+            values = self._numbers(rows.section, begin, after, width, point)
+            if len(values):
+                rows.blocks.append(values)
+            begin = after
+
+    def _numbers(self, section: Section, begin: int, end: int, width: int, point: str) -> NDArray:
+        """(rows, columns) of the frame, the sub-frame and what the groups need; NaN for empty cells."""
+        wanted = _wanted(section)
+        names = [str(index) for index in range(width)]
+        kept = [names[index] for index in wanted]
+        try:
+            table = csv.read_csv(
+                pa.BufferReader(self.data[begin:end]),
+                read_options=csv.ReadOptions(column_names=names, block_size=_BLOCK + 1),
+                parse_options=csv.ParseOptions(delimiter=section.delimiter, newlines_in_values=False),
+                convert_options=csv.ConvertOptions(
+                    include_columns=kept,
+                    column_types=dict.fromkeys(kept, pa.float64()),
+                    null_values=_NO_NUMBER,
+                    decimal_point=point,
+                ),
+            )
+        except pa.ArrowInvalid as error:
+            cut = self.data.rfind(b"\n", begin, end - 1) + 1 or begin
+            if self._cut_off(cut, end) and cut >= begin:
+                self.truncated = True
+                return self._numbers(section, begin, cut, width, point) if cut > begin else np.empty((0, len(wanted)))
+            raise self._mistake(section, begin, end, width, point) from error
+        return np.stack([column.to_numpy() for column in table.columns], axis=1)
+
+    def _cut_off(self, begin: int, end: int) -> bool:
+        """Whether the line from begin to end is the file's last and lacks its end."""
+        cut = end == len(self.data) and self.data[end - 1 : end] != b"\n" and self.data.find(b"\n", begin, end) < 0
+        self.truncated = self.truncated or cut
+        return cut
+
+    def _mistake(self, section: Section, begin: int, end: int, width: int, point: str) -> InputError:
+        """Which line, and which of its cells, is no row of numbers."""
+        while begin < end:
+            after = self.data.find(b"\n", begin, end) + 1 or end
+            cells = self.data[begin:after].decode("utf-8", errors="replace").strip("\r\n").split(section.delimiter)
+            if len(cells) != width:
+                return InputError(f"{len(cells)} cells, {width} in the lines before it", where=self.place(begin))
+            for index in _wanted(section):
+                text = cells[index].strip().strip('"')
+                try:
+                    float(text.replace(point, ".")) if text not in _NO_NUMBER else 0.0
+                except ValueError:
+                    return InputError(f"{text[:30]!r} in column {index + 1} is not a number", where=self.place(begin))
+            begin = after
+        return InputError("the frames cannot be read", where=str(self.file))
+
+
+def _wanted(section: Section) -> list[int]:
+    sub_frame = [] if section.sub_frame_column is None else [section.sub_frame_column]
+    return [section.frame_column, *sub_frame, *_columns(section)]
+
+
+def _columns(section: Section) -> list[int]:
+    return [c for group in section.groups for c in (*group.rotation_columns, *group.position_columns)]
+
+
+def _log(parts: list[_Rows], reading: _Reading, file: Path) -> MocapLog:
+    subjects: dict[str, Subject] = {}
+    notes: list[str] = []
+    origin: float | None = None
+    for part in parts:
+        section = part.section
+        notes += [f"left out, as it holds no pose: {name}" for name in section.left_out]
+        if not part.blocks:
+            continue
+        values = np.concatenate(part.blocks)
+        frame = values[:, 0]
+        if origin is None:
+            origin = float(frame[np.isfinite(frame)][0]) if np.isfinite(frame).any() else 0.0
+        sub_frame = np.zeros(len(frame)) if section.sub_frame_column is None else np.nan_to_num(values[:, 1])
+        time = ((frame - origin) * (1 + sub_frame.max()) + sub_frame) / section.rate
+        keep = ascending(time)
+        if not keep.all():
+            notes.append(f"{np.sum(~keep)} frames of section {section.name} left out, as their numbers do not grow")
+        column = 1 + (section.sub_frame_column is not None)
+        for group in section.groups:
+            after = column + len(group.rotation_columns) + len(group.position_columns)
+            if group.name in subjects:
+                notes.append(f"{group.name} stands in the file twice; the first is used")
+            else:
+                subjects[group.name] = _subject(group, time[keep], values[keep, column:after], file)
+            column = after
+    assumed = [group.name for part in parts for group in part.section.groups if group.assumed]
+    if assumed:
+        notes.append(f"the header does not say what the angles of {', '.join(assumed)} are: taken as helical")
+    if reading.truncated:
+        notes.append("the last line is cut off and left out")
+    return MocapLog(FORMAT, tuple(subjects.values()), tuple(dict.fromkeys(notes)), reading.truncated)
+
+
+def _subject(group: Group, time: NDArray, values: NDArray, file: Path) -> Subject:
+    """One subject's poses; a row of nothing but zeros is an occlusion, as some exports write it."""
+    count = len(group.rotation_columns)
+    unseen = np.isnan(values[:, count:]).any(axis=1) | (values == 0).all(axis=1)
+    position = np.where(unseen[:, None], np.nan, values[:, count:] * group.position_scale)
+    reach = np.max(np.abs(position[~unseen]), initial=0.0)
+    if reach > LARGEST_ROOM:
+        raise InputError(
+            f"{group.name!r} is {reach:.0f} m from the origin",
+            where=str(file),
+            hint="the unit over its columns is wrong; export it again",
+        )
+    rotation = np.where(unseen[:, None], np.nan, values[:, :count] * group.rotation_scale)
+    try:
+        quaternion = _quaternion(group.rotations, rotation)
+    except ValueError as error:
+        row, length = error.args
+        raise InputError(
+            f"the quaternion of {group.name!r} has length {length:.3g} at {time[row]:.3f} s", where=str(file)
+        ) from None
+    return Subject(group.name, time, position, quaternion)
+
+
+def _quaternion(kind: Rotations, rotation: NDArray) -> NDArray:
+    """(N, 4) from what the columns hold, NaN where that is NaN."""
+    if kind is Rotations.QUATERNION:
+        return unit_quaternions(rotation)
+    quaternion = np.full((len(rotation), 4), np.nan)
+    if kind is not Rotations.NONE:
+        known = np.isfinite(rotation).all(axis=1)
+        turn = rotation[known]
+        # capital letters: each about the axes as the rotations before have turned them
+        made = Rotation.from_euler("XYZ", turn) if kind is Rotations.EULER else Rotation.from_rotvec(turn)
+        quaternion[known] = made.as_quat()
+    return quaternion
