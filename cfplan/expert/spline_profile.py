@@ -32,7 +32,8 @@ def _fit(grid: NDArray, s: NDArray, values: NDArray, weights: NDArray, degree: i
     # Knots go on beyond the ends at the same spacing, so that differences of coefficients are derivatives everywhere.
     knots = grid[0] + step * np.arange(-degree, len(grid) + degree)
     count = len(grid) - 1 + degree
-    basis = BSpline.design_matrix(np.clip(s, grid[0], grid[-1]), knots, degree)
+    inside = np.clip(s, knots[degree], knots[-degree - 1])  # the last knot may differ from the end by rounding
+    basis = BSpline.design_matrix(inside, knots, degree)
     normal = basis.T @ sparse.diags_array(weights / len(s)) @ basis
     target = basis.T @ (weights * values) / len(s)
     # The (degree + 1)-th difference of the coefficients is the jump of the highest derivative at an inner knot.
