@@ -97,7 +97,11 @@ def plan_convex(
     width = window(airframe, limits)
     profiles = (smooth_profile(path, at, speeds, share * width, nodes, along) for share in WINDOW_SHARES)
     profile = least_slowed(path, profiles, airframe, limits)
-    stats: dict[str, float | int | str] = {"solver": "copp-py", "solve_seconds": time.perf_counter() - begun}
+    stats: dict[str, float | int | str] = {
+        "solver": "copp-py",
+        "solve_seconds": time.perf_counter() - begun,
+        "point_mass_time": float(np.sum(2 * np.diff(at.length) / (np.sqrt(speeds[1:]) + np.sqrt(speeds[:-1])))),
+    }
     if profile is None:
         return Solution(Status.NOT_CONVERGED, None, "no smoothing of the solution stays above h = 0", stats)
     return Solution(Status.SOLVED, profile, stats=stats)

@@ -79,6 +79,14 @@ def test_the_convex_profile_is_near_the_bound_before_it_is_slowed(wiggly):
     assert bound < duration < 1.1 * bound
 
 
+@pytest.mark.parametrize("set_name", list(LIMIT_SETS))
+def test_the_inner_polygons_come_close_to_the_outer_ones(set_name, wiggly):
+    chosen = LIMIT_SETS[set_name]
+    bound = lower_bound(wiggly, chosen.airframe, chosen.limits)
+    inside = plan_convex(wiggly, chosen.airframe, chosen.limits).stats["point_mass_time"]
+    assert bound < inside < 1.03 * bound
+
+
 def test_looser_limits_never_raise_the_bound(wiggly):
     bounds = [
         lower_bound(wiggly, HARDWARE.airframe, replace(HARDWARE.limits, speed=speed, acceleration=acceleration))
