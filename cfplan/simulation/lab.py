@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from cfplan.errors import LinkError
 from cfplan.simulation.room import RoomSettings, lab_variable
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_vicon_faults import ViconFault
 from cfplan.vehicle.airframe import Airframe
 
 TRUTH, CLOSE = "truth", "close"
@@ -49,7 +50,7 @@ class Truth:
     motor: NDArray
     # (N, 4) 16-bit commands
     off_in_air: NDArray
-    # (N,) ticks of 1 ms, so far, with all motors off more than 2 cm above the floor
+    # (N,) ticks of 1 ms, so far, with all motors off well above the floor
     supervisor: NDArray
     # (N,) the supervisor's state
     locked: bool
@@ -75,10 +76,19 @@ class Truth:
 class Lab:
     """A running lab; a context manager. `start_lab` makes it."""
 
-    def __init__(self, process: subprocess.Popen, connection: Connection, number: int, port: int):
+    def __init__(
+        self,
+        process: subprocess.Popen,
+        connection: Connection,
+        number: int,
+        port: int,
+        mocap_uri: str = "",
+    ):
         self.number = number
         self.uri = f"sim://{number}"
         self.port = port
+        self.mocap_uri = mocap_uri
+        # of the vehicle in the virtual Vicon; "" where the room has none
         self._process = process
         self._connection = connection
         os.environ[lab_variable(number)] = f"127.0.0.1:{port}"
@@ -101,6 +111,11 @@ class Lab:
         except (OSError, EOFError) as why:
             raise LinkError("the lab has died", where=self.uri) from why
         return Truth.of(np.frombuffer(rows).reshape(-1, ROW_SIZE), locked)
+
+    def disturb(self, fault: ViconFault) -> None:
+        """Let something go wrong with the virtual Vicon; the fault's start counts from now."""
+        with suppress(OSError):  # the lab has died, which others will notice
+            self._connection.send(fault)
 
     def close(self) -> None:
         """End it; may be called twice."""
@@ -144,7 +159,10 @@ def start_lab(
         connection.send((airframe, vehicle or VehicleSettings(), room or RoomSettings()))
         if not connection.poll(_START_TIMEOUT):
             raise EOFError
-        return Lab(process, connection, number, connection.recv())
+        port, vicon_port = connection.recv()
+        subject = room.vicon.subject if room is not None and room.vicon is not None else ""
+        mocap_uri = f"vicon://127.0.0.1:{vicon_port}/{subject}" if subject else ""
+        return Lab(process, connection, number, port, mocap_uri)
     except (OSError, EOFError) as why:
         process.kill()
         code = process.wait()

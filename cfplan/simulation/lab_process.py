@@ -1,6 +1,7 @@
 """The lab's own process: runs the virtual Crazyflie and the room in real time, against absolute deadlines."""
 
 import gc
+import math
 import os
 import select
 import signal
@@ -17,6 +18,8 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import NULL_PACKET, Port, pack
+from cfplan.simulation.virtual_vicon import VirtualVicon
+from cfplan.simulation.virtual_vicon_faults import ViconFault
 from cfplan.vehicle.airframe import Airframe
 
 _STEP = 2  # ms between wakes
@@ -55,6 +58,7 @@ class LabLoop:
     def __init__(self, airframe: Airframe, vehicle: VehicleSettings, room: RoomSettings):
         self.vehicle = VirtualCrazyflie(airframe, vehicle)
         self.capture = MotionCapture(room)
+        self.vicon: VirtualVicon | None = None
         self.record = Recorder()
         self.link, self.poses = _adjacent_sockets()
         self.port: int = self.link.getsockname()[1]
@@ -89,14 +93,25 @@ class LabLoop:
             tick = self.vehicle.tick
             if tick >= self.capture.next_tick:
                 self.capture.look(self._origin + tick / 1000, self.vehicle.stabilizer.loop.truth)
+            self._look(self._origin + tick / 1000)
             if tick % _RECORD_PERIOD == 0:
                 self.record.note(self._origin + tick / 1000, self.vehicle)
             stop = min(target, self.capture.next_tick, tick + _RECORD_PERIOD - tick % _RECORD_PERIOD)
+            if self.vicon is not None:
+                stop = min(stop, max(tick + 1, math.ceil((self.vicon.next_look - self._origin) * 1000)))
             self.vehicle.advance(stop - tick)
         self._send_out(now)
 
+    def _look(self, now: float) -> None:
+        """Let the virtual Vicon see the vehicle, where it is time."""
+        if self.vicon is not None and now >= self.vicon.next_look:
+            truth = self.vehicle.stabilizer.loop.truth.tolist()
+            self.vicon.look(now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]))
+
     def _send_out(self, now: float) -> None:
         packets = self.vehicle.sent()
+        if self.vicon is not None:
+            self.vicon.step(now)
         if self._client is not None and now - self._heard > _SILENCE:
             self._client = None
         if self._client is not None:
@@ -132,6 +147,8 @@ class LabLoop:
             return False
         if request == TRUTH:
             control.send((self.record.rows(), self.vehicle.supervisor.ever_locked))
+        elif isinstance(request, ViconFault) and self.vicon is not None:
+            self.vicon.inject(request, time.monotonic())
         return request != CLOSE
 
 
@@ -163,11 +180,14 @@ def _adjacent_sockets() -> tuple[socket.socket, socket.socket]:
 
 def serve(control: Connection) -> None:
     """Make the lab that the other side asks for, say on which port it listens, and run it."""
-    loop = LabLoop(*control.recv())
+    airframe, vehicle, room = control.recv()
+    loop = LabLoop(airframe, vehicle, room)
     _warm_up(loop.vehicle)
+    if room.vicon is not None:
+        loop.vicon = VirtualVicon(room.vicon, time.monotonic())
     gc.collect()
     gc.freeze()
-    control.send(loop.port)
+    control.send((loop.port, loop.vicon.port if loop.vicon is not None else None))
     loop.run(control)
 
 

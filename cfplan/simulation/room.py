@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InputError, LinkError
 from cfplan.flight.poses import Pose
+from cfplan.simulation.virtual_vicon import ViconSettings
 
 SUBSCRIBE, UNSUBSCRIBE = b"\1", b"\0"
 SUBSCRIPTION_LASTS = 2.0  # s without a renewal
@@ -37,6 +38,8 @@ class RoomSettings:
     latency: float = 0.010
     # s from the moment of a pose to its leaving the room
     seed: int = 7
+    vicon: ViconSettings | None = None
+    # a virtual Vicon that sees the vehicle too, with its own rate, noise and faults
 
     def __post_init__(self) -> None:
         for name in ("rate", "position_noise", "attitude_noise", "latency"):

@@ -111,7 +111,7 @@ def _at_rest(position: NDArray) -> Goal:
 
 
 def _wrapped(angle: float) -> float:
-    return math.remainder(angle, 2 * math.pi)
+    return math.remainder(angle, 2 * math.pi) if math.isfinite(angle) else math.nan
 
 
 class HighLevelCommander:
@@ -144,13 +144,15 @@ class HighLevelCommander:
             self.state = Planner.IDLE
         if self.state is Planner.IDLE:
             return Setpoint()
-        goal = self._goal(time)
+        with np.errstate(all="ignore"):  # what a client sends may be no number
+            goal = self._goal(time)
+            body_rate = _body_rate(goal)
         self._last = goal
         setpoint = Setpoint(mode=ON_BOARD.copy())
         setpoint.values[POSITION] = goal.position[:3]
         setpoint.values[VELOCITY] = goal.velocity[:3]
         setpoint.values[ACCELERATION] = goal.acceleration[:3]
-        setpoint.values[BODY_RATE] = _body_rate(goal)
+        setpoint.values[BODY_RATE] = body_rate
         setpoint.values[YAW] = goal.position[3]
         return setpoint
 
@@ -164,7 +166,8 @@ class HighLevelCommander:
 
     def receive(self, payload: bytes, time: float, *, blocked: bool) -> bytes:
         """Carry out a command; the answer has the return code in its fourth byte."""
-        code = self._command(payload[0], payload[1:], time, blocked) if payload else errno.ENOEXEC
+        with np.errstate(all="ignore"):
+            code = self._command(payload[0], payload[1:], time, blocked) if payload else errno.ENOEXEC
         return payload[:3].ljust(3, b"\0") + bytes((code,))
 
     def _command(self, command: int, data: bytes, time: float, blocked: bool) -> int:

@@ -3,6 +3,7 @@
 import errno
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from math import copysign, inf, isfinite
 from struct import calcsize, unpack_from
 from struct import pack as bytes_of
 
@@ -134,8 +135,11 @@ class LogBlocks:
 
 
 def _encode(layout: str, value: float) -> bytes:
-    """A value as the wire has it; what does not fit is cut to the type's bits, as in C."""
+    """A value as the wire has it; what does not fit is infinite, or cut to the type's bits, as in C."""
     if layout in _FLOATING:
-        return bytes_of("<" + layout, value)
+        try:
+            return bytes_of("<" + layout, value)
+        except OverflowError:
+            return bytes_of("<" + layout, copysign(inf, value))
     size = calcsize("<" + layout)
-    return (int(value) & ((1 << 8 * size) - 1)).to_bytes(size, "little")
+    return ((int(value) if isfinite(value) else 0) & ((1 << 8 * size) - 1)).to_bytes(size, "little")

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cfplan.simulation.body import ALL_WELL, STILL_AIR, TIME_STEP, at_rest, pack_body, rotation, step_body
+from cfplan.simulation.body import ALL_WELL, FLOOR, STILL_AIR, TIME_STEP, at_rest, pack_body, rotation, step_body
 from cfplan.simulation.estimator import Filter, estimate, new_filter, reset, step_filter
 from cfplan.simulation.mellinger import FULL_COMMAND, MEMORY_SIZE, distribute_power, level_out, step_mellinger
 from cfplan.simulation.virtual_crazyflie.setpoints import Setpoint
@@ -19,7 +19,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 # Where each flag lies in the array that `run` fills.
 OFF_TICKS, OFF_IN_AIR_TICKS, RESETS = range(3)
 
-IN_AIR = 0.02  # m above the floor
+IN_AIR = 0.05  # m above the floor; a landing ends a little above it
 _NOISE_ROWS = 8191  # ms after which the sensors' noise repeats; a prime, so that it beats with nothing
 
 
@@ -97,9 +97,9 @@ class Stabilizer:
 def _sensor_noise(sensors: Sensors, seed: int) -> NDArray:
     chance = np.random.default_rng(seed)
     noise = np.empty((_NOISE_ROWS, 6))
-    noise[:, :3] = chance.normal(chance.normal(0, sensors.gyro_bias, 3), sensors.gyro_noise, (_NOISE_ROWS, 3))
+    noise[:, :3] = chance.normal(chance.normal(0.0, sensors.gyro_bias, 3), sensors.gyro_noise, (_NOISE_ROWS, 3))
     noise[:, 3:] = chance.normal(
-        chance.normal(0, sensors.acceleration_bias, 3), sensors.acceleration_noise, (_NOISE_ROWS, 3)
+        chance.normal(0.0, sensors.acceleration_bias), sensors.acceleration_noise, (_NOISE_ROWS, 3)
     )
     return noise
 
@@ -119,30 +119,42 @@ def _run(
     flying: bool,
     per_command: float,
 ) -> None:
-    floor = body[10]
-    gyro = np.empty(3)
+    gyro, measured = np.empty(3), np.empty(3)
+    none = poses[:0]
     for now in range(tick, tick + ticks):
-        noise = loop.noise[now % len(loop.noise)]
-        gyro[:] = loop.truth[10:13] + noise[0:3]
-        loop.belief[10:13] = gyro
-        fresh = poses if now == tick else poses[:0]
-        measured = loop.acceleration + noise[3:6]
-        if not step_filter(loop.kalman, prior, gyro, measured, fresh, now, flying):
-            loop.counts[2] += 1
+        row = now % len(loop.noise)
+        for axis in range(3):
+            gyro[axis] = loop.truth[10 + axis] + loop.noise[row, axis]
+            measured[axis] = loop.acceleration[axis] + loop.noise[row, 3 + axis]
+            loop.belief[10 + axis] = gyro[axis]
+        if not step_filter(loop.kalman, prior, gyro, measured, poses if now == tick else none, now, flying):
+            loop.counts[RESETS] += 1
         estimate(loop.kalman, loop.belief)
 
         if now % 2 == 0:
             step_mellinger(loop.control, loop.memory, gains, setpoint, mode, loop.belief)
             distribute_power(loop.control, loop.motors)
-        if not allowed:
-            loop.motors[:] = 0.0
-        if np.all(loop.motors == 0.0):
-            loop.counts[0] += 1
-            if loop.truth[2] > floor + IN_AIR:
-                loop.counts[1] += 1
+        _drive(loop, body, allowed, per_command)
 
-        before = loop.truth[3:6].copy()
-        step_body(loop.truth, loop.motors * per_command, body, loop.wind, loop.efficiency)
-        force = (loop.truth[3:6] - before) / TIME_STEP
-        force[2] += GRAVITY
-        loop.acceleration[:] = rotation(loop.truth[6:10]).T @ force
+
+@njit(cache=True)
+def _drive(loop: Loop, body: NDArray, allowed: bool, per_command: float) -> None:
+    """Turn the motors, move the body, and note what an accelerometer there feels."""
+    off = True
+    command = np.empty(4)
+    for motor in range(4):
+        if not (allowed and loop.motors[motor] > 0.0):  # so that not-a-number is off, as its cast to an integer is
+            loop.motors[motor] = 0.0
+        off = off and loop.motors[motor] == 0.0
+        command[motor] = loop.motors[motor] * per_command
+    if off:
+        loop.counts[OFF_TICKS] += 1
+        if loop.truth[2] > body[FLOOR] + IN_AIR:
+            loop.counts[OFF_IN_AIR_TICKS] += 1
+    vx, vy, vz = loop.truth[3], loop.truth[4], loop.truth[5]
+    step_body(loop.truth, command, body, loop.wind, loop.efficiency)
+    fx, fy = (loop.truth[3] - vx) / TIME_STEP, (loop.truth[4] - vy) / TIME_STEP
+    fz = (loop.truth[5] - vz) / TIME_STEP + GRAVITY
+    turn = rotation(loop.truth[6:10])
+    for axis in range(3):
+        loop.acceleration[axis] = turn[0, axis] * fx + turn[1, axis] * fy + turn[2, axis] * fz

@@ -139,7 +139,7 @@ class VirtualCrazyflie:
 
     @property
     def acceleration(self) -> NDArray:
-        """(3,) m/s², specific force in body axes as low-pass filtered measurement."""
+        """(3,) m/s², specific force in body axes: what the supervisor's low-pass filter leaves of the measurement."""
         return self.stabilizer.loop.acceleration
 
     def _stabilize(self, ticks: int) -> None:
