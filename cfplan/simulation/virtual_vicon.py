@@ -89,7 +89,8 @@ class VirtualVicon:
     def look(self, time: float, position: Triple, quaternion: Quaternion) -> None:
         """The vehicle is here; see it."""
         settings, faults = self._settings, self._faults
-        self._looks += 1
+        # Frames that nobody had time to take are counted, and missing.
+        self._looks = max(self._looks, round((time - self._start) * settings.rate)) + 1
         if self._last is not None and faults.acting(FaultKind.REPEAT, time):
             self._queue(time, self._last)
             return
