@@ -134,6 +134,9 @@ class Link:
 
     # What waits for an answer: for the ground only.
 
+    def has_parameter(self, name: str) -> bool:
+        return self._crazyflie.param.toc.get_element_by_complete_name(name) is not None
+
     def set_parameter(self, name: str, value: float, patience: float = 2.0) -> float:
         """Write, then read what the vehicle has. Raises LinkError where it has no such parameter or does not answer."""
         group, _, short = name.partition(".")

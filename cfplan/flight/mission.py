@@ -72,6 +72,16 @@ class Mission:
             "locSrv.extQuatStdDev": EXTERNAL_ATTITUDE_STD,
         }
 
+    @property
+    def parameters_if_known(self) -> dict[str, float]:
+        """What is set where the vehicle has it, which is from firmware 2026.04 on: rotor drag over mass, 1/s.
+
+        A filter that does not know of drag takes the tilt that holds against it for acceleration: at 2 m/s its
+        attitude is 4° off. Along the thrust axis it measures what drag does.
+        """
+        drag = self.limits.airframe.drag[0] / self.limits.airframe.mass
+        return {"kalman.dragB_x": drag, "kalman.dragB_y": drag}
+
 
 def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0) -> Mission:
     """The mission that flies these setpoints; stops are made for each of them."""

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from cfplan.errors import CfplanError, ExitCode, InputError, PreflightError
+from cfplan.flight.forecast import Forecast
 from cfplan.flight.freshness import Freshness
 from cfplan.flight.keys import Order
 from cfplan.flight.link import GO_TO, LAND, TAKE_OFF, Link
@@ -83,7 +84,7 @@ class Pilot:
         self._limits, self._now, self._sleep = mission.limits, clock, sleep
         self._plan = Stream(mission.payloads, mission.rate)
         self._watch = Watch(mission.limits)
-        self._freshness = Freshness(mission.limits.pose.jump)
+        self._freshness, self._forecast = Freshness(mission.limits.pose.jump), Forecast()
         self._link: Link
         self._connected = self._feeding = self._airborne = False
         self._stream: Stream | None = None
@@ -142,7 +143,13 @@ class Pilot:
         self._link.release_priority()
         self._enter(Phase.CONFIGURE)
         self._restart_pace()
-        parameters = {name: self._link.set_parameter(name, value) for name, value in mission.parameters.items()}
+        wanted = mission.parameters
+        for name, value in mission.parameters_if_known.items():
+            if self._link.has_parameter(name):
+                wanted[name] = value
+            else:
+                self._say(Level.WARNING, f"the vehicle has no {name}: expect it some centimetres off at speed")
+        read_back = {name: self._link.set_parameter(name, value) for name, value in wanted.items()}
         self._link.start_logs()
         self._until(lambda: self._link.estimate is not None and self._link.status is not None, 3.0)
         if self._link.estimate is None or self._link.status is None:
@@ -150,7 +157,7 @@ class Pilot:
         self._quieten()
         self._feed()
         self._converge()
-        self._preflight(parameters)
+        self._preflight(wanted, read_back)
         self._enter(Phase.ARM)
         self._restart_pace()
         self._floor = self._pose().position[2]
@@ -199,7 +206,7 @@ class Pilot:
         if not self._until(agreed, 10.0):
             self._say(Level.WARNING, "the vehicle's estimate does not settle")
 
-    def _preflight(self, parameters: dict[str, float]) -> None:
+    def _preflight(self, wanted: dict[str, float], read_back: dict[str, float]) -> None:
         """The table. An auto-arming vehicle is not ready for moments, so a table that fails gets two more tries."""
         self._enter(Phase.PREFLIGHT)
         for _ in range(_TRIES):
@@ -223,7 +230,8 @@ class Pilot:
                     round_trip=self._link.round_trip,
                     could_fly=could_fly,
                     status=status,
-                    parameters=parameters,
+                    wanted=wanted,
+                    read_back=read_back,
                     poses=tuple(self._recent),
                     pose_age=self._now() - pose.time,
                     estimate=estimate,
@@ -430,9 +438,11 @@ class Pilot:
             if not fault:
                 newest = pose
                 self._recent.append(pose)
+                self._forecast.add(pose)
                 self._note_deviation(pose)
-        if newest is not None and self._now() - newest.time < self._limits.pose.age_brake:
-            self._link.send_pose(newest.position, newest.quaternion)
+        now = self._now()
+        if newest is not None and now - newest.time < self._limits.pose.age_brake:
+            self._link.send_pose(self._forecast.position(now), newest.quaternion)
         while len(self._recent) > 1 and self._recent[0].time < self._recent[-1].time - 1.0:
             self._recent.popleft()
 

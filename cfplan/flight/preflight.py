@@ -35,8 +35,10 @@ class Ground:
     could_fly: bool
     # the supervisor said so at least once in the last second
     status: VehicleStatus
-    parameters: Mapping[str, float]
-    # as read back
+    wanted: Mapping[str, float]
+    # parameters as they were set
+    read_back: Mapping[str, float]
+    # the same as the vehicle then had them
     poses: Sequence[Pose]
     # of about the last second, oldest first
     pose_age: float
@@ -102,12 +104,12 @@ def check_endurance(ground: Ground) -> Check:
 
 def check_parameters(ground: Ground) -> Check:
     wrong = [
-        f"{name} is {ground.parameters.get(name, math.nan):g}, not {wanted:g}"
-        for name, wanted in ground.mission.parameters.items()
-        if not math.isclose(ground.parameters.get(name, math.nan), wanted, rel_tol=1e-6)
+        f"{name} is {ground.read_back.get(name, math.nan):g}, not {wanted:g}"
+        for name, wanted in ground.wanted.items()
+        if not math.isclose(ground.read_back.get(name, math.nan), wanted, rel_tol=1e-6)
     ]
     return Check(
-        "parameters read back", "; ".join(wrong) or f"{len(ground.mission.parameters)} as set", "as set", not wrong,
+        "parameters read back", "; ".join(wrong) or f"{len(ground.wanted)} as set", "as set", not wrong,
         "restart the vehicle",
     )  # fmt: skip
 

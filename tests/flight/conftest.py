@@ -98,6 +98,7 @@ class World:
     round_trip: float = 0.002
     refuses: dict[int, int] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
+    unknown: tuple[str, ...] = ()
     stubborn: dict[str, float] = field(default_factory=dict)
     replies: dict[int, int] = field(default_factory=dict)
     extra_bits: int = 0
@@ -219,6 +220,9 @@ class World:
 
     def send_pose(self, position, quaternion) -> None:
         self.forwarded.append((self.now, *position))
+
+    def has_parameter(self, name: str) -> bool:
+        return name not in self.unknown
 
     def set_parameter(self, name: str, value: float) -> float:
         self.parameters[name] = self.stubborn.get(name, value)

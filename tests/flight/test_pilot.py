@@ -224,6 +224,18 @@ def test_a_parameter_that_the_vehicle_changes_back_fails_preflight(world, fly):
     assert "stabilizer.controller is 1, not 2" in outcome.reason
 
 
+def test_the_vehicle_is_told_of_its_drag_where_it_has_a_place_for_it(world, fly):
+    fly()
+    assert world.parameters["kalman.dragB_x"] > 0.1
+
+
+def test_older_firmware_flies_without_it_and_that_is_said(world, fly):
+    world.unknown = ("kalman.dragB_x", "kalman.dragB_y")
+    assert fly().exit_code is ExitCode.OK
+    assert "kalman.dragB_x" not in world.parameters
+    assert "no kalman.dragB_x" in world.said
+
+
 def test_a_refused_take_off_ends_on_the_ground(world, fly):
     world.refuses[TAKE_OFF] = 16
     outcome = fly()
