@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.errors import InfeasibleError
+from cfplan.errors import InfeasibleError, InputError
 from cfplan.expert.convex_profile import smooth_profile, window
 from cfplan.expert.convex_rows import Rows, inner_rows, outer_rows
 from cfplan.expert.convex_stations import Stations, stations
@@ -31,6 +31,8 @@ PLAN_SPACING, PLAN_TURN = 0.03, 0.03
 # coarser, as what the planner makes of it is certified and not proven
 WINDOW_SHARES = (0.25, 0.5, 1.0)
 # of the width at which a jump of acceleration takes the whole of a limit; wider rounds tight corners off too much
+BOUNDARY_SLACK = 1.01
+# on b where a segment hands over: what is on a limit from inside may be over the polygon's
 Boundary = tuple[float | None, float | None]
 # m²/s² at the start and the end of the path, None where it is free
 
@@ -116,27 +118,41 @@ def _boundary(path: Path, start: BoundaryState | None, end: BoundaryState | None
     return values[0], values[1]
 
 
-def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
-    import copp_py
+def _library() -> Any:
+    try:
+        import copp_py
+    except ImportError:
+        raise InputError(
+            "the convex problem needs copp-py, which is not installed", hint="pip install 'cfplan[bench]'"
+        ) from None
+    return copp_py
 
+
+def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
+    copp_py = _library()
     ceiling, most, ends = rows.ceiling.copy(), rows.most.copy(), []
     for index, beside, value in ((0, 1, boundary[0]), (-1, -2, boundary[1])):
         if value is None:  # free: let b jump in the interval at that end, which only ever allows more
             most[[index, beside]] = 1e6
             value = ceiling[index]
+        elif value > ceiling[index] * BOUNDARY_SLACK:
+            raise InfeasibleError(
+                f"a boundary state of {value**0.5:.3f} m/s is faster than the limits allow there, "
+                f"{ceiling[index] ** 0.5:.3f} m/s"
+            )
         ceiling[index] = max(value, 1e-9)  # the library wants it positive
         ends.append(float(value))
     constraints = copp_py.constraints.Constraints(3, capacity=len(at.length))
     constraints.append_s(at.length)
     constraints.add_constraint_1st(ceiling[:, None], 0)
     constraints.add_constraint_2nd(rows.first, rows.second, most, 0)
-    solver: Any = copp_py.solver.topp2_ra  # its stubs do not export Problem
-    return solver.Problem(constraints, idx_s_interval=(0, len(at.length) - 1), a_boundary=(ends[0], ends[1]))
+    return copp_py.solver.topp2_ra.Problem(
+        constraints, idx_s_interval=(0, len(at.length) - 1), a_boundary=(ends[0], ends[1])
+    )
 
 
 def _reachable_top(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
-    import copp_py
-
+    copp_py = _library()
     try:
         return copp_py.solver.reach_set2.bidirectional(_problem(at, rows, boundary)).a_max
     except copp_py.core.CoppError as error:
@@ -147,8 +163,7 @@ def _reachable_top(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
 
 
 def _solved(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
-    import copp_py
-
+    copp_py = _library()
     try:
         return copp_py.solver.topp2_ra.solve(_problem(at, rows, boundary))
     except copp_py.core.CoppError as error:

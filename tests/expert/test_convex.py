@@ -109,6 +109,15 @@ def test_a_flying_start_takes_less_time_than_a_slow_one():
     assert times[0] > times[1]
 
 
+def test_a_start_faster_than_the_limits_is_infeasible_and_says_so():
+    straight = Path(np.array([0.0, 2.0, 4.0]), np.array([[[0.0, 0, 1], [1, 0, 0]], [[4, 0, 1], [1, 0, 0]]]))
+    solution = plan_convex(
+        straight, HARDWARE.airframe, HARDWARE.limits, start=BoundaryState(h=9.0, dh=0.0, ddh=0.0, yaw=0.0, dyaw=0.0)
+    )
+    assert solution.status is Status.INFEASIBLE
+    assert "3.000 m/s" in solution.reason
+
+
 def test_thrust_below_weight_is_infeasible_in_both_faces(wiggly):
     limits = replace(HARDWARE.limits, motor_thrust_max=0.07)
     with pytest.raises(InfeasibleError, match="limits"):
