@@ -9,6 +9,7 @@ from cfplan.cli.check import check
 from cfplan.cli.dataset import dataset
 from cfplan.cli.doctor import doctor
 from cfplan.cli.fly import fly
+from cfplan.cli.mocap import mocap
 from cfplan.cli.output import print_error
 from cfplan.cli.plan import plan
 from cfplan.cli.replay import replay
@@ -32,7 +33,7 @@ def cfplan() -> None:
     """Plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
 
 
-for command in (plan, check, sim, fly, replay, dataset, doctor):
+for command in (plan, check, sim, fly, replay, mocap, dataset, doctor):
     cfplan.add_command(command)
 
 

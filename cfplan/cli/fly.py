@@ -2,7 +2,6 @@
 
 import math
 import shlex
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -106,7 +105,7 @@ def fly(
         click.echo(f"record: {folder}")
         click.echo(f"replay: cfplan replay {shlex.quote(str(folder))}")
     if outcome.exit_code is not ExitCode.OK:
-        print(f"{click.style('error:', fg='red')} {outcome.reason}", file=sys.stderr)
+        click.echo(f"{click.style('error:', fg='red')} {outcome.reason}", err=True)
     return int(outcome.exit_code)
 
 

@@ -1,6 +1,5 @@
 """The pilot's poses from a motion capture system."""
 
-import difflib
 import math
 import time
 from collections import Counter
@@ -10,7 +9,7 @@ from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Frame, Scene
 from cfplan.flight.mocap.sorting import Sorter, Verdict
-from cfplan.flight.mocap.uri import MocapUri, parse_uri
+from cfplan.flight.mocap.uri import MocapUri, no_such_body, parse_uri
 from cfplan.flight.poses import Pose
 from cfplan.safety.limits import PoseLimits
 
@@ -133,11 +132,7 @@ class MocapSource:
         subjects = {subject.name: subject for subject in self._scene.subjects}
         subject = subjects.get(self._uri.subject)
         if subject is None:
-            raise InputError(
-                f"there is no body named {self._uri.subject!r}",
-                where=str(self._uri),
-                hint=_suggestion(self._uri.subject, list(subjects)),
-            )
+            raise no_such_body(self._uri, subjects.keys())
         if self._uri.system == "vicon-sdk" and subject.name not in subject.segments:
             raise InputError(
                 f"the segment of {subject.name!r} is named {' and '.join(map(repr, subject.segments)) or 'nothing'}",
@@ -191,11 +186,3 @@ def _check_looks(pose: Pose, where: str) -> None:
             where=where,
             hint="set the system to z up, and define the body anew with the vehicle level and pointing along x",
         )
-
-
-def _suggestion(name: str, there: list[str]) -> str:
-    if not there:
-        return "nothing is defined or enabled there"
-    close = difflib.get_close_matches(name, there, 1)
-    meant = f"did you mean {close[0]!r}? " if close else ""
-    return f"{meant}there are: {', '.join(sorted(there))}"

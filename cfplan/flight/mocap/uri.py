@@ -1,5 +1,7 @@
 """Where motion capture is found, and which body in it is the vehicle: `vicon://192.168.1.2/cf1`."""
 
+import difflib
+from collections.abc import Collection
 from dataclasses import dataclass
 from urllib.parse import unquote, urlsplit
 
@@ -68,3 +70,14 @@ def parse_uri(text: str, *, subject_needed: bool) -> MocapUri:
     if port == 0:
         raise InputError("port 0 is none", where=text, hint=f"leave it out for {usual}")
     return MocapUri(parts.scheme, host, port or usual, subject)
+
+
+def no_such_body(uri: MocapUri, there: Collection[str]) -> InputError:
+    """The error of a body that is not there, with what is."""
+    close = difflib.get_close_matches(uri.subject, there, 1)
+    meant = f"did you mean {close[0]!r}? " if close else ""
+    return InputError(
+        f"there is no body named {uri.subject!r}",
+        where=str(uri),
+        hint=f"{meant}there are: {', '.join(sorted(there))}" if there else "no body is defined or enabled there",
+    )

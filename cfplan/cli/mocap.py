@@ -1,0 +1,87 @@
+"""`cfplan mocap`: what motion capture sees."""
+
+import math
+import sys
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import click
+
+from cfplan.cli import options
+from cfplan.cli.output import print_json, print_table
+
+if TYPE_CHECKING:
+    from cfplan.flight.mocap.survey import Survey
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cfplan mocap vicon://192.168.1.2            every body
+  cfplan mocap vicon://192.168.1.2/cf1        and is cf1 among them?
+  cfplan mocap vicon-sdk://192.168.1.2        through Vicon's own client
+  cfplan mocap qualisys://192.168.1.3         optitrack:// and vrpn:// likewise"""
+)
+@click.argument("uri")
+@click.option("--seconds", type=click.FloatRange(0.1, 86400), default=5.0, show_default=True, help="How long to look.")
+@options.as_json
+def mocap(uri: str, seconds: float, as_json: bool) -> int:
+    """Show the bodies that a motion capture system at URI sees, and how steadily its frames come."""
+    from cfplan.flight.mocap.survey import survey
+    from cfplan.flight.mocap.uri import parse_uri
+
+    where = parse_uri(uri, subject_needed=False)
+    live = not as_json and sys.stdout.isatty()
+    found = survey(where, seconds, _show_live if live else lambda _: None)
+    if live:
+        click.echo("\r\033[K", nl=False)
+    if as_json:
+        print_json({"uri": str(where), **asdict(found), "remarks": _remarks(found)})
+    else:
+        _print(str(where), found)
+    return 0
+
+
+def _show_live(found: "Survey") -> None:
+    bodies = "  ".join(f"{body.name} {_place(body.position)}" for body in found.bodies)
+    click.echo(f"\r\033[K{found.rate:.0f} Hz  {bodies}"[:200], nl=False)
+
+
+def _print(uri: str, found: "Survey") -> None:
+    rows = [
+        ["rate", f"{found.rate:.1f} Hz" + _announced(found)],
+        ["jitter", f"{1e3 * found.jitter:.2f} ms"],
+        ["longest gap", f"{1e3 * found.longest_gap:.1f} ms"],
+        ["frames", f"{found.frames}, {found.dropouts} missing"],
+        ["latency, by the system", _milliseconds(found.latency)],
+        ["delay on the way, p99", _milliseconds(found.delay)],
+    ]
+    print_table(uri, ["", "value"], rows)
+    columns = ["body", "seen", "good", "frozen", "jumped", "flipped", "broken", "position / m", "yaw", "tilt"]
+    lines = []
+    for body in found.bodies:
+        counts = [str(body.counts.get(name, 0)) for name in ("good", "frozen", "jumped", "flipped", "not a pose")]
+        angles = [f"{math.degrees(angle):.0f}°" if body.position else "–" for angle in (body.yaw, body.tilt)]
+        lines.append([body.name, f"{100 * body.seen:.1f} %", *counts, _place(body.position), *angles])
+    print_table(f"{len(lines)} bodies", columns, lines)
+    for remark in _remarks(found):
+        click.echo(remark)
+
+
+def _remarks(found: "Survey") -> list[str]:
+    remarks = [f"{body.name}: {body.remark}" for body in found.bodies if body.remark]
+    if not found.bodies:
+        remarks.append("no body is defined, enabled and seen there")
+    return remarks
+
+
+def _announced(found: "Survey") -> str:
+    return f" of {found.announced_rate:.0f}" if math.isfinite(found.announced_rate) else ""
+
+
+def _milliseconds(seconds: float) -> str:
+    return f"{1e3 * seconds:.1f} ms" if math.isfinite(seconds) else "not told"
+
+
+def _place(position: tuple[float, float, float] | None) -> str:
+    return " ".join(f"{value:.3f}" for value in position) if position else "not seen"

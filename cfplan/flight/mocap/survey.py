@@ -1,0 +1,193 @@
+"""What a motion capture system sends, looked at for a while: is it good enough to fly by?"""
+
+import math
+import statistics
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from cfplan.errors import CfplanError, LinkError
+from cfplan.flight.mocap.clock import FrameClock
+from cfplan.flight.mocap.feed import Feed
+from cfplan.flight.mocap.frames import Body, Frame, Scene
+from cfplan.flight.mocap.sorting import Sorter, Verdict
+from cfplan.flight.mocap.uri import MocapUri, no_such_body
+from cfplan.flight.telemetry import Triple
+
+FIRST_FRAME_WITHIN = 4.5  # s
+_JUMP = 0.15  # m
+_DROPOUT = 1.5  # periods between frames; one is missing where it takes longer
+_LOOK = 0.005  # s
+_SHOW = 0.25  # s
+
+
+@dataclass(frozen=True, slots=True)
+class BodyReport:
+    """One body over the time that was looked at."""
+
+    name: str
+    segments: tuple[str, ...]
+    # the root first; empty where the system does not tell
+    counts: dict[str, int]
+    # frames by verdict
+    position: Triple | None
+    # m, the last
+    yaw: float
+    # rad, the last
+    tilt: float
+    # rad, the last
+    quality: float
+    # the last, not a number where the system does not tell
+
+    @property
+    def seen(self) -> float:
+        """Share of the frames in which it was seen."""
+        total = sum(self.counts.values())
+        return 1.0 - self.counts.get(Verdict.OCCLUDED, 0) / total if total else 0.0
+
+    @property
+    def remark(self) -> str:
+        """What a person should know about it."""
+        if self.segments and self.name not in self.segments:
+            return f"its segment is named {self.segments[0]!r}: Vicon's own client (vicon-sdk://) will not see it"
+        if self.counts.get(Verdict.GOOD, 0) == 0:
+            return "never seen" if self.position is None else "no good pose"
+        if self.tilt > math.radians(45):
+            return "not level: is y up instead of z?"
+        if self.position is not None and max(map(abs, self.position)) > 30.0:
+            return "far away: millimetres taken as metres?"
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """The stream, and each body in it."""
+
+    seconds: float
+    frames: int
+    rate: float
+    # Hz, as the frames came
+    announced_rate: float
+    # Hz, as the system says; not a number where it does not
+    jitter: float
+    # s, standard deviation of the time between frames
+    longest_gap: float
+    # s between frames
+    dropouts: int
+    # frames that are missing: by their numbers where there are some, else by the gaps
+    latency: float
+    # s from exposure to sending, as the system says; not a number where it does not
+    delay: float
+    # s, the 99th percentile of what the way here added to its shortest; not a number without frame numbers
+    bodies: tuple[BodyReport, ...]
+
+
+class Surveyor:
+    """Gathers frames."""
+
+    def __init__(self) -> None:
+        self._received: list[float] = []
+        self._delays: list[float] = []
+        self._missing = 0
+        self._last: Frame | None = None
+        self._clock = FrameClock(0.0)
+        self._sorters: dict[str, Sorter] = {}
+        self._bodies: dict[str, Body] = {}
+        self.scene: Scene | None = None
+
+    @property
+    def frames(self) -> int:
+        """How many came."""
+        return len(self._received)
+
+    def add(self, frame: Frame) -> None:
+        """Take a frame into account."""
+        last, self._last = self._last, frame
+        self._received.append(frame.received)
+        taken = self._clock.taken(frame.received, frame.number, frame.rate)
+        if frame.number is not None and math.isfinite(frame.rate):
+            self._delays.append(frame.received - taken)
+        if last is not None and last.number is not None and frame.number is not None:
+            self._missing += max(0, frame.number - last.number - 1)
+        seen = {body.name: body for body in frame.bodies}
+        self._bodies |= seen
+        for name in [*seen, *frame.hidden]:
+            self._sorters.setdefault(name, Sorter(_JUMP)).sort(taken, seen.get(name), frame.number)
+
+    def report(self) -> Survey:
+        """What was seen so far."""
+        gaps = [b - a for a, b in zip(self._received, self._received[1:], strict=False)]
+        span = self._received[-1] - self._received[0] if gaps else 0.0
+        last = self._last
+        numbered = last is not None and last.number is not None
+        period = statistics.median(gaps) if gaps else math.inf
+        delays = sorted(self._delays)
+        return Survey(
+            seconds=span,
+            frames=len(self._received),
+            rate=len(gaps) / span if span > 0 else 0.0,
+            announced_rate=last.rate if last else math.nan,
+            jitter=statistics.pstdev(gaps) if gaps else 0.0,
+            longest_gap=max(gaps, default=0.0),
+            dropouts=self._missing
+            if numbered
+            else sum(round(gap / period) - 1 for gap in gaps if gap > _DROPOUT * period),
+            latency=last.latency if last else math.nan,
+            delay=delays[int(0.99 * len(delays))] if delays else math.nan,
+            bodies=tuple(self._body(name) for name in self._names()),
+        )
+
+    def _names(self) -> list[str]:
+        known = [subject.name for subject in self.scene.subjects] if self.scene else []
+        return known + sorted(self._sorters.keys() - set(known))
+
+    def _body(self, name: str) -> BodyReport:
+        subjects = self.scene.subjects if self.scene else ()
+        segments = next((subject.segments for subject in subjects if subject.name == name), ())
+        counts: Counter[Verdict] = self._sorters[name].counts if name in self._sorters else Counter()
+        body = self._bodies.get(name)
+        x, y, z, w = body.quaternion if body else (math.nan,) * 4
+        return BodyReport(
+            name=name,
+            segments=segments,
+            counts={str(verdict): count for verdict, count in counts.items()},
+            position=body.position if body else None,
+            yaw=math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+            tilt=math.acos(max(-1.0, min(1.0, 1 - 2 * (x * x + y * y)))) if body else math.nan,
+            quality=body.quality if body else math.nan,
+        )
+
+
+def survey(uri: MocapUri, seconds: float, show: Callable[[Survey], None] = lambda _: None) -> Survey:
+    """Look at everything that a system sends for so long; `show` gets what is known a few times a second.
+
+    Raises a CfplanError where no frame comes, or where the URI names a body that is not there.
+    """
+    surveyor, shown = Surveyor(), 0.0
+    with Feed(replace(uri, subject="")) as feed:
+        feed.start()
+        end = time.monotonic() + FIRST_FRAME_WITHIN
+        while time.monotonic() < end:
+            for message in feed.messages():
+                if isinstance(message, CfplanError):
+                    raise message
+                if isinstance(message, Scene):
+                    surveyor.scene = message
+                elif isinstance(message, Frame):
+                    if not surveyor.frames:
+                        end = time.monotonic() + seconds
+                    surveyor.add(message)
+            if failure := feed.failure():
+                raise failure
+            if surveyor.frames and time.monotonic() - shown > _SHOW:
+                shown = time.monotonic()
+                show(surveyor.report())
+            time.sleep(_LOOK)
+        if not surveyor.frames:
+            hint = "is the system live and streaming?"
+            raise LinkError(f"no frame within {FIRST_FRAME_WITHIN:g} s ({feed.stage})", where=str(uri), hint=hint)
+    found = surveyor.report()
+    if uri.subject and uri.subject not in {body.name for body in found.bodies}:
+        raise no_such_body(uri, [body.name for body in found.bodies])
+    return found
