@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -58,7 +57,7 @@ def print_json(document: Any) -> None:
 
 def print_error(error: CfplanError, *, as_json: bool) -> None:
     """One line on standard error, and the same as JSON on standard output where that was asked for."""
-    print(f"{click.style('error:', fg='red')} {error}", file=sys.stderr)
+    click.echo(f"{click.style('error:', fg='red')} {error}", err=True)
     if as_json:
         code = int(error.exit_code)
         print_json({"error": error.what, "where": error.where, "hint": error.hint, "exit_code": code})
