@@ -6,6 +6,7 @@ flight. Both sides of a grid point are thus seen, where h''' and ψ'' jump. Betw
 the larger of them by at most an eighth of its second difference there; that is added, twice over, to every worst value.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
@@ -46,7 +47,7 @@ class Margin:
     @property
     def passed(self) -> bool:
         """False for NaN too."""
-        return self.share <= 1.0
+        return bool(self.share <= 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +84,15 @@ class Certificate:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """For JSON; what is not finite becomes None."""
         return {
             "passed": self.passed,
             "duration": self.duration,
             "samples": self.samples,
-            "margins": [{**asdict(margin), "passed": margin.passed} for margin in self.margins],
+            "margins": [
+                {key: _plain(value) for key, value in asdict(margin).items()} | {"passed": margin.passed}
+                for margin in self.margins
+            ],
         }
 
 
@@ -174,6 +178,10 @@ def _norm(vectors: NDArray) -> NDArray:
     return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def _margin(peak: _Peak, trajectory: Trajectory) -> Margin:
     quantity = peak.quantity
     worst = quantity.sign * peak.value
@@ -183,9 +191,9 @@ def _margin(peak: _Peak, trajectory: Trajectory) -> Margin:
     return Margin(
         name=quantity.name,
         unit=quantity.unit,
-        worst=worst,
-        limit=quantity.limit,
-        share=max(0.0, share) if np.isfinite(worst) else float("nan"),
+        worst=float(worst),
+        limit=float(quantity.limit),
+        share=max(0.0, float(share)) if np.isfinite(worst) and np.isfinite(quantity.limit) else float("nan"),
         time=float(trajectory.time_at(peak.s)),
         s=peak.s,
         position=(x, y, z),

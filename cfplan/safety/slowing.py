@@ -32,19 +32,16 @@ def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Spac
 
     Raises:
         InfeasibleError: no share passes, because hovering or the path itself breaks a limit; says which.
-        NotCertifiedError: the trajectory is not a number somewhere.
     """
     certificate = certify(trajectory, limits, space)
     if certificate.passed:
         return Slowed(trajectory, certificate, 1.0)
-    if np.isnan(certificate.worst.share):
-        raise NotCertifiedError(f"{certificate.worst.name} is not a number", where=f"s = {certificate.worst.s:.4g}")
     _check_hover(trajectory, limits)
     _check_place(certificate)
 
     # False position between hover and what failed, in the square of the share: so rise accelerations.
     low, low_excess = 0.0, _hover_share(trajectory, limits) - 1.0
-    high, high_excess = 1.0, certificate.worst.share - 1.0
+    high, high_excess = 1.0, _excess(certificate)
     best: Slowed | None = None
     for trial in range(_TRIALS):
         square = low + (high - low) * (low_excess + _AIM) / (low_excess - high_excess)
@@ -56,12 +53,12 @@ def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Spac
             break
         certificate = certify(slower, limits, space)
         if certificate.passed:
-            low, low_excess = square, certificate.worst.share - 1.0
+            low, low_excess = square, _excess(certificate)
             best = Slowed(slower, certificate, square**0.5)
             if low_excess > -RESOLUTION:
                 break
         else:
-            high, high_excess = square, certificate.worst.share - 1.0
+            high, high_excess = square, _excess(certificate)
         if high < LEAST_SHARE**2 or (best is not None and high - low <= 2.0 * RESOLUTION * high):
             break
     if best is None:
@@ -71,6 +68,12 @@ def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Spac
             hint="loosen that limit or change the path there",
         )
     return best
+
+
+def _excess(certificate: Certificate) -> float:
+    """By how much the worst share exceeds 1. Not a number (no thrust, upside down) is infinitely much."""
+    share = certificate.worst.share
+    return np.inf if np.isnan(share) else share - 1.0
 
 
 def _hover_share(trajectory: Trajectory, limits: PlanLimits) -> float:

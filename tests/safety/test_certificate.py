@@ -1,0 +1,221 @@
+"""No limit is exceeded anywhere on a trajectory that passed: attacked with rough profiles and far finer grids."""
+
+import json
+from dataclasses import fields, replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.path import Path
+from cfplan.safety.certificate import _peak, _pieces, _samples, certify
+from cfplan.safety.limits import PlanLimits
+from cfplan.safety.slowing import slow_until_certified
+from cfplan.safety.space import Space
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.airframes import AIRFRAMES
+from cfplan.vehicle.trajectory import Trajectory, state_at
+
+AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
+LIMITS = PlanLimits(
+    speed=2.0, acceleration=5.0, angular_velocity=8.0, tilt=np.radians(30), motor_thrust_min=0.024,
+    motor_thrust_max=0.109, specific_thrust_min=4.905,
+)  # fmt: skip
+SPACE = Space(low=(-2.25, -4.0, 0.0), high=(2.25, 4.0, 2.0), margin=0.2)
+
+points = st.tuples(st.floats(-2, 2), st.floats(-3.5, 3.5), st.floats(0.3, 1.7))
+gentle = st.floats(0.5, 2.0)
+rough = st.floats(0.02, 6.0)
+
+
+def finely(trajectory, parts=20):
+    """The worst of every quantity on a grid 20 times as fine as the certificate's, both sides of breaks included."""
+    path, profile = trajectory.path, trajectory.profile
+    edges = np.union1d(profile.s, path.breaks)
+    worst = {}
+    for left, right in pairwise(edges):
+        if right - left < 1e-11:
+            continue
+        duration = float(trajectory.time_at(right) - trajectory.time_at(left))
+        count = parts * max(10, int(np.ceil(duration / 1e-3)))
+        s = np.append(np.linspace(left, right, count, endpoint=False), np.nextafter(right, 0))
+        interval = np.full(len(s), int(profile.interval(np.array((left + right) / 2))))
+        state = state_at(path, profile, trajectory.airframe, s, time=s, interval=interval)
+        inside = np.minimum(state.position - SPACE.low, np.array(SPACE.high) - state.position)
+        for name, value in {
+            "speed": np.linalg.norm(state.velocity, axis=1).max(),
+            "acceleration": np.linalg.norm(state.acceleration, axis=1).max(),
+            "angular velocity": np.linalg.norm(state.body_rate, axis=1).max(),
+            "tilt": np.arccos(np.clip(state.thrust_axis[:, 2], -1, 1)).max(),
+            "motor thrust, most": state.motor_thrust.max(),
+            "motor thrust, least": -state.motor_thrust.min(),
+            "specific thrust, least": -state.specific_thrust.min(),
+            "distance to the walls": -inside.min(),
+        }.items():
+            worst[name] = max(worst.get(name, -np.inf), value)
+    return worst
+
+
+def make(make_profile, waypoints, coefficients, turns, scale):
+    apart = np.linalg.norm(np.diff(waypoints, axis=0), axis=1) > 0.1
+    waypoints = np.array(waypoints)[np.r_[True, apart]]
+    path = min_snap(waypoints if len(waypoints) > 1 else [[0, 0, 1], [0.5, 0, 1]])
+    yaw = np.resize(turns, len(coefficients) - 1).cumsum()
+    return Trajectory(path, make_profile(path.end, scale * np.array(coefficients), yaw), AIRFRAME)
+
+
+def as_upper(margin):
+    """The worst value with the sign of `finely`: larger is worse."""
+    return -margin.worst if "least" in margin.name or "walls" in margin.name else margin.worst
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(points, min_size=2, max_size=4),
+    st.one_of(st.lists(gentle, min_size=6, max_size=25), st.lists(rough, min_size=6, max_size=25)),
+    st.lists(st.floats(-1, 1), min_size=1, max_size=25),
+    st.floats(0.1, 4.0),
+)
+def test_nothing_between_the_samples_is_worse_than_the_certificate_says(make_profile, waypoints, rates, turns, scale):
+    trajectory = make(make_profile, waypoints, rates, turns, scale)
+    certificate = certify(trajectory, LIMITS, SPACE)
+    true = finely(trajectory)
+    for margin in certificate.margins:
+        # Far beyond the limits thrust can vanish and the attitude flip within a millisecond; failed is failed then.
+        if margin.share < 3.0 and certificate.worst.share < 100.0:
+            assert as_upper(margin) >= true[margin.name] - 1e-12, margin.name
+            assert as_upper(margin) <= true[margin.name] + 0.02 * abs(margin.limit), f"{margin.name} is overstated"
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.lists(points, min_size=2, max_size=4),
+    st.lists(rough, min_size=6, max_size=40),
+    st.lists(st.floats(-1, 1), min_size=1, max_size=25),
+)
+def test_what_just_passes_keeps_every_limit_on_a_far_finer_grid(make_profile, waypoints, rates, turns):
+    slowed = slow_until_certified(make(make_profile, waypoints, rates, turns, 4.0), LIMITS)
+    true = finely(slowed.trajectory)
+    assert true["speed"] <= LIMITS.speed
+    assert true["acceleration"] <= LIMITS.acceleration
+    assert true["angular velocity"] <= LIMITS.angular_velocity
+    assert true["tilt"] <= LIMITS.tilt
+    assert true["motor thrust, most"] <= LIMITS.motor_thrust_max
+    assert -true["motor thrust, least"] >= LIMITS.motor_thrust_min
+    assert -true["specific thrust, least"] >= LIMITS.specific_thrust_min
+
+
+@pytest.fixture(scope="module")
+def trajectory(make_profile):
+    path, random = min_snap([[0, 0, 1], [1, 1.5, 1.3], [-1, 2, 0.7]]), np.random.default_rng(0)
+    return Trajectory(path, make_profile(path.end, random.uniform(0.8, 1.3, 30)), AIRFRAME)
+
+
+def test_a_smooth_peak_between_samples_is_not_missed():
+    first = np.arange(20) == 0
+    for shift in np.linspace(0, 1, 21):
+        angles = (np.arange(20) - 9.5 + shift) * 0.2
+        values = np.cos(angles)[None]
+        assert 1.0 <= _peak(values, first)[1] <= 1.02
+        assert -1.02 <= _peak(np.cos(angles + np.pi)[None], first)[1] <= -np.cos(angles).min() + 0.02
+
+
+def test_a_jump_between_pieces_is_no_peak():
+    values = np.array([[0.0, 0.0, 0.0, 5.0, 5.0, 5.0]])
+    first = np.array([True, False, False, True, False, False])
+    assert _peak(values, first) == (3, 5.0)
+
+
+def test_one_value_that_is_no_number_fails():
+    for place in range(6):
+        values = np.ones((2, 6))
+        values[1, place] = np.nan
+        assert np.isnan(_peak(values, np.arange(6) % 3 == 0)[1])
+
+
+def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval(trajectory):
+    pieces = _pieces(trajectory)
+    s, interval, first = _samples(pieces, np.arange(len(pieces.counts)))
+    assert np.diff(trajectory.time_at(s)).max() <= 1.001e-3
+    assert np.bincount(interval).min() >= 10
+    assert np.count_nonzero(first) >= len(np.union1d(trajectory.profile.s, trajectory.path.breaks)) - 1
+    fast = Trajectory(trajectory.path, trajectory.profile.slowed(50.0), AIRFRAME)
+    assert certify(fast, LIMITS).samples >= 10 * (len(trajectory.profile.s) - 1)
+
+
+def test_batches_change_nothing(trajectory, monkeypatch):
+    whole = certify(trajectory, LIMITS, SPACE)
+    monkeypatch.setattr("cfplan.safety.certificate.BATCH", 500)
+    assert certify(trajectory, LIMITS, SPACE) == whole
+
+
+def test_the_worst_value_is_where_and_when_the_certificate_says(trajectory):
+    margins = {margin.name: margin for margin in certify(trajectory, LIMITS, SPACE).margins}
+    for name, value_of in (
+        ("speed", lambda state: np.linalg.norm(state.velocity)),
+        ("acceleration", lambda state: np.linalg.norm(state.acceleration)),
+        ("tilt", lambda state: np.arccos(state.thrust_axis[2])),
+        ("specific thrust, least", lambda state: state.specific_thrust),
+    ):
+        state = trajectory.at(margins[name].time)
+        np.testing.assert_allclose(state.position, margins[name].position, atol=1e-6)
+        assert margins[name].worst == pytest.approx(value_of(state), rel=1e-3)
+
+
+def test_shares_are_of_the_limit_or_of_the_way_down_from_hover(trajectory):
+    margins = {margin.name: margin for margin in certify(trajectory, LIMITS, SPACE).margins}
+    assert margins["speed"].share == pytest.approx(margins["speed"].worst / 2.0)
+    least = margins["specific thrust, least"]
+    assert least.share == pytest.approx((GRAVITY - least.worst) / (GRAVITY - 4.905))
+
+
+def test_limits_that_hovering_breaks_never_pass(trajectory):
+    still = Trajectory(trajectory.path, trajectory.profile.slowed(0.05), AIRFRAME)
+    assert certify(still, LIMITS).passed
+    for changes in ({"motor_thrust_min": 0.079}, {"motor_thrust_max": 0.077}, {"specific_thrust_min": 9.9}):
+        assert not certify(still, replace(LIMITS, **changes)).passed
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(PlanLimits)])
+def test_a_limit_that_is_no_number_fails(trajectory, name):
+    assert not certify(trajectory, replace(LIMITS, **{name: float("nan")})).passed
+
+
+def test_leaving_the_space_fails_at_the_place(trajectory):
+    narrow = Space(low=(-2.25, -4.0, 0.0), high=(2.25, 2.1, 2.0), margin=0.2)
+    worst = certify(trajectory, LIMITS, narrow).worst
+    farthest = trajectory.path(np.linspace(0, trajectory.path.end, 5000))[:, 1].max()
+    assert worst.name == "distance to the walls"
+    assert worst.position[1] == pytest.approx(float(farthest), abs=1e-5)
+    assert worst.worst == pytest.approx(2.1 - float(farthest), abs=1e-5)
+
+
+def test_the_certificate_is_json_and_a_table(trajectory):
+    certificate = certify(trajectory, LIMITS, SPACE)
+    data = json.loads(json.dumps(certificate.to_dict(), allow_nan=False))
+    assert data["passed"] is certificate.passed
+    assert len(data["margins"]) == len(certificate.rows()) == 8
+    assert certificate.rows()[0][0] == "speed"
+
+
+@pytest.mark.parametrize("steep_first", [False, True])
+def test_a_break_in_the_snap_of_a_path_is_seen_from_both_sides(make_profile, steep_first):
+    # Straight along x in one piece; in the other y is a quartic that starts from s = 1 with its first derivatives 0.
+    # The last piece counts from its right end, s = 2.
+    table = np.zeros((2, 5, 3))
+    table[:, 0, 2] = 1.0
+    table[:, 1, 0] = 1.0
+    table[1, 0, 0] = 2.0
+    quartic = np.polynomial.Polynomial([1.0, 1.0 if not steep_first else -1.0]) ** 4
+    if steep_first:
+        table[0, :, 1] = 0.2 * np.polynomial.Polynomial([-1.0, 1.0]).__pow__(4).coef
+    else:
+        table[1, :, 1] = 0.2 * quartic.coef
+    path = Path(np.array([0.0, 1.0, 2.0]), table)
+    # Fast where the snap is, fastest at the break, where the profile has no grid point of its own.
+    trajectory = Trajectory(path, make_profile(2.0, np.full(6, 2.0)), AIRFRAME)
+    most = {margin.name: margin for margin in certify(trajectory, LIMITS).margins}["motor thrust, most"]
+    assert most.worst >= finely(trajectory)["motor thrust, most"]

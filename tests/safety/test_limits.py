@@ -1,0 +1,176 @@
+"""safety.yaml: what is read, and what is refused where."""
+
+import copy
+import math
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from cfplan.errors import CfplanError, InputError
+from cfplan.safety.limits import Ladder, load_limits
+from cfplan.vehicle.airframes import AIRFRAMES
+
+SAFETY = Path(__file__).parents[2] / "safety.yaml"
+CONTENT = yaml.safe_load(SAFETY.read_text())
+
+
+def keys(content=CONTENT, above=()):
+    """The place of every value in the file."""
+    for key, value in content.items():
+        if isinstance(value, dict):
+            yield from keys(value, (*above, key))
+        else:
+            yield (*above, key)
+
+
+def changed(tmp_path, changes):
+    content = copy.deepcopy(CONTENT)
+    for place, value in changes.items():
+        section = content
+        *above, key = place.split(".")
+        for name in above:
+            section = section[name]
+        section[key] = value
+    file = tmp_path / "safety.yaml"
+    file.write_text(yaml.safe_dump(content, sort_keys=False))
+    return file
+
+
+def test_the_projects_own_file_says_what_the_design_says():
+    limits = load_limits(SAFETY)
+    assert limits.airframe is AIRFRAMES["crazyflie-2.1+"]
+    plan = limits.plan
+    assert (plan.speed, plan.acceleration, plan.angular_velocity) == (2.0, 5.0, 8.0)
+    assert plan.tilt == pytest.approx(math.radians(30))
+    assert plan.specific_thrust_min == pytest.approx(0.5 * 9.81)
+    assert limits.airframe.motor_thrust_min < plan.motor_thrust_min < limits.airframe.hover_thrust
+    assert limits.airframe.hover_thrust < plan.motor_thrust_max < limits.airframe.motor_thrust_max
+    assert limits.flight.acceleration.brake == limits.flight.angular_velocity.brake == 10.0
+    assert limits.flight.deviation == Ladder(0.3, 0.6, 1.0)
+    assert [high - low for low, high in zip(limits.space.low, limits.space.high, strict=True)] == [4.5, 8.0, 2.0]
+    assert limits.firmware.oldest == (2025, 9, 1)
+
+
+@pytest.mark.parametrize("vehicle", AIRFRAMES)
+def test_every_vehicle_can_fly_within_the_projects_limits(tmp_path, vehicle):
+    assert load_limits(changed(tmp_path, {"vehicle": vehicle})).airframe.name == vehicle
+
+
+def test_a_vehicle_file_lies_beside_the_safety_file(tmp_path):
+    (tmp_path / "mine.yaml").write_text(
+        "name: mine\nmass: 0.03\ninertia: [1.6e-5, 1.6e-5, 2.9e-5]\narm: 0.03\nthrust_to_torque: 0.006\n"
+        "motor_thrust_min: 0.01\nmotor_thrust_max: 0.15\nmotor_time_constant: 0.05\ndrag: [0.01, 0.01]\nsource: me\n"
+    )
+    assert load_limits(changed(tmp_path, {"vehicle": "mine.yaml"})).airframe.mass == 0.03
+
+
+@pytest.mark.parametrize("place", [".".join(place) for place in keys()])
+def test_no_key_may_be_missing(tmp_path, place):
+    content = copy.deepcopy(CONTENT)
+    *above, key = place.split(".")
+    section = content
+    for name in above:
+        section = section[name]
+    del section[key]
+    file = tmp_path / "safety.yaml"
+    file.write_text(yaml.safe_dump(content))
+    with pytest.raises(InputError, match=f"{key}' is missing"):
+        load_limits(file)
+
+
+NUMBERS = [".".join(p) for p in keys() if p[-1] not in ("vehicle", "low", "high", "latency", "controller", "estimator")]
+
+
+@pytest.mark.parametrize("place", [place for place in NUMBERS if place != "firmware.oldest"])
+@pytest.mark.parametrize("value", [0, -1.0, "fast", True, None, float("nan"), float("inf"), [1.0], 1e9])
+def test_no_number_may_be_zero_negative_or_no_number(tmp_path, place, value):
+    with pytest.raises(InputError) as error:
+        load_limits(changed(tmp_path, {place: value}))
+    assert re.match(r".*safety\.yaml:\d+:\d+$", error.value.where)
+
+
+@pytest.mark.parametrize("place", ["", "plan.", "flight.speed.", "space.", "pose."])
+def test_unknown_keys_are_errors(tmp_path, place):
+    with pytest.raises(InputError, match="unknown key") as error:
+        load_limits(changed(tmp_path, {f"{place}sped": 1.0}))
+    assert "known" in error.value.hint
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"vehicle": "crazyfly"}, "unknown vehicle 'crazyfly'"),
+        ({"vehicle": "nowhere.yaml"}, "no such file"),
+        ({"plan.motor_reserve": 0.45}, "cannot hover"),
+        ({"plan.specific_thrust": 9.9}, "hovering is impossible"),
+        ({"plan.tilt_deg": 50}, "cannot hold its height beyond a tilt of 44"),
+        ({"plan.acceleration": 9.8}, "cannot accelerate at more than 9.6"),
+        ({"plan.speed": 3.5}, "not below flight.speed.brake"),
+        ({"plan.acceleration": 10.0}, "not below flight.acceleration.brake"),
+        ({"plan.angular_velocity": 12.0}, "not below flight.angular_velocity.brake"),
+        ({"flight.deviation.land": 0.2}, "must rise from brake over land to cut"),
+        ({"flight.fence.cut": 0.1}, "must rise from brake over land to cut"),
+        ({"space.margin": 1.0}, "leaves no room"),
+        ({"space.high": [-3.0, 4.0, 2.0]}, "leaves no room"),
+        ({"space.high": [3.0, 4.0]}, "space.high"),
+        ({"battery.under_load": 4.0}, "under_load must be below"),
+        ({"pose.age_brake": 0.04}, "pose ages must rise"),
+        ({"pose.rate_min": 120}, "rate_min is above"),
+        ({"pose.rate": 15, "pose.rate_min": 10}, "every pose grows older"),
+        ({"ground.take_off_height": 0.1}, "ends outside the space"),
+        ({"firmware.oldest": "new"}, "oldest"),
+        ({"firmware.controller": 9}, "controller"),
+    ],
+)
+def test_limits_that_contradict_each_other_or_the_vehicle_are_refused(tmp_path, changes, said):
+    with pytest.raises(InputError, match=said) as error:
+        load_limits(changed(tmp_path, changes))
+    assert "\n" not in str(error.value)
+    assert error.value.where
+
+
+def test_the_place_of_a_wrong_value_is_its_line_and_column(tmp_path):
+    file = tmp_path / "safety.yaml"
+    file.write_text(SAFETY.read_text().replace("tilt_deg: 30 ", "tilt_deg: 60 "))
+    line = next(n for n, text in enumerate(file.read_text().splitlines(), start=1) if "tilt_deg" in text)
+    with pytest.raises(InputError) as error:
+        load_limits(file)
+    assert error.value.where == f"{file}:{line}:13"
+
+
+def read_or_refused(file):
+    """The limits, or what the error says."""
+    try:
+        return load_limits(file)
+    except CfplanError as error:
+        return str(error)
+
+
+leaves = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8), st.lists(st.floats(), max_size=4)
+)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.dictionaries(st.sampled_from([".".join(place) for place in keys()]), leaves, min_size=1, max_size=3))
+def test_any_values_are_read_soundly_or_refused_in_one_line(tmp_path, changes):
+    limits = read_or_refused(changed(tmp_path, changes))
+    if isinstance(limits, str):
+        assert "\n" not in limits
+    else:
+        assert limits.plan.motor_thrust_min < limits.airframe.hover_thrust < limits.plan.motor_thrust_max
+        assert 0 < limits.plan.speed < limits.flight.speed.brake < limits.flight.speed.land < limits.flight.speed.cut
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, len(SAFETY.read_text())), st.text(max_size=6))
+def test_a_file_with_a_slip_anywhere_is_read_or_refused_in_one_line(tmp_path, place, slip):
+    text = SAFETY.read_text()
+    file = tmp_path / "safety.yaml"
+    file.write_text(text[:place] + slip + text[place + len(slip) :], encoding="utf-8", errors="surrogatepass")
+    limits = read_or_refused(file)
+    assert not isinstance(limits, str) or "\n" not in limits
