@@ -2,8 +2,7 @@
 
 import math
 import shlex
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,16 +13,14 @@ from cfplan.cli import options
 from cfplan.cli.flight_progress import FlightProgress
 from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.cli.rehearsal import PlannedFlight, PlanOptions, certify_bytes, obtain_plan, rehearse
-from cfplan.errors import CfplanError, ExitCode, InputError
+from cfplan.cli.vehicle import check_mocap, vehicle
+from cfplan.errors import CfplanError, ExitCode
 
 if TYPE_CHECKING:
     from cfplan.flight.outcome import FlightOutcome
-    from cfplan.flight.poses import PoseSource
     from cfplan.flight.telemetry import Telemetry
     from cfplan.recording.header import RecordHeader
-    from cfplan.safety.limits import Limits
 
-SIMULATED = "sim://"
 _PATH_SAMPLES = 500  # of the drawn path
 
 
@@ -39,6 +36,12 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
 @options.planning
 @click.option("--uri", default="sim://0", show_default=True, help="The vehicle; sim:// is the virtual Crazyflie.")
 @click.option(
+    "--mocap",
+    "mocap_uri",
+    help="The vehicle in motion capture, as vicon://192.168.1.2/cf1. sim:// has poses of its own; "
+    "vicon://lab/cf1 takes them through a virtual Vicon.",
+)
+@click.option(
     "--records",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("records"),
@@ -53,11 +56,13 @@ def fly(
     nodes: int | None,
     speed_share: float | None,
     uri: str,
+    mocap_uri: str | None,
     records: Path,
     as_json: bool,
 ) -> int:
     """Fly along PATH: plan, certify, rehearse, then take off, stream the flight, land, and keep a record."""
     steps = Steps(as_json=as_json)
+    check_mocap(uri, mocap_uri)
     flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
     encoded = certify_bytes(flight, steps)
     rehearsed = rehearse(flight, encoded, steps)
@@ -72,7 +77,7 @@ def fly(
     with steps.step("stops") as said:
         mission = mission_of(encoded, flight.limits)
         said.append(f"a way to stop from each of {len(mission.payloads)} setpoints")
-    with _vehicle(uri, flight.limits) as (drivers, pose_source):
+    with vehicle(uri, mocap_uri, flight.limits) as (drivers, pose_source):
         folder = new_record_folder(records, flight.name)
         try:
             save_plan(flight.plan, folder / "plan.parquet", {"name": flight.name, "path file": str(path_or_plan)})
@@ -117,23 +122,6 @@ def _both(first: "Callable[[Telemetry], None]", second: "Callable[[Telemetry], N
         second(message)
 
     return tell
-
-
-@contextmanager
-def _vehicle(uri: str, limits: "Limits") -> "Iterator[tuple[list[type], PoseSource]]":
-    """The link drivers and the poses for a URI; for the virtual Crazyflie, its lab too."""
-    if not uri.startswith(SIMULATED):
-        raise InputError(
-            "only the virtual Crazyflie has a source of poses so far",
-            where=uri,
-            hint=f"fly {SIMULATED}0; motion capture for hardware is still to come",
-        )
-    from cfplan.simulation.lab import start_lab
-    from cfplan.simulation.room import RoomPoseSource
-    from cfplan.simulation.sim_driver import SimDriver
-
-    with start_lab(limits.airframe) as lab:
-        yield [SimDriver], RoomPoseSource(lab.number)
 
 
 def _header(flight: PlannedFlight, uri: str, source: Path) -> "RecordHeader":
