@@ -68,13 +68,16 @@ def check_points(points: NDArray, closest: float = CLOSEST, where: Callable[[int
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"waypoints must be x, y, z each, not an array of shape {points.shape}")
     if len(points) < 2:
-        raise InputError(f"a path needs two waypoints at least, not {len(points)}")
+        raise InputError(
+            f"a path needs two waypoints at least, not {len(points)}", hint="give at least a start and an end"
+        )
     bad = ~(np.abs(points) <= FARTHEST).all(axis=1)
     if bad.any():
         index = int(np.argmax(bad))
         raise InputError(
             f"coordinates must be numbers within {FARTHEST:g} m of the origin, not {points[index].tolist()}",
             where=where(index),
+            hint="replace it by metres in the frame of the room",
         )
     distances = np.linalg.norm(np.diff(points, axis=0), axis=1)
     near = int(np.argmin(distances))

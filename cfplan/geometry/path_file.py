@@ -96,7 +96,11 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
     path.check(where=places.where(given))
 
     if content.yaw.angle_deg and content.yaw.mode is not YawMode.FIXED:
-        raise InputError("angle_deg is for mode fixed only", where=places.where_key("yaw", "angle_deg"))
+        raise InputError(
+            "angle_deg is for mode fixed only",
+            where=places.where_key("yaw", "angle_deg"),
+            hint="leave angle_deg out, or set mode: fixed",
+        )
     place, turn = content.place, math.radians(content.place.yaw_deg)
     offset = np.array([place.x, place.y, place.z])
     fixed = content.yaw.mode is YawMode.FIXED
@@ -121,10 +125,18 @@ def read_points(file: pathlib.Path) -> tuple[NDArray, list[int]]:
 def _source(content: _Content, places: Places) -> str:
     given = [key for key in _SOURCES if getattr(content, key) is not None]
     if not given:
-        raise InputError(f"one of {', '.join(_SOURCES)} is needed", where=places.where())
+        raise InputError(
+            f"one of {', '.join(_SOURCES)} is needed",
+            where=places.where(),
+            hint="list waypoints: [[x, y, z], ...] in metres",
+        )
     if len(given) > 1:
         later = max(given, key=lambda key: places.keys[(key,)])
-        raise InputError(f"only one of {' and '.join(given)} may be given", where=places.where_key(later))
+        raise InputError(
+            f"only one of {' and '.join(given)} may be given",
+            where=places.where_key(later),
+            hint="keep the one that describes the path",
+        )
     return given[0]
 
 
@@ -133,11 +145,17 @@ def _from_waypoints(content: _Content, places: Places) -> tuple[Path, NDArray]:
     for index, row in enumerate(rows):
         if len(row) != 3:
             raise InputError(
-                f"waypoint {index + 1} has {len(row)} numbers, not x, y, z", where=places.where("waypoints", index)
+                f"waypoint {index + 1} has {len(row)} numbers, not x, y, z",
+                where=places.where("waypoints", index),
+                hint="write it as [x, y, z] in metres",
             )
     points = np.array(rows, dtype=float).reshape(-1, 3)
     if len(points) < 2:
-        raise InputError(f"a path needs two waypoints at least, not {len(points)}", where=places.where("waypoints"))
+        raise InputError(
+            f"a path needs two waypoints at least, not {len(points)}",
+            where=places.where("waypoints"),
+            hint="add a waypoint: a path has at least a start and an end",
+        )
     check_points(points, CLOSEST, lambda index: places.where("waypoints", index))
     points = _repeated(points, content.laps, places)
     return min_snap(points), points
@@ -147,7 +165,9 @@ def _from_points(content: _Content, places: Places) -> tuple[Path, NDArray]:
     file = _beside(places, content.points)
     points, lines = read_points(file)
     if len(points) < 2:
-        raise InputError(f"a path needs two points at least, not {len(points)}", where=str(file))
+        raise InputError(
+            f"a path needs two points at least, not {len(points)}", where=str(file), hint="add rows x, y, z to the file"
+        )
     few = len(points) < _FEW
     check_points(points, CLOSEST if few else CLOSEST_DENSE, lambda index: f"{file}:{lines[index]}")
     points = _repeated(points, content.laps, places)
@@ -168,7 +188,7 @@ def _beside(places: Places, name: str | None) -> pathlib.Path:
 def _repeated(points: NDArray, laps: int, places: Places) -> NDArray:
     """The points of all laps: the end of a lap is the start of the next, so it stands once."""
     if 1 + laps * (len(points) - 1) > _MOST:
-        raise InputError(f"more than {_MOST} points", where=places.where("laps"))
+        raise InputError(f"more than {_MOST} points", where=places.where("laps"), hint="give fewer points or laps")
     if laps == 1:
         return points
     gap = float(np.linalg.norm(points[-1] - points[0]))

@@ -37,7 +37,9 @@ def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> tuple[Path, NDArra
     if (durations < _SHORTEST).any():
         bad = int(np.argmax(durations < _SHORTEST))
         raise InputError(
-            f"a duration must be at least {_SHORTEST} s, not {durations[bad]:g}", where=f"{file}:{lines[bad]}"
+            f"a duration must be at least {_SHORTEST} s, not {durations[bad]:g}",
+            where=f"{file}:{lines[bad]}",
+            hint="the first number of a row is the duration of the piece in seconds",
         )
     table = rows[:, 1:25].reshape(-1, 3, 8).transpose(0, 2, 1)
     durations, table = np.tile(durations, laps), np.tile(table, (laps, 1, 1))

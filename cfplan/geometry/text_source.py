@@ -24,23 +24,27 @@ def read_text(file: pathlib.Path) -> str:
     """
     try:
         if file.is_dir():
-            raise InputError("a folder, not a file", where=str(file))
+            raise InputError("a folder, not a file", where=str(file), hint="name the file in it")
         with file.open("rb") as stream:
             content = stream.read(LARGEST_FILE + 1)
     except FileNotFoundError:
-        raise InputError("no such file", where=str(file)) from None
+        raise InputError(
+            "no such file",
+            where=str(file),
+            hint="is the name right? It is taken from the working folder, or from the path file's",
+        ) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot be read: {reason}", where=str(file)) from None
+        raise InputError(f"cannot be read: {reason}", where=str(file), hint="look at its permissions") from None
     if len(content) > LARGEST_FILE:
-        raise InputError(f"larger than {LARGEST_FILE // 1_000_000} MB", where=str(file))
+        raise InputError(f"larger than {LARGEST_FILE // 1_000_000} MB", where=str(file), hint="thin the points out")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise InputError("not UTF-8 text", where=f"{file}:{line}", hint="save the file as UTF-8") from None
     if not text.strip():
-        raise InputError("the file is empty", where=str(file))
+        raise InputError("the file is empty", where=str(file), hint="is it the right file?")
     return text
 
 
@@ -78,11 +82,17 @@ def _numbers(cells: list[str], columns: int, what: str, where: str) -> list[floa
         raise InputError(f"the row has {len(cells)} numbers, not {columns}", where=where, hint=f"each row is {what}")
     for column, cell in enumerate(cells, start=1):
         if not _is_number(cell):
-            raise InputError(f"column {column} is not a number: {cell[:40]!r}", where=where)
+            raise InputError(
+                f"column {column} is not a number: {cell[:40]!r}", where=where, hint="write a plain decimal number"
+            )
         if not math.isfinite(float(cell)):
-            raise InputError(f"column {column} is not a finite number: {cell[:40]}", where=where)
+            raise InputError(
+                f"column {column} is not a finite number: {cell[:40]}", where=where, hint="write a plain decimal number"
+            )
         if abs(float(cell)) > LARGEST_NUMBER:
-            raise InputError(f"column {column} is out of all bounds: {cell[:40]}", where=where)
+            raise InputError(
+                f"column {column} is out of all bounds: {cell[:40]}", where=where, hint="write metres and seconds"
+            )
     return [float(cell) for cell in cells]
 
 

@@ -107,12 +107,20 @@ def _composed(text: str, file: str) -> yaml.Node:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
         said = [part for part in (error.context, error.problem) if part]
-        raise InputError(_one_line(", ".join(said) or "not YAML"), where=_mark(file, error)) from None
+        raise InputError(
+            _one_line(", ".join(said) or "not YAML"),
+            where=_mark(file, error),
+            hint="a bracket, a comma or an indent is wrong there or just before",
+        ) from None
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
-        raise InputError(f"the character {error.character!r} is not allowed in YAML", where=f"{file}:{line}") from None
+        raise InputError(
+            f"the character {error.character!r} is not allowed in YAML",
+            where=f"{file}:{line}",
+            hint="save the file as UTF-8 text",
+        ) from None
     if node is None:
-        raise InputError("the file is empty", where=file)
+        raise InputError("the file is empty", where=file, hint="flights/ has files to start from")
     return node
 
 
@@ -130,7 +138,9 @@ def _plain(node: yaml.Node, location: Location, places: Places) -> Any:
     places.values[location] = (node.start_mark.line + 1, node.start_mark.column + 1)
     where = places.where(*location)
     if node.tag not in _TAGS:
-        raise InputError(f"the tag {node.tag} is not used here", where=where)
+        raise InputError(
+            f"the tag {node.tag} is not used here", where=where, hint="write the value plainly, without a tag"
+        )
     if isinstance(node, yaml.MappingNode):
         return dict(_entries(node, location, places))
     if isinstance(node, yaml.SequenceNode):
@@ -144,7 +154,7 @@ def _entries(node: yaml.MappingNode, location: Location, places: Places) -> Iter
         place = (key.start_mark.line + 1, key.start_mark.column + 1)
         where = f"{places.file}:{place[0]}:{place[1]}"
         if not isinstance(key, yaml.ScalarNode):
-            raise InputError("a key must be a word", where=where)
+            raise InputError("a key must be a word", where=where, hint="write `key: value`")
         inner = (*location, key.value)
         if inner in places.keys:
             raise InputError(f"the key {key.value!r} stands twice", where=where, hint="keep one of them")
@@ -159,20 +169,20 @@ def _scalar(node: yaml.ScalarNode, where: str) -> Any:
     if text.lower() in _WORDS:
         return _WORDS[text.lower()]
     if _NOT_FINITE.fullmatch(text):
-        raise InputError(f"a finite number is needed, not {text}", where=where)
+        raise InputError(f"a finite number is needed, not {text}", where=where, hint="write a plain decimal number")
     if _INTEGER.fullmatch(text):
         return int(text)
     if _FLOAT.fullmatch(text):
         number = float(text)
         if not math.isfinite(number):
-            raise InputError(f"the number {text[:40]} is too large", where=where)
+            raise InputError(f"the number {text[:40]} is too large", where=where, hint="write a plain decimal number")
         return number
     return _checked_text(text, where)
 
 
 def _checked_text(text: str, where: str) -> str:
     if any("\ud800" <= character <= "\udfff" for character in text):
-        raise InputError("half of a surrogate pair is not a character", where=where)
+        raise InputError("half of a surrogate pair is not a character", where=where, hint="save the file as UTF-8")
     return text
 
 

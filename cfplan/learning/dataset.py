@@ -90,7 +90,9 @@ def _prepare(folder: Path, spec: DatasetSpec) -> None:
         else:
             spec.save(folder)
     except OSError as error:
-        raise InputError(f"cannot be used for a dataset: {error.strerror}", where=str(folder)) from None
+        raise InputError(
+            f"cannot be used for a dataset: {error.strerror}", where=str(folder), hint="give another folder"
+        ) from None
 
 
 Labelled = Iterator[tuple[int, bytes, bytes]]

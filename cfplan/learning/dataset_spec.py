@@ -58,7 +58,11 @@ class DatasetSpec:
         ]
         for name, is_wrong, allowed in wrong:
             if is_wrong:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be {allowed}", where="dataset")
+                raise InputError(
+                    f"{name} is {getattr(self, name)}; it must be {allowed}",
+                    where="dataset",
+                    hint="see `cfplan dataset make --help`",
+                )
 
     @property
     def rows(self) -> int:
@@ -96,7 +100,11 @@ def load_spec(folder: Path) -> DatasetSpec:
         content |= {"box": tuple(content["box"]), "waypoints": tuple(content["waypoints"])}
         return DatasetSpec(**content | {"yaw": YawMode(content["yaw"]), "relabel": Relabel(content["relabel"])})
     except (ValueError, TypeError, UnicodeDecodeError) as error:
-        raise InputError(f"not a dataset description: {error}", where=str(file)) from None
+        raise InputError(
+            f"not a dataset description: {error}",
+            where=str(file),
+            hint="give another folder, or make the dataset again",
+        ) from None
 
 
 def require_same(existing: DatasetSpec, wanted: DatasetSpec, folder: Path) -> None:

@@ -71,7 +71,9 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
             os.unlink(name)
             raise
     except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror or error}", where=str(target)) from None
+        raise InputError(
+            f"cannot be written: {error.strerror or error}", where=str(target), hint="name another file with -o"
+        ) from None
 
 
 def load_plan(file: FilePath | str) -> Plan:
@@ -87,7 +89,7 @@ def load_plan(file: FilePath | str) -> Plan:
     try:
         table = pyarrow.parquet.read_table(file)
     except FileNotFoundError:
-        raise InputError("no such file", where=where) from None
+        raise InputError("no such file", where=where, hint="make it with `cfplan plan PATH -o FILE`") from None
     except (OSError, pyarrow.ArrowException) as error:
         raise InputError(f"not a plan, or cut off: {_one_line(error)}", where=where, hint=_HINT) from None
     try:

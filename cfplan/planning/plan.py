@@ -102,7 +102,10 @@ def plan(
         trajectory = Trajectory(path, trajectory.profile.slowed(speed_share), airframe)
         certificate = certify(trajectory, limits.plan, limits.space)
         if not certificate.passed:
-            raise NotCertifiedError(f"{certificate.worst.name} exceeds its limit at a speed share of {speed_share:g}")
+            raise NotCertifiedError(
+                f"{certificate.worst.name} exceeds its limit at a speed share of {speed_share:g}",
+                hint="0.5 flies at half the speed",
+            )
     _check_endurance(trajectory.duration, limits)
     return Plan(
         path=path,
@@ -121,11 +124,23 @@ def plan(
 
 def _check_arguments(nodes: int | None, speed_share: float, bound: bool) -> None:
     if nodes is not None and not 2 <= nodes <= 10 * MOST_NODES:
-        raise InputError(f"{nodes} nodes; 2 to {10 * MOST_NODES} make sense", where="nodes")
+        raise InputError(
+            f"{nodes} nodes; 2 to {10 * MOST_NODES} make sense",
+            where="nodes",
+            hint="leave nodes out to have them chosen",
+        )
     if not LEAST_SPEED_SHARE <= speed_share <= 1.0:
-        raise InputError(f"a speed share of {speed_share:g} is not from {LEAST_SPEED_SHARE} to 1", where="speed_share")
+        raise InputError(
+            f"a speed share of {speed_share:g} is not from {LEAST_SPEED_SHARE} to 1",
+            where="speed_share",
+            hint="0.5 flies at half the speed",
+        )
     if bound and speed_share < 1.0:
-        raise InputError("a speed share would break the boundary state that is given", where="speed_share")
+        raise InputError(
+            "a speed share would break the boundary state that is given",
+            where="speed_share",
+            hint="leave the share or the boundary state out",
+        )
 
 
 def _tries(planner: str, nodes: int, fixed: bool) -> Iterator[tuple[str, int]]:

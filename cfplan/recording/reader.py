@@ -92,12 +92,18 @@ def _read(file: Path) -> bytes:
     try:
         data = file.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror or error})", where=str(file)) from error
+        raise InputError(
+            f"cannot be read ({error.strerror or error})", where=str(file), hint="look at the file's permissions"
+        ) from error
     if not data:
         raise InputError("the record is empty", where=str(file), hint="the flight ended as the record was opened")
     if not data.startswith(MAGIC):
         if MAGIC.startswith(data):
-            raise InputError("the record ends before its header; nothing of it can be read", where=str(file))
+            raise InputError(
+                "the record ends before its header; nothing of it can be read",
+                where=str(file),
+                hint="the flight ended before anything was recorded",
+            )
         raise _not_ours(file, "it is no MCAP file")
     return data
 

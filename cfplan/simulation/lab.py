@@ -106,10 +106,12 @@ class Lab:
         try:
             self._connection.send(TRUTH)
             if not self._connection.poll(_ANSWER_TIMEOUT):
-                raise LinkError("the lab does not answer", where=self.uri)
+                raise LinkError("the lab does not answer", where=self.uri, hint="is the machine overloaded? Try again")
             rows, locked = self._connection.recv()
         except (OSError, EOFError) as why:
-            raise LinkError("the lab has died", where=self.uri) from why
+            raise LinkError(
+                "the lab has died", where=self.uri, hint="try again; a first start compiles for up to a minute"
+            ) from why
         return Truth.of(np.frombuffer(rows).reshape(-1, ROW_SIZE), locked)
 
     def disturb(self, fault: ViconFault) -> None:
@@ -166,4 +168,6 @@ def start_lab(
     except (OSError, EOFError) as why:
         process.kill()
         code = process.wait()
-        raise LinkError(f"the virtual lab did not start (exit {code})", where=f"sim://{number}") from why
+        raise LinkError(
+            f"the virtual lab did not start (exit {code})", where=f"sim://{number}", hint="run `cfplan doctor`"
+        ) from why
