@@ -1,7 +1,4 @@
-"""Vicon Tracker's and Nexus's CSV: sections of frames at a fixed rate, a subject every few columns.
-
-The file is mapped, not read: a block of lines at a time is turned into numbers, so that its size hardly matters.
-"""
+"""Vicon Tracker's and Nexus's CSV: sections of frames at a fixed rate, a subject every few columns."""
 
 import mmap
 import re
@@ -10,24 +7,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
-from pyarrow import csv
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
+from cfplan.recording.importers.csv_numbers import Lines, is_cut_off, numbers, place
 from cfplan.recording.importers.mocap_log import MocapLog, Subject, ascending, unit_quaternions
 from cfplan.recording.importers.vicon_header import Group, Rotations, Section, read_head
 
 FORMAT = "Vicon CSV"
 LARGEST_ROOM = 100.0  # m from the origin; beyond it the unit is wrong
-_BLOCK = 1 << 24  # bytes turned into numbers at a time
 _HEAD_LINES = 5
 _BEGIN = re.compile(rb"[\s,;\"]*[A-Za-z][\w ]*\"?[,;\t ]*\r?\n\"?[\d.,]+\"?[,;\t ]*\r?\n")
 _FRAME = re.compile(rb"(?m)^\"?frame\"?[,;\t]\"?sub ?frame", re.IGNORECASE)
 _BLANK = re.compile(rb"\n[ \t,;\r]*\n")
 _CONTENT = re.compile(rb"[^\s,;]")
-_NO_NUMBER = ["", " ", "NaN", "nan", "-nan", "NA", "-nan(ind)"]
 
 
 @dataclass(slots=True)
@@ -71,17 +65,11 @@ class _Reading:
             if parts and self.data[begin : begin + 1] in b'0123456789-"':  # a blank line between frames
                 self._append(parts[-1], begin, end)
                 continue
-            lines, place = self._lines(begin, end)
-            section = read_head(lines, where=self.place(begin), rotations=self.rotations)
+            lines, frames = self._lines(begin, end)
+            section = read_head(lines, where=place(self.data, begin, self.file), rotations=self.rotations)
             parts.append(_Rows(section))
-            self._append(parts[-1], place, end)
+            self._append(parts[-1], frames, end)
         return parts
-
-    def place(self, offset: int) -> str:
-        """`file:line` of a byte."""
-        starts = range(0, offset, _BLOCK)
-        lines = sum(self.data[start : min(start + _BLOCK, offset)].count(b"\n") for start in starts)
-        return f"{self.file}:{lines + 1}"
 
     def _stretches(self) -> Iterator[tuple[int, int]]:
         """What stands between blank lines."""
@@ -110,66 +98,19 @@ class _Reading:
         delimiter = rows.section.delimiter
         width = first_line.count(delimiter.encode()) + 1
         point = "," if delimiter == ";" and b"," in first_line else "."
-        wanted = [rows.section.frame_column, *_columns(rows.section)]
+        wanted = _wanted(rows.section)
         if max(wanted) >= width:
-            if self._cut_off(begin, end):
-                return
-            raise InputError(f"{width} cells where the columns are {rows.section.headings}", where=self.place(begin))
-        while begin < end:
-            after = end if end - begin <= _BLOCK else self.data.rfind(b"\n", begin, begin + _BLOCK) + 1
-            if after <= begin:
-                raise InputError("a line is too long", where=self.place(begin))
-            values = self._numbers(rows.section, begin, after, width, point)
-            if len(values):
-                rows.blocks.append(values)
-            begin = after
-
-    def _numbers(self, section: Section, begin: int, end: int, width: int, point: str) -> NDArray:
-        """(rows, columns) of the frame, the sub-frame and what the groups need; NaN for empty cells."""
-        wanted = _wanted(section)
-        names = [str(index) for index in range(width)]
-        kept = [names[index] for index in wanted]
-        try:
-            table = csv.read_csv(
-                pa.BufferReader(self.data[begin:end]),
-                read_options=csv.ReadOptions(column_names=names, block_size=_BLOCK + 1),
-                parse_options=csv.ParseOptions(delimiter=section.delimiter, newlines_in_values=False),
-                convert_options=csv.ConvertOptions(
-                    include_columns=kept,
-                    column_types=dict.fromkeys(kept, pa.float64()),
-                    null_values=_NO_NUMBER,
-                    decimal_point=point,
-                ),
-            )
-        except pa.ArrowInvalid as error:
-            cut = self.data.rfind(b"\n", begin, end - 1) + 1 or begin
-            if self._cut_off(cut, end) and cut >= begin:
+            if is_cut_off(self.data, begin, end):
                 self.truncated = True
-                return self._numbers(section, begin, cut, width, point) if cut > begin else np.empty((0, len(wanted)))
-            raise self._mistake(section, begin, end, width, point) from error
-        return np.stack([column.to_numpy() for column in table.columns], axis=1)
-
-    def _cut_off(self, begin: int, end: int) -> bool:
-        """Whether the line from begin to end is the file's last and lacks its end."""
-        cut = end == len(self.data) and self.data[end - 1 : end] != b"\n" and self.data.find(b"\n", begin, end) < 0
+                return
+            raise InputError(
+                f"{width} cells where the columns are {rows.section.headings}",
+                where=place(self.data, begin, self.file),
+            )
+        values, cut = numbers(self.data, Lines(begin, end, delimiter, width, wanted, point), self.file)
         self.truncated = self.truncated or cut
-        return cut
-
-    def _mistake(self, section: Section, begin: int, end: int, width: int, point: str) -> InputError:
-        """Which line, and which of its cells, is no row of numbers."""
-        while begin < end:
-            after = self.data.find(b"\n", begin, end) + 1 or end
-            cells = self.data[begin:after].decode("utf-8", errors="replace").strip("\r\n").split(section.delimiter)
-            if len(cells) != width:
-                return InputError(f"{len(cells)} cells, {width} in the lines before it", where=self.place(begin))
-            for index in _wanted(section):
-                text = cells[index].strip().strip('"')
-                try:
-                    float(text.replace(point, ".")) if text not in _NO_NUMBER else 0.0
-                except ValueError:
-                    return InputError(f"{text[:30]!r} in column {index + 1} is not a number", where=self.place(begin))
-            begin = after
-        return InputError("the frames cannot be read", where=str(self.file))
+        if len(values):
+            rows.blocks.append(values)
 
 
 def _wanted(section: Section) -> list[int]:

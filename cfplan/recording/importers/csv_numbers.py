@@ -1,0 +1,118 @@
+"""Lines of numbers in a mapped text file, read a block of lines at a time, so that its size hardly matters."""
+
+import mmap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import csv
+
+from cfplan.errors import InputError
+
+BLOCK = 1 << 24  # bytes turned into numbers at a time
+_NO_NUMBER = ["", " ", "NaN", "nan", "-nan", "NA", "-nan(ind)"]  # what a cell without a value holds
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """Where the numbers stand."""
+
+    begin: int
+    # byte of the first line
+    end: int
+    # byte behind the last line
+    delimiter: str
+    width: int
+    # cells of every line
+    wanted: Sequence[int]
+    # the cells to read
+    point: str = "."
+    # of the decimals
+
+
+def numbers(data: mmap.mmap, lines: Lines, file: Path) -> tuple[NDArray, bool]:
+    """(rows, wanted), NaN for empty cells; and whether the file's last line was cut off, which is then left out.
+
+    Raises InputError with the file's line where one has another number of cells, or a wanted one is no number.
+    """
+    blocks, cut = [np.empty((0, len(lines.wanted)))], False
+    for begin, end in _blocks(data, lines):
+        try:
+            blocks.append(_block(data[begin:end], lines))
+        except pa.ArrowInvalid as error:
+            last = data.rfind(b"\n", begin, end) + 1 or begin
+            cut = is_cut_off(data, last, end)
+            mistake = _mistake(data, begin, last if cut else end, lines, file)
+            if mistake is not None or not cut:
+                raise mistake or InputError("the numbers cannot be read", where=place(data, begin, file)) from error
+            if last > begin:
+                blocks.append(_block(data[begin:last], lines))
+    return np.concatenate(blocks), cut
+
+
+def place(data: mmap.mmap, offset: int, file: Path) -> str:
+    """`file:line` of a byte."""
+    starts = range(0, offset, BLOCK)
+    before = sum(data[start : min(start + BLOCK, offset)].count(b"\n") for start in starts)
+    return f"{file}:{before + 1}"
+
+
+def is_cut_off(data: mmap.mmap, begin: int, end: int) -> bool:
+    """Whether begin to end is the file's last line, and without its end."""
+    return begin < end == len(data) and data.find(b"\n", begin, end) < 0
+
+
+def _blocks(data: mmap.mmap, lines: Lines) -> Iterator[tuple[int, int]]:
+    begin = lines.begin
+    while begin < lines.end:
+        end = lines.end if lines.end - begin <= BLOCK else data.rfind(b"\n", begin, begin + BLOCK) + 1 or lines.end
+        yield begin, end
+        begin = end
+
+
+def _block(text: bytes, lines: Lines) -> NDArray:
+    names = [str(index) for index in range(lines.width)]
+    kept = [names[index] for index in lines.wanted]
+    table = csv.read_csv(
+        pa.BufferReader(text),
+        read_options=csv.ReadOptions(column_names=names, block_size=len(text) + 1),
+        parse_options=csv.ParseOptions(delimiter=lines.delimiter),
+        convert_options=csv.ConvertOptions(
+            include_columns=kept,
+            column_types=dict.fromkeys(kept, pa.float64()),
+            null_values=_NO_NUMBER,
+            decimal_point=lines.point,
+        ),
+    )
+    return np.stack([column.to_numpy() for column in table.columns], axis=1)
+
+
+def _mistake(data: mmap.mmap, begin: int, end: int, lines: Lines, file: Path) -> InputError | None:
+    """Which line, and which of its cells, is no row of numbers."""
+    while begin < end:
+        after = data.find(b"\n", begin, end) + 1 or end
+        line = data[begin:after].decode("utf-8", errors="replace").strip("\r\n")
+        cells = line.split(lines.delimiter)
+        if line and len(cells) != lines.width:
+            return InputError(
+                f"{len(cells)} cells, {lines.width} in the lines before it", where=place(data, begin, file)
+            )
+        for index in lines.wanted if line else ():
+            text = cells[index].strip().strip('"')
+            if not _is_number(text.replace(lines.point, ".")):
+                return InputError(
+                    f"{text[:30]!r} in column {index + 1} is not a number", where=place(data, begin, file)
+                )
+        begin = after
+    return None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return text in _NO_NUMBER
+    return True
