@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from cfplan.flight.telemetry import Telemetry
     from cfplan.recording.header import RecordHeader
 
+PROMISED_LATENESS = 2e-3  # s, of all setpoints but one in a hundred
 _PATH_SAMPLES = 500  # of the drawn path
 
 
@@ -140,10 +141,11 @@ def _header(flight: PlannedFlight, uri: str, source: Path) -> "RecordHeader":
         thrust_at_full_command=limits.airframe.motor_thrust_max,
         plan_limits=limits.plan,
         bounds=FlightBounds(
-            speed=limits.plan.speed,
-            acceleration=limits.plan.acceleration,
-            body_rate=limits.plan.angular_velocity,
+            speed=limits.flight.speed.brake,
+            acceleration=limits.flight.acceleration.brake,
+            body_rate=limits.flight.angular_velocity.brake,
             deviation=limits.flight.deviation.brake,
+            lateness=PROMISED_LATENESS,
             pose_age=limits.pose.age_warning,
             battery_voltage=limits.battery.under_load,
         ),
