@@ -1,7 +1,7 @@
 """The one entry to planning: from a path and limits to a certified trajectory, and how it came about."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.planning.planners import available, find_planner
 from cfplan.planning.repair import repair
-from cfplan.safety.certificate import Certificate, certify
+from cfplan.safety.certificate import Certificate
 from cfplan.safety.limits import Limits
 from cfplan.safety.slowing import Slowed
 from cfplan.safety.space import check_space
@@ -88,8 +88,9 @@ def plan(
     count = nodes if nodes is not None else default_nodes(path)
 
     notes: list[str] = []
-    slowed, name, count = _best(path, airframe, limits, planner, _tries(planner, count, nodes is not None), notes,
-                                yaw=yaw, yaw_angle=yaw_angle, start=start, end=end)  # fmt: skip
+    tries = _tries(planner, count, fixed=nodes is not None)
+    options = {"yaw": yaw, "yaw_angle": yaw_angle, "start": start, "end": end}
+    slowed, name, count = _best(path, airframe, limits, planner, tries, options, notes)
     if slowed.share < 1.0:
         if start is not None or end is not None:
             raise InfeasibleError(
@@ -97,22 +98,16 @@ def plan(
                 hint="start slower, or leave the boundary free",
             )
         notes.append(f"{name}'s profile was slowed to {slowed.share:.2%} of its speed to pass")
-    trajectory, certificate = slowed.trajectory, slowed.certificate
+    flown = slowed
     if speed_share < 1.0:
-        trajectory = Trajectory(path, trajectory.profile.slowed(speed_share), airframe)
-        certificate = certify(trajectory, limits.plan, limits.space)
-        if not certificate.passed:
-            raise NotCertifiedError(
-                f"{certificate.worst.name} exceeds its limit at a speed share of {speed_share:g}",
-                hint="0.5 flies at half the speed",
-            )
-    _check_endurance(trajectory.duration, limits)
+        flown = repair(path, slowed.trajectory.profile.slowed(speed_share), airframe, limits.plan, limits.space)
+    _check_endurance(flown.trajectory.duration, limits)
     return Plan(
         path=path,
         airframe=airframe,
         limits=limits,
-        trajectory=trajectory,
-        certificate=certificate,
+        trajectory=flown.trajectory,
+        certificate=flown.certificate,
         planner=name,
         nodes=count,
         slowed=slowed.share,
@@ -159,8 +154,8 @@ def _best(
     limits: Limits,
     planner: str,
     tries: Iterator[tuple[str, int]],
+    options: Mapping[str, Any],
     notes: list[str],
-    **options: Any,
 ) -> tuple[Slowed, str, int]:
     """The fastest of the planner's tries, or the first of a fallback; stops at the first good one."""
     best: tuple[Slowed, str, int] | None = None
@@ -175,7 +170,7 @@ def _best(
             continue
         try:
             found = repair(path, solution.profile, airframe, limits.plan, limits.space)
-        except NotCertifiedError as error:
+        except (InfeasibleError, NotCertifiedError) as error:
             notes.append(f"{name} with {nodes} nodes: {error}")
             continue
         if best is None or found.trajectory.duration < best[0].trajectory.duration:

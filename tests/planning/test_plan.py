@@ -1,0 +1,184 @@
+"""plan(): certified or refused with a reason, whatever the planner does."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cfplan.errors import CfplanError, InfeasibleError, InputError
+from cfplan.expert.solution import Solution, Status
+from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.yaw import YawMode
+from cfplan.planning import planners
+from cfplan.planning.plan import FEWEST_NODES, MOST_NODES, default_nodes, plan
+from cfplan.planning.planners import PLANNERS, find_planner
+from cfplan.safety.certificate import certify
+
+
+def stub(monkeypatch, **answers):
+    """Replace planners by functions of (path, nodes) that give a Solution; returns the calls made."""
+    calls = []
+
+    def find(name):
+        def planner(path, airframe, limits, *, nodes, **options):
+            calls.append((name, nodes, options))
+            return answers[name](path, nodes)
+
+        return planner
+
+    monkeypatch.setattr("cfplan.planning.plan.find_planner", find)
+    monkeypatch.setattr("cfplan.planning.plan.available", lambda name: name in answers)
+    return calls
+
+
+def test_a_plan_is_certified_for_its_limits_and_space(path, limits):
+    made = plan(path, limits.airframe, limits, planner="min-snap")
+    assert made.certificate.passed
+    assert made.certificate == certify(made.trajectory, limits.plan, limits.space)
+    assert (made.planner, made.nodes, made.speed_share) == ("min-snap", default_nodes(path), 1.0)
+    assert made.profile is made.trajectory.profile
+    assert made.seconds > 0
+
+
+def test_too_fast_a_profile_is_slowed_and_the_plan_says_by_how_much(path, limits, make_profile, monkeypatch):
+    fast = make_profile(path.end, np.full(40, 9.0))
+    calls = stub(monkeypatch, expert=lambda path, nodes: Solution(Status.SOLVED, fast))
+    made = plan(path, limits.airframe, limits)
+    assert made.certificate.passed
+    assert 0.1 < made.slowed < 0.9
+    assert f"{made.slowed:.2%}" in made.notes[-1]
+    # Once more with twice the nodes, in the hope of slowing less.
+    assert [nodes for _, nodes, _ in calls] == [default_nodes(path), 2 * default_nodes(path)]
+
+
+def test_the_faster_of_two_tries_is_taken(path, limits, make_profile, monkeypatch):
+    def answer(path, nodes):
+        rates = np.full(40, 9.0)
+        if nodes == default_nodes(path):
+            rates[20] = 0.5  # rough, so that it must be slowed more
+        return Solution(Status.SOLVED, make_profile(path.end, rates))
+
+    stub(monkeypatch, expert=answer)
+    assert plan(path, limits.airframe, limits).nodes == 2 * default_nodes(path)
+
+
+def test_nodes_that_are_given_are_kept(path, limits, make_profile, monkeypatch):
+    fast = make_profile(path.end, np.full(40, 9.0))
+    calls = stub(monkeypatch, expert=lambda path, nodes: Solution(Status.SOLVED, fast))
+    plan(path, limits.airframe, limits, nodes=77)
+    assert [nodes for _, nodes, _ in calls] == [77]
+
+
+def test_where_the_planner_fails_another_one_steps_in_and_the_plan_says_so(path, limits, make_profile, monkeypatch):
+    stub(
+        monkeypatch,
+        expert=lambda path, nodes: Solution(Status.NOT_CONVERGED, None, "restoration failed"),
+        **{"min-snap": lambda path, nodes: Solution(Status.SOLVED, make_profile(path.end, np.full(40, 0.5)))},
+    )
+    made = plan(path, limits.airframe, limits)
+    assert made.planner == "min-snap"
+    assert made.certificate.passed
+    assert "did not converge" in made.notes[0]
+    assert "restoration failed" in made.notes[0]
+
+
+def test_an_unsound_profile_counts_as_a_failure(path, limits, make_profile, monkeypatch):
+    sound = make_profile(path.end, np.full(40, 0.5))
+    broken = replace(sound, h=np.full_like(sound.h, np.nan))
+    stub(
+        monkeypatch,
+        expert=lambda path, nodes: Solution(Status.SOLVED, broken),
+        convex=lambda path, nodes: Solution(Status.SOLVED, sound),
+    )
+    made = plan(path, limits.airframe, limits)
+    assert made.planner == "convex"
+    assert "h is not finite" in made.notes[0]
+
+
+def test_where_every_planner_fails_the_reasons_are_given_in_one_line(path, limits, monkeypatch):
+    stub(monkeypatch, expert=lambda path, nodes: Solution(Status.INFEASIBLE, None, "no\nway"))
+    with pytest.raises(InfeasibleError, match="no profile meets the limits") as error:
+        plan(path, limits.airframe, limits)
+    assert "\n" not in str(error.value)
+    assert error.value.hint
+
+
+def test_a_speed_share_slows_the_whole_flight(path, limits):
+    whole, half = (plan(path, limits.airframe, limits, planner="min-snap", speed_share=share) for share in (1.0, 0.5))
+    assert half.trajectory.duration == pytest.approx(2 * whole.trajectory.duration)
+    fast, slow = ({margin.name: margin.worst for margin in made.certificate.margins} for made in (whole, half))
+    assert slow["speed"] == pytest.approx(fast["speed"] / 2, rel=1e-4)
+    assert slow["acceleration"] == pytest.approx(fast["acceleration"] / 4, rel=1e-3)
+    assert half.certificate.passed
+
+
+@pytest.mark.parametrize("arguments", [{"speed_share": s} for s in (0.0, -1.0, 1.1, float("nan"))] + [{"nodes": 1}])
+def test_arguments_out_of_range_are_refused(path, limits, arguments):
+    with pytest.raises(InputError, match=re.escape(next(iter(arguments))[:5])):
+        plan(path, limits.airframe, limits, planner="min-snap", **arguments)
+
+
+def test_a_boundary_state_is_never_slowed_away(path, limits, make_profile, monkeypatch):
+    fast = make_profile(path.end, np.full(40, 9.0))
+    stub(monkeypatch, expert=lambda path, nodes: Solution(Status.SOLVED, fast))
+    with pytest.raises(InfeasibleError, match="break the boundary state"):
+        plan(path, limits.airframe, limits, start=fast.boundary(0))
+    with pytest.raises(InputError, match="break the boundary state"):
+        plan(path, limits.airframe, limits, start=fast.boundary(0), speed_share=0.5)
+
+
+def test_yaw_and_boundary_states_reach_the_planner(path, limits, make_profile, monkeypatch):
+    slow = make_profile(path.end, np.full(40, 0.1))
+    calls = stub(monkeypatch, expert=lambda path, nodes: Solution(Status.SOLVED, slow))
+    end = slow.boundary(-1)
+    plan(path, limits.airframe, limits, yaw=YawMode.TANGENT, yaw_angle=0.3, end=end)
+    assert calls[0][2] == {"yaw": YawMode.TANGENT, "yaw_angle": 0.3, "start": None, "end": end}
+
+
+def test_a_path_outside_the_space_is_refused_before_any_planner_runs(limits, monkeypatch):
+    calls = stub(monkeypatch)
+    with pytest.raises(InfeasibleError, match="outside the space"):
+        plan(min_snap([[0, 0, 1], [5, 0, 1]]), limits.airframe, limits)
+    assert not calls
+
+
+def test_a_path_longer_than_the_battery_lasts_is_refused(path, limits):
+    tired = replace(limits, battery=replace(limits.battery, endurance=15.0))
+    with pytest.raises(InfeasibleError, match="the battery is trusted for 15 s"):
+        plan(path, limits.airframe, tired, planner="min-snap", speed_share=0.5)
+
+
+def test_an_unknown_planner_is_refused_with_the_known_ones():
+    with pytest.raises(InputError, match="unknown planner 'min snap'") as error:
+        find_planner("min snap")
+    assert "did you mean min-snap?" in error.value.hint
+    assert all(name in error.value.hint for name in PLANNERS)
+
+
+def test_a_planner_whose_part_is_missing_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(planners, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match="not installed") as error:
+        find_planner("convex")
+    assert "pip install" in error.value.hint
+
+
+def test_the_number_of_nodes_grows_with_the_path_within_bounds():
+    def count(length):
+        return default_nodes(min_snap([[0, 0, 1], [length, 0, 1]]))
+
+    assert count(0.1) == FEWEST_NODES
+    assert count(20.0) == pytest.approx(200, abs=1)
+    assert count(1e4) == MOST_NODES
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_every_planner_ends_in_a_certified_plan_or_a_typed_error(limits, planner):
+    path = min_snap([[-1, 0, 1], [0.5, 0.8, 1.3], [1, 0, 1]])
+    try:
+        made = plan(path, limits.airframe, limits, planner=planner, nodes=60)
+    except CfplanError as error:
+        pytest.fail(str(error))
+    assert made.planner == planner
+    assert made.certificate.passed
+    assert made.slowed > 0.8
