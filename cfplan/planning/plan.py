@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
+from cfplan.expert.solution import Solution
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.planning.planners import available, find_planner
@@ -164,9 +165,7 @@ def _best(
             break
         solution = find_planner(name)(path, airframe, limits.plan, nodes=nodes, **options)
         if solution.profile is None:
-            notes.append(
-                f"{name} with {nodes} nodes: {solution.status}{f' ({solution.reason})' * bool(solution.reason)}"
-            )
+            notes.append(_failure(name, nodes, solution))
             continue
         try:
             found = repair(path, solution.profile, airframe, limits.plan, limits.space)
@@ -180,6 +179,11 @@ def _best(
             f"no plan. {'; '.join(notes)}", hint="loosen the plan's limits, or make the path gentler or longer"
         )
     return best
+
+
+def _failure(name: str, nodes: int, solution: Solution) -> str:
+    own_words = f" ({' '.join(solution.reason.split())})" if solution.reason else ""
+    return f"{name} with {nodes} nodes: {solution.status}{own_words}"
 
 
 def _check_endurance(duration: float, limits: Limits) -> None:

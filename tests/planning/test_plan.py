@@ -172,7 +172,7 @@ def test_the_number_of_nodes_grows_with_the_path_within_bounds():
     assert count(1e4) == MOST_NODES
 
 
-@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("planner", [name for name in PLANNERS if name != "expert"])
 def test_every_planner_ends_in_a_certified_plan_or_a_typed_error(limits, planner):
     path = min_snap([[-1, 0, 1], [0.5, 0.8, 1.3], [1, 0, 1]])
     try:
