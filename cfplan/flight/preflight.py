@@ -12,14 +12,13 @@ from cfplan.flight.outcome import Check
 from cfplan.flight.pace import Lateness
 from cfplan.flight.packets import decode
 from cfplan.flight.poses import Pose
+from cfplan.flight.supervisor import FAULTS, FLYING
 from cfplan.flight.telemetry import Estimate, VehicleStatus
 
 OLDEST_PROTOCOL = 8  # the first with go-to as it is sent here
 LARGEST_VARIANCE = 1e-3  # m², a standard deviation of 3 cm
 LATEST_WAKING = 0.005  # s, 99th percentile
 LARGEST_ROUND_TRIP = 0.05  # s
-CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = 1 << 3, 1 << 4, 1 << 5, 1 << 6, 1 << 7
-_GROUNDED = {TUMBLED: "tumbled", LOCKED: "locked", CRASHED: "crashed"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +78,7 @@ def check_round_trip(ground: Ground) -> Check:
 
 
 def check_supervisor(ground: Ground) -> Check:
-    faults = [text for bit, text in _GROUNDED.items() if ground.status.supervisor & bit]
+    faults = [text for bit, text in FAULTS.items() if ground.status.supervisor & bit]
     if ground.status.supervisor & FLYING:
         faults.append("flying already")
     if not faults and not ground.could_fly:

@@ -24,7 +24,7 @@ from cfplan.flight.reporter import Reporter
 from cfplan.flight.telemetry import Telemetry
 
 _SWITCH_INTERVAL = 0.0005  # s; the stream gets the interpreter back after at most this
-_STREAM_PRIORITY = 20  # of SCHED_FIFO, where the system permits it
+_STREAM_PRIORITY, _THREAD_PRIORITY = 20, 10  # of SCHED_FIFO, where the system permits it
 _POLL = 0.05  # s
 
 
@@ -182,5 +182,8 @@ def _quieten() -> None:
     gc.freeze()
     gc.disable()
     with contextlib.suppress(OSError):
-        # Threads made later, by cflib, do not inherit it.
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_STREAM_PRIORITY))
+        # The other threads too: one that is kept from the processor while it holds the interpreter keeps the stream
+        # waiting as well.
+        for thread in os.listdir("/proc/self/task"):
+            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(_THREAD_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_STREAM_PRIORITY))

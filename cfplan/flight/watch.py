@@ -8,7 +8,7 @@ from cfplan.errors import ExitCode
 from cfplan.flight.keys import Order
 from cfplan.flight.outcome import Rung
 from cfplan.flight.poses import Pose
-from cfplan.flight.preflight import CRASHED, LOCKED, TUMBLED
+from cfplan.flight.supervisor import FAULTS
 from cfplan.flight.telemetry import Estimate, Triple, VehicleStatus
 from cfplan.safety.limits import Ladder, Limits
 
@@ -16,7 +16,6 @@ LATEST_SETPOINT = 0.25  # s; the vehicle gives up following after 0.5 s
 OLDEST_LOG = 0.5  # s without the vehicle's log
 LINK_GONE = 1.5  # s without it, after which the link counts as lost
 DISAGREEMENT_FACTOR = 5.0  # in the air estimate and pose may be apart by so many times what preflight allows
-_FAULTS = {TUMBLED: "tumbled", LOCKED: "locked", CRASHED: "crashed"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +96,7 @@ class Watch:
         silent = seen.now - max(seen.estimate.time, seen.status.time)
         if silent > OLDEST_LOG:
             yield _safety(Rung.LAND, f"the vehicle's log has been silent for {silent:.1f} s")
-        for bit, fault in _FAULTS.items():
+        for bit, fault in FAULTS.items():
             if seen.status.supervisor & bit:
                 yield _safety(Rung.CUT, f"the vehicle {fault}")
         voltage = self._loaded_voltage(seen.status)

@@ -172,8 +172,11 @@ def test_no_pose_of_a_frozen_source_is_forwarded(world, fly):
 
 
 @pytest.mark.parametrize("phase", [Phase.TAKE_OFF, Phase.GO_TO_START, Phase.HOLD, Phase.HAND_BACK, Phase.LAND])
-def test_the_operator_can_land_at_any_time_in_the_air(world, fly, phase):
-    world.when(phase, 0.7, lambda: land(world))
+@pytest.mark.parametrize("after", [0.0, 0.01, 0.02, 0.7])
+def test_the_operator_can_land_at_any_time_in_the_air(world, fly, phase, after):
+    if phase is Phase.TAKE_OFF and after == 0.0:
+        after = 0.005  # before that it is still on the ground
+    world.when(phase, after, lambda: land(world))
     outcome = fly()
     assert outcome.exit_code is ExitCode.ENDED_BY_PILOT
     assert world.position[2] < 0.05

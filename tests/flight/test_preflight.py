@@ -7,7 +7,8 @@ import pytest
 
 from cfplan.flight.pace import Lateness
 from cfplan.flight.poses import Pose
-from cfplan.flight.preflight import CAN_FLY, FLYING, LOCKED, TUMBLED, Ground, run_checks
+from cfplan.flight.preflight import Ground, run_checks
+from cfplan.flight.supervisor import CAN_FLY, FLYING, LOCKED, TUMBLED
 from cfplan.flight.telemetry import Estimate, VehicleStatus
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)

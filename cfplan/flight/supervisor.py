@@ -1,0 +1,11 @@
+"""The bits of the log variable supervisor.info, as the firmware's supervisor.c sets them."""
+
+ARMED = 1 << 1
+CAN_FLY = 1 << 3
+FLYING = 1 << 4
+TUMBLED = 1 << 5
+LOCKED = 1 << 6
+CRASHED = 1 << 7
+HIGH_LEVEL_ACTIVE = 1 << 8
+
+FAULTS = {TUMBLED: "tumbled", LOCKED: "locked", CRASHED: "crashed"}
