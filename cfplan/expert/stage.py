@@ -1,0 +1,146 @@
+"""What must hold at one point of an interval, as CasADi functions with first and second derivatives.
+
+Inside an interval h is a cubic and yaw a parabola, so everything physical at a point is a function of the interval's
+own variables. They are kept in node units (s counted in grid steps, h over a scale), which makes the dynamics the
+same for every path and every N:
+
+    given yaw   (x, x', x'', x''')                      h = scale · x
+    free yaw    (x, x', x'', ψ, ψ', x''', ψ'')
+
+Path, airframe and limits are arguments, so the same compiled functions serve every problem.
+"""
+
+from dataclasses import dataclass
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.flatness import flat_state
+
+# Rows of the constraint vector; each is scaled so that the limit is 1 (thrusts: -1 to 1).
+ACCELERATION, ANGULAR_VELOCITY, TILT, SPECIFIC_THRUST = range(4)
+THRUSTS = slice(4, 8)
+ROWS = 8
+LOWER = np.array([-np.inf, -np.inf, -np.inf, 1.0, -1.0, -1.0, -1.0, -1.0])
+UPPER = np.array([1.0, 1.0, 1.0, np.inf, 1.0, 1.0, 1.0, 1.0])
+
+POINT_DATA = 17  # γ' to γ'''' (12), place in the interval 0 to 1, weight of the penalties, ψ, ψ', ψ''
+COMMON_DATA = 15
+
+# Gauss-Legendre places and weights on [0, 1], for the time spent in an interval.
+GAUSS_PLACES = 0.5 + np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6)
+GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+
+
+@dataclass(frozen=True, slots=True)
+class Penalties:
+    """What a second of flight costs beyond its time; keeps solutions smooth and yaw from drifting."""
+
+    angular_acceleration: float = 1e-6
+    # s⁴/rad², per squared angular acceleration
+    yaw_rate: float = 1e-2
+    # s²/rad², per squared yaw rate; free yaw only
+    roughness: float = 1e-3
+    # s, per squared third derivative of h over h, in grid steps, an interval
+
+
+def common_data(airframe: Airframe, limits: PlanLimits, scale: float) -> NDArray:
+    """(COMMON_DATA,) what is the same at every point; `scale` turns x into h in node units."""
+    middle = 0.5 * (limits.motor_thrust_max + limits.motor_thrust_min)
+    half = 0.5 * (limits.motor_thrust_max - limits.motor_thrust_min)
+    return np.array([
+        airframe.mass, *airframe.inertia, airframe.arm, airframe.thrust_to_torque, *airframe.drag,
+        limits.acceleration, limits.angular_velocity, np.cos(limits.tilt), limits.specific_thrust_min, middle, half,
+        scale,
+    ])  # fmt: skip
+
+
+def local_variables(z: casadi.SX, free_yaw: bool, place: casadi.SX) -> tuple[list[casadi.SX], list[casadi.SX]]:
+    """(x, x', x'', x''') and, where yaw is free, (ψ, ψ', ψ''), at a place within the interval."""
+    jerk = z[5] if free_yaw else z[3]
+    x = [
+        z[0] + place * (z[1] + place * (z[2] / 2 + place * jerk / 6)),
+        z[1] + place * (z[2] + place * jerk / 2),
+        z[2] + place * jerk,
+        jerk,
+    ]
+    if not free_yaw:
+        return x, []
+    return x, [z[3] + place * (z[4] + place * z[6] / 2), z[4] + place * z[6], z[6]]
+
+
+def point_expressions(free_yaw: bool) -> tuple[list[casadi.SX], casadi.SX, casadi.SX]:
+    """([variables, point data, common data, penalty weights], constraint rows, penalty)."""
+    z = casadi.SX.sym("z", variables(free_yaw))
+    point = casadi.SX.sym("point", POINT_DATA)
+    common = casadi.SX.sym("common", COMMON_DATA)
+    weights = casadi.SX.sym("weights", 3)
+
+    (mass, jx, jy, jz, arm, thrust_to_torque, drag, axial_drag, acceleration, angular_velocity, cos_tilt,
+     specific_thrust_min, middle, half, scale) = casadi.vertsplit(common)  # fmt: skip
+    airframe = Airframe("symbolic", mass, (jx, jy, jz), arm, thrust_to_torque, 0.0, 0.0, 0.0, (drag, axial_drag), "")
+    entries = casadi.vertsplit(point)
+    derivatives = tuple(tuple(entries[3 * k : 3 * k + 3]) for k in range(4))
+    place, weight = entries[12:14]
+    x, yaw = local_variables(z, free_yaw, place)
+    h = tuple(scale * value for value in x)
+    flat = flat_state(
+        airframe, derivatives, h, tuple(yaw) if free_yaw else tuple(entries[14:17]), casadi.cos, casadi.sin
+    )
+
+    def squared(vector):
+        return sum(component * component for component in vector)
+
+    rows = [
+        squared(flat.acceleration) / acceleration**2,
+        squared(flat.body_rate) / angular_velocity**2,
+        (1 - flat.thrust_axis[2]) / (1 - cos_tilt),
+        flat.specific_thrust / specific_thrust_min,
+        *((thrust - middle) / half for thrust in flat.motor_thrust),
+    ]
+    penalty = weights[0] * squared(flat.angular_acceleration)
+    if free_yaw:
+        penalty += weights[1] * h[0] * yaw[1] ** 2
+    penalty = penalty / casadi.sqrt(h[0]) + weights[2] * (x[3] / x[0]) ** 2
+    return [z, point, common, weights], casadi.vertcat(*rows), weight * penalty
+
+
+def variables(free_yaw: bool) -> int:
+    """Number of variables of an interval."""
+    return 7 if free_yaw else 4
+
+
+def family(free_yaw: bool) -> str:
+    """Name of the functions' family."""
+    return "free" if free_yaw else "given"
+
+
+def point_functions(free_yaw: bool) -> list[casadi.Function]:
+    """Values, first and second derivatives at a point; and those of the time spent in an interval."""
+    inputs, rows, penalty = point_expressions(free_yaw)
+    z = inputs[0]
+    name = family(free_yaw)
+    multipliers = casadi.SX.sym("multipliers", ROWS)
+    factor = casadi.SX.sym("factor")
+    lagrangian = factor * penalty + casadi.dot(multipliers, rows)
+    hessian, gradient = casadi.hessian(lagrangian, z)
+
+    def function(title: str, arguments: list[casadi.SX], results: list[casadi.SX]) -> casadi.Function:
+        return casadi.Function(f"{name}_{title}", arguments, casadi.cse([casadi.densify(r) for r in results]))
+
+    h = [local_variables(z, free_yaw, place)[0][0] for place in GAUSS_PLACES]
+    time = sum(w / casadi.sqrt(value) for w, value in zip(GAUSS_WEIGHTS, h, strict=True))
+    time_hessian, time_gradient = casadi.hessian(time, z)
+    return [
+        function("rows", inputs, [rows]),
+        function("penalty", inputs, [penalty]),
+        function("penalty_gradient", inputs, [casadi.gradient(penalty, z)]),
+        function("jacobian", inputs, [rows, casadi.jacobian(rows, z)]),
+        function("hessian", [*inputs, multipliers, factor], [gradient, hessian]),
+        function("time", [z], [time]),
+        function("time_gradient", [z], [time_gradient]),
+        function("time_hessian", [z], [time_gradient, time_hessian]),
+    ]
