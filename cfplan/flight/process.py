@@ -14,8 +14,8 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
 from cfplan.errors import CfplanError, LinkError
+from cfplan.flight.connection import connect
 from cfplan.flight.keys import Keyboard, Order
-from cfplan.flight.link import connect
 from cfplan.flight.mission import Mission
 from cfplan.flight.outcome import FlightOutcome
 from cfplan.flight.pilot import Pilot

@@ -7,7 +7,7 @@ from cflib.crtp.crtpdriver import CRTPDriver
 from cflib.crtp.exceptions import WrongUriType
 
 from cfplan.errors import LinkError
-from cfplan.flight.link import connect
+from cfplan.flight.connection import connect
 
 
 class SilentDriver(CRTPDriver):
