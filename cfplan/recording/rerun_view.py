@@ -4,17 +4,14 @@ Everything is sent as whole columns after the flight; the stream's process never
 since the record's first message, on the one timeline `flight`.
 """
 
-import os
-import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import rerun as rr
-import rerun_cli
 from numpy.typing import NDArray
 
-from cfplan.errors import InputError
 from cfplan.flight.telemetry import Level
 from cfplan.recording import layout
 from cfplan.recording.plots import FLOWN as FLOWN_COLOUR
@@ -24,8 +21,8 @@ from cfplan.recording.record import Record
 from cfplan.recording.states import PHASE_COLOURS, SUPERVISOR_COLOURS, supervisor_states
 from cfplan.recording.summary import dropouts, pose_gaps
 from cfplan.recording.summary_text import summary_text
+from cfplan.recording.viewer import open_viewer, save
 
-APPLICATION = "cfplan"
 AXIS_LENGTH = 0.2  # m, of the body axes as drawn
 BODY_SCALE = 3.0  # the vehicle is drawn larger than it is, or it could not be seen in its room
 TRACK_RADIUS, TAIL_RADIUS, PATH_RADIUS = 0.004, 0.012, 0.006  # m, of the lines
@@ -38,41 +35,12 @@ LEVEL_NAMES = {Level.INFO: "INFO", Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 
 def write_rrd(record: Record, file: Path, *, overwrite: bool = False) -> None:
     """Write the recording with its blueprint; whole or not at all. Raises InputError where the file cannot be."""
-    if file.exists() and not overwrite:
-        raise InputError("there is a file already", where=str(file), hint="name another file")
-    unfinished = file.with_name(file.name + ".part")
-    try:
-        unfinished.touch()
-        with rr.RecordingStream(APPLICATION) as stream:
-            stream.save(unfinished, default_blueprint=layout.blueprint(record))
-            log_record(stream, record)
-            stream.flush()
-            stream.disconnect()
-        unfinished.replace(file)
-    except OSError as error:
-        unfinished.unlink(missing_ok=True)
-        raise InputError(
-            f"cannot be written ({error.strerror or error})",
-            where=str(file),
-            hint="choose a folder that can be written",
-        ) from error
+    save(file, layout.blueprint(record), partial(log_record, record=record), overwrite=overwrite)
 
 
 def show(record: Record) -> None:
     """Open the viewer on the recording; it stays open by itself. Raises InputError where there is no screen."""
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError("there is no screen to open the viewer on", hint="save the recording: --save flight.rrd")
-    with rr.RecordingStream(APPLICATION) as stream:
-        # not the `rerun` found by name: that is absent where the environment is not activated
-        viewer = Path(rerun_cli.__file__).with_name("rerun.exe" if sys.platform == "win32" else "rerun")
-        rr.spawn(
-            hide_welcome_screen=True,
-            executable_path=str(viewer),
-            default_blueprint=layout.blueprint(record),
-            recording=stream,
-        )
-        log_record(stream, record)
-        stream.flush()
+    open_viewer(layout.blueprint(record), partial(log_record, record=record))
 
 
 def log_record(stream: rr.RecordingStream, record: Record) -> None:
@@ -121,11 +89,11 @@ def _log_vehicle(stream: rr.RecordingStream, record: Record) -> None:
         strict=True,
     )
     stream.log(layout.BODY, rr.TransformAxes3D(AXIS_LENGTH), static=True)
-    _log_outline(stream, layout.BODY, record, poses.time, FLOWN_COLOUR)
+    log_outline(stream, layout.BODY, record.header.vehicle.arm, poses.time - record.start, FLOWN_COLOUR)
     stretches = np.split(poses.position, dropouts(pose_gaps(poses.time)) + 1)
     track = rr.LineStrips3D(stretches, colors=[_dimmed(FLOWN_COLOUR)], radii=TRACK_RADIUS)
     stream.log(layout.FLOWN, track, static=True)
-    _log_tail(stream, layout.TAIL, record, poses.time, poses.position, FLOWN_COLOUR)
+    log_tail(stream, layout.TAIL, poses.time - record.start, poses.position, FLOWN_COLOUR)
 
 
 def _log_ghost(stream: rr.RecordingStream, record: Record) -> None:
@@ -135,17 +103,17 @@ def _log_ghost(stream: rr.RecordingStream, record: Record) -> None:
         return
     columns = rr.Transform3D.columns(translation=setpoints.position, quaternion=setpoints.quaternion)
     stream.send_columns(layout.GHOST, [_since_start(record, setpoints.due)], columns, strict=True)
-    _log_outline(stream, layout.GHOST, record, setpoints.due, WANTED_COLOUR)
-    _log_tail(stream, layout.WANTED_TAIL, record, setpoints.due, setpoints.position, WANTED_COLOUR)
+    log_outline(stream, layout.GHOST, record.header.vehicle.arm, setpoints.due - record.start, WANTED_COLOUR)
+    log_tail(stream, layout.WANTED_TAIL, setpoints.due - record.start, setpoints.position, WANTED_COLOUR)
 
 
-def _log_outline(stream: rr.RecordingStream, entity: str, record: Record, times: NDArray, colour: Colour) -> None:
+def log_outline(stream: rr.RecordingStream, entity: str, arm: float, times: NDArray, colour: Colour) -> None:
     """The outline of the vehicle from the first of the times to the last, so that it never stands at the origin."""
-    strips = vehicle_outline(record.header.vehicle.arm * BODY_SCALE)
+    strips = vehicle_outline(arm * BODY_SCALE)
     columns = rr.LineStrips3D.columns(
         strips=strips, colors=[colour] * len(strips), radii=[0.008] * len(strips)
     ).partition([len(strips), 0])
-    ends = rr.TimeColumn(layout.TIMELINE, duration=np.array([times[0], times[-1]]) - record.start)
+    ends = rr.TimeColumn(layout.TIMELINE, duration=times[[0, -1]])
     stream.send_columns(f"{entity}/outline", [ends], columns, strict=True)
 
 
@@ -157,14 +125,12 @@ def vehicle_outline(arm: float) -> list[NDArray]:
     return [corners[[0, 2]], corners[[1, 3]], *(corner + circle for corner in corners)]
 
 
-def _log_tail(
-    stream: rr.RecordingStream, entity: str, record: Record, times: NDArray, positions: NDArray, colour: Colour
-) -> None:
+def log_tail(stream: rr.RecordingStream, entity: str, times: NDArray, positions: NDArray, colour: Colour) -> None:
     """Each step as a short line at its own time; the layout shows those of the last seconds."""
     stream.log(entity, rr.LineStrips3D.from_fields(colors=[colour], radii=[TAIL_RADIUS]), static=True)
     if len(times) > 1:
         columns = rr.LineStrips3D.columns(strips=_steps(positions))
-        stream.send_columns(entity, [_since_start(record, times[1:])], columns, strict=True)
+        stream.send_columns(entity, [rr.TimeColumn(layout.TIMELINE, duration=times[1:])], columns, strict=True)
 
 
 def _steps(positions: NDArray) -> pa.ListArray:

@@ -1,0 +1,207 @@
+"""Flights laid over one another, and over a plan: each a trial, time 0 where the path begins."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.signal import correlate
+
+from cfplan.errors import InputError
+from cfplan.recording.importers.mocap_log import Subject
+from cfplan.recording.record import Record
+from cfplan.recording.summary import reference_span, reference_times
+from cfplan.vehicle.trajectory import Trajectory
+
+STEP = 0.01  # s, of the grid on which time is first looked for
+_LONGEST_GAP = 0.1  # s between poses, over which a straight line still tells where the vehicle was
+_ALIKE = 0.5  # of the plan's own spread: beyond it, log and plan hardly are the same flight
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """Where a vehicle should have been."""
+
+    name: str
+    time: NDArray
+    # (M,) s from the begin of the path
+    position: NDArray
+    # (M, 3) m
+
+    def at(self, time: NDArray) -> NDArray:
+        """(N, 3) m; NaN before its begin and after its end."""
+        axes = [np.interp(time, self.time, axis, left=np.nan, right=np.nan) for axis in self.position.T]
+        return np.stack(axes, axis=-1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """One flight of the overlay."""
+
+    name: str
+    time: NDArray
+    # (N,) s from the begin of the path, or of the log where there is no reference
+    position: NDArray
+    # (N, 3) m, NaN where it was not seen
+    quaternion: NDArray
+    # (N, 4) body→world, x y z w, NaN where not known
+    reference: Reference | None
+
+    @property
+    def deviation(self) -> NDArray:
+        """(N,) m from the reference at that time; NaN where there is none."""
+        if self.reference is None:
+            return np.full(len(self.time), np.nan)
+        return np.linalg.norm(self.position - self.reference.at(self.time), axis=1)
+
+    @property
+    def speed(self) -> NDArray:
+        """(N,) m/s by differences of the positions; NaN at gaps."""
+        if len(self.time) < 3:
+            return np.full(len(self.time), np.nan)
+        return np.linalg.norm(np.gradient(self.position, self.time, axis=0), axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """How a log was laid over a plan: moved in time, in space as given."""
+
+    offset: float
+    # s of the log's clock at which the plan begins
+    covered: float
+    # share of the plan's time in which the subject was seen
+    aside: tuple[float, float, float]
+    # m, mean of the log minus the plan
+    max_deviation: float
+    # m
+    rms_deviation: float
+    # m
+    alike: bool
+    # whether the log looks like a flight of the plan at all
+
+    def __str__(self) -> str:
+        x, y, z = (100 * value for value in self.aside)
+        return (
+            f"offset {self.offset:.3f} s, {100 * self.covered:.0f} % of the plan seen, deviation "
+            f"{100 * self.rms_deviation:.1f} cm rms, {100 * self.max_deviation:.1f} cm max, "
+            f"in the mean ({x:.1f}, {y:.1f}, {z:.1f}) cm aside"
+        )
+
+
+def reference_of(trajectory: Trajectory, name: str) -> Reference:
+    """A plan, sampled."""
+    time = np.append(np.arange(0.0, trajectory.duration, STEP), trajectory.duration)
+    return Reference(name, time, trajectory.at(time).position)
+
+
+def trial_of_record(record: Record, name: str) -> Trial:
+    """A recorded flight with the setpoints that it followed as its reference; time 0 at the first of its path."""
+    begin, end = reference_span(record)
+    poses = record.poses
+    if math.isnan(begin):
+        return Trial(name, poses.time - record.start, poses.position, poses.quaternion, None)
+    wanted = reference_times(record.setpoints)
+    along = (wanted >= begin) & (wanted <= end)
+    reference = Reference(record.header.name, wanted[along] - begin, record.setpoints.position[along])
+    return Trial(name, poses.time - begin, poses.position, poses.quaternion, reference)
+
+
+def subject_of_record(record: Record, name: str) -> Subject:
+    """A recorded flight as motion capture saw it."""
+    poses = record.poses
+    return Subject(name, poses.time - record.start, poses.position, poses.quaternion)
+
+
+def trial_of_subject(subject: Subject, reference: Reference | None = None, offset: float = 0.0) -> Trial:
+    """A subject of a log; time 0 at `offset` of its clock."""
+    return Trial(subject.name, subject.time - offset, subject.position, subject.quaternion, reference)
+
+
+def align(subject: Subject, reference: Reference) -> Alignment:
+    """Where in the log the plan was flown, by correlation.
+
+    Looked for is the time at which the difference of log and plan varies least, so that neither a shift of the
+    laboratory's origin nor what was flown before and after matters. A part of the plan that was not seen counts as if
+    it had been missed by the plan's own spread. A vehicle that lags behind its setpoints by a constant time is moved
+    by that too: no log by itself can tell the two apart.
+
+    Raises InputError where the subject was hardly seen.
+    """
+    time, position = subject.time[subject.seen], subject.position[subject.seen]
+    if len(time) < 2 or time[-1] - time[0] < 2 * STEP:
+        raise InputError("seen for too short a time to be laid over a plan", where=subject.name)
+    centre = reference.position.mean(axis=0)
+    plan_grid = np.arange(0.0, reference.time[-1] + STEP / 2, STEP)
+    plan = np.stack([np.interp(plan_grid, reference.time, axis) for axis in (reference.position - centre).T], axis=1)
+    spread = float(np.mean(np.sum((plan - plan.mean(axis=0)) ** 2, axis=1)))
+    log_grid = np.arange(time[0], time[-1], STEP)
+    log, weight = _resampled(log_grid, time, position - centre)
+
+    # Sums over the plan's samples for every shift: of weights, of both, of their squares and of their product.
+    ones = np.ones(len(plan))
+    count = correlate(weight, ones, method="fft")
+    sums = [correlate(weight * axis, ones, method="fft") for axis in log.T]
+    plan_sums = [correlate(weight, axis, method="fft") for axis in plan.T]
+    squares = correlate(weight * np.sum(log**2, axis=1), ones, method="fft")
+    plan_squares = correlate(weight, np.sum(plan**2, axis=1), method="fft")
+    products = sum(correlate(weight * a, b, method="fft") for a, b in zip(log.T, plan.T, strict=True))
+    seen = np.maximum(count, 1.0)
+    mean = [(a - b) / seen for a, b in zip(sums, plan_sums, strict=True)]
+    variance = (squares - 2 * products + plan_squares) / seen - sum(axis**2 for axis in mean)
+    covered = np.clip(count / len(plan), 0, 1)
+    shift = int(np.argmin(covered * variance + (1 - covered) * spread)) - (len(plan) - 1)
+
+    def varies(offset: float) -> float:
+        difference = _difference(time, position, reference, offset)
+        return float(np.mean(np.sum((difference - difference.mean(axis=0)) ** 2, axis=1)))
+
+    guess = float(time[0] + shift * STEP)
+    found = minimize_scalar(varies, bounds=(guess - STEP, guess + STEP), method="bounded", options={"xatol": 1e-7})
+    offset = float(found.x) if found.fun <= varies(guess) else guess
+    difference = _difference(time, position, reference, offset)
+    distance = np.linalg.norm(difference, axis=1)
+    x, y, z = (float(value) for value in difference.mean(axis=0))
+    return Alignment(
+        offset=offset,
+        covered=len(difference) / len(reference.time),
+        aside=(x, y, z),
+        max_deviation=float(distance.max()),
+        rms_deviation=float(np.sqrt(np.mean(distance**2))),
+        alike=varies(offset) <= _ALIKE**2 * spread,
+    )
+
+
+def _resampled(grid: NDArray, time: NDArray, position: NDArray) -> tuple[NDArray, NDArray]:
+    """Positions at the grid's times (N, 3), 0 in gaps, and weights (N,) that are 0 there."""
+    at = np.stack([np.interp(grid, time, axis) for axis in position.T], axis=1)
+    weight = _near(grid, time).astype(float)
+    return at * weight[:, None], weight
+
+
+def _near(moments: NDArray, time: NDArray) -> NDArray:
+    """(N,) whether the subject was seen shortly before and after each moment."""
+    after = np.clip(np.searchsorted(time, moments), 1, len(time) - 1)
+    gap = max(_LONGEST_GAP, 3 * float(np.median(np.diff(time))))
+    return (moments >= time[0]) & (moments <= time[-1]) & (time[after] - time[after - 1] <= gap)
+
+
+def _difference(time: NDArray, position: NDArray, reference: Reference, offset: float) -> NDArray:
+    """(K, 3) m log minus plan, at those of the plan's times at which the log tells."""
+    moments = reference.time + offset
+    near = _near(moments, time)
+    if not near.any():
+        return np.zeros((1, 3))
+    at = np.stack([np.interp(moments[near], time, axis) for axis in position.T], axis=1)
+    return at - reference.position[near]
+
+
+def extent(trials: Sequence[Trial]) -> tuple[NDArray, NDArray]:
+    """Lower and upper corner of all that is drawn, (3,) m each."""
+    points = [trial.position[np.isfinite(trial.position).all(axis=1)] for trial in trials]
+    points += [trial.reference.position for trial in trials if trial.reference is not None]
+    everything = np.concatenate([*points, np.zeros((0, 3))])
+    if len(everything) == 0:
+        return np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.0])
+    return everything.min(axis=0), everything.max(axis=0)
