@@ -136,11 +136,12 @@ def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = No
     ends = np.cumsum(pieces.counts)
     worst: dict[str, _Peak] = {}
     for batch in np.split(np.arange(len(ends)), np.flatnonzero(np.diff(ends // BATCH)) + 1):
-        s, interval, first = _samples(pieces, batch)
+        s, interval, starts = _samples(pieces, batch)
         with np.errstate(all="ignore"):
             state = state_at(trajectory.path, trajectory.profile, trajectory.airframe, s, time=s, interval=interval)
             for quantity in _quantities(state, trajectory, limits, space):
-                index, value = _peak(np.ascontiguousarray(np.atleast_2d(quantity.sign * quantity.values)), first)
+                rows = np.ascontiguousarray(np.atleast_2d(quantity.sign * quantity.values))
+                index, value = _peak(rows, starts, pieces.counts[batch])
                 known = worst.get(quantity.name)
                 if known is None or not value <= known.value:  # NaN is worse than everything and stays
                     worst[quantity.name] = known if known and np.isnan(known.value) else _Peak(
@@ -215,7 +216,7 @@ def _pieces(trajectory: Trajectory) -> _Pieces:
 
 
 def _samples(pieces: _Pieces, batch: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """s, (N,), the profile's interval of each, and whether it is the first of its piece."""
+    """s, (N,), the profile's interval of each, and where each piece starts."""
     left, right, interval, counts = (values[batch] for values in pieces)
     starts = np.cumsum(counts) - counts
     piece = np.repeat(np.arange(len(counts)), counts)
@@ -223,33 +224,27 @@ def _samples(pieces: _Pieces, batch: NDArray) -> tuple[NDArray, NDArray, NDArray
     s = left[piece] + share * (right - left)[piece]
     # The last sample of a piece must fall on its own side of a break of the path.
     s[starts + counts - 1] = np.nextafter(right, -np.inf)
-    first = np.zeros(len(s), dtype=bool)
-    first[starts] = True
-    return s, interval[piece], first
+    return s, interval[piece], starts
 
 
 @njit(cache=True)
-def _peak(rows: NDArray, first: NDArray) -> tuple[int, float]:
+def _peak(rows: NDArray, starts: NDArray, counts: NDArray) -> tuple[int, float]:
     """Index of the largest of (k, N) values, and that value with what may rise above it between samples.
 
-    NaN counts as larger than everything.
+    Pieces begin at `starts` and have `counts` samples each, at least three. NaN is larger than everything.
     """
-    size = rows.shape[1]
     index, peak = 0, -np.inf
     for row in rows:
-        sag = 0.0  # of the sample before
-        for n in range(size):
-            starts, ends = first[n], n + 1 == size or first[n + 1]
-            middle = n + 1 if starts else n - 1 if ends else n  # a second difference needs both neighbours
-            here = 2.0 * row[middle] - row[middle - 1] - row[middle + 1]
-            rise = max(here, 0.0) if starts else max(here, sag, 0.0)
-            # Between this sample and the one before, and between it and the next, its own sag is in both.
-            bound = row[n] + _ALLOWANCE * rise
-            if not starts:
-                bound = max(bound, row[n - 1] + _ALLOWANCE * rise)
-            if not bound <= peak:
-                index, peak = n, bound
-                if np.isnan(bound):
-                    return index, peak
-            sag = here
+        for piece in range(len(starts)):
+            start, count = starts[piece], counts[piece]
+            # Each inner sample answers for both gaps beside it, so all gaps of the piece are covered.
+            for n in range(start + 1, start + count - 1):
+                before, here, after = row[n - 1], row[n], row[n + 1]
+                sag = 2.0 * here - before - after
+                bound = max(before, here, after) + _ALLOWANCE * (0.0 if sag <= 0.0 else sag)
+                if not bound <= peak:
+                    peak = bound
+                    index = n if here >= before and here >= after else n - 1 if before >= after else n + 1
+                    if np.isnan(bound):
+                        return n, peak
     return index, peak

@@ -115,33 +115,42 @@ def trajectory(make_profile):
 
 
 def test_a_smooth_peak_between_samples_is_not_missed():
-    first = np.arange(20) == 0
+    whole = np.array([0]), np.array([20])
     for shift in np.linspace(0, 1, 21):
         angles = (np.arange(20) - 9.5 + shift) * 0.2
-        values = np.cos(angles)[None]
-        assert 1.0 <= _peak(values, first)[1] <= 1.02
-        assert -1.02 <= _peak(np.cos(angles + np.pi)[None], first)[1] <= -np.cos(angles).min() + 0.02
+        assert 1.0 <= _peak(np.cos(angles)[None], *whole)[1] <= 1.02
+        # A valley has no peak inside: nothing is added to what stands at its ends.
+        assert _peak(-np.cos(angles[5:15])[None], np.array([0]), np.array([10]))[1] == -np.cos(angles[[5, 14]]).min()
+
+
+def test_a_peak_in_the_first_or_last_gap_of_a_piece_is_not_missed():
+    for shift in np.linspace(0, 1, 21):
+        angles = (np.arange(10) - shift) * 0.2
+        for values in (np.cos(angles), np.cos(angles)[::-1]):
+            assert 1.0 <= _peak(np.ascontiguousarray(values)[None], np.array([0]), np.array([10]))[1] <= 1.02
 
 
 def test_a_jump_between_pieces_is_no_peak():
     values = np.array([[0.0, 0.0, 0.0, 5.0, 5.0, 5.0]])
-    first = np.array([True, False, False, True, False, False])
-    assert _peak(values, first) == (3, 5.0)
+    index, peak = _peak(values, np.array([0, 3]), np.array([3, 3]))
+    assert index in (3, 4, 5)
+    assert peak == 5.0
 
 
-def test_one_value_that_is_no_number_fails():
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_one_value_that_is_not_finite_fails(wrong):
     for place in range(6):
         values = np.ones((2, 6))
-        values[1, place] = np.nan
-        assert np.isnan(_peak(values, np.arange(6) % 3 == 0)[1])
+        values[1, place] = wrong
+        assert not np.isfinite(_peak(values, np.array([0, 3]), np.array([3, 3]))[1])
 
 
 def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval(trajectory):
     pieces = _pieces(trajectory)
-    s, interval, first = _samples(pieces, np.arange(len(pieces.counts)))
+    s, interval, starts = _samples(pieces, np.arange(len(pieces.counts)))
     assert np.diff(trajectory.time_at(s)).max() <= 1.001e-3
     assert np.bincount(interval).min() >= 10
-    assert np.count_nonzero(first) >= len(np.union1d(trajectory.profile.s, trajectory.path.breaks)) - 1
+    assert len(starts) >= len(np.union1d(trajectory.profile.s, trajectory.path.breaks)) - 1
     fast = Trajectory(trajectory.path, trajectory.profile.slowed(50.0), AIRFRAME)
     assert certify(fast, LIMITS).samples >= 10 * (len(trajectory.profile.s) - 1)
 
