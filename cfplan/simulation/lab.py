@@ -91,7 +91,9 @@ class Lab:
         # of the vehicle in the virtual Vicon; "" where the room has none
         self._process = process
         self._connection = connection
-        os.environ[lab_variable(number)] = f"127.0.0.1:{port}"
+        self._address = f"127.0.0.1:{port}"
+        self._hidden = os.environ.get(lab_variable(number))
+        os.environ[lab_variable(number)] = self._address
 
     @property
     def process_id(self) -> int:
@@ -129,8 +131,11 @@ class Lab:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        if os.environ.get(lab_variable(self.number)) == f"127.0.0.1:{self.port}":
-            del os.environ[lab_variable(self.number)]
+        name = lab_variable(self.number)
+        if os.environ.get(name) == self._address:
+            del os.environ[name]
+            if self._hidden is not None:
+                os.environ[name] = self._hidden
 
     def __enter__(self) -> "Lab":
         return self
@@ -146,8 +151,8 @@ def start_lab(
 ) -> Lab:
     """Start a lab with a vehicle of this airframe as `sim://number`. Raises LinkError where it does not come up.
 
-    A plain child process rather than one of multiprocessing's, so that it can be started from a daemonic process and
-    from a script without a main guard.
+    A lab that had that number is hidden until this one is closed. A plain child process rather than one of
+    multiprocessing's, so that it can be started from a daemonic process and from a script without a main guard.
     """
     ours, theirs = socket.socketpair()
     with theirs:

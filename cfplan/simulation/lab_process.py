@@ -22,6 +22,7 @@ from cfplan.simulation.virtual_vicon import VirtualVicon
 from cfplan.simulation.virtual_vicon_faults import ViconFault
 from cfplan.vehicle.airframe import Airframe
 
+_WARM_UP = 200  # ms
 _STEP = 2  # ms between wakes
 _RECORD_PERIOD = 10  # ms
 _MOST_BEHIND = 0.25  # s that a stall may be caught up with; beyond, simulated time is lost
@@ -57,7 +58,8 @@ class LabLoop:
 
     def __init__(self, airframe: Airframe, vehicle: VehicleSettings, room: RoomSettings):
         self.vehicle = VirtualCrazyflie(airframe, vehicle)
-        self.capture = MotionCapture(room)
+        self._warm_up()
+        self.capture = MotionCapture(room, begin=self.vehicle.tick)
         self.vicon: VirtualVicon | None = None
         self.record = Recorder()
         self.link, self.poses = _adjacent_sockets()
@@ -66,6 +68,11 @@ class LabLoop:
         self._heard = 0.0
         self._subscribers: dict[_Address, float] = {}
         self._origin = 0.0
+
+    def _warm_up(self) -> None:
+        """Compile, and let the supervisor pass its checks, before anyone looks."""
+        self.vehicle.advance(_WARM_UP)
+        self.vehicle.sent()
 
     def run(self, control: Connection) -> None:
         """Until told to end, or until whoever started this has gone."""
@@ -182,19 +189,12 @@ def serve(control: Connection) -> None:
     """Make the lab that the other side asks for, say on which port it listens, and run it."""
     airframe, vehicle, room = control.recv()
     loop = LabLoop(airframe, vehicle, room)
-    _warm_up(loop.vehicle)
     if room.vicon is not None:
         loop.vicon = VirtualVicon(room.vicon, time.monotonic())
     gc.collect()
     gc.freeze()
     control.send((loop.port, loop.vicon.port if loop.vicon is not None else None))
     loop.run(control)
-
-
-def _warm_up(vehicle: VirtualCrazyflie) -> None:
-    """Compile, and let the supervisor pass its checks, before anyone looks."""
-    vehicle.advance(200)
-    vehicle.sent()
 
 
 def main() -> None:

@@ -49,10 +49,11 @@ class RoomSettings:
 
 
 class MotionCapture:
-    """Sees the vehicle `rate` times a second; what it saw comes out `latency` later."""
+    """Sees the vehicle `rate` times a second, from the tick `begin` on; what it saw comes out `latency` later."""
 
-    def __init__(self, settings: RoomSettings):
+    def __init__(self, settings: RoomSettings, begin: int = 0):
         self._settings = settings
+        self._begin = begin
         self._chance = np.random.default_rng(settings.seed)
         self._number = 0
         self._waiting: list[tuple[float, bytes]] = []
@@ -60,7 +61,7 @@ class MotionCapture:
     @property
     def next_tick(self) -> int:
         """The tick of 1 ms at which it looks next."""
-        return round(self._number * 1000 / self._settings.rate)
+        return self._begin + round(self._number * 1000 / self._settings.rate)
 
     def look(self, time: float, truth: NDArray) -> None:
         """See the vehicle, whose state begins with position and has its quaternion at 6:10."""
