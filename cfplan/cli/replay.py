@@ -1,36 +1,180 @@
-"""`cfplan replay`: look at a recorded flight in rerun."""
+"""`cfplan replay`: look at flights in rerun."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json
+from cfplan.cli.rehearsal import PLAN_SUFFIX, PlanOptions, obtain_plan
+
+if TYPE_CHECKING:
+    from cfplan.recording.importers.mocap_log import Subject
+    from cfplan.recording.overlay import Reference, Trial
+
+EPILOG = """\b
+Examples:
+  cfplan replay records/2026-11-21_101500-figure-eight --save flight.rrd
+  cfplan replay vicon.csv --subject cf1 --plan flights/figure8.yaml
+  cfplan replay records/toppquad records/learned"""
 
 
-@click.command(epilog="Example: cfplan replay records/2026-11-21_101500-figure-eight --save flight.rrd")
-@click.argument("record", type=click.Path(path_type=Path))
+@click.command(epilog=EPILOG)
+@click.argument("flights", metavar="FLIGHT...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--plan", "plan_file", type=click.Path(path_type=Path), help="Lay the flights over this path or plan.")
+@click.option("--subject", "names", multiple=True, help="Show this subject of a mocap log only; may be repeated.")
+@click.option(
+    "--angles",
+    type=click.Choice(["helical", "euler"]),
+    help="What the three angles of a Vicon CSV are where its header does not say.",
+)
 @click.option("--save", type=click.Path(path_type=Path), help="Write a rerun file here instead of opening the viewer.")
 @click.option("--force", is_flag=True, help="Overwrite the file.")
 @options.as_json
-def replay(record: Path, save: Path | None, force: bool, as_json: bool) -> None:
-    """Replay a flight's RECORD (its folder, or its flight.mcap) in rerun."""
+def replay(
+    flights: tuple[Path, ...],
+    plan_file: Path | None,
+    names: tuple[str, ...],
+    angles: str | None,
+    save: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Replay a FLIGHT in rerun, or several as trials in one view.
+
+    Each is a record (its folder, or its flight.mcap) or a log of motion capture: Vicon CSV, a Crazyflie's microSD log,
+    crazyswarm2 CSV, a ROS bag, or a MAVLink .tlog.
+    """
+    from cfplan.recording.reader import is_record
+
+    steps = Steps(as_json=as_json)
+    if len(flights) == 1 and plan_file is None and is_record(flights[0]):
+        document = _replay_record(flights[0], save, force, steps)
+    else:
+        document = _replay_trials(flights, plan_file, names, angles, save, force, steps)
+    if as_json:
+        print_json({**document, "rrd": str(save) if save else None})
+
+
+def _replay_record(place: Path, save: Path | None, force: bool, steps: Steps) -> dict[str, Any]:
     from cfplan.recording.reader import read_record
     from cfplan.recording.rerun_view import show, write_rrd
     from cfplan.recording.summary import summarise
 
-    steps = Steps(as_json=as_json)
     with steps.step("read") as said:
-        flight = read_record(record)
+        flight = read_record(place)
         said.append(f"{flight.header.name}, {flight.duration:.1f} s, {len(flight.setpoints.time)} setpoints")
         if flight.truncated:
             said.append("truncated: what follows the last whole chunk is lost")
     if save is not None:
         with steps.step("rerun file") as said:
             write_rrd(flight, save, overwrite=force)
-            said.append(f"{save} ({save.stat().st_size / 1e6:.1f} MB); open it with: rerun {save}")
+            said.append(_saved(save))
     else:
         with steps.step("viewer"):
             show(flight)
-    if as_json:
-        print_json({"record": str(record), "rrd": str(save) if save else None, **summarise(flight).to_json()})
+    return {"record": str(place), **summarise(flight).to_json()}
+
+
+def _replay_trials(
+    flights: tuple[Path, ...],
+    plan_file: Path | None,
+    names: tuple[str, ...],
+    angles: str | None,
+    save: Path | None,
+    force: bool,
+    steps: Steps,
+) -> dict[str, Any]:
+    from cfplan.recording.overlay_view import show_overlay, write_overlay
+
+    reference = _reference(plan_file, steps) if plan_file is not None else None
+    trials: list[Trial] = []
+    told: list[dict[str, Any]] = []
+    for place in flights:
+        for trial, said in _trials(place, reference, names, angles, steps):
+            trials.append(trial)
+            told.append({"file": str(place), "name": trial.name, **said})
+    if save is not None:
+        with steps.step("rerun file") as said_of_file:
+            write_overlay(trials, save, overwrite=force)
+            said_of_file.append(_saved(save))
+    else:
+        with steps.step("viewer"):
+            show_overlay(trials)
+    return {"trials": told}
+
+
+def _saved(file: Path) -> str:
+    return f"{file} ({file.stat().st_size / 1e6:.1f} MB); open it with: rerun {file}"
+
+
+def _reference(plan_file: Path, steps: Steps) -> "Reference":
+    from cfplan.recording.overlay import reference_of
+
+    if plan_file.suffix == PLAN_SUFFIX:  # as it was planned, whatever today's limits say
+        from cfplan.planning.files import load_plan
+
+        with steps.step("plan") as said:
+            trajectory = load_plan(plan_file).trajectory
+            said.append(f"{trajectory.duration:.2f} s, read from {plan_file}")
+        return reference_of(trajectory, plan_file.stem)
+    planned = obtain_plan(plan_file, PlanOptions(None, "expert", None, None), steps)
+    return reference_of(planned.plan.trajectory, planned.name)
+
+
+def _trials(
+    place: Path, reference: "Reference | None", names: tuple[str, ...], angles: str | None, steps: Steps
+) -> "list[tuple[Trial, dict[str, Any]]]":
+    """The trials of one file, and what is to be told of each; laid over the reference where there is one."""
+    from cfplan.recording.overlay import subject_of_record, trial_of_record, trial_of_subject
+    from cfplan.recording.reader import is_record, read_record
+
+    if is_record(place):
+        with steps.step("read") as said:
+            record = read_record(place)
+            name = place.resolve().name if place.is_dir() else place.resolve().parent.name
+            said.append(f"{name}, {record.duration:.1f} s, {len(record.poses.time)} poses")
+        if reference is None:
+            return [(trial_of_record(record, name), {"format": "cfplan record", "truncated": record.truncated})]
+        about = {"format": "cfplan record", "truncated": record.truncated}
+        return [_laid(subject_of_record(record, name), reference, about, steps)]
+
+    subjects, about = _read_log(place, names, angles, steps)
+    if reference is None:
+        return [(trial_of_subject(subject), {**about, "duration": subject.duration}) for subject in subjects]
+    return [_laid(subject, reference, about, steps) for subject in subjects]
+
+
+def _read_log(
+    place: Path, names: tuple[str, ...], angles: str | None, steps: Steps
+) -> "tuple[tuple[Subject, ...], dict[str, Any]]":
+    from cfplan.recording.importers.table import read_log
+    from cfplan.recording.importers.vicon_header import Rotations
+
+    with steps.step("read") as said:
+        log = read_log(place, rotations=Rotations(angles) if angles else None)
+        subjects = log.select(names, where=str(place))
+        said.append(f"{log.format}: {', '.join(subject.name for subject in subjects)}")
+        said.extend(
+            f"{subject.name} unseen in {100 * (1 - subject.seen.mean()):.1f} % of {subject.duration:.1f} s"
+            for subject in subjects
+            if not subject.seen.all()
+        )
+        said.extend(log.notes)
+    return subjects, {"format": log.format, "truncated": log.truncated, "notes": list(log.notes)}
+
+
+def _laid(
+    subject: "Subject", reference: "Reference", about: dict[str, Any], steps: Steps
+) -> "tuple[Trial, dict[str, Any]]":
+    from dataclasses import asdict
+
+    from cfplan.recording.overlay import align, trial_of_subject
+
+    with steps.step("align") as said:
+        found = align(subject, reference)
+        said.append(f"{subject.name}: {found}")
+        if not found.alike:
+            said.append(f"it hardly looks like a flight of {reference.name}")
+    return trial_of_subject(subject, reference, found.offset), {**about, "alignment": asdict(found)}

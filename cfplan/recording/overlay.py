@@ -82,7 +82,7 @@ class Alignment:
     # whether the log looks like a flight of the plan at all
 
     def __str__(self) -> str:
-        x, y, z = (100 * value for value in self.aside)
+        x, y, z = (round(100 * value, 1) + 0.0 for value in self.aside)  # no -0.0
         return (
             f"offset {self.offset:.3f} s, {100 * self.covered:.0f} % of the plan seen, deviation "
             f"{100 * self.rms_deviation:.1f} cm rms, {100 * self.max_deviation:.1f} cm max, "

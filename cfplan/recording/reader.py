@@ -75,6 +75,18 @@ def read_record(place: Path) -> Record:
     return Record(folder=file.parent, header=header, summary=_summary(file.parent), truncated=not whole, **streams)
 
 
+def is_record(place: Path) -> bool:
+    """Whether a folder or a file is a record of ours, damaged or not; other MCAP files and other logs are not."""
+    if place.name == FLIGHT_FILE or (place / FLIGHT_FILE).exists():
+        return True
+    try:
+        with place.open("rb") as stream:
+            head = stream.read(len(MAGIC) + _RECORD.size + 4 + len(PROFILE))
+    except OSError:
+        return False
+    return head.startswith(MAGIC) and head.endswith(PROFILE.encode())
+
+
 def _find(place: Path) -> Path:
     if place.is_dir():
         file = place / FLIGHT_FILE
