@@ -54,11 +54,6 @@ class DataStreamClient:
         push = struct.pack("<?", True)
         self._socket.sendall(packet((Block.OBJECT_ENUMS, kinds(wanted)), (Block.REQUEST_FRAME, push)))
 
-    @property
-    def connected(self) -> bool:
-        """Whether somebody answered."""
-        return self._socket is not None
-
     def wait(self) -> Frame:
         """The next frame."""
         while True:

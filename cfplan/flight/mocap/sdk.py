@@ -7,9 +7,10 @@ a process that can be killed, and what can be looked at beforehand is.
 
 import math
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from cfplan.errors import CfplanError, InputError, LinkError
+from cfplan.errors import InputError, LinkError
 from cfplan.flight.mocap.datastream_client import DataStreamClient, open_connection
 from cfplan.flight.mocap.frames import Body, Frame, Scene
 from cfplan.flight.mocap.uri import MocapUri
@@ -93,13 +94,10 @@ class SdkDriver:
         try:
             client.connect()
             end = time.monotonic() + _SCENE_TIMEOUT
-            while time.monotonic() < end and client.scene() is None:
-                client.wait()
+            with suppress(LinkError):  # a dialect that only the vendor's client understands
+                while time.monotonic() < end and client.scene() is None:
+                    client.wait()
             return client.scene()
-        except CfplanError:
-            if client.connected:  # a dialect that only the vendor's client understands
-                return None
-            raise
         finally:
             client.close()
 

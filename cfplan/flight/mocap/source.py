@@ -51,6 +51,11 @@ class MocapSource:
         """How many poses were what."""
         return self._sorter.counts
 
+    @property
+    def child_id(self) -> int | None:
+        """The process in which the driver runs, None where there is none."""
+        return self._feed.child_id if self._feed is not None else None
+
     def open(self) -> None:
         """Connect, and see the body upright and in metres. Raises a CfplanError within 5 s where that cannot be."""
         self._begin()

@@ -174,6 +174,7 @@ def survey(uri: MocapUri, seconds: float, show: Callable[[Survey], None] = lambd
                     raise message
                 if isinstance(message, Scene):
                     surveyor.scene = message
+                    _check_subject(uri, {subject.name for subject in message.subjects})
                 elif isinstance(message, Frame):
                     if not surveyor.frames:
                         end = time.monotonic() + seconds
@@ -188,6 +189,10 @@ def survey(uri: MocapUri, seconds: float, show: Callable[[Survey], None] = lambd
             hint = "is the system live and streaming?"
             raise LinkError(f"no frame within {FIRST_FRAME_WITHIN:g} s ({feed.stage})", where=str(uri), hint=hint)
     found = surveyor.report()
-    if uri.subject and uri.subject not in {body.name for body in found.bodies}:
-        raise no_such_body(uri, [body.name for body in found.bodies])
+    _check_subject(uri, {body.name for body in found.bodies})
     return found
+
+
+def _check_subject(uri: MocapUri, there: set[str]) -> None:
+    if uri.subject and uri.subject not in there:
+        raise no_such_body(uri, there)

@@ -1,0 +1,67 @@
+"""URIs of motion capture."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cfplan.errors import InputError
+from cfplan.flight.mocap.uri import SYSTEMS, MocapUri, no_such_body, parse_uri
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("vicon://192.168.1.2/cf1", MocapUri("vicon", "192.168.1.2", 801, "cf1")),
+        ("vicon://tracker:8010/cf1/", MocapUri("vicon", "tracker", 8010, "cf1")),
+        ("vicon-sdk://tracker/cf1", MocapUri("vicon-sdk", "tracker", 801, "cf1")),
+        ("qualisys://10.0.0.7/my%20drone", MocapUri("qualisys", "10.0.0.7", 22222, "my drone")),
+        ("optitrack://motive/cf1", MocapUri("optitrack", "motive", 1510, "cf1")),
+        ("vrpn://[fe80::1]:3884/cf1", MocapUri("vrpn", "fe80::1", 3884, "cf1")),
+    ],
+)
+def test_a_uri_names_system_computer_and_body(text, expected):
+    assert parse_uri(text, subject_needed=True) == expected
+
+
+def test_a_uri_survives_being_written_and_read():
+    for text in ("vicon://a/cf1", "vicon-sdk://a:9/cf1", "vrpn://[fe80::1]/x"):
+        assert str(parse_uri(text, subject_needed=True)) == text
+    assert parse_uri("vicon://a", subject_needed=False).subject == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("vicon://192.168.1.2", "which body"),
+        ("vicon:///cf1", "not named"),
+        ("192.168.1.2/cf1", "no URI"),
+        ("vikon://a/cf1", "vikon"),
+        ("vicon://a:99999/cf1", "no URI"),
+        ("vicon://a:0/cf1", "port 0"),
+        ("vicon://a/b/c", "one body"),
+        ("vicon://a/cf1?rate=5", "no URI"),
+        ("vicon://me@a/cf1", "no URI"),
+    ],
+)
+def test_a_wrong_uri_is_an_error_with_a_hint(text, words):
+    with pytest.raises(InputError, match=words) as caught:
+        parse_uri(text, subject_needed=True)
+    assert caught.value.where == text
+    assert caught.value.hint
+
+
+@given(st.text() | st.builds("{}://{}".format, st.sampled_from(list(SYSTEMS)), st.text()))
+def test_any_text_is_a_uri_or_an_input_error(text):
+    try:
+        uri = parse_uri(text, subject_needed=False)
+    except InputError:
+        return
+    assert uri.system in SYSTEMS
+    assert 0 < uri.port < 65536
+    assert uri.host
+
+
+def test_a_body_that_is_not_there_is_told_with_those_that_are():
+    error = no_such_body(parse_uri("vicon://a/cf1", subject_needed=True), ["cf2", "gate"])
+    assert "did you mean 'cf2'" in error.hint
+    assert "cf2, gate" in error.hint
