@@ -23,6 +23,7 @@ from cfplan.vehicle.trajectory import Trajectory
 
 NODES_PER_METRE = 10
 FEWEST_NODES, MOST_NODES = 60, 3000
+NODES_PER_PIECE = 4
 GOOD_SHARE = 0.97  # a plan that had to be slowed further is worth a second try with twice the nodes
 LEAST_SPEED_SHARE = 0.01
 FALLBACKS = ("convex", "min-snap")
@@ -57,8 +58,9 @@ class Plan:
 
 
 def default_nodes(path: Path) -> int:
-    """Intervals for a path: ten a metre, within bounds."""
-    return int(np.clip(round(NODES_PER_METRE * path.length), FEWEST_NODES, MOST_NODES))
+    """Intervals for a path: ten a metre, within bounds, and a few for each of its pieces."""
+    by_length = int(np.clip(round(NODES_PER_METRE * path.length), FEWEST_NODES, MOST_NODES))
+    return max(by_length, NODES_PER_PIECE * (len(path.breaks) - 1))
 
 
 def plan(

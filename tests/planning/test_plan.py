@@ -170,9 +170,11 @@ def test_the_number_of_nodes_grows_with_the_path_within_bounds():
     assert count(0.1) == FEWEST_NODES
     assert count(20.0) == pytest.approx(200, abs=1)
     assert count(1e4) == MOST_NODES
+    waypoints = np.column_stack([0.02 * np.arange(101), np.zeros(101), np.ones(101)])
+    assert default_nodes(min_snap(waypoints)) >= 300
 
 
-@pytest.mark.parametrize("planner", [name for name in PLANNERS if name != "expert"])
+@pytest.mark.parametrize("planner", PLANNERS)
 def test_every_planner_ends_in_a_certified_plan_or_a_typed_error(limits, planner):
     path = min_snap([[-1, 0, 1], [0.5, 0.8, 1.3], [1, 0, 1]])
     try:
