@@ -163,7 +163,7 @@ def test_when_the_main_process_is_killed_the_pilot_lands(lab, mission, tmp_path)
 
 
 def test_a_second_ctrl_c_cuts_the_motors(limits, fly_in):
-    with start_lab(limits.airframe) as lab:
+    with start_lab(limits.airframe, number=1) as lab:
         flight = fly_in(lab, at_setpoint(120, lambda: (interrupt(), interrupt())))
         assert flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT
         assert flight.outcome.rung is Rung.CUT
@@ -177,7 +177,7 @@ def test_a_pilot_that_is_killed_is_an_error_and_the_vehicle_stops_by_itself(limi
         assert pilot.pid is not None
         os.kill(pilot.pid, signal.SIGKILL)
 
-    with start_lab(limits.airframe) as lab:
+    with start_lab(limits.airframe, number=2) as lab:
         with pytest.raises(LinkError, match="exit code -9"):
             fly_in(lab, at_setpoint(100, kill_pilot))
         wait_until(lambda: lab.truth().locked, 4.0)
@@ -185,7 +185,7 @@ def test_a_pilot_that_is_killed_is_an_error_and_the_vehicle_stops_by_itself(limi
 
 
 def test_an_empty_battery_stays_on_the_ground(limits, fly_in):
-    with start_lab(limits.airframe, vehicle=VehicleSettings(charge=0.05)) as lab:
+    with start_lab(limits.airframe, vehicle=VehicleSettings(charge=0.05), number=3) as lab:
         flight = fly_in(lab)
         assert flight.outcome.exit_code is ExitCode.PREFLIGHT
         assert "battery at rest" in flight.outcome.reason
@@ -194,9 +194,9 @@ def test_an_empty_battery_stays_on_the_ground(limits, fly_in):
 
 
 def test_a_lab_that_is_gone_is_an_error_with_a_hint(limits, mission, monkeypatch):
-    monkeypatch.setenv("CFPLAN_SIM_3", "127.0.0.1:9")
+    monkeypatch.setenv("CFPLAN_SIM_7", "127.0.0.1:9")
     began = time.monotonic()
     with pytest.raises(LinkError) as caught:
-        fly(mission, uri="sim://3", drivers=[SimDriver], pose_source=RoomPoseSource(3))
+        fly(mission, uri="sim://7", drivers=[SimDriver], pose_source=RoomPoseSource(7))
     assert time.monotonic() - began < 8.0  # of which the start of a process takes its part
     assert caught.value.hint
