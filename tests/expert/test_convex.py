@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InfeasibleError
+from cfplan.expert import convex
 from cfplan.expert.convex import lower_bound, plan_convex
+from cfplan.expert.convex_rows import inner_rows
+from cfplan.expert.convex_stations import stations
 from cfplan.expert.limit_sets import LIMIT_SETS
 from cfplan.expert.min_snap_baseline import plan_min_snap
 from cfplan.expert.solution import Status
@@ -85,6 +88,25 @@ def test_the_inner_polygons_come_close_to_the_outer_ones(set_name, wiggly):
     bound = lower_bound(wiggly, chosen.airframe, chosen.limits)
     inside = plan_convex(wiggly, chosen.airframe, chosen.limits).stats["point_mass_time"]
     assert bound < inside < 1.03 * bound
+
+
+@pytest.mark.parametrize("set_name", list(LIMIT_SETS))
+def test_the_inner_solution_keeps_the_limits_when_differentiated_in_the_world(set_name, wiggly):
+    """With the test above this encloses the best time from both sides; its arithmetic shares no line with the rows."""
+    chosen = LIMIT_SETS[set_name]
+    at = stations(wiggly, spacing=0.004, turn=0.004)
+    fastest = np.full(len(at.length), chosen.limits.speed)
+    b = convex._solved(at, inner_rows(at, chosen.airframe, chosen.limits, fastest), (0.0, 0.0))
+    time = np.concatenate([[0.0], np.cumsum(2 * np.diff(at.length) / (np.sqrt(b[1:]) + np.sqrt(b[:-1])))])
+    velocity = np.diff(wiggly(at.s), axis=0) / np.diff(time)[:, None]
+    middle = 0.5 * (time[1:] + time[:-1])
+    acceleration = np.diff(velocity, axis=0) / np.diff(middle)[:, None]
+    away = (at.length[1:-1] > 0.05) & (at.length[1:-1] < at.length[-1] - 0.05)  # stations are micrometres apart there
+    thrust = acceleration + [0, 0, 9.81] + chosen.airframe.drag[0] / chosen.airframe.mass * velocity[1:]
+    most = 4 * chosen.limits.motor_thrust_max / chosen.airframe.mass
+    assert np.linalg.norm(velocity, axis=1).max() <= chosen.limits.speed * (1 + 1e-6)
+    assert np.linalg.norm(acceleration[away], axis=1).max() <= chosen.limits.acceleration * 1.01
+    assert np.linalg.norm(thrust[away], axis=1).max() <= most * 1.01
 
 
 def test_looser_limits_never_raise_the_bound(wiggly):
