@@ -16,6 +16,7 @@ from cfplan.recording.summary import reference_span, reference_times
 from cfplan.vehicle.trajectory import Trajectory
 
 STEP = 0.01  # s, of the grid on which time is first looked for
+SPEED_SPAN = 0.025  # s
 _LONGEST_GAP = 0.1  # s between poses, over which a straight line still tells where the vehicle was
 _ALIKE = 0.5  # of the plan's own spread: beyond it, log and plan hardly are the same flight
 
@@ -58,10 +59,14 @@ class Trial:
 
     @property
     def speed(self) -> NDArray:
-        """(N,) m/s by differences of the positions; NaN at gaps."""
-        if len(self.time) < 3:
-            return np.full(len(self.time), np.nan)
-        return np.linalg.norm(np.gradient(self.position, self.time, axis=0), axis=1)
+        """(N,) m/s from SPEED_SPAN before to as much after, so that noise of a millimetre hardly shows; NaN at gaps."""
+        speed = np.full(len(self.time), np.nan)
+        if len(self.time) > 2:
+            reach = max(1, round(SPEED_SPAN / float(np.median(np.diff(self.time)))))
+            moved = self.position[2 * reach :] - self.position[: -2 * reach]
+            took = self.time[2 * reach :] - self.time[: -2 * reach]
+            speed[reach:-reach] = np.linalg.norm(moved, axis=1) / took
+        return speed
 
 
 @dataclass(frozen=True, slots=True)

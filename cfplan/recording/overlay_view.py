@@ -124,34 +124,40 @@ def dashes(points: NDArray) -> list[NDArray]:
 
 
 def stretches(trial: Trial) -> list[NDArray]:
-    """The positions between the gaps in which it was not seen."""
+    """The rows between the gaps in which it was not seen."""
     seen = np.isfinite(trial.position).all(axis=1)
     edges = np.flatnonzero(np.diff(seen.astype(int))) + 1
     pieces = np.split(np.arange(len(seen)), edges)
-    return [trial.position[piece] for piece in pieces if len(piece) > 1 and seen[piece[0]]]
+    return [piece for piece in pieces if len(piece) > 1 and seen[piece[0]]]
 
 
 def _log_track(stream: rr.RecordingStream, entity: str, trial: Trial, colour: Colour) -> None:
-    track = rr.LineStrips3D(stretches(trial), colors=[(*colour, 140)], radii=TRACK_RADIUS)
+    track = rr.LineStrips3D(
+        [trial.position[piece] for piece in stretches(trial)], colors=[(*colour, 140)], radii=TRACK_RADIUS
+    )
     stream.log(f"{entity}/track", track, static=True)
-    time, position, quaternion = _thinned(trial)
-    if len(time) == 0:
+    rows = _drawn(trial)
+    if len(rows) == 0:
         return
-    log_tail(stream, f"{entity}/tail", time, position, colour)
-    columns = rr.Transform3D.columns(translation=position, quaternion=quaternion)
-    stream.send_columns(f"{entity}/body", [rr.TimeColumn(TIMELINE, duration=time)], columns, strict=True)
-    log_outline(stream, f"{entity}/body", ARM, time, colour)
-
-
-def _thinned(trial: Trial) -> tuple[NDArray, NDArray, NDArray]:
-    """Times, positions and orientations to draw: where it was seen, level where the log does not say how it lay."""
-    seen = np.flatnonzero(np.isfinite(trial.position).all(axis=1) & np.isfinite(trial.time))
-    if len(seen) > 1:
-        rate = 1 / float(np.median(np.diff(trial.time[seen])))
-        seen = seen[:: max(1, round(rate / DRAWN_RATE))]
-    quaternion = trial.quaternion[seen]
+    for piece in stretches(trial):
+        some = np.intersect1d(rows, piece, assume_unique=True)
+        log_tail(stream, f"{entity}/tail", trial.time[some], trial.position[some], colour)
+    quaternion = trial.quaternion[rows]
     level = ~np.isfinite(quaternion).all(axis=1)
-    return trial.time[seen], trial.position[seen], np.where(level[:, None], [0.0, 0.0, 0.0, 1.0], quaternion)
+    columns = rr.Transform3D.columns(
+        translation=trial.position[rows], quaternion=np.where(level[:, None], [0.0, 0.0, 0.0, 1.0], quaternion)
+    )
+    stream.send_columns(f"{entity}/body", [rr.TimeColumn(TIMELINE, duration=trial.time[rows])], columns, strict=True)
+    log_outline(stream, f"{entity}/body", ARM, trial.time[rows], colour)
+
+
+def _drawn(trial: Trial) -> NDArray:
+    """The rows to draw in 3-D: those in which it was seen, not more of them than can be told apart."""
+    seen = np.flatnonzero(np.isfinite(trial.position).all(axis=1))
+    if len(seen) < 2:
+        return seen
+    rate = 1 / float(np.median(np.diff(trial.time[seen])))
+    return seen[:: max(1, round(rate / DRAWN_RATE))]
 
 
 def _log_curve(
@@ -159,7 +165,8 @@ def _log_curve(
 ) -> None:
     style = rr.SeriesLines(colors=[colour], names=[label], widths=[1.5], aggregation_policy="MinMax")
     stream.log(entity, style, static=True)
-    known = np.isfinite(values) & np.isfinite(time)
+    known = np.isfinite(values)
+    known[1:] |= known[:-1].copy()  # what is not a number behind each stretch, so that no line leads over a gap
     if known.any():
         columns = rr.Scalars.columns(scalars=values[known])
         stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time[known])], columns, strict=True)
