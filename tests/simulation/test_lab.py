@@ -17,6 +17,7 @@ from cflib.crazyflie.log import LogConfig
 from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 from cflib.crazyflie.syncLogger import SyncLogger
 from cflib.crtp.crtpstack import CRTPPort
+from cflib.positioning.motion_commander import MotionCommander
 
 from cfplan.errors import InputError, LinkError
 from cfplan.simulation.lab import start_lab
@@ -198,6 +199,28 @@ def test_a_whole_flight_take_off_go_to_stream_hand_back_land(lab, link):
     assert truth.off_in_air[-1] == truth.off_in_air[begun_at]
     assert not truth.locked
     assert np.allclose(np.diff(truth.time), 0.01, atol=1e-6)
+
+
+def test_motion_commander_flies_with_the_default_controller(lab, link):
+    """The firmware's PID and its velocity setpoints, as cflib's own examples use them."""
+    read_back(link, "stabilizer.controller", 1)
+    feed = PoseFeed(link)
+    read_back(link, "stabilizer.estimator", 2)
+    feed.start()
+    for axis, value in zip("XYZ", feed.start_position, strict=True):
+        link.param.set_value(f"kalman.initial{axis}", value)
+    link.param.set_value("kalman.resetEstimation", 1)
+    time.sleep(0.7)
+    with MotionCommander(link, default_height=0.5) as motion:
+        motion.forward(0.4)
+        motion.left(0.3)
+        time.sleep(0.3)
+        place = feed.latest.position
+    feed.stop.set()
+    feed.join()
+    x, y, _ = feed.start_position
+    assert place == pytest.approx((x + 0.4, y + 0.3, 0.5), abs=0.2)
+    assert until(lambda: lab.truth().position[-1, 2] == 0.0)
 
 
 def test_the_link_closes_at_once_and_opens_again(lab):

@@ -4,6 +4,7 @@ from dataclasses import fields
 
 from cfplan.simulation.estimator import Prior
 from cfplan.simulation.mellinger import MellingerGains
+from cfplan.simulation.virtual_crazyflie.pid import default_gains, default_limits
 
 PID, MELLINGER = 1, 2
 COMPLEMENTARY, KALMAN = 1, 2
@@ -19,6 +20,29 @@ PRIOR_PARAMETERS = tuple(
         "initialZ", "initialYaw", "maxPos", "maxVel", "dragB_x", "dragB_y", "dragB_z",
     )
 )  # fmt: skip
+
+_GAIN_NAMES = ("p", "i", "d")
+# The PID controller's gains in the order of its loops, and its limits; the limits inside the loops are scaled ones.
+PID_GAIN_PARAMETERS = tuple(
+    tuple(f"{group}{gain}" for gain in _GAIN_NAMES)
+    for group in (
+        "posCtlPid.xK", "posCtlPid.yK", "posCtlPid.zK", "velCtlPid.vxK", "velCtlPid.vyK", "velCtlPid.vzK",
+        "pid_attitude.roll_k", "pid_attitude.pitch_k", "pid_attitude.yaw_k",
+        "pid_rate.roll_k", "pid_rate.pitch_k", "pid_rate.yaw_k",
+    )
+)  # fmt: skip
+PID_LIMIT_PARAMETERS = (
+    "posCtlPid.rLimit", "posCtlPid.pLimit", "posCtlPid.thrustBase", "posCtlPid.thrustMin", "pid_attitude.yawMaxDelta",
+)  # fmt: skip
+PID_SPEED_PARAMETERS = ("posCtlPid.xVelMax", "posCtlPid.yVelMax", "posCtlPid.zVelMax")
+
+
+def _pid_defaults() -> dict[str, float]:
+    found = dict(zip(PID_LIMIT_PARAMETERS, default_limits(), strict=True))
+    for names, row in zip(PID_GAIN_PARAMETERS, default_gains(), strict=True):
+        found |= dict(zip(names, row[:3], strict=True))
+    return found | dict.fromkeys(PID_SPEED_PARAMETERS, 1.0)
+
 
 DEFAULTS: dict[str, float] = {
     **dict(zip(GAIN_PARAMETERS, MellingerGains().pack(), strict=True)),
@@ -40,15 +64,5 @@ DEFAULTS: dict[str, float] = {
     "flightmode.yawMode": 2,
     "system.selftestPassed": 1,
     "kalman.mNBaro": 2.0,
-    "posCtlPid.xKp": 2.0,
-    "posCtlPid.yKp": 2.0,
-    "posCtlPid.zKp": 2.0,
-    "posCtlPid.zKi": 0.5,
-    "posCtlPid.xVelMax": 1.0,
-    "posCtlPid.yVelMax": 1.0,
-    "posCtlPid.zVelMax": 1.0,
-    "posCtlPid.rLimit": 20.0,
-    "posCtlPid.pLimit": 20.0,
-    "posCtlPid.thrustBase": 36000,
-    "posCtlPid.thrustMin": 20000,
+    **_pid_defaults(),
 }

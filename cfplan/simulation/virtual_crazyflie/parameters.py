@@ -50,7 +50,7 @@ class Parameters:
     def __setitem__(self, name: str, value: float) -> None:
         number = self._ids[name]
         layout = self.toc.variables[number].format
-        self._values[number] = unpack_from(layout, bytes_of(layout, value))[0]
+        self._values[number] = unpack_from(layout, bytes_of(layout, value if layout == "<f" else int(value)))[0]
 
     def watch(self, name: str, changed: Callable[[float], None]) -> None:
         """Call `changed` with the new value whenever a client writes it."""

@@ -13,7 +13,7 @@ class Sensors:
     5 and 15 cm after 0.05, 0.2, 0.5 and 1 s, on average.
     """
 
-    gyro_noise: float = 0.05
+    gyro_noise: float = 0.01
     # rad/s, standard deviation of a sample
     gyro_bias: float = 0.006
     # rad/s, standard deviation about each axis of what calibration leaves

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from cfplan.simulation.body import ALL_WELL, FLOOR, STILL_AIR, TIME_STEP, at_rest, pack_body, rotation, step_body
 from cfplan.simulation.estimator import Filter, estimate, new_filter, reset, step_filter
 from cfplan.simulation.mellinger import FULL_COMMAND, MEMORY_SIZE, distribute_power, level_out, step_mellinger
+from cfplan.simulation.virtual_crazyflie.pid import MEMORY_SIZE as PID_MEMORY_SIZE
+from cfplan.simulation.virtual_crazyflie.pid import OUTPUT_LIMIT, OVERHEAD, default_gains, default_limits, step_pid
 from cfplan.simulation.virtual_crazyflie.setpoints import Setpoint
 from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
 from cfplan.vehicle.airframe import GRAVITY, Airframe
@@ -19,6 +21,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 # Where each flag lies in the array that `run` fills.
 OFF_TICKS, OFF_IN_AIR_TICKS, RESETS = range(3)
 
+NO_MELLINGER = np.zeros(0)  # in place of its gains where the PID controller flies
 IN_AIR = 0.05  # m above the floor; a landing ends a little above it
 _NOISE_ROWS = 8191  # ms after which the sensors' noise repeats; a prime, so that it beats with nothing
 
@@ -34,7 +37,9 @@ class Loop(NamedTuple):
     acceleration: NDArray
     # (3,) m/s², specific force as measured, body axes
     memory: NDArray
-    # (10,) of the controller
+    # (10,) of the Mellinger controller
+    pid_memory: NDArray
+    # (36,) of the PID controller
     control: NDArray
     # (4,)
     motors: NDArray
@@ -56,12 +61,16 @@ class Stabilizer:
         position = np.array(settings.position, dtype=float)
         self.body = pack_body(airframe, floor=float(position[2]))
         self.prior, self.gains = prior, gains
+        self.pid_gains, self.pid_limits = default_gains(), default_limits()
+        self.mellinger = False
+        # which of the two controllers flies
         self.loop = Loop(
             truth=at_rest(position, settings.yaw),
             kalman=new_filter(prior),
             belief=np.zeros(13),
             acceleration=np.array([0.0, 0.0, GRAVITY]),
             memory=np.zeros(MEMORY_SIZE),
+            pid_memory=np.zeros(PID_MEMORY_SIZE),
             control=np.zeros(4),
             motors=np.zeros(4),
             counts=np.zeros(3, dtype=np.int64),
@@ -75,6 +84,11 @@ class Stabilizer:
     def reset_controller(self) -> None:
         """Forget the integrals, as when another controller is chosen."""
         self.loop.memory[:] = 0.0
+        self.loop.pid_memory[:] = 0.0
+
+    def limit_speed(self, axis: int, most: float) -> None:
+        """The PID controller's most speed along an axis, m/s."""
+        self.pid_gains[axis, OUTPUT_LIMIT] = (max(most, 0.5) if axis == 2 else most) * OVERHEAD
 
     def reset_estimator(self) -> None:
         """Let the filter begin anew, at the place that its parameters name."""
@@ -89,8 +103,8 @@ class Stabilizer:
             values, mode = values.copy(), mode.copy()
             level_out(values, mode)
         _run(
-            self.loop, self.body, self.gains, self.prior, values, mode, poses, tick, ticks,
-            allowed, flying, self._per_command,
+            self.loop, self.body, self.gains if self.mellinger else NO_MELLINGER, self.pid_gains, self.pid_limits,
+            self.prior, values, mode, setpoint.velocity_in_body, poses, tick, ticks, allowed, flying, self._per_command,
         )  # fmt: skip
 
 
@@ -109,9 +123,12 @@ def _run(
     loop: Loop,
     body: NDArray,
     gains: NDArray,
+    pid_gains: NDArray,
+    pid_limits: NDArray,
     prior: NDArray,
     setpoint: NDArray,
     mode: NDArray,
+    velocity_in_body: bool,
     poses: NDArray,
     tick: int,
     ticks: int,
@@ -132,7 +149,13 @@ def _run(
         estimate(loop.kalman, loop.belief)
 
         if now % 2 == 0:
-            step_mellinger(loop.control, loop.memory, gains, setpoint, mode, loop.belief)
+            if len(gains) > 0:
+                step_mellinger(loop.control, loop.memory, gains, setpoint, mode, loop.belief)
+            else:
+                step_pid(
+                    loop.control, loop.pid_memory, pid_gains, pid_limits, setpoint, mode, velocity_in_body,
+                    loop.belief, now,
+                )  # fmt: skip
             distribute_power(loop.control, loop.motors)
         _drive(loop, body, allowed, per_command)
 

@@ -1,5 +1,7 @@
 """The virtual Crazyflie: packets go in and come out, time goes on when it is told to. No threads, no clock."""
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,11 @@ from cfplan.simulation.virtual_crazyflie.defaults import (
     DEFAULTS,
     GAIN_PARAMETERS,
     KALMAN,
+    MELLINGER,
+    PID,
+    PID_GAIN_PARAMETERS,
+    PID_LIMIT_PARAMETERS,
+    PID_SPEED_PARAMETERS,
     PRIOR_PARAMETERS,
 )
 from cfplan.simulation.virtual_crazyflie.high_level import HighLevelCommander, Planner
@@ -237,6 +244,13 @@ class VirtualCrazyflie:
             watch(name, fill(self.stabilizer.gains, place))
         for place, name in enumerate(PRIOR_PARAMETERS):
             watch(name, fill(self.stabilizer.prior, place))
+        for loop, names in enumerate(PID_GAIN_PARAMETERS):
+            for place, name in enumerate(names):
+                watch(name, fill(self.stabilizer.pid_gains[loop], place))
+        for place, name in enumerate(PID_LIMIT_PARAMETERS):
+            watch(name, fill(self.stabilizer.pid_limits, place))
+        for place, name in enumerate(PID_SPEED_PARAMETERS):
+            watch(name, partial(self.stabilizer.limit_speed, place))
         supervised = self.supervisor.settings
         watch("supervisor.tmblChckEn", lambda value: setattr(supervised, "tumble_check", bool(value)))
         watch("supervisor.prefltTimeout", lambda value: setattr(supervised, "preflight_timeout", int(value)))
@@ -248,8 +262,11 @@ class VirtualCrazyflie:
         watch("kalman.resetEstimation", self._reset_estimation)
 
     def _choose_controller(self, value: float) -> None:
-        if value == 0:
-            self.parameters["stabilizer.controller"] = DEFAULTS["stabilizer.controller"]
+        if value not in (PID, MELLINGER):
+            self.parameters["stabilizer.controller"] = PID
+            if value != 0:
+                self.say(f"Controller {value:.0f} is not simulated, PID flies")
+        self.stabilizer.mellinger = value == MELLINGER
         self.stabilizer.reset_controller()
 
     def _choose_estimator(self, value: float) -> None:
