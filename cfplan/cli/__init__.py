@@ -13,6 +13,7 @@ from cfplan.cli.mocap import mocap
 from cfplan.cli.output import print_error
 from cfplan.cli.plan import plan
 from cfplan.cli.replay import replay
+from cfplan.cli.report import report
 from cfplan.cli.sim import sim
 from cfplan.errors import CfplanError
 
@@ -33,7 +34,7 @@ def cfplan() -> None:
     """Plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
 
 
-for command in (plan, check, sim, fly, replay, mocap, dataset, doctor):
+for command in (plan, check, sim, fly, replay, report, mocap, dataset, doctor):
     cfplan.add_command(command)
 
 

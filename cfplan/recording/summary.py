@@ -39,6 +39,8 @@ class FlightSummary:
     # m
     peak_speed: float
     # m/s, by the vehicle's estimate, along the path
+    peak_acceleration: float
+    # m/s², gravity not counted, by the vehicle's estimate, along the path
     peak_body_rate: float
     # rad/s, norm, along the path
     lateness_p50: float
@@ -92,6 +94,7 @@ def summarise(record: Record) -> FlightSummary:
         max_deviation_to_path=_worst(along.to_path),
         rms_deviation_to_path=_rms(along.to_path),
         peak_speed=_peak(record.estimates.time, record.estimates.velocity, begin, end),
+        peak_acceleration=_peak(record.estimates.time, record.estimates.acceleration, begin, end),
         peak_body_rate=_peak(record.status.time, record.status.body_rate, begin, end),
         lateness_p50=_percentile(late, 50),
         lateness_p99=_percentile(late, 99),

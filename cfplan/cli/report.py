@@ -1,0 +1,50 @@
+"""`cfplan report`: a flight on one page."""
+
+from pathlib import Path
+
+import click
+
+from cfplan.cli import options
+from cfplan.cli.output import Steps, print_json
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  cfplan report records/2026-11-21_101500-figure-eight
+  cfplan report records/toppquad records/learned -o comparison.html
+  cfplan report records/learned --json"""
+)
+@click.argument("records", metavar="RECORD...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="The page; else report.html in the record's folder, or here for several records.",
+)
+@click.option("--force", is_flag=True, help="Overwrite the page.")
+@options.as_json
+def report(records: tuple[Path, ...], output: Path | None, force: bool, as_json: bool) -> None:
+    """Report on a flight's RECORD, or compare several, in one HTML page that needs nothing else.
+
+    With --json the numbers are printed, and a page is written only where -o names one.
+    """
+    from cfplan.recording.report import flight_to_dict, read_flight
+    from cfplan.recording.report_page import write_page
+
+    steps = Steps(as_json=as_json)
+    flights = []
+    for place in records:
+        with steps.step("read") as said:
+            flights.append(read_flight(place))
+            said.append(f"{flights[-1].name}, {flights[-1].record.duration:.1f} s")
+            said.extend(flights[-1].notes)
+    file = output
+    if file is None and not as_json:
+        file = flights[0].record.folder / "report.html" if len(flights) == 1 else Path("report.html")
+    if file is not None:
+        with steps.step("page") as said:
+            write_page(flights, file, overwrite=force)
+            said.append(f"{file} ({file.stat().st_size / 1e6:.1f} MB)")
+    if as_json:
+        print_json({"flights": [flight_to_dict(flight) for flight in flights], "page": str(file) if file else None})

@@ -1,0 +1,200 @@
+"""Charts as SVG text: lines over time with their limits, and places seen from above or from a side.
+
+Nothing is needed to see them but a browser. Where there are more points than pixels, the least and the largest of each
+pixel's width are drawn, so that no spike is lost.
+"""
+
+import html
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.recording.plots import LIMIT, Colour
+
+WIDTH, HEIGHT = 560, 250  # of a chart, in its own units
+LEFT, RIGHT, TOP, BOTTOM = 52, 12, 46, 34  # around what is drawn
+LIGHTEST = 0.42  # of a colour's luminance on white paper; lighter ones are darkened to it
+COLUMNS = 400  # pixels, across which points are told apart
+_LETTER = 6.2  # width of one, about
+_GRID, _TEXT, _BAND = "#e3e3e3", "#444", "#f3f6fb"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """One line of a chart; NaN breaks it."""
+
+    label: str
+    x: NDArray
+    # (N,)
+    y: NDArray
+    # (N,)
+    colour: Colour
+    dashed: bool = False
+
+
+def time_chart(
+    title: str, curves: Sequence[Curve], *, limits: Sequence[float] = (), band: tuple[float, float] | None = None
+) -> str:
+    """Curves over time in s, the limits as level lines, the band (the time along the path) shaded.
+
+    A limit far above all that was measured is named rather than drawn, or nothing else could be seen.
+    """
+    x = _span([curve.x for curve in curves])
+    y = _span([curve.y for curve in curves])
+    near = [limit for limit in limits if y[0] - 2 * (y[1] - y[0]) <= limit <= y[1] + 2 * (y[1] - y[0])]
+    far = [limit for limit in limits if limit not in near]
+    low, high = _padded(min([y[0], *near]), max([y[1], *near]))
+    frame = _Frame(x[0], x[1], low, high, WIDTH, HEIGHT)
+    parts = []
+    if band is not None:
+        begin, end = (min(max(frame.x(np.array(edge)).item(), LEFT), WIDTH - RIGHT) for edge in band)
+        height = HEIGHT - TOP - BOTTOM
+        parts.append(f'<rect x="{begin:.1f}" y="{TOP}" width="{end - begin:.1f}" height="{height}" fill="{_BAND}"/>')
+    parts.append(_grid(frame, "s"))
+    parts += [_line(frame, curve) for curve in curves]
+    for limit in near:
+        height = frame.y(np.array(limit)).item()
+        parts.append(
+            f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{height:.1f}" y2="{height:.1f}" '
+            f'stroke="{_css(LIMIT)}" stroke-dasharray="6 3"/>'
+        )
+    labels = [(curve.label, _css(curve.colour)) for curve in curves]
+    labels += [("limit" + f" {limit:g} (above)" * (limit in far), _css(LIMIT)) for limit in (*near[:1], *far[:1])]
+    return _svg(title, labels, parts, WIDTH, HEIGHT)
+
+
+def place_chart(title: str, curves: Sequence[Curve], axes: tuple[str, str]) -> str:
+    """Curves in m over m, both axes to the same scale."""
+    x, y = _span([curve.x for curve in curves]), _span([curve.y for curve in curves])
+    (left, right), (low, high) = _padded(*x), _padded(*y)
+    across = WIDTH - LEFT - RIGHT
+    tall = min(max((high - low) / (right - left) * across, 60.0), 460.0)
+    height = tall + TOP + BOTTOM
+    scale = min(across / (right - left), tall / (high - low))
+    spare = (across / scale - (right - left)) / 2
+    rise = (tall / scale - (high - low)) / 2
+    frame = _Frame(left - spare, right + spare, low - rise, high + rise, WIDTH, height)
+    parts = [_grid(frame, f"{axes[0]}, m", axes[1] + ", m"), *(_line(frame, curve) for curve in curves)]
+    return _svg(title, [(curve.label, _css(curve.colour)) for curve in curves], parts, WIDTH, height)
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """From values to places in the chart."""
+
+    left: float
+    right: float
+    low: float
+    high: float
+    width: float
+    height: float
+
+    def x(self, values: NDArray) -> NDArray:
+        return LEFT + (values - self.left) / (self.right - self.left) * (self.width - LEFT - RIGHT)
+
+    def y(self, values: NDArray) -> NDArray:
+        return self.height - BOTTOM - (values - self.low) / (self.high - self.low) * (self.height - TOP - BOTTOM)
+
+
+def _span(arrays: Sequence[NDArray]) -> tuple[float, float]:
+    values = np.concatenate([np.ravel(array[np.isfinite(array)]) for array in arrays] or [np.empty(0)])
+    if len(values) == 0:
+        return 0.0, 1.0
+    low, high = float(values.min()), float(values.max())
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def _padded(low: float, high: float) -> tuple[float, float]:
+    room = 0.05 * (high - low)
+    return (low if 0 <= low < 0.3 * high and low == 0 else low - room), high + room
+
+
+def ticks(low: float, high: float, count: int = 6) -> list[float]:
+    """Round numbers between low and high, about `count` of them."""
+    raw = (high - low) / count
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw * (1 - 1e-9))
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
+    return [number * step for number in range(first, last + 1)]
+
+
+def _grid(frame: _Frame, x_label: str, y_label: str = "") -> str:
+    bottom, right = frame.height - BOTTOM, frame.width - RIGHT
+    parts = []
+    for value in ticks(frame.left, frame.right, 8):
+        x = frame.x(np.array(value)).item()
+        parts.append(f'<line x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{bottom:.1f}" stroke="{_GRID}"/>')
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 15:.1f}" text-anchor="middle">{_label(value)}</text>')
+    for value in ticks(frame.low, frame.high, 5):
+        y = frame.y(np.array(value)).item()
+        parts.append(f'<line x1="{LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}" stroke="{_GRID}"/>')
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{_label(value)}</text>')
+    parts.append(f'<text x="{right}" y="{bottom + 29:.1f}" text-anchor="end">{html.escape(x_label)}</text>')
+    parts.append(f'<text x="6" y="{TOP - 6}">{html.escape(y_label)}</text>' if y_label else "")
+    return "".join(parts)
+
+
+def _label(value: float) -> str:
+    return f"{value + 0.0:.6g}"
+
+
+def _line(frame: _Frame, curve: Curve) -> str:
+    """A path with a new begin behind every gap."""
+    rows = thinned(curve.x, curve.y, COLUMNS) if _rising(curve.x) else np.arange(len(curve.x))
+    x, y = frame.x(curve.x[rows]), frame.y(curve.y[rows])
+    known = np.isfinite(x) & np.isfinite(y)
+    begins = known & ~np.r_[False, known[:-1]]
+    path = "".join(
+        f"{'M' if begin else 'L'}{a:.1f} {b:.1f}" for a, b, begin, draw in zip(x, y, begins, known, strict=True) if draw
+    )
+    dash = ' stroke-dasharray="5 4"' if curve.dashed else ""
+    return f'<path d="{path}" fill="none" stroke="{_css(curve.colour)}" stroke-width="1.4"{dash}/>'
+
+
+def _rising(x: NDArray) -> bool:
+    return bool(np.all(np.diff(x) >= 0))
+
+
+def thinned(x: NDArray, y: NDArray, columns: int) -> NDArray:
+    """Rows enough to draw y over rising x: of each column the first, the last, the least, the largest, and a gap."""
+    if len(x) <= 4 * columns:
+        return np.arange(len(x))
+    edges = np.linspace(x[0], x[-1], columns + 1)
+    starts = np.unique(np.searchsorted(x, edges[:-1]))
+    kept = []
+    for begin, end in zip(starts, [*starts[1:], len(x)], strict=True):
+        part = y[begin:end]
+        unknown = np.flatnonzero(~np.isfinite(part))
+        picked = [0, len(part) - 1, *unknown[:1], *unknown[-1:]]
+        if len(unknown) < len(part):
+            picked += [int(np.nanargmin(part)), int(np.nanargmax(part))]
+        kept.append(begin + np.unique(picked))
+    return np.concatenate(kept)
+
+
+def _svg(title: str, labels: Sequence[tuple[str, str]], parts: Sequence[str], width: float, height: float) -> str:
+    legend, x = [], float(LEFT)
+    for label, colour in dict.fromkeys(labels):
+        legend.append(
+            f'<line x1="{x:.0f}" x2="{x + 14:.0f}" y1="32" y2="32" stroke="{colour}" stroke-width="3"/>'
+            f'<text x="{x + 18:.0f}" y="36">{html.escape(label)}</text>'
+        )
+        x += 30 + _LETTER * len(label)
+    return (
+        f'<svg viewBox="0 0 {width:g} {height:.0f}" role="img" xmlns="http://www.w3.org/2000/svg" '
+        f'font-size="11" fill="{_TEXT}"><title>{html.escape(title)}</title>'
+        f'<text x="{LEFT}" y="16" font-size="13" font-weight="600">{html.escape(title)}</text>'
+        f"{''.join(legend)}{''.join(parts)}</svg>"
+    )
+
+
+def _css(colour: Colour) -> str:
+    """For white paper: as it is, or darkened."""
+    red, green, blue = colour
+    luminance = (0.2126 * red + 0.7152 * green + 0.0722 * blue) / 255
+    factor = min(1.0, LIGHTEST / luminance) if luminance > 0 else 1.0
+    return "#" + "".join(f"{round(channel * factor):02x}" for channel in colour)
