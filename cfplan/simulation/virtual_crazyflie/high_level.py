@@ -5,6 +5,7 @@ Idle, it asks for nothing, which is motors off, every 10 ms at the lowest priori
 
 import errno
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
 from struct import error, unpack
@@ -115,10 +116,11 @@ def _wrapped(angle: float) -> float:
 
 
 class HighLevelCommander:
-    """Carries out commands one at a time; `follow` tells it where the vehicle is while it is idle."""
+    """Carries out commands one at a time; from idle a curve starts `where` the vehicle believes that it is."""
 
-    def __init__(self, memory: bytearray):
+    def __init__(self, memory: bytearray, where: Callable[[], Goal]):
         self.state = Planner.IDLE
+        self._where = where
         self._memory = memory
         self._pieces: list[_Piece] = []
         self._begin = 0.0
@@ -133,10 +135,6 @@ class HighLevelCommander:
     def finished(self, time: float) -> bool:
         """Whether the last curve has been flown to its end."""
         return time - self._begin >= sum(piece.duration for piece in self._pieces)
-
-    def follow(self, position: NDArray, velocity: NDArray, yaw: float) -> None:
-        """The vehicle's estimated state, from which the next curve starts."""
-        self._last = Goal(np.append(position, yaw), np.append(velocity, 0.0), np.zeros(4), np.zeros(4))
 
     def setpoint(self, time: float) -> Setpoint:
         """What to do now, asked every 10 ms."""
@@ -193,6 +191,8 @@ class HighLevelCommander:
         return group == 0 or bool(group & self._group_mask)
 
     def _move(self, command: int, data: bytes, time: float) -> int:
+        if self.state is Planner.IDLE:
+            self._last = self._where()
         if command in (_TAKE_OFF, _LAND):
             _, height, duration = unpack("<Bff", data)
             return self._climb(command == _LAND, height, 0.0, duration, time)

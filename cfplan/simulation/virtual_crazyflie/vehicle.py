@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.simulation.mellinger import euler_yaw
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.commander import Commander, Priority
 from cfplan.simulation.virtual_crazyflie.defaults import (
@@ -19,7 +20,7 @@ from cfplan.simulation.virtual_crazyflie.defaults import (
     PID_SPEED_PARAMETERS,
     PRIOR_PARAMETERS,
 )
-from cfplan.simulation.virtual_crazyflie.high_level import HighLevelCommander, Planner
+from cfplan.simulation.virtual_crazyflie.high_level import Goal, HighLevelCommander, Planner
 from cfplan.simulation.virtual_crazyflie.localization import Localization
 from cfplan.simulation.virtual_crazyflie.log_blocks import DATA_CHANNEL, LogBlocks
 from cfplan.simulation.virtual_crazyflie.measures import getters
@@ -59,7 +60,7 @@ class VirtualCrazyflie:
         )
         self.supervisor = Supervisor(auto_arming=self.settings.auto_arming, say=self.say)
         self.memories = Memories()
-        self.planner = HighLevelCommander(self.memories.trajectory)
+        self.planner = HighLevelCommander(self.memories.trajectory, self._where)
         self.commander = Commander(self.planner.stop)
         self.localization = Localization()
         self.battery = Battery(self.settings.charge)
@@ -132,8 +133,6 @@ class VirtualCrazyflie:
         loop = self.stabilizer.loop
         can_fly = self.supervisor.can_fly
         if can_fly:
-            if self.planner.state is Planner.IDLE:
-                self._tell_planner()
             wanted = self.planner.setpoint(self.tick / 1000)
             self.commander.offer(wanted, Priority.HIGH_LEVEL, self.tick)
         if self.tick % SUPERVISOR_PERIOD == 0:
@@ -163,12 +162,10 @@ class VirtualCrazyflie:
             flying=supervisor.is_flying,
         )
 
-    def _tell_planner(self) -> None:
+    def _where(self) -> Goal:
         belief = self.stabilizer.loop.belief
-        x, y, z, w = belief[6:10]
-        self.planner.follow(
-            belief[0:3].copy(), belief[3:6].copy(), float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-        )
+        still = np.zeros(4)
+        return Goal(np.append(belief[0:3], euler_yaw(belief[6:10])), np.append(belief[3:6], 0.0), still, still)
 
     def _take_setpoint(self, port: Port, channel: int, payload: bytes) -> None:
         setpoint: Setpoint | None = None
@@ -191,7 +188,6 @@ class VirtualCrazyflie:
             return
         if len(payload) != 5:
             raise FirmwareAssert(f"notify setpoint stop with {len(payload) - 1} bytes")
-        self._tell_planner()
         self.commander.relax()
 
     def _localize(self, channel: int, payload: bytes) -> None:

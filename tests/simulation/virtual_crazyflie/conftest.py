@@ -32,8 +32,8 @@ class Rig:
         self.received += answers
         return answers
 
-    def run(self, seconds: float, each_ms: Callable[[int], None] | None = None) -> None:
-        """Let time go by, poses fed; `each_ms` is called before each millisecond."""
+    def run(self, seconds: float, every_10_ms: Callable[[int], None] | None = None) -> None:
+        """Let time go by, poses fed; `every_10_ms` is called with the tick of 1 ms before each step of 10."""
         end = self.vehicle.tick + round(seconds * 1000)
         while self.vehicle.tick < end:
             tick = self.vehicle.tick
@@ -42,9 +42,9 @@ class Rig:
             for packet in self.capture.ready(tick / 1000 + 1e-9):
                 if self.feeding:
                     self.send(Port.LOCALIZATION, 1, b"\x08" + struct.pack("<7f", *_POSE.unpack(packet)[2:]))
-            if each_ms is not None:
-                each_ms(tick)
-            self.vehicle.advance(1)
+            if every_10_ms is not None:
+                every_10_ms(tick)
+            self.vehicle.advance(min(10 - tick % 10, end - tick))
             self.received += self.vehicle.sent()
 
     @property
@@ -111,7 +111,7 @@ class Rig:
     def stream_hover(self, seconds: float) -> None:
         """Full-state setpoints at 100 Hz where the vehicle is now."""
         place = self.belief[:3].copy()
-        self.run(seconds, lambda tick: self.hover_setpoint(place) if tick % 10 == 0 else None)
+        self.run(seconds, lambda tick: self.hover_setpoint(place))
 
 
 @pytest.fixture

@@ -18,9 +18,7 @@ def go_to(planner, place, yaw=0.0, duration=2.0, time=0.0, relative=0, linear=0)
 
 @pytest.fixture
 def planner():
-    made = HighLevelCommander(bytearray(4096))
-    made.follow(np.array([1.0, 2.0, 0.5]), np.zeros(3), 0.3)
-    return made
+    return HighLevelCommander(bytearray(4096), lambda: Goal(np.array([1.0, 2.0, 0.5, 0.3]), STILL, STILL, STILL))
 
 
 def test_a_septic_meets_its_ends_and_moves_smoothly():
@@ -72,8 +70,8 @@ def test_relative_targets_count_from_where_it_is(planner):
     assert end[YAW] == pytest.approx(0.4)
 
 
-def test_it_turns_the_short_way(planner):
-    planner.follow(np.zeros(3), np.zeros(3), 3.0)
+def test_it_turns_the_short_way():
+    planner = HighLevelCommander(bytearray(4096), lambda: Goal(np.array([0, 0, 0, 3.0]), STILL, STILL, STILL))
     go_to(planner, (0.0, 0.0, 1.0), yaw=-3.0)
     turned = planner.setpoint(9.0).values[YAW] - planner.setpoint(0.0).values[YAW]
     assert turned == pytest.approx(2 * np.pi - 6.0, abs=1e-6)
