@@ -1,7 +1,6 @@
 """A motion capture system's frames, read from a child process without ever waiting for it."""
 
 import os
-import pickle
 import select
 import signal
 import subprocess
@@ -11,7 +10,7 @@ import time
 from typing import Self
 
 from cfplan.errors import CfplanError, LinkError
-from cfplan.flight.mocap.child import CONNECT_ALARM, FRAME_ALARM, HEAD, Message
+from cfplan.flight.mocap.child import CONNECT_ALARM, FRAME_ALARM, Message, decoded
 from cfplan.flight.mocap.frames import Stage
 from cfplan.flight.mocap.uri import MocapUri
 
@@ -57,14 +56,7 @@ class Feed:
                     self._heard = time.monotonic()
             except BlockingIOError:
                 pass
-            found: list[Message] = []
-            while len(self._buffer) >= HEAD.size:
-                (size,) = HEAD.unpack_from(self._buffer)
-                end = HEAD.size + size
-                if len(self._buffer) < end:
-                    break
-                found.append(pickle.loads(self._buffer[HEAD.size : end]))
-                del self._buffer[:end]
+            found = decoded(self._buffer)
         for message in found:
             if isinstance(message, Stage):
                 self.stage = message.text

@@ -8,6 +8,7 @@ a process that can be killed, and what can be looked at beforehand is.
 import math
 import time
 from contextlib import suppress
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from cfplan.errors import InputError, LinkError
@@ -34,6 +35,8 @@ class SdkDriver:
         """Raises InputError where the package is missing, LinkError where nobody answers. May hang."""
         try:
             import motioncapture
+
+            import_module("numpy")  # the package does so with its first pose, which would then come late
         except ImportError as why:
             raise InputError(
                 "the package motioncapture is not installed",
