@@ -26,6 +26,7 @@ from cfplan.flight.telemetry import Telemetry
 _SWITCH_INTERVAL = 0.0005  # s; the stream gets the interpreter back after at most this
 _STREAM_PRIORITY, _THREAD_PRIORITY = 20, 10  # of SCHED_FIFO, where the system permits it
 _POLL = 0.05  # s
+_LANDING = 60.0  # s that a pilot without a main process has to come down
 
 
 def fly(
@@ -56,7 +57,9 @@ def fly(
         try:
             return _attend(process, telemetry, orders, keyboard, on_telemetry)
         finally:
-            process.join(5.0)
+            orders.close()  # where this end fails, the pilot notices and lands
+            telemetry.close()
+            process.join(_LANDING)
             if process.is_alive():
                 process.kill()
 
@@ -172,6 +175,8 @@ def _run(
         last = pilot.fly()
     except CfplanError as error:
         last = error
+    except Exception as error:  # on the ground; in the air the pilot lands first
+        last = CfplanError(f"fault in the pilot: {error!r}", where=uri, hint="nothing was armed; please report this")
     report.close(last)
     os._exit(0)  # cflib leaves threads behind that never end
 
