@@ -16,9 +16,10 @@ from cfplan.recording.summary import reference_span, reference_times
 from cfplan.vehicle.trajectory import Trajectory
 
 STEP = 0.01  # s, of the grid on which time is first looked for
-SPEED_SPAN = 0.025  # s
+NEARBY = 0.2  # s, around what the grid says, where time is looked for closely
+SPEED_SPAN = 0.025  # s, before and after
 _LONGEST_GAP = 0.1  # s between poses, over which a straight line still tells where the vehicle was
-_ALIKE = 0.5  # of the plan's own spread: beyond it, log and plan hardly are the same flight
+_ALIKE = 0.5  # of the plan's own variance: where more is left, log and plan hardly are the same flight
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,25 +157,36 @@ def align(subject: Subject, reference: Reference) -> Alignment:
     mean = [(a - b) / seen for a, b in zip(sums, plan_sums, strict=True)]
     variance = (squares - 2 * products + plan_squares) / seen - sum(axis**2 for axis in mean)
     covered = np.clip(count / len(plan), 0, 1)
-    shift = int(np.argmin(covered * variance + (1 - covered) * spread)) - (len(plan) - 1)
+    cost = covered * variance + (1 - covered) * spread
+    best = int(np.argmin(cost))
+    guess = float(time[0] + (best - (len(plan) - 1)) * STEP)
+
+    # What part of the plan is seen changes with the offset and draws it by a few steps: near it, that part is kept.
+    moments = reference.time + guess
+    fixed = _near(moments - NEARBY, time) & _near(moments + NEARBY, time)
 
     def varies(offset: float) -> float:
-        difference = _difference(time, position, reference, offset)
-        return float(np.mean(np.sum((difference - difference.mean(axis=0)) ** 2, axis=1)))
+        at = np.stack([np.interp(reference.time[fixed] + offset, time, axis) for axis in position.T], axis=1)
+        return float(np.sum(np.var(at - reference.position[fixed], axis=0)))
 
-    guess = float(time[0] + shift * STEP)
-    found = minimize_scalar(varies, bounds=(guess - STEP, guess + STEP), method="bounded", options={"xatol": 1e-7})
-    offset = float(found.x) if found.fun <= varies(guess) else guess
-    difference = _difference(time, position, reference, offset)
+    offset = guess
+    if np.count_nonzero(fixed) > 2:
+        offset = min(guess + np.arange(-NEARBY, NEARBY, STEP), key=varies)
+        bounds = (offset - STEP, offset + STEP)
+        offset = float(minimize_scalar(varies, bounds=bounds, method="bounded", options={"xatol": 1e-7}).x)
+    difference = position - reference.at(time - offset)
+    difference = difference[np.isfinite(difference[:, 0])]
+    if len(difference) == 0:
+        raise InputError("not seen while the plan was flown", where=subject.name)
     distance = np.linalg.norm(difference, axis=1)
     x, y, z = (float(value) for value in difference.mean(axis=0))
     return Alignment(
         offset=offset,
-        covered=len(difference) / len(reference.time),
+        covered=float(np.mean(_near(reference.time + offset, time))),
         aside=(x, y, z),
         max_deviation=float(distance.max()),
         rms_deviation=float(np.sqrt(np.mean(distance**2))),
-        alike=varies(offset) <= _ALIKE**2 * spread,
+        alike=bool(cost[best] <= _ALIKE * spread),
     )
 
 
@@ -190,16 +202,6 @@ def _near(moments: NDArray, time: NDArray) -> NDArray:
     after = np.clip(np.searchsorted(time, moments), 1, len(time) - 1)
     gap = max(_LONGEST_GAP, 3 * float(np.median(np.diff(time))))
     return (moments >= time[0]) & (moments <= time[-1]) & (time[after] - time[after - 1] <= gap)
-
-
-def _difference(time: NDArray, position: NDArray, reference: Reference, offset: float) -> NDArray:
-    """(K, 3) m log minus plan, at those of the plan's times at which the log tells."""
-    moments = reference.time + offset
-    near = _near(moments, time)
-    if not near.any():
-        return np.zeros((1, 3))
-    at = np.stack([np.interp(moments[near], time, axis) for axis in position.T], axis=1)
-    return at - reference.position[near]
 
 
 def extent(trials: Sequence[Trial]) -> tuple[NDArray, NDArray]:

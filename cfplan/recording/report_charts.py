@@ -16,7 +16,7 @@ from cfplan.recording.plots import LIMIT, Colour
 
 WIDTH, HEIGHT = 560, 250  # of a chart, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 46, 34  # around what is drawn
-LIGHTEST = 0.42  # of a colour's luminance on white paper; lighter ones are darkened to it
+LIGHTEST = 0.55  # of a colour's luminance on white paper; lighter ones are darkened to it
 COLUMNS = 400  # pixels, across which points are told apart
 _LETTER = 6.2  # width of one, about
 _GRID, _TEXT, _BAND = "#e3e3e3", "#444", "#f3f6fb"
@@ -61,8 +61,10 @@ def time_chart(
             f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{height:.1f}" y2="{height:.1f}" '
             f'stroke="{_css(LIMIT)}" stroke-dasharray="6 3"/>'
         )
-    labels = [(curve.label, _css(curve.colour)) for curve in curves]
-    labels += [("limit" + f" {limit:g} (above)" * (limit in far), _css(LIMIT)) for limit in (*near[:1], *far[:1])]
+    labels = [(curve.label, curve.colour, curve.dashed) for curve in curves]
+    labels += [("limit", LIMIT, True)] * bool(near) + [
+        (f"limit {limit:g} (off the chart)", LIMIT, True) for limit in far
+    ]
     return _svg(title, labels, parts, WIDTH, HEIGHT)
 
 
@@ -71,14 +73,15 @@ def place_chart(title: str, curves: Sequence[Curve], axes: tuple[str, str]) -> s
     x, y = _span([curve.x for curve in curves]), _span([curve.y for curve in curves])
     (left, right), (low, high) = _padded(*x), _padded(*y)
     across = WIDTH - LEFT - RIGHT
-    tall = min(max((high - low) / (right - left) * across, 60.0), 460.0)
+    tall = min(max((high - low) / (right - left) * across, 60.0), 420.0)
     height = tall + TOP + BOTTOM
     scale = min(across / (right - left), tall / (high - low))
     spare = (across / scale - (right - left)) / 2
     rise = (tall / scale - (high - low)) / 2
     frame = _Frame(left - spare, right + spare, low - rise, high + rise, WIDTH, height)
     parts = [_grid(frame, f"{axes[0]}, m", axes[1] + ", m"), *(_line(frame, curve) for curve in curves)]
-    return _svg(title, [(curve.label, _css(curve.colour)) for curve in curves], parts, WIDTH, height)
+    labels = [(curve.label, curve.colour, curve.dashed) for curve in curves]
+    return _svg(title, labels, parts, WIDTH, height)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +111,9 @@ def _span(arrays: Sequence[NDArray]) -> tuple[float, float]:
 
 
 def _padded(low: float, high: float) -> tuple[float, float]:
+    """With some room around; what begins at zero stays there."""
     room = 0.05 * (high - low)
-    return (low if 0 <= low < 0.3 * high and low == 0 else low - room), high + room
+    return (0.0 if low == 0 else low - room), high + room
 
 
 def ticks(low: float, high: float, count: int = 6) -> list[float]:
@@ -176,11 +180,14 @@ def thinned(x: NDArray, y: NDArray, columns: int) -> NDArray:
     return np.concatenate(kept)
 
 
-def _svg(title: str, labels: Sequence[tuple[str, str]], parts: Sequence[str], width: float, height: float) -> str:
+def _svg(
+    title: str, labels: Sequence[tuple[str, Colour, bool]], parts: Sequence[str], width: float, height: float
+) -> str:
     legend, x = [], float(LEFT)
-    for label, colour in dict.fromkeys(labels):
+    for label, colour, dashed in dict.fromkeys(labels):
+        dash = ' stroke-dasharray="5 3"' if dashed else ""
         legend.append(
-            f'<line x1="{x:.0f}" x2="{x + 14:.0f}" y1="32" y2="32" stroke="{colour}" stroke-width="3"/>'
+            f'<line x1="{x:.0f}" x2="{x + 14:.0f}" y1="32" y2="32" stroke="{_css(colour)}" stroke-width="3"{dash}/>'
             f'<text x="{x + 18:.0f}" y="36">{html.escape(label)}</text>'
         )
         x += 30 + _LETTER * len(label)

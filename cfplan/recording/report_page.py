@@ -17,7 +17,7 @@ from cfplan.recording.report_charts import Curve, place_chart, time_chart
 from cfplan.recording.summary import reference_span
 
 _PATH: Colour = (120, 120, 120)
-_VIEWS = (("From above", 0, 1), ("From the side", 1, 2))
+_SIDES = (("From the side", 1, 2), ("From the front", 0, 2))
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 2em auto; padding: 0 1em; }
 h1 { font-size: 1.6em; } h2 { font-size: 1.25em; margin-top: 2.2em; border-bottom: 1px solid #ddd; }
@@ -85,7 +85,7 @@ def _summary(flights: Sequence[Flight]) -> str:
 def _comparison(flights: Sequence[Flight]) -> str:
     trials = [trial_of_record(flight.record, flight.name) for flight in flights]
     over = [_along(trial) for trial in trials]
-    charts = [_places(trials, name, a, b) for name, a, b in _VIEWS]
+    charts = _views(trials)
     for title, values in (
         ("Deviation in time, m", [trial.deviation for trial in trials]),
         ("Speed, m/s", [trial.speed for trial in trials]),
@@ -103,6 +103,12 @@ def _along(trial: Trial) -> np.ndarray:
     if trial.reference is None or len(trial.reference.time) == 0:
         return np.arange(len(trial.time))
     return np.flatnonzero((trial.time >= 0) & (trial.time <= trial.reference.time[-1]))
+
+
+def _views(trials: Sequence[Trial]) -> list[str]:
+    """From above, and beside it from two sides."""
+    sides = "".join(_places(trials, name, across, up) for name, across, up in _SIDES)
+    return [_places(trials, "From above", 0, 1), f"<div>{sides}</div>"]
 
 
 def _places(trials: Sequence[Trial], title: str, across: int, up: int) -> str:
@@ -123,7 +129,7 @@ def _flight(flight: Flight) -> str:
     begin, end = (moment - record.start for moment in reference_span(record))
     band = (begin, end) if np.isfinite(begin) else None
     trial = trial_of_record(record, flight.name)
-    charts = [_places([trial], name, a, b) for name, a, b in _VIEWS]
+    charts = _views([trial])
     for plot in plots(record):
         curves = [
             Curve(label, line.time - record.start, line.values.reshape(len(line.time), -1)[:, column], colour)
