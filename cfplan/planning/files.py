@@ -58,7 +58,7 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
         "profile": {f.name: getattr(plan.profile, f.name).tolist() for f in fields(SpeedProfile)},
     }
     table = pyarrow.table(_columns(plan.trajectory))
-    table = table.replace_schema_metadata({_KEY: json.dumps(metadata, allow_nan=False).encode()})
+    table = table.replace_schema_metadata({_KEY: json.dumps(metadata).encode()})
     target = FilePath(file)
     try:
         handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)

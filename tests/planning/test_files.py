@@ -1,7 +1,9 @@
 """Plans survive being written and read, and nothing else is taken for a plan."""
 
 import json
+import math
 import os
+from dataclasses import replace
 
 import numpy as np
 import pyarrow
@@ -50,6 +52,12 @@ def test_what_is_loaded_is_what_was_saved(made, saved):
         np.testing.assert_array_equal(
             getattr(loaded.trajectory.at(times), name), getattr(made.trajectory.at(times), name)
         )
+
+
+def test_a_limit_that_is_left_open_stays_open(made, limits, tmp_path):
+    opened = replace(made, limits=replace(limits, plan=replace(limits.plan, speed=math.inf)))
+    save_plan(opened, tmp_path / "open.parquet")
+    assert load_plan(tmp_path / "open.parquet").limits == opened.limits
 
 
 def test_any_parquet_reader_sees_the_flight_and_its_provenance(made, saved):
