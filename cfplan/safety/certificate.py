@@ -163,6 +163,9 @@ def _quantities(
     yield _Quantity("speed", "m/s", 1, _norm(state.velocity), limits.speed, 0.0)
     yield _Quantity("acceleration", "m/s²", 1, _norm(state.acceleration), limits.acceleration, 0.0)
     yield _Quantity("angular velocity", "rad/s", 1, _norm(state.body_rate), limits.angular_velocity, 0.0)
+    if limits.angular_acceleration != math.inf:
+        turning = _norm(state.angular_acceleration)
+        yield _Quantity("angular acceleration", "rad/s²", 1, turning, limits.angular_acceleration, 0.0)
     yield _Quantity("tilt", "rad", 1, tilt, limits.tilt, 0.0)
     yield _Quantity("motor thrust, most", "N", 1, motors, limits.motor_thrust_max, 0.0)
     yield _Quantity("motor thrust, least", "N", -1, motors, limits.motor_thrust_min, hover)

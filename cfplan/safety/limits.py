@@ -1,5 +1,6 @@
 """What safety.yaml allows: `plan` binds planned motion, `flight` binds measured motion."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +26,8 @@ class PlanLimits:
     # N, each motor, the reserve for feedback taken off
     specific_thrust_min: float
     # m/s², collective thrust over mass
+    angular_acceleration: float = math.inf
+    # rad/s², norm: what lags behind in torque, with motors that take a tenth of a second
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,6 +40,7 @@ class _Plan(_Section):
     speed: Encodable
     acceleration: Encodable
     angular_velocity: Encodable
+    angular_acceleration: Positive
     tilt_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
     motor_reserve: Share
     specific_thrust: Positive
@@ -160,6 +161,7 @@ def _plan_limits(plan: _Plan, airframe: Airframe) -> PlanLimits:
         motor_thrust_min=airframe.motor_thrust_min + reserve,
         motor_thrust_max=airframe.motor_thrust_max - reserve,
         specific_thrust_min=plan.specific_thrust,
+        angular_acceleration=plan.angular_acceleration,
     )
 
 

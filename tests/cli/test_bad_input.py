@@ -26,9 +26,9 @@ BAD_PATHS = {
 BAD_SAFETY = {
     "a negative limit": (r"^  speed: 2.0", "  speed: -2.0", 2, "safety.yaml:7:"),
     "a zero limit": (r"^  acceleration: 5.0", "  acceleration: 0", 2, "safety.yaml:8:"),
-    "an unknown key": (r"^  tilt_deg: 30", "  tilt: 30", 2, "safety.yaml:10:"),
+    "an unknown key": (r"^  tilt_deg: 30", "  tilt: 30", 2, "safety.yaml:11:"),
     "an unknown vehicle": (r"^vehicle: \S+", "vehicle: crazyflie-9", 2, "safety.yaml:4:"),
-    "limits under which it cannot hover": (r"^  motor_reserve: 0.1", "  motor_reserve: 0.45", 2, "safety.yaml:11:"),
+    "limits under which it cannot hover": (r"^  motor_reserve: 0.2", "  motor_reserve: 0.45", 2, "safety.yaml:12:"),
     "a battery too small for the path": (r"^  endurance: 240", "  endurance: 9", 3, "endurance"),
 }
 
