@@ -167,17 +167,16 @@ def thinned(x: NDArray, y: NDArray, columns: int) -> NDArray:
     """Rows enough to draw y over rising x: of each column the first, the last, the least, the largest, and a gap."""
     if len(x) <= 4 * columns:
         return np.arange(len(x))
-    edges = np.linspace(x[0], x[-1], columns + 1)
-    starts = np.unique(np.searchsorted(x, edges[:-1]))
-    kept = []
-    for begin, end in zip(starts, [*starts[1:], len(x)], strict=True):
-        part = y[begin:end]
-        unknown = np.flatnonzero(~np.isfinite(part))
-        picked = [0, len(part) - 1, *unknown[:1], *unknown[-1:]]
-        if len(unknown) < len(part):
-            picked += [int(np.nanargmin(part)), int(np.nanargmax(part))]
-        kept.append(begin + np.unique(picked))
-    return np.concatenate(kept)
+    width = (x[-1] - x[0]) / columns
+    column = np.minimum(((x - x[0]) / width).astype(int), columns - 1) if width > 0 else np.zeros(len(x), dtype=int)
+    firsts = np.flatnonzero(np.r_[True, np.diff(column) > 0])
+    lasts = np.r_[firsts[1:], len(x)] - 1
+    unknown = ~np.isfinite(y)
+    least = np.lexsort((np.where(unknown, np.inf, y), column))[firsts]
+    largest = np.lexsort((np.where(unknown, -np.inf, y), column))[lasts]
+    gaps = np.flatnonzero(unknown)
+    gaps = gaps[np.unique(column[gaps], return_index=True)[1]]
+    return np.unique(np.concatenate([firsts, lasts, least, largest, gaps]))
 
 
 def _svg(

@@ -132,7 +132,12 @@ def _flight(flight: Flight) -> str:
     charts = _views([trial])
     for plot in plots(record):
         curves = [
-            Curve(label, line.time - record.start, line.values.reshape(len(line.time), -1)[:, column], colour)
+            Curve(
+                label,
+                line.time - record.start,
+                line.values.reshape(len(line.time), len(line.labels))[:, column],
+                colour,
+            )
             for line in plot.lines
             for column, (label, colour) in enumerate(zip(line.labels, line.colours, strict=True))
         ]
