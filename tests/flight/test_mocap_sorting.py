@@ -62,7 +62,7 @@ def test_new_frames_with_the_old_pose_are_frozen(numbers):
 
 
 @pytest.mark.parametrize("size", [0.3, 1.0, 20.0])
-@pytest.mark.parametrize("lasting", [0.05, 0.5, 3.0])
+@pytest.mark.parametrize("lasting", [0.05, 0.5, 10.0])
 def test_a_jump_is_not_believed_however_long_and_its_end_is_good(size, lasting):
     sorter, i = sorter_after()
     end = i + round(lasting / PERIOD)
@@ -73,7 +73,7 @@ def test_a_jump_is_not_believed_however_long_and_its_end_is_good(size, lasting):
 
 
 @pytest.mark.parametrize("angle", [math.pi, math.pi / 2, -2.0])
-@pytest.mark.parametrize("lasting", [0.05, 0.5, 3.0])
+@pytest.mark.parametrize("lasting", [0.05, 0.5, 10.0])
 def test_a_flip_is_not_believed_however_long(angle, lasting):
     sorter, i = sorter_after()
     for k in range(i, i + round(lasting / PERIOD)):
@@ -88,9 +88,9 @@ def test_a_single_outlier_costs_only_itself():
 
 def test_a_body_carried_elsewhere_is_believed_after_a_while():
     sorter, i = sorter_after()
-    verdicts = [sorter.sort(k * PERIOD, flown(k * PERIOD, offset=(5, 0, 0)), k) for k in range(i, i + 600)]
+    verdicts = [sorter.sort(k * PERIOD, flown(k * PERIOD, offset=(5, 0, 0)), k) for k in range(i, i + 3100)]
     assert verdicts[0] is Verdict.JUMPED
-    assert verdicts[490] is Verdict.JUMPED
+    assert verdicts[2990] is Verdict.JUMPED
     assert verdicts[-1] is Verdict.GOOD
 
 

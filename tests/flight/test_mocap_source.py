@@ -218,7 +218,7 @@ def test_a_segment_named_otherwise_is_told_or_does_not_matter():
     ids=["millimetres", "y up", "hidden", "broken", "paused", "stalled"],
 )
 def test_poses_that_cannot_be_flown_by_are_an_error_in_time(settings, pose, words, monkeypatch):
-    monkeypatch.setattr("cfplan.flight.mocap.source.OPEN_WITHIN", 2.0)
+    monkeypatch.setattr("cfplan.flight.mocap.source.OPEN_WITHIN", 1.6)
     with serve(settings, lambda _: pose) as vicon, pytest.raises((InputError, LinkError), match=words) as caught:
         pose_source(vicon.uri, LIMITS).open()
     assert caught.value.hint

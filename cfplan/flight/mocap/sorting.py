@@ -19,7 +19,7 @@ _MOST_TURN = 1.3  # rad, however long ago; a pattern seen the wrong way round tu
 _SPEED = 4.0  # m/s at which another track may go on
 _HISTORY = 0.1  # s of good poses from which the velocity is taken
 _EXTRAPOLATE = 0.3  # s for which that velocity is taken to last
-_BELIEVE_AFTER = 5.0  # s that another track must last; longer than a landing takes
+_BELIEVE_AFTER = 30.0  # s that another track must last; no landing takes so long
 
 
 class Verdict(StrEnum):
