@@ -29,7 +29,7 @@ def window(airframe: Airframe, limits: PlanLimits) -> float:
     derivative are about that: to be met by body rate, and by the torque that motors have to spare in hover.
     """
     spare = min(limits.motor_thrust_max - airframe.hover_thrust, airframe.hover_thrust - limits.motor_thrust_min)
-    turning = 4 * airframe.arm * max(spare, 1e-3) / max(airframe.inertia[:2])
+    turning = min(4 * airframe.arm * max(spare, 1e-3) / max(airframe.inertia[:2]), limits.angular_acceleration)
     most = min(limits.acceleration, 4 * limits.motor_thrust_max / airframe.mass)
     rate, acceleration = GRAVITY * limits.angular_velocity, GRAVITY * turning
     return max(2 * most / rate, (4 * most / acceleration) ** 0.5)

@@ -139,6 +139,7 @@ def _bounds(
     rows_low, rows_high = np.zeros((count, ROWS)), np.zeros((count, ROWS))
     rows_low[:, 6:], rows_high[:, 6:] = -np.inf, np.inf
     rows_high[:, 6], rows_high[:, 7] = limits.acceleration**2, limits.angular_velocity**2
+    rows_high[:, 12] = limits.angular_acceleration**2
     rows_low[:, 8], rows_low[:, 9] = np.cos(limits.tilt), limits.specific_thrust_min
     if yaw is not YawMode.FREE:
         rows_low[:, 10] = rows_high[:, 10] = 0.0
@@ -167,7 +168,9 @@ def _end_caps(path: Path, grid: NDArray, airframe: Airframe, limits: PlanLimits)
     """
     caps = np.full(len(grid), np.inf)
     spare = min(limits.motor_thrust_max - airframe.hover_thrust, airframe.hover_thrust - limits.motor_thrust_min)
-    turning = END_SHARE * 4 * airframe.arm * max(spare, 1e-3) / max(airframe.inertia[:2])
+    turning = END_SHARE * min(
+        4 * airframe.arm * max(spare, 1e-3) / max(airframe.inertia[:2]), limits.angular_acceleration
+    )
     for ends in (range(END_NODES), range(len(grid) - END_NODES, len(grid))):
         near = np.linspace(grid[max(ends[0] - 1, 0)], grid[min(ends[-1] + 1, len(grid) - 1)], 8 * END_NODES)
         third, fourth = (float(np.linalg.norm(path(near, order), axis=1).max()) for order in (3, 4))

@@ -10,7 +10,7 @@
 
 after Mao, Spasojevic, Hsieh and Kumar, "TOPPQuad" (IROS 2024) with the changes of "Sequence Modeling for Time-Optimal
 Quadrotor Trajectory Optimization", appendix "Dataset Generation". Added here, because the certificate asks for it: the
-airframe's drag (zero drag gives back the equations above), tilt and least specific thrust.
+airframe's drag (zero drag gives back the equations above), tilt, least specific thrust and angular acceleration.
 
 Rest: at a rest end γ' = γ'' = 0, so the vehicle is level and still there whatever h is, and h is left free but for its
 least value. Fixing h = 0 there would leave no way out of rest, since ω is per s. Body rates at the ends are free
@@ -24,8 +24,9 @@ from typing import Any
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 VARIABLES = 16
-ROWS = 12
-# a node: 3 force, 3 torque, acceleration², angular velocity², tilt, specific thrust, yaw fixed, yaw at the start
+ROWS = 13
+# a node: 3 force, 3 torque, acceleration², angular velocity², tilt, specific thrust, yaw fixed, yaw at the start,
+# angular acceleration²
 STEP_ROWS = 8
 # an interval: h, q, ω
 H_LEAST = 1e-3
@@ -100,7 +101,8 @@ def _node(airframe: Airframe) -> Any:
     force = acceleration + plane / airframe.mass * velocity + casadi.DM([0, 0, GRAVITY])
     lifted = wrench[0] / airframe.mass - (axial - plane) / airframe.mass * casadi.dot(thrust_axis, velocity)
     inertia = casadi.DM(airframe.inertia)
-    torque = inertia * (0.5 * omega * dh + alpha * h) + casadi.cross(omega, inertia * omega) * h
+    turning = 0.5 * omega * dh + alpha * h  # angular acceleration in time
+    torque = inertia * turning + casadi.cross(omega, inertia * omega) * h
     rows = casadi.vertcat(
         (force - thrust_axis * lifted) / GRAVITY,
         (torque - wrench[1:4]) / (airframe.arm * airframe.hover_thrust),
@@ -111,6 +113,7 @@ def _node(airframe: Airframe) -> Any:
         # Hopf: q = q(b₃) ⊗ q_yaw has z : w = sin : cos of half the yaw
         q[2] * path[6] - q[3] * path[7],
         q[3] - q[2],
+        casadi.sumsqr(turning),
     )
     return casadi.Function("node", [x, path], [rows])
 

@@ -80,6 +80,7 @@ def test_the_coupling_is_newton_and_euler_in_time(variables):
     assert rows[6] == pytest.approx(acceleration @ acceleration, rel=1e-6)
     assert rows[7] == pytest.approx(now @ now, rel=1e-9)
     assert rows[8] == pytest.approx(thrust_axis[2], rel=1e-12)
+    assert rows[12] == pytest.approx(turning @ turning, rel=1e-6)
 
 
 def test_yaw_starts_in_the_first_quarter_turn(free):
