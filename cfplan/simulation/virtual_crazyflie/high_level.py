@@ -1,6 +1,7 @@
 """The on-board planner (CRTP port 8): take-off, landing and go-to as septics, and uploaded polynomials.
 
-Idle, it asks for nothing, which is motors off, every 10 ms at the lowest priority: the null-setpoint gap.
+Idle, it asks for nothing, which is motors off, every 10 ms at the lowest priority: the null-setpoint gap. Spirals,
+take-off and landing by speed, and compressed curves are not simulated; they answer ENOEXEC.
 """
 
 import errno

@@ -31,8 +31,8 @@ class VehicleSettings:
     # m; its height is that of the floor
     yaw: float = 0.0
     # rad
-    auto_arming: bool = True
-    # brushed vehicles arm themselves; brushless ones wait for a request
+    auto_arming: bool | None = None
+    # None: as the airframe's name says; brushed vehicles arm themselves, brushless ones wait for a request
     charge: float = 1.0
     # share of the battery's capacity
     sensors: Sensors = field(default_factory=Sensors)

@@ -58,7 +58,9 @@ class VirtualCrazyflie:
             prior=np.array([self.parameters[name] for name in PRIOR_PARAMETERS]),
             gains=np.array([self.parameters[name] for name in GAIN_PARAMETERS]),
         )
-        self.supervisor = Supervisor(auto_arming=self.settings.auto_arming, say=self.say)
+        wanted = self.settings.auto_arming
+        auto_arming = "brushless" not in airframe.name if wanted is None else wanted
+        self.supervisor = Supervisor(auto_arming=auto_arming, say=self.say)
         self.memories = Memories()
         self.planner = HighLevelCommander(self.memories.trajectory, self._where)
         self.commander = Commander(self.planner.stop)

@@ -7,7 +7,9 @@ import pytest
 
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State, Supervisor
+from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import Port
+from cfplan.vehicle.airframes import AIRFRAMES
 
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 RUNNING, OFF = np.full(4, 30000.0), np.zeros(4)
@@ -49,6 +51,13 @@ def test_a_brushless_vehicle_waits_for_a_request():
     assert hand.look(1.0)[-1] is State.CHECKS_PASSED
     assert hand.supervisor.request_arming(True)
     assert hand.look(0.08)[-1] is State.READY_TO_FLY
+
+
+def test_the_airframe_says_whether_it_arms_itself():
+    for name, arms_itself in (("crazyflie-2.1+", True), ("crazyflie-2.1-brushless", False)):
+        vehicle = VirtualCrazyflie(AIRFRAMES[name])
+        vehicle.advance(300)
+        assert vehicle.supervisor.can_fly == arms_itself
 
 
 def test_an_armed_vehicle_that_does_not_fly_disarms_after_30_s_and_arms_itself_again():
