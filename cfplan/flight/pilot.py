@@ -26,6 +26,7 @@ _AT_START_WITHIN = 0.06  # m
 _AT_START_FOR = 0.5  # s
 _BRAKE_HOLD = 1.0  # s of hover after a stop
 _ON_THE_FLOOR = 0.15  # m above where it took off
+_BELOW_FLOOR = 0.03  # m that landings aim below it, so that motors stop on the floor and not above
 _MOTORS_STOPPED = 4.0  # s; the vehicle calls itself landed 2 s after they did
 
 
@@ -178,7 +179,7 @@ class Pilot:
         duration = manoeuvre_time(height, self._limits.ground.land_speed)
 
         def land() -> None:
-            cockpit.link.land(cockpit.floor, duration)
+            cockpit.link.land(cockpit.floor - _BELOW_FLOOR, duration)
 
         if cockpit.stream is not None:
             self._hand_over(land, LAND, "to land")
