@@ -1,0 +1,202 @@
+"""Datasets: the same rows whoever makes them, nothing lost when the making stops, failures as rows."""
+
+import errno
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.errors import CfplanError, InputError
+from cfplan.geometry.path import Path as Curve
+from cfplan.geometry.yaw import YawMode
+from cfplan.learning import dataset
+from cfplan.learning.dataset import SchedulerError, label_shard, make_dataset, read_dataset, read_timing
+from cfplan.learning.dataset_info import describe
+from cfplan.learning.dataset_spec import DatasetSpec, Relabel, load_spec
+from cfplan.learning.labels import row_path
+
+SMALL = DatasetSpec(
+    count=6, seed=3, limits="hardware", box=(4.5, 8.0, 2.0), waypoints=(2, 3), nodes=40, yaw=YawMode.FIXED, shard_rows=2
+)
+
+
+def shard_bytes(folder: Path) -> dict[str, bytes]:
+    """The files of the rows."""
+    return {file.name: file.read_bytes() for file in sorted((folder / "shards").iterdir())}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The small dataset, made by one worker."""
+    folder = tmp_path_factory.mktemp("made")
+    make_dataset(folder, SMALL)
+    return folder
+
+
+def test_rows_hold_path_grid_label_and_provenance(made):
+    spec, rows = read_dataset(made)
+    assert spec == SMALL
+    assert rows["row"].to_pylist() == list(range(6))
+    for row in rows.to_pylist():
+        assert row["status"] == "SOLVED"
+        assert row["vehicle"] == "crazyflie-2.1+"
+        assert row["seed"] == 3
+        assert len(row["h"]) == len(row["yaw"]) == row["nodes"] + 1 == 41
+        assert 0 < row["certified_share"] <= 1
+        stored = Curve(np.array(row["breaks"]), np.array(row["coefficients"]).reshape(len(row["breaks"]) - 1, -1, 3))
+        s = np.linspace(0, row["end"], 17)
+        np.testing.assert_array_equal(stored(s), row_path(SMALL, row["row"])(s))
+
+
+def test_travel_time_is_that_of_the_profile(made):
+    """Checked by quadrature of 1/√h, with h from the stored nodes and derivatives."""
+    _, rows = read_dataset(made)
+    row = rows.to_pylist()[0]
+    step = row["end"] / row["nodes"]
+    x = np.linspace(0, step, 401)[:, None]
+    h, dh, ddh = (np.array(row[name])[:-1] for name in ("h", "dh", "ddh"))
+    inside = h + x * (dh + x * (ddh / 2 + x * np.array(row["dddh"]) / 6))
+    assert row["travel_time"] == pytest.approx(np.trapezoid(1 / np.sqrt(inside), x, axis=0).sum(), rel=1e-5)
+
+
+def test_two_workers_make_the_same_bytes_as_one(made, tmp_path):
+    make_dataset(tmp_path, SMALL, workers=2)
+    assert shard_bytes(tmp_path) == shard_bytes(made)
+
+
+def test_solve_times_are_kept_apart(made):
+    assert read_timing(made)["row"].to_pylist() == list(range(6))
+    assert "solve_seconds" not in read_dataset(made)[1].column_names
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(made, tmp_path, monkeypatch):
+    labelled: list[int] = []
+
+    def label_until_interrupted(spec, number):
+        if len(labelled) == 1:
+            raise KeyboardInterrupt
+        labelled.append(number)
+        return label_shard(spec, number)
+
+    monkeypatch.setattr(dataset, "label_shard", label_until_interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        make_dataset(tmp_path, SMALL)
+    monkeypatch.undo()
+    kept = shard_bytes(tmp_path)
+    assert len(kept) == 1
+    heard: list[int] = []
+    make_dataset(tmp_path, SMALL, on_rows=heard.append)
+    assert shard_bytes(tmp_path) == shard_bytes(made)
+    assert heard == [2, 2, 2]  # what was there first, then a shard at a time
+
+
+def test_a_full_disk_loses_nothing_that_was_written(made, tmp_path, monkeypatch):
+    write = dataset._write
+    written: list[Path] = []
+
+    def write_until_full(file, content):
+        if len(written) == 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written.append(file)
+        write(file, content)
+
+    monkeypatch.setattr(dataset, "_write", write_until_full)
+    with pytest.raises(InputError, match="No space left"):
+        make_dataset(tmp_path, SMALL)
+    monkeypatch.undo()
+    assert len(shard_bytes(tmp_path)) == 1
+    make_dataset(tmp_path, SMALL)
+    assert shard_bytes(tmp_path) == shard_bytes(made)
+
+
+def test_a_folder_with_another_dataset_is_refused_naming_what_differs(made):
+    before = shard_bytes(made)
+    with pytest.raises(InputError, match=r"limits hardware there, simulation here; nodes 40 there, 50 here"):
+        make_dataset(made, replace(SMALL, limits="simulation", nodes=50))
+    with pytest.raises(InputError, match="version"):
+        make_dataset(made, replace(SMALL, version="0.0.1"))
+    assert shard_bytes(made) == before
+
+
+def test_paths_that_cannot_be_are_rows_with_a_reason(tmp_path):
+    spec = replace(SMALL, count=2, box=(0.1, 0.1, 0.1))
+    make_dataset(tmp_path, spec)
+    _, rows = read_dataset(tmp_path)
+    assert rows["status"].to_pylist() == ["PATH", "PATH"]
+    assert all("no room" in reason for reason in rows["reason"].to_pylist())
+    assert describe(tmp_path)["failed"] == {"PATH": 2}
+
+
+@pytest.mark.parametrize("relabel", Relabel)
+def test_perturbed_copies_stay_within_epsilon_and_are_labelled_as_asked(tmp_path, relabel):
+    spec = replace(SMALL, count=1, epsilon=0.01, copies=2, relabel=relabel)
+    make_dataset(tmp_path, spec)
+    clean, *copies = read_dataset(tmp_path)[1].to_pylist()
+    s = np.linspace(0, clean["end"], spec.nodes + 1)
+    for copy in copies:
+        distance = np.linalg.norm(row_path(spec, copy["row"])(s) - row_path(spec, 0)(s), axis=1)
+        assert 0 < distance.max() <= 0.01
+        assert (copy["h"] == clean["h"]) == (relabel is Relabel.KEEP)
+
+
+def test_info_counts_and_describes(made):
+    found = describe(made)
+    assert found["rows"] == found["rows_wanted"] == found["solved"] == 6
+    assert found["certified_as_they_are"] + found["certified_when_slowed"] == 6
+    times = found["percentiles"]["travel_time"]
+    assert 0 < times["0"] <= times["50"] <= times["100"]
+    assert found["active_limits"]["speed"] > 0.5
+    json.dumps(found)
+
+
+def test_damaged_files_are_named(made, tmp_path):
+    with pytest.raises(InputError, match=r"no dataset.json"):
+        read_dataset(tmp_path)
+    (tmp_path / "dataset.json").write_text("{}")
+    with pytest.raises(InputError, match="not a dataset description"):
+        load_spec(tmp_path)
+    (tmp_path / "dataset.json").write_bytes((made / "dataset.json").read_bytes())
+    with pytest.raises(InputError, match="no rows yet"):
+        read_dataset(tmp_path)
+    (tmp_path / "shards").mkdir()
+    (tmp_path / "shards" / "00000.parquet").write_bytes(b"PAR1 damaged")
+    with pytest.raises(InputError, match=r"damaged") as error:
+        read_dataset(tmp_path)
+    assert error.value.where.endswith("00000.parquet")
+
+
+@pytest.mark.parametrize("change", [{"count": 0}, {"nodes": 1}, {"waypoints": (4, 3)}, {"epsilon": 0.1}, {"seed": -1}])
+def test_specs_without_sense_are_refused(change):
+    with pytest.raises(InputError, match=next(iter(change))):
+        replace(SMALL, **change)
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense", "tcp://nowhere.invalid:8786"])
+def test_an_unreachable_scheduler_is_an_error(tmp_path, address):
+    with pytest.raises(SchedulerError) as error:
+        make_dataset(tmp_path, SMALL, scheduler=address)
+    assert error.value.where == address
+    assert isinstance(error.value, CfplanError)
+
+
+@pytest.mark.integration
+def test_a_cluster_makes_the_same_bytes_also_when_a_worker_is_killed(made, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+    killed: list[int] = []
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+
+        def kill_one(_: int) -> None:
+            if not killed and len(heard) > 1:
+                killed.append(next(iter(cluster.workers.values())).pid)
+                os.kill(killed[0], signal.SIGKILL)
+
+        heard: list[int] = []
+        make_dataset(
+            tmp_path, SMALL, scheduler=cluster.scheduler_address, on_rows=lambda n: (heard.append(n), kill_one(n))
+        )
+    assert killed
+    assert shard_bytes(tmp_path) == shard_bytes(made)
