@@ -5,6 +5,7 @@ import sys
 import click
 
 from cfplan import __version__
+from cfplan.cli.bench import bench, study
 from cfplan.cli.check import check
 from cfplan.cli.dataset import dataset
 from cfplan.cli.doctor import doctor
@@ -34,7 +35,7 @@ def cfplan() -> None:
     """Plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
 
 
-for command in (plan, check, sim, fly, replay, report, mocap, dataset, doctor):
+for command in (plan, check, sim, fly, replay, report, mocap, dataset, bench, study, doctor):
     cfplan.add_command(command)
 
 

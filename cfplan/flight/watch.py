@@ -155,6 +155,9 @@ def _safety(rung: Rung, text: str) -> Trip:
 
 
 def _rung(ladder: Ladder, value: float, text: str) -> Trip:
+    """The rung of a measured value; what is not a number says that the measurement cannot be trusted: land."""
+    if math.isnan(value):
+        return _safety(Rung.LAND, text)
     if value > ladder.cut:
         return _safety(Rung.CUT, text)
     if value > ladder.land:

@@ -83,6 +83,12 @@ def test_a_body_rate_beyond_the_limit_that_lasts_brakes(watch):
     assert last is Rung.BRAKE
 
 
+@pytest.mark.parametrize("broken", [{"velocity": (math.nan, 0.0, 0.0)}, {"rate": (0.0, 0.0, math.nan)}])
+def test_a_measurement_that_is_no_number_lands_when_it_lasts(watch, broken):
+    assert rung(watch, seen(now=10.0, **broken)) is Rung.NONE
+    assert rung(watch, seen(now=10.2, **broken)) is Rung.LAND
+
+
 def test_a_voltage_dip_is_averaged_away_and_an_empty_battery_is_not(watch):
     for step in range(100):
         assert rung(watch, seen(now=10.0 + step / 100)) is Rung.NONE

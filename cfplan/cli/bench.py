@@ -1,0 +1,128 @@
+"""`cfplan bench` and `cfplan study`: measured comparisons, each one command and one JSON file."""
+
+import json
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from cfplan.cli import options
+from cfplan.cli.output import print_json, print_table
+from cfplan.errors import InputError
+
+_output = click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the result here, as JSON.")
+_yaw = click.option("--yaw", type=click.Choice(["fixed", "tangent", "free"]), default="free", show_default=True)
+_boxes = click.option("--box", "boxes", multiple=True, help="4.5x8x2 or 10x10x10; may be given twice.  [default: both]")
+_sets = click.option("--limits", "limit_sets", multiple=True, help="hardware or simulation.  [default: both]")
+
+
+@click.command(epilog="Example: cfplan bench --paths 20 --planner expert --planner toppquad")
+@click.option("--paths", type=int, default=100, show_default=True, help="Random paths in each box with each set.")
+@click.option("--planner", "planners", multiple=True, help="May be given several times.  [default: all there are]")
+@click.option("--nodes", type=int, default=100, show_default=True, help="Grid intervals.")
+@click.option("--seed", "first_seed", type=int, default=0, show_default=True, help="Of the first path.")
+@_boxes
+@_sets
+@_yaw
+@_output
+@options.as_json
+def bench(yaw: str, output: Path | None, as_json: bool, **what: Any) -> None:
+    """Compare the planners on the same paths, in one run, on one thread."""
+    from cfplan.studies.machine import one_thread
+
+    one_thread()
+    from cfplan.geometry.yaw import YawMode
+    from cfplan.studies.bench import bench as run
+
+    _require_free(output)
+    with _progress("planning", as_json) as progress:
+        result = run(**_given(what), yaw=YawMode(yaw), command=_command(), progress=progress)
+    _publish(result, output, as_json)
+
+
+@click.group()
+def study() -> None:
+    """Measure one thing about the planners, with tables for docs/studies."""
+
+
+@study.command(epilog="Example: cfplan study feasibility --paths 1000 -o docs/studies/feasibility.json")
+@click.option("--paths", type=int, default=1000, show_default=True, help="Random paths in all.")
+@click.option("--planner", default="expert", show_default=True)
+@click.option("--nodes", type=int, default=100, show_default=True, help="Grid intervals.")
+@_boxes
+@_sets
+@_yaw
+@_output
+@options.as_json
+def feasibility(yaw: str, output: Path | None, as_json: bool, **what: Any) -> None:
+    """How many plans pass the dense certificate as they are, and what slowing costs the others."""
+    from cfplan.studies.machine import one_thread
+
+    one_thread()
+    from cfplan.geometry.yaw import YawMode
+    from cfplan.studies.feasibility import dense_feasibility
+
+    _require_free(output)
+    with _progress("planning", as_json) as progress:
+        result = dense_feasibility(**_given(what), yaw=YawMode(yaw), command=_command(), progress=progress)
+    _publish(result, output, as_json)
+
+
+@study.command(epilog="Example: cfplan study scaling -o docs/studies/scaling.json")
+@click.option("--planner", default="expert", show_default=True)
+@click.option("--repeats", type=int, default=5, show_default=True, help="Paths of each size.")
+@_yaw
+@_output
+@options.as_json
+def scaling(yaw: str, output: Path | None, as_json: bool, **what: Any) -> None:
+    """How planning time grows with the number of nodes, from 100 to 3,000."""
+    from cfplan.studies.machine import one_thread
+
+    one_thread()
+    from cfplan.geometry.yaw import YawMode
+    from cfplan.studies.scaling import scaling as run
+
+    _require_free(output)
+    with _progress("planning", as_json) as progress:
+        result = run(**_given(what), yaw=YawMode(yaw), command=_command(), progress=progress)
+    _publish(result, output, as_json)
+
+
+def _given(what: dict[str, Any]) -> dict[str, Any]:
+    """What was not given is left to the study's own default."""
+    return {name: value for name, value in what.items() if value != ()}
+
+
+def _command() -> str:
+    return shlex.join(["cfplan", *sys.argv[1:]])
+
+
+@contextmanager
+def _progress(what: str, as_json: bool) -> Iterator[Callable[[int, int], None]]:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True, quiet=as_json)) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _require_free(output: Path | None) -> None:
+    """Before an hour is spent measuring."""
+    if output is not None and not output.parent.is_dir():
+        raise InputError("no such folder", where=str(output.parent), hint="make it first")
+
+
+def _publish(result: Any, output: Path | None, as_json: bool) -> None:
+    document = result.to_dict()
+    if output is not None:
+        output.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    if as_json:
+        print_json(document)
+    else:
+        for title, columns, rows in result.tables():
+            print_table(title, columns, rows)
