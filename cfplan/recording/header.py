@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -81,7 +81,9 @@ def header_from_json(text: str, *, where: str = "") -> RecordHeader:
             planner=str(values["planner"]),
             vehicle=_airframe(values["vehicle"]),
             thrust_at_full_command=_number(values["thrust_at_full_command"]),
-            plan_limits=PlanLimits(**{f.name: _number(values["plan_limits"].get(f.name)) for f in fields(PlanLimits)}),
+            plan_limits=PlanLimits(
+                **{f.name: _limit(values["plan_limits"].get(f.name), f) for f in fields(PlanLimits)}
+            ),
             bounds=FlightBounds(**{f.name: _number(values["bounds"].get(f.name)) for f in fields(FlightBounds)}),
             travel_time=_number(values["travel_time"]),
             path=np.array(values["path"], dtype=float).reshape(-1, 3),
@@ -107,6 +109,11 @@ def _airframe(values: Mapping[str, Any]) -> Airframe:
         source=str(values["source"]),
         **numbers,
     )
+
+
+def _limit(value: float | None, limit: Field) -> float:
+    """JSON has no word for a limit that is infinite: null is the default of a limit that has one, else not known."""
+    return _number(value) if value is not None or limit.default is MISSING else limit.default
 
 
 def _triple(values: list[float | None]) -> Triple:
