@@ -130,6 +130,17 @@ def test_a_microsd_log_that_lost_power_is_read_as_far_as_it_goes(tmp_path, lost)
     np.testing.assert_allclose(found, position[: len(found)], atol=1e-6)
 
 
+@pytest.mark.parametrize("block", [7, 100])
+def test_a_microsd_log_of_many_blocks_is_read_like_one_of_few(tmp_path, monkeypatch, block):
+    monkeypatch.setattr("cfplan.recording.importers.usd_log._BLOCK", block)
+    rows, position, rotations = estimate_rows()
+    file = tmp_path / "log00"
+    file.write_bytes(usd(ESTIMATE, rows))
+    log = read_log(file)
+    assert not log.truncated
+    assert_same(log.subjects[0], position, rotations)
+
+
 @settings(deadline=None, max_examples=80)
 @given(data=st.data())
 def test_a_flipped_bit_in_a_microsd_log_never_passes_unnoticed(tmp_path_factory, data):

@@ -221,6 +221,31 @@ def test_what_is_wrong_is_named_with_its_place(tmp_path, text, message, line):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("block", [150, 1000, 4000])
+def test_a_file_of_many_blocks_is_read_like_one_of_few(tmp_path, monkeypatch, block):
+    monkeypatch.setattr("cfplan.recording.importers.csv_numbers.BLOCK", block)
+    wanted = {"cf1": ("quaternion", poses()), "gate": ("euler", poses(seed=1))}
+    file = write(tmp_path / "log", wanted)
+    for subject in read_log(file).subjects:
+        assert_same(subject, wanted[subject.name][1])
+    file.write_text(file.read_text()[:-60])
+    assert read_log(file).truncated
+    lines = file.read_text().splitlines(keepends=True)
+    lines[30] = lines[30].replace(",0,", ",zero,", 1).replace(".", "!", 1)
+    file.write_text("".join(lines))
+    with pytest.raises(InputError, match="not a number") as caught:
+        read_log(file)
+    assert caught.value.where == f"{file}:31"
+
+
+def test_a_subject_that_stands_twice_is_read_once_and_said(tmp_path):
+    file = write(tmp_path / "log", {"cf1": ("quaternion", poses())})
+    file.write_text(file.read_text() + "\n" + file.read_text())
+    log = read_log(file)
+    assert len(log.subjects) == 1
+    assert "twice" in log.notes[0]
+
+
 def test_a_last_line_that_is_cut_off_ends_the_log_and_is_said(tmp_path):
     file = tmp_path / "log.csv"
     file.write_text(HEAD + "1,0,1,2,3,4,5,6\n2,0,1,2,3,4")

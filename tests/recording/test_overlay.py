@@ -1,30 +1,46 @@
 """Logs laid over plans: found where they were flown, whatever was flown before, unseen, shifted or noisy."""
 
 import dataclasses
+import io
 import json
+import socket
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun_cli
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from rerun.chunk import RrdReader
+from rerun.experimental import ViewerClient
 
 from cfplan.cli import cfplan
 from cfplan.errors import InputError
+from cfplan.geometry.min_snap import min_snap
+from cfplan.planning.files import save_plan
+from cfplan.planning.plan import plan
 from cfplan.recording import layout
 from cfplan.recording.importers.mocap_log import Subject
 from cfplan.recording.overlay import Reference, align, extent, trial_of_record, trial_of_subject
 from cfplan.recording.overlay_view import DASH, dashes, references, stretches, write_overlay
 from cfplan.recording.reader import is_record
 from cfplan.recording.summary import summarise
+from cfplan.safety.limits import load_limits
 
 DURATION = 8.0
+VULKAN = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
 
 
-def path(time):
+def software_vulkan():
+    return any(list(folder.glob("lvp_icd*.json")) for folder in VULKAN)
+
+
+def path(moments):
     """A knot flown once with a smooth begin and end, at rest before and after; (N, 3) m."""
-    x = np.clip(np.asarray(time) / DURATION, 0, 1)
+    x = np.clip(np.asarray(moments) / DURATION, 0, 1)
     angle = 2 * np.pi * (10 * x**3 - 15 * x**4 + 6 * x**5)
     return np.stack([np.sin(2 * angle), 1.5 * np.sin(angle), 1 + 0.3 * np.sin(3 * angle)], axis=-1)
 
@@ -169,15 +185,48 @@ def test_trials_read_back_from_the_recording(tmp_path):
         assert np.isnan(values).sum() == 1  # behind the stretch before the gap
 
 
+@pytest.mark.integration
+@pytest.mark.skipif(not software_vulkan(), reason="no software Vulkan driver (Debian: mesa-vulkan-drivers)")
+def test_every_view_of_an_overlay_renders_without_reports_and_is_not_blank(tmp_path, monkeypatch):
+    monkeypatch.setenv("RERUN_ANALYTICS", "false")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    trials = [trial_of_subject(log(5.0, gaps=((8, 9),)), PLAN, 105.0), trial_of_subject(log(6.0), PLAN, 105.0)]
+    write_overlay(trials, tmp_path / "a.rrd")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    executable = Path(rerun_cli.__file__).with_name("rerun")
+    viewer = ViewerClient.spawn(headless=True, port=port, hide_welcome_screen=True, executable_path=str(executable))
+    try:
+        viewer.open(str(tmp_path / "a.rrd"))
+        deadline = time.monotonic() + 30
+        while viewer.get_state().loading and time.monotonic() < deadline:
+            time.sleep(0.1)
+        viewer.set_time(layout.TIMELINE, duration=4.0)
+        time.sleep(1.0)
+        views = viewer.get_state().views
+        assert {view.name for view in views} == {"Trials", "Deviation, m", "Speed, m/s", "x, m", "y, m", "z, m"}
+        for view in views:
+            assert view.reports == [], view.name
+            image = Image.open(io.BytesIO(viewer.take_screenshot(view.view_id))).convert("RGB")
+            assert len(image.getcolors(maxcolors=1 << 24)) > 20, view.name
+        assert [entry.message for entry in viewer.get_logs() if entry.level == "ERROR"] == []
+    finally:
+        viewer.quit()
+
+
+def write_vicon(file, position):
+    """A subject cf1 at 100 Hz, level."""
+    head = "Objects\n100\n,,Global Angle (Quaternion) cf1:cf1,,,,,,\n"
+    head += "Frame,Sub Frame,RX,RY,RZ,RW,TX,TY,TZ\n,,,,,,mm,mm,mm\n"
+    rows = [f"{i + 1},0,0,0,0,1,{x:.6f},{y:.6f},{z:.6f}\n" for i, (x, y, z) in enumerate(1000 * position)]
+    file.write_text(head + "".join(rows))
+    return file
+
+
 @pytest.fixture
 def vicon(tmp_path):
-    file = tmp_path / "vicon.csv"
-    subject = log(5.0, rate=100.0)
-    lines = ["Objects", "100", ",,Global Angle (Quaternion) cf1:cf1,,,,,,", "Frame,Sub Frame,RX,RY,RZ,RW,TX,TY,TZ"]
-    lines += [",,,,,,mm,mm,mm"]
-    lines += [f"{i + 1},0,0,0,0,1,{x:.6f},{y:.6f},{z:.6f}" for i, (x, y, z) in enumerate(1000 * subject.position)]
-    file.write_text("\n".join(lines) + "\n")
-    return file
+    return write_vicon(tmp_path / "vicon.csv", log(5.0, rate=100.0).position)
 
 
 def run(*arguments):
@@ -190,6 +239,18 @@ def test_replay_lays_a_record_and_a_log_side_by_side(tmp_path, vicon, flight):
     document = json.loads(result.stdout)
     assert [trial["name"] for trial in document["trials"]] == ["cf1", flight.folder.name]
     assert (tmp_path / "a.rrd").stat().st_size > 10_000
+
+
+def test_replay_lays_a_log_over_a_plan_and_prints_the_offset(tmp_path):
+    limits = load_limits(Path(__file__).parents[2] / "safety.yaml")
+    path = min_snap([[-1, -1, 0.8], [0, 0.5, 1.2], [1, -0.5, 0.9]])
+    made = plan(path, limits.airframe, limits, planner="min-snap", nodes=60)
+    save_plan(made, tmp_path / "plan.parquet")
+    moments = np.arange(0, made.trajectory.duration + 6, 0.01)
+    file = write_vicon(tmp_path / "vicon.csv", made.trajectory.at(moments - 3.21).position)
+    result = run("replay", file, "--plan", tmp_path / "plan.parquet", "--save", tmp_path / "a.rrd")
+    assert result.exit_code == 0, result.output
+    assert "offset 3.210 s, 100 % of the plan seen" in result.stdout
 
 
 def test_replay_of_one_record_is_its_own_view(tmp_path, flight):
