@@ -129,6 +129,7 @@ def test_the_vendors_client_gives_no_faulty_pose_either(kind, verdict):
 
 def test_a_delay_makes_poses_old():
     with serve(ViconSettings(), flown) as vicon, opened(vicon.uri) as source:
+        assert until(lambda: source.poses() is not None and source.sees_delays)
         vicon.inject(ViconFault(FaultKind.DELAY, size=0.2))
         gathered(source, 0.4)
         poses = gathered(source, 0.3)

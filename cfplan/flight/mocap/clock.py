@@ -2,24 +2,35 @@
 
 A frame comes late by what the network and the computers add at that moment. Frame numbers count at the cameras' steady
 rate, so the earliest arrival seen lately tells when each number should have come, and what is later than that was
-delayed on its way: its pose is older than it looks.
+delayed on its way: its pose is older than it looks. The rate that a system announces is believed once its numbers were
+seen to count at it.
 """
 
 import math
 
-_WINDOW = 5.0  # s; between one and two of these are remembered, so that clocks may drift apart
+_PROOF = 1.0  # s; over two of these the numbers must count at the announced rate
+_TOLERANCE = 0.003  # of that rate, as the earliest arrivals of both tell
+_WINDOW = 2.0  # s; between one and two of these are remembered, so that clocks may drift apart
 
 
 class FrameClock:
-    """Dates frames back. Without frame numbers or rate, a frame counts as just taken."""
+    """Dates frames back. Without frame numbers or a rate that holds, a frame counts as just taken."""
 
     def __init__(self, latency: float):
         # latency in s from the exposure to this computer where nothing delays it
         self._latency = latency
         self._number: int | None = None
         self._rate = math.nan
+        self._proof: list[float] | None = None
+        # s, the earliest of the first and of the second time of proof; None once the rate is proven
+        self._proof_begin = math.nan
         self._earliest = [math.inf, math.inf]
-        self._window_end = -math.inf
+        self._window_end = math.inf
+
+    @property
+    def sure(self) -> bool:
+        """Whether delays are seen."""
+        return self._number is not None and self._proof is None
 
     def taken(self, received: float, number: int | None, rate: float, latency: float = math.nan) -> float:
         """When the frame was taken, s. `latency` is the system's own figure and counts where it is the larger one."""
@@ -27,10 +38,28 @@ class FrameClock:
         if number is None or not (math.isfinite(rate) and rate > 0):
             return received - behind
         if self._number is None or number < self._number or rate != self._rate:
-            self._earliest, self._window_end = [math.inf, math.inf], received + _WINDOW
+            self._begin(received)
         self._number, self._rate = number, rate
         start = received - number / rate
         if received > self._window_end:
             self._earliest, self._window_end = [start, self._earliest[0]], received + _WINDOW
         self._earliest[0] = min(self._earliest[0], start)
+        if self._proof is not None and not self._proven(received, start):
+            return received - behind
         return min(self._earliest) + number / rate - behind
+
+    def _begin(self, received: float) -> None:
+        self._proof, self._proof_begin = [math.inf, math.inf], received
+        self._earliest, self._window_end = [math.inf, math.inf], received + _WINDOW
+
+    def _proven(self, received: float, start: float) -> bool:
+        assert self._proof is not None
+        half = int((received - self._proof_begin) / _PROOF)
+        if half < 2:
+            self._proof[half] = min(self._proof[half], start)
+            return False
+        if not abs(self._proof[1] - self._proof[0]) < _TOLERANCE * _PROOF:
+            self._begin(received)
+            return False
+        self._proof = None
+        return True

@@ -52,6 +52,11 @@ class MocapSource:
         return self._sorter.counts
 
     @property
+    def sees_delays(self) -> bool:
+        """Whether frames that come late are known to be old; some seconds after opening, where frames bear numbers."""
+        return self._clock.sure
+
+    @property
     def child_id(self) -> int | None:
         """The process in which the driver runs, None where there is none."""
         return self._feed.child_id if self._feed is not None else None

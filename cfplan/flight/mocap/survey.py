@@ -79,7 +79,7 @@ class Survey:
     latency: float
     # s from exposure to sending, as the system says; not a number where it does not
     delay: float
-    # s, the 99th percentile of what the way here added to its shortest; not a number without frame numbers
+    # s, 99th percentile of what the way here added to its shortest; not a number without frame numbers, or too early
     bodies: tuple[BodyReport, ...]
 
 
@@ -106,7 +106,7 @@ class Surveyor:
         last, self._last = self._last, frame
         self._received.append(frame.received)
         taken = self._clock.taken(frame.received, frame.number, frame.rate)
-        if frame.number is not None and math.isfinite(frame.rate):
+        if self._clock.sure:
             self._delays.append(frame.received - taken)
         if last is not None and last.number is not None and frame.number is not None:
             self._missing += max(0, frame.number - last.number - 1)
