@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 import time
+from contextlib import suppress
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -16,14 +17,14 @@ from cfplan.simulation.lab import CLOSE, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SU
 from cfplan.simulation.room import SUBSCRIBE, SUBSCRIPTION_LASTS, MotionCapture, RoomSettings
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
-from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
+from cfplan.simulation.virtual_crazyflie.vehicle import COMMANDER_PERIOD, VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import NULL_PACKET, Port, pack
 from cfplan.simulation.virtual_vicon import VirtualVicon
 from cfplan.simulation.virtual_vicon_faults import ViconFault
 from cfplan.vehicle.airframe import Airframe
 
 _WARM_UP = 200  # ms
-_STEP = 2  # ms between wakes
+_VICON_STEP = 2  # ms between wakes for the virtual Vicon
 _RECORD_PERIOD = 10  # ms
 _MOST_BEHIND = 0.25  # s that a stall may be caught up with; beyond, simulated time is lost
 _SILENCE = 2.0  # s after which a client has gone
@@ -80,8 +81,7 @@ class LabLoop:
         sources: list[int] = [self.link.fileno(), self.poses.fileno(), control.fileno()]
         self._origin = time.monotonic() - self.vehicle.tick / 1000
         while os.getppid() == parent:
-            due = min(self._origin + (self.vehicle.tick + _STEP) / 1000, self.capture.next_due)
-            wait = max(0.0, due - time.monotonic())
+            wait = max(0.0, self._due() - time.monotonic())
             readable = select.select(sources, [], [], wait)[0]
             self._catch_up()
             if sources[0] in readable:
@@ -90,6 +90,15 @@ class LabLoop:
                 self._read_subscriptions()
             if sources[2] in readable and not self._obey(control):
                 return
+
+    def _due(self) -> float:
+        """When something happens next that is seen outside; whatever comes in wakes it besides."""
+        tick = self.vehicle.tick
+        if self.vicon is not None:
+            return min(self._origin + (tick + _VICON_STEP) / 1000, self.capture.next_due)
+        boundary = -(-tick // COMMANDER_PERIOD) * COMMANDER_PERIOD
+        after = min(boundary, self.capture.next_tick) + 1
+        return min(self._origin + after / 1000, self.capture.next_due)
 
     def _catch_up(self) -> None:
         now = time.monotonic()
@@ -193,8 +202,16 @@ def serve(control: Connection) -> None:
         loop.vicon = VirtualVicon(room.vicon, time.monotonic())
     gc.collect()
     gc.freeze()
+    _take_priority()
     control.send((loop.port, loop.vicon.port if loop.vicon is not None else None))
     loop.run(control)
+
+
+def _take_priority() -> None:
+    """Be on time on a busy computer, where permitted: it stands for hardware, which would not wait either."""
+    if hasattr(os, "sched_setscheduler"):
+        with suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
 
 
 def main() -> None:
