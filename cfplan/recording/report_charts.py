@@ -17,6 +17,7 @@ from cfplan.recording.plots import LIMIT, Colour
 WIDTH, HEIGHT = 560, 250  # of a chart, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 46, 34  # around what is drawn
 LIGHTEST = 0.55  # of a colour's luminance on white paper; lighter ones are darkened to it
+NARROWEST = 1.0  # m across a chart of places, or millimetres of noise would fill it
 COLUMNS = 400  # pixels, across which points are told apart
 _LETTER = 6.2  # width of one, about
 _GRID, _TEXT, _BAND = "#e3e3e3", "#444", "#f3f6fb"
@@ -72,6 +73,8 @@ def place_chart(title: str, curves: Sequence[Curve], axes: tuple[str, str]) -> s
     """Curves in m over m, both axes to the same scale."""
     x, y = _span([curve.x for curve in curves]), _span([curve.y for curve in curves])
     (left, right), (low, high) = _padded(*x), _padded(*y)
+    narrow = max(NARROWEST - (right - left), 0.0) / 2
+    left, right = left - narrow, right + narrow
     across = WIDTH - LEFT - RIGHT
     tall = min(max((high - low) / (right - left) * across, 60.0), 420.0)
     height = tall + TOP + BOTTOM
