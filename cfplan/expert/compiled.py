@@ -19,9 +19,9 @@ from pathlib import Path as FilePath
 import casadi
 
 from cfplan.expert import stage
-from cfplan.vehicle import flatness
+from cfplan.vehicle import airframe, flatness
 
-COMPILER_OPTIONS = ("-O2", "-fPIC", "-shared")
+COMPILER_OPTIONS = ("-O2", "-fno-math-errno", "-fPIC", "-shared")
 COMPILE_TIMEOUT = 120.0
 # s
 
@@ -83,8 +83,8 @@ def _interpreted() -> Mapping[str, casadi.Function]:
 
 
 def _key() -> str:
-    sources = [FilePath(module.__file__).read_bytes() for module in (stage, flatness) if module.__file__]
-    machine = f"{casadi.__version__} {platform.platform()} {platform.machine()} {COMPILER_OPTIONS}"
+    sources = [FilePath(module.__file__).read_bytes() for module in (stage, flatness, airframe) if module.__file__]
+    machine = f"{casadi.CasadiMeta.version()} {platform.platform()} {platform.machine()} {COMPILER_OPTIONS}"
     return hashlib.sha256(b"".join([*sources, machine.encode()])).hexdigest()[:20]
 
 

@@ -14,7 +14,7 @@ WIDTH = 2.0
 # intervals over which it is smoothed
 
 
-def guess_profile(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int, ceiling: float) -> NDArray:
+def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int, ceiling: float) -> NDArray:
     """(N+3,) coefficients of a cubic B-spline on the grid: h where it is taken to change slowly.
 
     With h' = 0 each limit alone gives a bound on h: |v|² = h|γ'|², |a| = h|γ''|, and with the thrust axis about

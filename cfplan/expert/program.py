@@ -1,4 +1,4 @@
-"""The nonlinear program of a speed profile: sparse structure, derivatives and solvers, built once a shape.
+"""The nonlinear program of a speed profile: sparse structure and derivatives, built once a shape.
 
 Variables in the order that fatrop wants: (state, control) of each interval, then the last state. Every cost and
 constraint belongs to one interval, because the state at its right end follows from its own variables. Derivatives
@@ -22,8 +22,8 @@ DYNAMICS_FREE[:3, [0, 1, 2, 5]] = DYNAMICS_GIVEN
 DYNAMICS_FREE[3, [3, 4, 6]] = 1, 1, 1 / 2
 DYNAMICS_FREE[4, [4, 6]] = 1, 1
 
-ALL_ROWS = tuple(range(stage.ROWS))
-THRUST_ROWS = tuple(range(stage.ROWS))[stage.THRUSTS]
+OBJECTIVE_SCALE = 1000.0
+# of the cost in seconds, so that multipliers are about 1, where fatrop starts them
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,12 +32,14 @@ class Shape:
 
     nodes: int
     free_yaw: bool
+    turning_limited: bool = False
+    # whether angular acceleration has a limit of its own
     end_intervals: int = 3
     # intervals at each end with points inside
-    end_places: tuple[float, ...] = (0.08, 0.2, 0.33, 0.5, 0.67, 0.8, 0.92)
+    end_places: tuple[float, ...] = (0.2, 0.5, 0.8)
     middle_places: tuple[float, ...] = (0.5,)
     # points inside every other interval
-    speed_places: tuple[float, ...] = (0.25, 0.5, 0.75)
+    speed_places: tuple[float, ...] = (0.5,)
     # where the speed limit holds besides the nodes
 
 
@@ -51,9 +53,9 @@ class Layout:
     place: NDArray = field(init=False)
     # (P,) in its interval, 0 to 1
     weight: NDArray = field(init=False)
-    # (P,) quadrature of the penalties, in intervals
+    # (P,) of the penalties: 1 at the left end of an interval, else 0
     selected: NDArray = field(init=False)
-    # (G,) entry of the (8, P) rows, column by column, that each nonlinear constraint takes
+    # (G,) entry of the (ROWS, P) rows, column by column, that each nonlinear constraint takes
     dynamics_rows: NDArray = field(init=False)
     # (N, nx) in the constraint vector
     point_rows: NDArray = field(init=False)
@@ -65,20 +67,20 @@ class Layout:
 
     def __post_init__(self) -> None:
         shape = self.shape
-        interval, place, weight, selected = [], [], [], []
+        interval: list[int] = []
+        place, weight, selected = [], [], []
         dynamics_rows, point_rows, speed_rows, counts = [], [], [], []
         row = 0
         states = self.states
+        every = [r for r in range(stage.ROWS) if shape.turning_limited or r != stage.ANGULAR_ACCELERATION]
+        jumping = [r for r in every if r in stage.JUMPING]
         for k in range(shape.nodes):
             at_end = k < shape.end_intervals or k >= shape.nodes - shape.end_intervals
             inside = shape.end_places if at_end else shape.middle_places
             last = k == shape.nodes - 1
-            points = [(0.0, ALL_ROWS), *((p, ALL_ROWS) for p in inside), (1.0, ALL_ROWS if last else THRUST_ROWS)]
+            points = [(0.0, every), *((p, every) for p in inside), (1.0, every if last else jumping)]
             places = np.array([p for p, _ in points])
-            gaps = np.diff(places)
-            weights = np.zeros(len(places))
-            weights[:-1] += gaps / 2
-            weights[1:] += gaps / 2
+            weights = (places == 0.0) * 1.0  # penalties count once an interval
             dynamics_rows.append(np.arange(row, row + states))
             row += states
             start = row
@@ -151,22 +153,26 @@ class Program:
         point_z = z[:, [int(k) for k in layout.interval]]
         data = casadi.reshape(p[: count * stage.POINT_DATA], stage.POINT_DATA, count)
         common = p[count * stage.POINT_DATA : count * stage.POINT_DATA + stage.COMMON_DATA]
-        inputs = [point_z, data, casadi.repmat(common, 1, count), casadi.repmat(p[-3:], 1, count)]
-        second = 1 / casadi.sqrt(common[14])  # of time in node units
+        weights = OBJECTIVE_SCALE * p[-3:]
+        inputs = [point_z, data, casadi.repmat(common, 1, count), casadi.repmat(weights, 1, count)]
+        second = OBJECTIVE_SCALE / casadi.sqrt(common[14])  # of time in node units
+
+        left = [int(i) for i in np.flatnonzero(layout.weight)]
+        left_inputs = [z, data[:, left], casadi.repmat(common, 1, n), casadi.repmat(weights, 1, n)]
 
         linear = self._linear()
         to_gradient = _scatter(layout.interval[:, None] * block + np.arange(block), layout.variables)
-        time_gradient_to = _scatter(np.arange(n)[:, None] * block + np.arange(block), layout.variables)
+        interval_to_gradient = _scatter(np.arange(n)[:, None] * block + np.arange(block), layout.variables)
 
         # values
         time = casadi.sum2(self._call("time", n, [z]))
-        f = second * time + casadi.sum2(self._call("penalty", count, inputs))
+        f = second * time + casadi.sum2(self._call("penalty", n, left_inputs))
         rows = casadi.vec(self._call("rows", count, inputs))
         g = self._constraints(rows, linear, x)
 
         # first derivatives
-        gradient_f = casadi.mtimes(to_gradient, casadi.vec(self._call("penalty_gradient", count, inputs)))
-        gradient_f += second * casadi.mtimes(time_gradient_to, casadi.vec(self._call("time_gradient", n, [z])))
+        gradient_f = casadi.mtimes(interval_to_gradient, casadi.vec(self._call("penalty_gradient", n, left_inputs)))
+        gradient_f += second * casadi.mtimes(interval_to_gradient, casadi.vec(self._call("time_gradient", n, [z])))
         rows_again, blocks = self._call("jacobian", count, inputs)
         jacobian = self._jacobian(blocks, linear)
 
@@ -182,7 +188,7 @@ class Program:
         )
         time_gradient, time_hessian = self._call("time_hessian", n, [z])
         gradient_l = casadi.mtimes(to_gradient, casadi.vec(point_gradient)) + casadi.mtimes(linear.T, multipliers)
-        gradient_l += factor * second * casadi.mtimes(time_gradient_to, casadi.vec(time_gradient))
+        gradient_l += factor * second * casadi.mtimes(interval_to_gradient, casadi.vec(time_gradient))
         hessian = self._hessian(point_hessian, factor * second * time_hessian)
 
         names = (["x", "p"], ["lam_f", "lam_g"])
@@ -284,45 +290,3 @@ def _sparse(values: casadi.MX, entries: NDArray, rows: NDArray, cols: NDArray, m
 def program(shape: Shape, chosen: Backend | None = None) -> Program:
     """The program of a shape, made once a process."""
     return Program(shape, chosen)
-
-
-QUIET = {"print_time": False, "show_eval_warnings": False, "calc_lam_p": False, "error_on_fail": False}
-
-
-@lru_cache(maxsize=32)
-def fatrop_solver(
-    shape: Shape, chosen: Backend | None = None, max_iterations: int = 300, extra=None, top=None
-) -> casadi.Function:
-    """Fatrop on the program of a shape."""
-    p = program(shape, chosen)
-    n, layout = shape.nodes, p.layout
-    options = {
-        **QUIET,
-        "structure_detection": "manual",
-        "N": n,
-        "nx": [layout.states] * (n + 1),
-        "nu": [layout.controls] * n + [0],
-        "ng": list(layout.counts),
-        "equality": _equality(layout),
-        "fatrop": {"print_level": 0, "max_iter": max_iterations, "tol": 1e-5},
-        "cache": {f.name(): f for f in (p.f, p.g, p.gradient_only, p.jacobian, p.hessian, p.multipliers)},
-    }
-    return casadi.nlpsol("expert", "fatrop", p.nlp, options)
-
-
-@lru_cache(maxsize=32)
-def ipopt_solver(shape: Shape, chosen: Backend | None = None, max_iterations: int = 500) -> casadi.Function:
-    """IPOPT on the program of a shape."""
-    p = program(shape, chosen)
-    options = {
-        **QUIET,
-        "ipopt": {"print_level": 0, "sb": "yes", "max_iter": max_iterations, "tol": 1e-5},
-        "cache": {f.name(): f for f in (p.f, p.g, p.gradient, p.jacobian, p.upper_hessian, p.multipliers)},
-    }
-    return casadi.nlpsol("expert", "ipopt", p.nlp, options)
-
-
-def _equality(layout: Layout) -> list[bool]:
-    equality = np.zeros(layout.constraints, dtype=bool)
-    equality[layout.dynamics_rows] = True
-    return [bool(e) for e in equality]

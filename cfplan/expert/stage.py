@@ -11,6 +11,7 @@ Path, airframe and limits are arguments, so the same compiled functions serve ev
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi
 import numpy as np
@@ -18,17 +19,19 @@ from numpy.typing import NDArray
 
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.flatness import flat_state
+from cfplan.vehicle.flatness import Flat, Vector, flat_state
 
 # Rows of the constraint vector; each is scaled so that the limit is 1 (thrusts: -1 to 1).
-ACCELERATION, ANGULAR_VELOCITY, TILT, SPECIFIC_THRUST = range(4)
-THRUSTS = slice(4, 8)
-ROWS = 8
-LOWER = np.array([-np.inf, -np.inf, -np.inf, 1.0, -1.0, -1.0, -1.0, -1.0])
-UPPER = np.array([1.0, 1.0, 1.0, np.inf, 1.0, 1.0, 1.0, 1.0])
+ACCELERATION, ANGULAR_VELOCITY, TILT, SPECIFIC_THRUST, ANGULAR_ACCELERATION = range(5)
+THRUSTS = slice(5, 9)
+ROWS = 9
+JUMPING = (ANGULAR_ACCELERATION, 5, 6, 7, 8)  # rows that jump with the controls, from interval to interval
+LOWER = np.array([-np.inf, -np.inf, -np.inf, 1.0, -np.inf, -1.0, -1.0, -1.0, -1.0])
+UPPER = np.array([1.0, 1.0, 1.0, np.inf, 1.0, 1.0, 1.0, 1.0, 1.0])
 
 POINT_DATA = 17  # γ' to γ'''' (12), place in the interval 0 to 1, weight of the penalties, ψ, ψ', ψ''
-COMMON_DATA = 15
+COMMON_DATA = 16
+UNBOUNDED = 1e4  # rad/s², stands for no limit of angular acceleration
 
 # Gauss-Legendre places and weights on [0, 1], for the time spent in an interval.
 GAUSS_PLACES = 0.5 + np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6)
@@ -49,13 +52,29 @@ class Penalties:
 
 def common_data(airframe: Airframe, limits: PlanLimits, scale: float) -> NDArray:
     """(COMMON_DATA,) what is the same at every point; `scale` turns x into h in node units."""
-    middle = 0.5 * (limits.motor_thrust_max + limits.motor_thrust_min)
-    half = 0.5 * (limits.motor_thrust_max - limits.motor_thrust_min)
     return np.array([
         airframe.mass, *airframe.inertia, airframe.arm, airframe.thrust_to_torque, *airframe.drag,
-        limits.acceleration, limits.angular_velocity, np.cos(limits.tilt), limits.specific_thrust_min, middle, half,
-        scale,
+        limits.acceleration, limits.angular_velocity, limits.tilt, limits.specific_thrust_min,
+        limits.motor_thrust_min, limits.motor_thrust_max, scale, min(limits.angular_acceleration, UNBOUNDED),
     ])  # fmt: skip
+
+
+def rows(flat: Flat, limits: PlanLimits, cos: Any) -> list[Any]:
+    """What UPPER and LOWER bound, in the order of the names above; of numpy arrays or CasADi symbols."""
+    middle = 0.5 * (limits.motor_thrust_max + limits.motor_thrust_min)
+    half = 0.5 * (limits.motor_thrust_max - limits.motor_thrust_min)
+    return [
+        _squared(flat.acceleration) / limits.acceleration**2,
+        _squared(flat.body_rate) / limits.angular_velocity**2,
+        (1 - flat.thrust_axis[2]) / (1 - cos(limits.tilt)),
+        flat.specific_thrust / limits.specific_thrust_min,
+        _squared(flat.angular_acceleration) / limits.angular_acceleration**2,
+        *((thrust - middle) / half for thrust in flat.motor_thrust),
+    ]
+
+
+def _squared(vector: Vector) -> Any:
+    return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
 
 def local_variables(z: casadi.SX, free_yaw: bool, place: casadi.SX) -> tuple[list[casadi.SX], list[casadi.SX]]:
@@ -79,33 +98,34 @@ def point_expressions(free_yaw: bool) -> tuple[list[casadi.SX], casadi.SX, casad
     common = casadi.SX.sym("common", COMMON_DATA)
     weights = casadi.SX.sym("weights", 3)
 
-    (mass, jx, jy, jz, arm, thrust_to_torque, drag, axial_drag, acceleration, angular_velocity, cos_tilt,
-     specific_thrust_min, middle, half, scale) = casadi.vertsplit(common)  # fmt: skip
-    airframe = Airframe("symbolic", mass, (jx, jy, jz), arm, thrust_to_torque, 0.0, 0.0, 0.0, (drag, axial_drag), "")
-    entries = casadi.vertsplit(point)
-    derivatives = tuple(tuple(entries[3 * k : 3 * k + 3]) for k in range(4))
+    (mass, jx, jy, jz, arm, thrust_to_torque, drag, axial_drag, acceleration, angular_velocity, tilt,
+     specific_thrust_min, thrust_min, thrust_max, scale, angular_acceleration) = _entries(common)  # fmt: skip
+    zero: Any = casadi.SX(0)
+    airframe = Airframe(
+        "symbolic", mass, (jx, jy, jz), arm, thrust_to_torque, zero, zero, zero, (drag, axial_drag), ""
+    )
+    limits = PlanLimits(
+        speed=zero, acceleration=acceleration, angular_velocity=angular_velocity, tilt=tilt,
+        motor_thrust_min=thrust_min, motor_thrust_max=thrust_max, specific_thrust_min=specific_thrust_min,
+        angular_acceleration=angular_acceleration,
+    )  # fmt: skip
+    entries = _entries(point)
+    derivatives: Any = tuple(tuple(entries[3 * k : 3 * k + 3]) for k in range(4))
     place, weight = entries[12:14]
     x, yaw = local_variables(z, free_yaw, place)
-    h = tuple(scale * value for value in x)
-    flat = flat_state(
-        airframe, derivatives, h, tuple(yaw) if free_yaw else tuple(entries[14:17]), casadi.cos, casadi.sin
-    )
+    h: Any = tuple(scale * value for value in x)
+    turn: Any = tuple(yaw if free_yaw else entries[14:17])
+    flat = flat_state(airframe, derivatives, h, turn, casadi.cos, casadi.sin)
 
-    def squared(vector):
-        return sum(component * component for component in vector)
-
-    rows = [
-        squared(flat.acceleration) / acceleration**2,
-        squared(flat.body_rate) / angular_velocity**2,
-        (1 - flat.thrust_axis[2]) / (1 - cos_tilt),
-        flat.specific_thrust / specific_thrust_min,
-        *((thrust - middle) / half for thrust in flat.motor_thrust),
-    ]
-    penalty = weights[0] * squared(flat.angular_acceleration)
+    penalty = weights[0] * _squared(flat.angular_acceleration)
     if free_yaw:
         penalty += weights[1] * h[0] * yaw[1] ** 2
     penalty = penalty / casadi.sqrt(h[0]) + weights[2] * (x[3] / x[0]) ** 2
-    return [z, point, common, weights], casadi.vertcat(*rows), weight * penalty
+    return [z, point, common, weights], casadi.vertcat(*rows(flat, limits, casadi.cos)), weight * penalty
+
+
+def _entries(vector: casadi.SX) -> list[Any]:
+    return casadi.vertsplit(vector)
 
 
 def variables(free_yaw: bool) -> int:
@@ -120,12 +140,12 @@ def family(free_yaw: bool) -> str:
 
 def point_functions(free_yaw: bool) -> list[casadi.Function]:
     """Values, first and second derivatives at a point; and those of the time spent in an interval."""
-    inputs, rows, penalty = point_expressions(free_yaw)
+    inputs, bounded, penalty = point_expressions(free_yaw)
     z = inputs[0]
     name = family(free_yaw)
     multipliers = casadi.SX.sym("multipliers", ROWS)
     factor = casadi.SX.sym("factor")
-    lagrangian = factor * penalty + casadi.dot(multipliers, rows)
+    lagrangian = factor * penalty + casadi.dot(multipliers, bounded)
     hessian, gradient = casadi.hessian(lagrangian, z)
 
     def function(title: str, arguments: list[casadi.SX], results: list[casadi.SX]) -> casadi.Function:
@@ -135,10 +155,10 @@ def point_functions(free_yaw: bool) -> list[casadi.Function]:
     time = sum(w / casadi.sqrt(value) for w, value in zip(GAUSS_WEIGHTS, h, strict=True))
     time_hessian, time_gradient = casadi.hessian(time, z)
     return [
-        function("rows", inputs, [rows]),
+        function("rows", inputs, [bounded]),
         function("penalty", inputs, [penalty]),
         function("penalty_gradient", inputs, [casadi.gradient(penalty, z)]),
-        function("jacobian", inputs, [rows, casadi.jacobian(rows, z)]),
+        function("jacobian", inputs, [bounded, casadi.jacobian(bounded, z)]),
         function("hessian", [*inputs, multipliers, factor], [gradient, hessian]),
         function("time", [z], [time]),
         function("time_gradient", [z], [time_gradient]),

@@ -1,0 +1,225 @@
+"""The numbers of one problem: path and limits into parameters and bounds, and a solution back into a profile."""
+
+import math
+from dataclasses import astuple, dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.expert import stage
+from cfplan.expert.between import SPEED, Excess, spread
+from cfplan.expert.guess import guess_spline
+from cfplan.expert.program import Layout
+from cfplan.expert.yaw_track import YawTrack
+from cfplan.geometry.path import Path
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.profile import BoundaryState, SpeedProfile
+
+MARGIN = 1e-3
+# share by which limits are tightened, for what happens between points
+FADE = 5
+# intervals over which that margin grows from nothing, next to a boundary state that may lie at a limit
+CEILING = 20.0
+# h at most, where the path nearly stands still, in squares of the speed limit
+FLOOR = 1e-4
+# h at least, likewise
+REST = 1e-9
+# |γ'| below which a path stands still
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """As the solvers take it; see Layout for the order of variables and constraints."""
+
+    layout: Layout
+    unit: float
+    # h where x is 1
+    step: float
+    # of s, an interval
+    x0: NDArray
+    p: NDArray
+    lbx: NDArray
+    ubx: NDArray
+    lbg: NDArray
+    ubg: NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Ends:
+    """Boundary states, None where the end is free."""
+
+    start: BoundaryState | None
+    end: BoundaryState | None
+
+
+def rests(path: Path, s: float) -> bool:
+    """Whether the path stands still there, whatever h is."""
+    return bool(np.linalg.norm(path(s, 1)) < REST)
+
+
+def pose(
+    layout: Layout,
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    track: YawTrack,
+    yaw_angle: float,
+    ends: Ends,
+    penalties: stage.Penalties,
+) -> Problem:
+    """The problem of a path. Where yaw is free its first value lies from `yaw_angle` to a quarter turn more."""
+    nodes = layout.shape.nodes
+    step, unit = path.end / nodes, limits.speed**2
+    p = _parameters(layout, path, airframe, limits, track, penalties, unit, step)
+    margin = _margin(nodes, ends)
+    lbx, ubx = _variable_bounds(layout, path, limits, unit, step, margin)
+    lbg, ubg = _constraint_bounds(layout, path, limits, unit, step, margin, ends)
+    x0 = _start(layout, guess_spline(path, airframe, limits, nodes, CEILING * unit) / unit)
+    if layout.shape.free_yaw:
+        lbx[3], ubx[3] = yaw_angle, yaw_angle + math.pi / 2
+        x0[np.arange(nodes + 1) * layout.block + 3] = ends.start.yaw if ends.start else yaw_angle + math.pi / 4
+    for variable, value in _held(layout, path, ends, unit, step):
+        lbx[variable] = ubx[variable] = x0[variable] = value
+    return Problem(layout, unit, step, x0, p, lbx, ubx, lbg, ubg)
+
+
+def tightened(problem: Problem, excess: Excess) -> Problem:
+    """The problem with limits lowered, in each interval that exceeds one between the points, by what it exceeds."""
+    layout = problem.layout
+    upper, lower = spread(excess.upper), spread(excess.lower)
+    lbg, ubg, ubx = problem.lbg.copy(), problem.ubg.copy(), problem.ubx.copy()
+    point, row = np.divmod(layout.selected, stage.ROWS)
+    interval = layout.interval[point]
+    ubg[layout.point_rows] -= np.maximum(upper[interval, row], 0.0)
+    lbg[layout.point_rows] += np.maximum(lower[interval, row], 0.0)
+    slower = 1.0 - np.maximum(upper[:, SPEED], 0.0)
+    ubg[layout.speed_rows] *= slower[:, None]
+    first = np.arange(layout.shape.nodes + 1) * layout.block
+    free = problem.lbx[first] < ubx[first]
+    around = np.minimum(np.append(slower, 1.0), np.append(1.0, slower))
+    ubx[first] *= np.where(free, around, 1.0)
+    return replace(problem, lbg=lbg, ubg=ubg, ubx=ubx)
+
+
+def profile_of(x: NDArray, problem: Problem, track: YawTrack, end: float) -> SpeedProfile:
+    """The solution as a profile, continuous to the last digit: through the splines whose coefficients it implies."""
+    layout, step, unit = problem.layout, problem.step, problem.unit
+    nodes, block = layout.shape.nodes, layout.block
+    table = np.append(x, np.zeros(layout.controls)).reshape(nodes + 1, block)
+    h, dh, ddh = table[:, 0], table[:, 1], table[:, 2]
+    inner = h - ddh / 6
+    cubic = np.concatenate([[inner[1] - 2 * dh[0]], inner, [inner[-2] + 2 * dh[-1]]])
+    grid = {
+        "s": np.linspace(0.0, end, nodes + 1),
+        "h": (cubic[:-2] + 4 * cubic[1:-1] + cubic[2:]) / 6 * unit,
+        "dh": (cubic[2:] - cubic[:-2]) / 2 * unit / step,
+        "ddh": np.diff(cubic, 2) * unit / step**2,
+        "dddh": np.diff(cubic, 3) * unit / step**3,
+    }
+    if not layout.shape.free_yaw:
+        return SpeedProfile(**grid, yaw=track.yaw, dyaw=track.dyaw, ddyaw=track.ddyaw)
+    psi, dpsi = table[:, 3], table[:, 4]
+    quadratic = np.append(psi - dpsi / 2, psi[-1] + dpsi[-1] / 2)
+    return SpeedProfile(
+        **grid,
+        yaw=(quadratic[:-1] + quadratic[1:]) / 2,
+        dyaw=np.diff(quadratic) / step,
+        ddyaw=np.diff(quadratic, 2) / step**2,
+    )
+
+
+def _parameters(
+    layout: Layout,
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    track: YawTrack,
+    penalties: stage.Penalties,
+    unit: float,
+    step: float,
+) -> NDArray:
+    data = np.zeros((len(layout.interval), stage.POINT_DATA))
+    s = (layout.interval + layout.place) * step
+    for order in (1, 2, 3, 4):
+        data[:, 3 * order - 3 : 3 * order] = path(s, order) * step**order
+    data[:, 12], data[:, 13] = layout.place, layout.weight
+    psi, psi_ds, psi_dds = track.at(layout.interval, layout.place, step)
+    data[:, 14], data[:, 15], data[:, 16] = psi, psi_ds * step, psi_dds * step**2
+    common = stage.common_data(airframe, limits, unit / step**2)
+    return np.concatenate([data.ravel(), common, astuple(penalties)])
+
+
+def _margin(nodes: int, ends: Ends) -> NDArray:
+    """(N,) share of tightening in each interval."""
+    fade = np.ones(nodes)
+    distance = np.arange(nodes) + 0.5
+    if ends.start:
+        fade = np.minimum(fade, (distance - 1.5) / FADE)
+    if ends.end:
+        fade = np.minimum(fade, (nodes - distance - 1.5) / FADE)
+    return MARGIN * np.clip(fade, 0.0, 1.0)
+
+
+def _highest(path: Path, limits: PlanLimits, s: NDArray, margin: NDArray, unit: float) -> NDArray:
+    """x where the speed limit is reached."""
+    nominal = np.maximum(np.linalg.norm(path(s, 1), axis=-1), REST)
+    return np.minimum(((1 - margin) * limits.speed / nominal) ** 2 / unit, CEILING)
+
+
+def _variable_bounds(
+    layout: Layout, path: Path, limits: PlanLimits, unit: float, step: float, margin: NDArray
+) -> tuple[NDArray, NDArray]:
+    nodes = layout.shape.nodes
+    first = np.arange(nodes + 1) * layout.block
+    lbx, ubx = np.full(layout.variables, -np.inf), np.full(layout.variables, np.inf)
+    lbx[first] = FLOOR
+    ubx[first] = _highest(path, limits, np.arange(nodes + 1) * step, np.append(margin, margin[-1]), unit)
+    return lbx, ubx
+
+
+def _constraint_bounds(
+    layout: Layout, path: Path, limits: PlanLimits, unit: float, step: float, margin: NDArray, ends: Ends
+) -> tuple[NDArray, NDArray]:
+    lbg, ubg = np.zeros(layout.constraints), np.zeros(layout.constraints)
+    point, row = np.divmod(layout.selected, stage.ROWS)
+    interval, place = layout.interval[point], layout.place[point]
+    tighter = 2 * margin[interval]  # most rows are squares
+    # What a boundary state alone decides was checked before, and may be at its limit.
+    decided = np.isin(row, stage.JUMPING, invert=True)
+    at_start = (interval == 0) & (place == 0.0) & (ends.start is not None)
+    at_end = (interval == layout.shape.nodes - 1) & (place == 1.0) & (ends.end is not None)
+    tighter = np.where(decided & (at_start | at_end), -0.1, tighter)
+    lbg[layout.point_rows] = stage.LOWER[row] + tighter
+    ubg[layout.point_rows] = stage.UPPER[row] - tighter
+    s = (np.arange(layout.shape.nodes)[:, None] + np.array(layout.shape.speed_places)) * step
+    lbg[layout.speed_rows] = FLOOR
+    ubg[layout.speed_rows] = _highest(path, limits, s, margin[:, None], unit)
+    return lbg, ubg
+
+
+def _start(layout: Layout, spline: NDArray) -> NDArray:
+    """Variables that follow a cubic B-spline with these coefficients, so the dynamics hold from the start."""
+    first = np.arange(layout.shape.nodes + 1) * layout.block
+    x0 = np.zeros(layout.variables)
+    x0[first] = (spline[:-2] + 4 * spline[1:-1] + spline[2:]) / 6
+    x0[first + 1] = (spline[2:] - spline[:-2]) / 2
+    x0[first + 2] = np.diff(spline, 2)
+    x0[first[:-1] + layout.states] = np.diff(spline, 3)
+    return x0
+
+
+def _held(layout: Layout, path: Path, ends: Ends, unit: float, step: float) -> list[tuple[int, float]]:
+    """Variables that have one value: boundary states, and at rest ends the derivatives of h and the yaw rate."""
+    nodes, block, states, free_yaw = layout.shape.nodes, layout.block, layout.states, layout.shape.free_yaw
+    held: list[tuple[int, float]] = []
+    for boundary, node, interval in ((ends.start, 0, 0), (ends.end, nodes, nodes - 1)):
+        at = node * block
+        if boundary:
+            held += [(at, boundary.h / unit), (at + 1, boundary.dh * step / unit)]
+            held += [(at + 2, boundary.ddh * step**2 / unit)]
+            held += [(at + 3, boundary.yaw), (at + 4, boundary.dyaw * step)] if free_yaw else []
+        elif rests(path, node * step):
+            held += [(interval * block + k, 0.0) for k in (1, 2, states)]
+            held += [(at + 4, 0.0)] if free_yaw else []
+    return held
