@@ -138,12 +138,31 @@ def align(subject: Subject, reference: Reference) -> Alignment:
     time, position = subject.time[subject.seen], subject.position[subject.seen]
     if len(time) < 2 or time[-1] - time[0] < 2 * STEP:
         raise InputError("seen for too short a time to be laid over a plan", where=subject.name)
+    guess, left_over = _on_grid(time, position, reference)
+    offset = _closely(guess, time, position, reference)
+    difference = position - reference.at(time - offset)
+    difference = difference[np.isfinite(difference[:, 0])]
+    if len(difference) == 0:
+        raise InputError("not seen while the plan was flown", where=subject.name)
+    distance = np.linalg.norm(difference, axis=1)
+    x, y, z = (float(value) for value in difference.mean(axis=0))
+    return Alignment(
+        offset=offset,
+        covered=float(np.mean(_near(reference.time + offset, time))),
+        aside=(x, y, z),
+        max_deviation=float(distance.max()),
+        rms_deviation=float(np.sqrt(np.mean(distance**2))),
+        alike=left_over <= _ALIKE,
+    )
+
+
+def _on_grid(time: NDArray, position: NDArray, reference: Reference) -> tuple[float, float]:
+    """The best offset in steps of STEP, and what share of the plan's own variance is then left between log and plan."""
     centre = reference.position.mean(axis=0)
     plan_grid = np.arange(0.0, reference.time[-1] + STEP / 2, STEP)
     plan = np.stack([np.interp(plan_grid, reference.time, axis) for axis in (reference.position - centre).T], axis=1)
-    spread = float(np.mean(np.sum((plan - plan.mean(axis=0)) ** 2, axis=1)))
-    log_grid = np.arange(time[0], time[-1], STEP)
-    log, weight = _resampled(log_grid, time, position - centre)
+    spread = float(np.sum(np.var(plan, axis=0)))
+    log, weight = _resampled(np.arange(time[0], time[-1], STEP), time, position - centre)
 
     # Sums over the plan's samples for every shift: of weights, of both, of their squares and of their product.
     ones = np.ones(len(plan))
@@ -159,35 +178,27 @@ def align(subject: Subject, reference: Reference) -> Alignment:
     covered = np.clip(count / len(plan), 0, 1)
     cost = covered * variance + (1 - covered) * spread
     best = int(np.argmin(cost))
-    guess = float(time[0] + (best - (len(plan) - 1)) * STEP)
+    left_over = float(cost[best]) / spread if spread > 0 else np.inf
+    return float(time[0] + (best - (len(plan) - 1)) * STEP), left_over
 
-    # What part of the plan is seen changes with the offset and draws it by a few steps: near it, that part is kept.
+
+def _closely(guess: float, time: NDArray, position: NDArray, reference: Reference) -> float:
+    """The offset near a guess at which the difference of log and plan varies least.
+
+    What part of the plan is seen changes with the offset and draws the guess by a few steps: here that part is kept.
+    """
     moments = reference.time + guess
     fixed = _near(moments - NEARBY, time) & _near(moments + NEARBY, time)
+    if np.count_nonzero(fixed) < 3:
+        return guess
 
     def varies(offset: float) -> float:
         at = np.stack([np.interp(reference.time[fixed] + offset, time, axis) for axis in position.T], axis=1)
         return float(np.sum(np.var(at - reference.position[fixed], axis=0)))
 
-    offset = guess
-    if np.count_nonzero(fixed) > 2:
-        offset = min(guess + np.arange(-NEARBY, NEARBY, STEP), key=varies)
-        bounds = (offset - STEP, offset + STEP)
-        offset = float(minimize_scalar(varies, bounds=bounds, method="bounded", options={"xatol": 1e-7}).x)
-    difference = position - reference.at(time - offset)
-    difference = difference[np.isfinite(difference[:, 0])]
-    if len(difference) == 0:
-        raise InputError("not seen while the plan was flown", where=subject.name)
-    distance = np.linalg.norm(difference, axis=1)
-    x, y, z = (float(value) for value in difference.mean(axis=0))
-    return Alignment(
-        offset=offset,
-        covered=float(np.mean(_near(reference.time + offset, time))),
-        aside=(x, y, z),
-        max_deviation=float(distance.max()),
-        rms_deviation=float(np.sqrt(np.mean(distance**2))),
-        alike=bool(cost[best] <= _ALIKE * spread),
-    )
+    nearest = min(guess + np.arange(-NEARBY, NEARBY, STEP), key=varies)
+    bounds = (nearest - STEP, nearest + STEP)
+    return float(minimize_scalar(varies, bounds=bounds, method="bounded", options={"xatol": 1e-7}).x)
 
 
 def _resampled(grid: NDArray, time: NDArray, position: NDArray) -> tuple[NDArray, NDArray]:
