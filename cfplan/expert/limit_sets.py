@@ -18,24 +18,27 @@ class LimitSet:
     limits: PlanLimits
 
 
-MOTOR_RESERVE = 0.95
-# share of a motor's thrust that a plan for hardware may use; the rest is feedback's
+MOTOR_RESERVE = 0.2
+# share of a motor's range that a plan for hardware leaves to feedback at either end
+_FLOWN = AIRFRAMES["crazyflie-2.1+"]
+_RESERVE = MOTOR_RESERVE * (_FLOWN.motor_thrust_max - _FLOWN.motor_thrust_min)
 
 LIMIT_SETS = MappingProxyType(
     {
-        # The paper's hardware data (appendix, "Hardware Experiment Dataset"), with the tilt and the thrust floor that
-        # real flight adds.
+        # The paper's hardware data (appendix, "Hardware Experiment Dataset"), with what real flight adds: tilt, thrust
+        # floor, reserve, and how fast motors follow. These are the plan limits of the project's own safety.yaml.
         "hardware": LimitSet(
             "hardware",
-            AIRFRAMES["crazyflie-2.1+"],
+            _FLOWN,
             PlanLimits(
                 speed=2.0,
                 acceleration=5.0,
                 angular_velocity=8.0,
                 tilt=math.radians(30.0),
-                motor_thrust_min=AIRFRAMES["crazyflie-2.1+"].motor_thrust_min,
-                motor_thrust_max=MOTOR_RESERVE * AIRFRAMES["crazyflie-2.1+"].motor_thrust_max,
+                motor_thrust_min=_FLOWN.motor_thrust_min + _RESERVE,
+                motor_thrust_max=_FLOWN.motor_thrust_max - _RESERVE,
                 specific_thrust_min=0.5 * GRAVITY,
+                angular_acceleration=35.0,
             ),
         ),
         # The paper's simulation data: 5 m/s and the motors bind, nothing else is meant to. The rest keeps plans away
