@@ -1,7 +1,6 @@
 """`cfplan doctor`: is everything there that a flight needs?"""
 
 import platform
-import shutil
 import sys
 from importlib import metadata
 
@@ -14,7 +13,9 @@ from cfplan.cli.output import print_json, print_table
 NEEDED = ("numpy", "scipy", "numba", "casadi", "cflib", "pydantic", "mcap", "pyarrow", "rerun-sdk")
 OPTIONAL = {
     "torch": "the learned planner: pip install 'cfplan[learn]'",
-    "toppra": "the convex baseline: pip install 'cfplan[bench]'",
+    "motioncapture": "motion capture other than Vicon: pip install 'cfplan[mocap]'",
+    "rosbags": "ROS bags in cfplan replay: pip install 'cfplan[ros]'",
+    "pymavlink": "MAVLink logs in cfplan replay: pip install 'cfplan[mavlink]'",
 }
 CRAZYRADIO_USB = {(0x1915, 0x7777): "Crazyradio", (0x35F0, 0xBAD2): "Crazyradio 2.0"}
 
@@ -23,7 +24,7 @@ CRAZYRADIO_USB = {(0x1915, 0x7777): "Crazyradio", (0x35F0, 0xBAD2): "Crazyradio 
 @options.as_json
 def doctor(as_json: bool) -> int:
     """Show versions, packages, the compiler and the radio, and what is missing."""
-    checks = [_python(), *map(_package, NEEDED), *(_optional(name) for name in OPTIONAL), _compiler(), _radio()]
+    checks = [_python(), *map(_package, NEEDED), *(_optional(name) for name in OPTIONAL), _expert(), _radio()]
     missing = [check for check in checks if check["verdict"] == "missing"]
     if as_json:
         print_json({"cfplan": __version__, "checks": checks, "ok": not missing})
@@ -60,11 +61,15 @@ def _optional(name: str) -> dict[str, str]:
     return _check(name, version or "-", "ok" if version else "optional", "" if version else OPTIONAL[name])
 
 
-def _compiler() -> dict[str, str]:
-    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-    if compiler is None:
-        return _check("C compiler", "-", "optional", "without one the expert plans several times slower")
-    return _check("C compiler", compiler)
+def _expert() -> dict[str, str]:
+    """How the expert's functions are evaluated here; compiles them if that was never done."""
+    from cfplan.expert.compiled import Backend, backend, compiler
+
+    used = backend()
+    if used is Backend.COMPILED:
+        return _check("expert", f"compiled ({compiler()})")
+    hint = "its cache folder cannot be written" if compiler() else "install a C compiler to plan several times faster"
+    return _check("expert", str(used), "optional", hint)
 
 
 def _radio() -> dict[str, str]:

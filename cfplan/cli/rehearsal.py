@@ -34,6 +34,8 @@ class PlannedFlight:
     name: str
     plan: "Plan"
     limits: "Limits"
+    lower_bound: float | None = None
+    # s, that no flight along the path can beat; None where it was not asked
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -44,6 +46,7 @@ class PlannedFlight:
             "planner": plan.planner,
             "length": plan.path.length,
             "duration": plan.trajectory.duration,
+            "lower_bound": self.lower_bound,
             "nodes": plan.nodes,
             "planning_seconds": plan.seconds,
             "slowed": plan.slowed,
@@ -70,6 +73,7 @@ def obtain_plan(path_or_plan: Path, options: PlanOptions, steps: Steps) -> Plann
             said.append(f"{plan.trajectory.duration:.2f} s, {plan.planner}, read from {path_or_plan}")
         return PlannedFlight(path_or_plan.stem, plan, limits)
 
+    from cfplan.expert.convex import lower_bound
     from cfplan.geometry.path_file import load_path_file
     from cfplan.planning.plan import plan as make_plan
     from cfplan.safety.space import check_space
@@ -91,7 +95,12 @@ def obtain_plan(path_or_plan: Path, options: PlanOptions, steps: Steps) -> Plann
         )
         said.append(f"{plan.trajectory.duration:.2f} s of flight by {plan.planner}")
         said.extend(plan.notes)
-    return PlannedFlight(path_file.name, plan, limits)
+    with steps.step("bound") as said:
+        bound = lower_bound(plan.path, plan.airframe, limits.plan)
+        said.append(
+            f"no flight takes less than {bound:.2f} s; this one {plan.trajectory.duration / bound - 1:.1%} more"
+        )
+    return PlannedFlight(path_file.name, plan, limits, bound)
 
 
 def _read_plan(file: Path, limits: "Limits") -> "Plan":

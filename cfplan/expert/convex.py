@@ -9,10 +9,11 @@ acceleration jumps the profile breaks them, and is as slow after repair as that 
 import time
 from typing import Any
 
+import copp_py
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.errors import InfeasibleError, InputError
+from cfplan.errors import InfeasibleError
 from cfplan.expert.convex_profile import smooth_profile, window
 from cfplan.expert.convex_rows import Rows, inner_rows, outer_rows
 from cfplan.expert.convex_stations import Stations, stations
@@ -118,18 +119,7 @@ def _boundary(path: Path, start: BoundaryState | None, end: BoundaryState | None
     return values[0], values[1]
 
 
-def _library() -> Any:
-    try:
-        import copp_py
-    except ImportError:
-        raise InputError(
-            "the convex problem needs copp-py, which is not installed", hint="pip install 'cfplan[bench]'"
-        ) from None
-    return copp_py
-
-
 def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
-    copp_py = _library()
     ceiling, most, ends = rows.ceiling.copy(), rows.most.copy(), []
     for index, beside, value in ((0, 1, boundary[0]), (-1, -2, boundary[1])):
         if value is None:  # free: let b jump in the interval at that end, which only ever allows more
@@ -146,13 +136,13 @@ def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
     constraints.append_s(at.length)
     constraints.add_constraint_1st(ceiling[:, None], 0)
     constraints.add_constraint_2nd(rows.first, rows.second, most, 0)
-    return copp_py.solver.topp2_ra.Problem(
+    reachability: Any = copp_py.solver.topp2_ra  # its stub forgets to export Problem
+    return reachability.Problem(
         constraints, idx_s_interval=(0, len(at.length) - 1), a_boundary=(ends[0], ends[1])
     )
 
 
 def _reachable_top(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
-    copp_py = _library()
     try:
         return copp_py.solver.reach_set2.bidirectional(_problem(at, rows, boundary)).a_max
     except copp_py.core.CoppError as error:
@@ -163,7 +153,6 @@ def _reachable_top(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
 
 
 def _solved(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
-    copp_py = _library()
     try:
         return copp_py.solver.topp2_ra.solve(_problem(at, rows, boundary))
     except copp_py.core.CoppError as error:

@@ -11,7 +11,7 @@ from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
 from cfplan.expert.solution import Solution
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
-from cfplan.planning.planners import available, find_planner
+from cfplan.planning.planners import find_planner
 from cfplan.planning.repair import repair
 from cfplan.safety.certificate import Certificate
 from cfplan.safety.limits import Limits
@@ -147,7 +147,7 @@ def _tries(planner: str, nodes: int, fixed: bool) -> Iterator[tuple[str, int]]:
     if not fixed:
         yield planner, 2 * nodes
     for fallback in FALLBACKS:
-        if fallback != planner and available(fallback):
+        if fallback != planner:
             yield fallback, nodes
 
 

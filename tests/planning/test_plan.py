@@ -11,7 +11,7 @@ from cfplan.expert.solution import Solution, Status
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
 from cfplan.planning import planners
-from cfplan.planning.plan import FEWEST_NODES, MOST_NODES, default_nodes, plan
+from cfplan.planning.plan import FALLBACKS, FEWEST_NODES, MOST_NODES, default_nodes, plan
 from cfplan.planning.planners import PLANNERS, find_planner
 from cfplan.safety.certificate import certify
 
@@ -28,7 +28,7 @@ def stub(monkeypatch, **answers):
         return planner
 
     monkeypatch.setattr("cfplan.planning.plan.find_planner", find)
-    monkeypatch.setattr("cfplan.planning.plan.available", lambda name: name in answers)
+    monkeypatch.setattr("cfplan.planning.plan.FALLBACKS", [name for name in FALLBACKS if name in answers])
     return calls
 
 
