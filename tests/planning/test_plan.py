@@ -10,7 +10,6 @@ from cfplan.errors import CfplanError, InfeasibleError, InputError
 from cfplan.expert.solution import Solution, Status
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
-from cfplan.planning import planners
 from cfplan.planning.plan import FALLBACKS, FEWEST_NODES, MOST_NODES, default_nodes, plan
 from cfplan.planning.planners import PLANNERS, find_planner
 from cfplan.safety.certificate import certify
@@ -154,13 +153,6 @@ def test_an_unknown_planner_is_refused_with_the_known_ones():
         find_planner("min snap")
     assert "did you mean min-snap?" in error.value.hint
     assert all(name in error.value.hint for name in PLANNERS)
-
-
-def test_a_planner_whose_part_is_missing_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(planners, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match="not installed") as error:
-        find_planner("convex")
-    assert "pip install" in error.value.hint
 
 
 def test_the_number_of_nodes_grows_with_the_path_within_bounds():
