@@ -11,7 +11,7 @@ import click
 
 from cfplan.errors import CfplanError, ExitCode
 
-_FILE_WIDTH = 120  # characters, of tables that go to a file or a pipe
+_FILE_WIDTH = 170  # characters, of tables that go to a file or a pipe
 
 
 class Steps:

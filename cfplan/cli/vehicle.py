@@ -38,17 +38,18 @@ def vehicle(uri: str, mocap_uri: str | None, limits: "Limits") -> "Iterator[tupl
         return
     from cfplan.simulation.lab import start_lab
     from cfplan.simulation.room import RoomPoseSource, RoomSettings
-    from cfplan.simulation.sim_driver import SimDriver
+    from cfplan.simulation.sim_driver import SimDriver, lab_number
     from cfplan.simulation.virtual_vicon import ViconSettings
 
+    number = lab_number(uri)
     if mocap is None:
-        with start_lab(limits.airframe) as lab:
+        with start_lab(limits.airframe, number=number) as lab:
             yield [SimDriver], RoomPoseSource(lab.number)
     elif mocap.host == VIRTUAL_VICON:
         room = RoomSettings(vicon=ViconSettings(subject=mocap.subject))
-        with start_lab(limits.airframe, room=room) as lab:
+        with start_lab(limits.airframe, room=room, number=number) as lab:
             there = lab.mocap_uri.replace("vicon:", f"{mocap.system}:", 1)
             yield [SimDriver], pose_source(there, limits.pose)
     else:
-        with start_lab(limits.airframe):
+        with start_lab(limits.airframe, number=number):
             yield [SimDriver], pose_source(str(mocap), limits.pose)

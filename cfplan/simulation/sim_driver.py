@@ -60,7 +60,7 @@ class SimDriver(CRTPDriver):
             raise WrongUriType(f"not a {_SCHEME} URI")
         if self._socket is not None:
             raise LinkError("the link is open already", where=uri)
-        number = _number(uri)
+        number = lab_number(uri)
         address = lab_address(number)
         if address is None:
             self._own_lab = start_lab(AIRFRAMES[_OWN_LAB_AIRFRAME], number=number)
@@ -155,7 +155,8 @@ class SimDriver(CRTPDriver):
         return f"{_SCHEME}0: the virtual Crazyflie of the first lab"
 
 
-def _number(uri: str) -> int:
+def lab_number(uri: str) -> int:
+    """N of sim://N. Raises InputError."""
     match = re.fullmatch(r"sim://(\d{1,3})", uri)
     if match is None:
         raise InputError("no such virtual vehicle", where=uri, hint="sim://0, sim://1, …")
