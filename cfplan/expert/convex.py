@@ -137,9 +137,7 @@ def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
     constraints.add_constraint_1st(ceiling[:, None], 0)
     constraints.add_constraint_2nd(rows.first, rows.second, most, 0)
     reachability: Any = copp_py.solver.topp2_ra  # its stub forgets to export Problem
-    return reachability.Problem(
-        constraints, idx_s_interval=(0, len(at.length) - 1), a_boundary=(ends[0], ends[1])
-    )
+    return reachability.Problem(constraints, idx_s_interval=(0, len(at.length) - 1), a_boundary=(ends[0], ends[1]))
 
 
 def _reachable_top(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
