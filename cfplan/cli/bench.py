@@ -92,6 +92,20 @@ def scaling(yaw: str, output: Path | None, as_json: bool, **what: Any) -> None:
     _publish(result, output, as_json)
 
 
+@study.command(epilog="Example: cfplan study flights flights/*.yaml -o docs/studies/flights.json")
+@click.argument("path_files", metavar="PATH...", type=click.Path(path_type=Path), nargs=-1, required=True)
+@_output
+@options.as_json
+def flights(path_files: tuple[Path, ...], output: Path | None, as_json: bool) -> None:
+    """Fly every PATH on the virtual Crazyflie, one after the other, and put the figures side by side."""
+    from cfplan.studies.flights import Flights, fly_each
+
+    _require_free(output)
+    with _progress("flying", as_json) as progress:
+        result: Flights = fly_each(path_files, command=_command(), progress=progress)
+    _publish(result, output, as_json)
+
+
 def _given(what: dict[str, Any]) -> dict[str, Any]:
     """What was not given is left to the study's own default."""
     return {name: value for name, value in what.items() if value != ()}

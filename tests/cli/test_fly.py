@@ -81,14 +81,3 @@ def test_a_truncated_record_says_so_and_replays_what_is_there(flight, tmp_path):
     assert ended.returncode == 0
     assert "truncated" in ended.stdout
     assert (tmp_path / "part.rrd").stat().st_size > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(file.stem for file in (REPOSITORY / "flights").glob("*.yaml")))
-def test_every_path_file_flies(name, tmp_path):
-    ended = fly(name, tmp_path)
-    assert ended.returncode == 0, ended.stderr
-    flight = json.loads(ended.stdout)
-    assert flight["plan"]["certificate"]["passed"]
-    assert flight["outcome"]["deviation_max"] <= 0.08
-    assert flight["outcome"]["lateness_p99"] <= 2e-3

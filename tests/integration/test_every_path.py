@@ -1,0 +1,72 @@
+"""Every file of flights/, planned, certified, flown through the packets, and judged by what really happened."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.errors import ExitCode
+from cfplan.flight.encoding import check_bytes, encode_trajectory
+from cfplan.flight.mission import mission_of
+from cfplan.flight.outcome import Rung
+from cfplan.flight.process import fly
+from cfplan.flight.telemetry import SetpointSent
+from cfplan.geometry.path_file import load_path_file
+from cfplan.planning.plan import plan
+from cfplan.safety.limits import load_limits
+from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.lab import start_lab
+from cfplan.simulation.room import RoomPoseSource, RoomSettings
+from cfplan.simulation.sim_driver import SimDriver
+
+REPOSITORY = Path(__file__).parents[2]
+FLIGHTS = sorted((REPOSITORY / "flights").glob("*.yaml"))
+
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
+
+
+@pytest.mark.parametrize("file", FLIGHTS, ids=[file.stem for file in FLIGHTS])
+def test_a_path_file_certifies_and_flies_as_planned(file):
+    limits = load_limits(REPOSITORY / "safety.yaml")
+    path_file = load_path_file(file)
+    made = plan(
+        path_file.path,
+        limits.airframe,
+        limits,
+        yaw=path_file.yaw,
+        yaw_angle=path_file.yaw_angle,
+        speed_share=path_file.speed,
+    )
+    assert made.certificate.passed
+    encoded = encode_trajectory(made.trajectory)
+    check_bytes(encoded, made.trajectory, limits.plan)
+    assert dry_run(encoded, made.trajectory, limits.airframe, limits.flight).passed
+
+    assert limits.airframe.motor_time_constant == 0.105
+    room = RoomSettings(position_noise=1e-3, attitude_noise=np.radians(0.2), latency=0.010)
+    sent: list[SetpointSent] = []
+    with start_lab(limits.airframe, room=room) as lab:
+        outcome = fly(
+            mission_of(encoded, limits),
+            uri=lab.uri,
+            drivers=[SimDriver],
+            pose_source=RoomPoseSource(lab.number),
+            on_telemetry=lambda message: sent.append(message) if isinstance(message, SetpointSent) else None,
+        )
+        truth = lab.truth()
+
+    assert (outcome.exit_code, outcome.reason) == (ExitCode.OK, "landed")
+    assert outcome.rung is Rung.NONE
+    assert outcome.lateness.p99 <= 2e-3
+    assert truth.off_in_air[-1] == 0
+    assert not truth.locked
+    assert truth.position[-1, 2] < 0.02
+
+    streamed = (truth.time >= outcome.first_setpoint) & (
+        truth.time <= outcome.first_setpoint + made.trajectory.duration
+    )
+    reference = made.trajectory.at(truth.time[streamed] - outcome.first_setpoint).position
+    deviation = np.linalg.norm(truth.position[streamed] - reference, axis=1)
+    assert streamed.sum() > 90 * made.trajectory.duration
+    assert deviation.max() <= 0.08
+    assert np.all(limits.space.beyond(truth.position[streamed]) < 0)
