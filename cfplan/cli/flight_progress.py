@@ -42,6 +42,7 @@ class FlightProgress:
         self._first_index_time = 0.0
         self._pose: PoseReceived | None = None
         self._battery = 0.0
+        self.heard_vehicle = False
         self._shown = 0.0
         self._began = time.monotonic()
 
@@ -67,6 +68,7 @@ class FlightProgress:
             self._pose = message
         elif isinstance(message, VehicleStatus):
             self._battery = message.battery_voltage
+            self.heard_vehicle = True
         now = time.monotonic()
         if now - self._shown > _REFRESH:
             self._shown = now

@@ -2,6 +2,7 @@
 
 import math
 import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -80,11 +81,12 @@ def fly(
         said.append(f"a way to stop from each of {len(mission.payloads)} setpoints")
     with vehicle(uri, mocap_uri, flight.limits) as (drivers, pose_source):
         folder = new_record_folder(records, flight.name)
+        progress = FlightProgress(duration=mission.duration, steps=steps)
         try:
             save_plan(flight.plan, folder / "plan.parquet", {"name": flight.name, "path file": str(path_or_plan)})
             with (
                 RecordWriter(folder, _header(flight, uri, path_or_plan)) as writer,
-                FlightProgress(duration=mission.duration, steps=steps) as progress,
+                progress,
             ):
                 outcome = fly_mission(
                     mission,
@@ -94,7 +96,10 @@ def fly(
                     on_telemetry=_both(writer.write, progress.show),
                 )
         except CfplanError:
-            steps.say(f"what was recorded: {folder}")
+            if progress.heard_vehicle:
+                steps.say(f"what was recorded: {folder}")
+            else:
+                shutil.rmtree(folder)  # there was no flight
             raise
     if writer.failure:
         steps.failed("record", writer.failure)

@@ -87,6 +87,7 @@ def test_an_unreachable_vehicle_ends_in_one_line(cfplan, path_file, safety_file,
     assert ended.err.splitlines()[-1].startswith("error: ")
     assert uri in ended.err.splitlines()[-1]
     assert "Traceback" not in ended.err
+    assert not list((tmp_path / "records").glob("*"))
 
 
 def test_a_record_that_is_none_is_refused(cfplan, tmp_path):
