@@ -20,7 +20,10 @@ _boxes = click.option("--box", "boxes", multiple=True, help="4.5x8x2 or 10x10x10
 _sets = click.option("--limits", "limit_sets", multiple=True, help="hardware or simulation.  [default: both]")
 
 
-@click.command(epilog="Example: cfplan bench --paths 20 --planner expert --planner toppquad")
+@click.command(
+    short_help="Compare the planners on the same paths.",
+    epilog="Example: cfplan bench --paths 20 --planner expert --planner toppquad",
+)
 @click.option("--paths", type=int, default=100, show_default=True, help="Random paths in each box with each set.")
 @click.option("--planner", "planners", multiple=True, help="May be given several times.  [default: all there are]")
 @click.option("--nodes", type=int, default=100, show_default=True, help="Grid intervals.")
@@ -44,7 +47,7 @@ def bench(yaw: str, output: Path | None, as_json: bool, **what: Any) -> None:
     _publish(result, output, as_json)
 
 
-@click.group()
+@click.group(short_help="Measurements for docs/studies.")
 def study() -> None:
     """Measure one thing about the planners, with tables for docs/studies."""
 

@@ -10,7 +10,7 @@ from cfplan.cli.rehearsal import PlanOptions, certify_bytes, obtain_plan
 from cfplan.errors import ExitCode
 
 
-@click.command(epilog="Example: cfplan check flights/circle.yaml")
+@click.command(short_help="The certificate of a path or of a plan.", epilog="Example: cfplan check flights/circle.yaml")
 @options.path_or_plan
 @options.planning
 @options.as_json

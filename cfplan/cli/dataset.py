@@ -10,7 +10,7 @@ from cfplan.cli.output import print_json, print_table
 from cfplan.errors import InputError
 
 
-@click.group()
+@click.group(short_help="Labelled paths for training.")
 def dataset() -> None:
     """Make datasets of paths labelled by the expert, and look into them."""
 

@@ -20,7 +20,7 @@ OPTIONAL = {
 CRAZYRADIO_USB = {(0x1915, 0x7777): "Crazyradio", (0x35F0, 0xBAD2): "Crazyradio 2.0"}
 
 
-@click.command(epilog="Example: cfplan doctor --json")
+@click.command(short_help="Versions, packages, compiler, radio.", epilog="Example: cfplan doctor --json")
 @options.as_json
 def doctor(as_json: bool) -> int:
     """Show versions, packages, the compiler and the radio, and what is missing."""

@@ -27,12 +27,13 @@ _PATH_SAMPLES = 500  # of the drawn path
 
 
 @click.command(
+    short_help="Plan, certify, rehearse, fly and record a path.",
     epilog="""\b
 Examples:
   cfplan fly flights/figure8.yaml
   cfplan fly flights/figure8.yaml --speed 0.3
 
-Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts."""
+Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts.""",
 )
 @options.path_or_plan
 @options.planning

@@ -15,12 +15,13 @@ if TYPE_CHECKING:
 
 
 @click.command(
+    short_help="What motion capture sees.",
     epilog="""\b
 Examples:
   cfplan mocap vicon://192.168.1.2            every body
   cfplan mocap vicon://192.168.1.2/cf1        and is cf1 among them?
   cfplan mocap vicon-sdk://192.168.1.2        through Vicon's own client
-  cfplan mocap qualisys://192.168.1.3         optitrack:// and vrpn:// likewise"""
+  cfplan mocap qualisys://192.168.1.3         optitrack:// and vrpn:// likewise""",
 )
 @click.argument("uri")
 @click.option("--seconds", type=click.FloatRange(0.1, 86400), default=5.0, show_default=True, help="How long to look.")

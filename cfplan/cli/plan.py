@@ -10,7 +10,9 @@ from cfplan.cli.rehearsal import PlanOptions, obtain_plan
 from cfplan.errors import InputError
 
 
-@click.command(epilog="Example: cfplan plan flights/circle.yaml -o circle.parquet")
+@click.command(
+    short_help="A certified trajectory for a path.", epilog="Example: cfplan plan flights/circle.yaml -o circle.parquet"
+)
 @options.path_file
 @options.planning
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the plan here, as Parquet.")

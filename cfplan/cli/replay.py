@@ -20,7 +20,7 @@ Examples:
   cfplan replay records/toppquad records/learned"""
 
 
-@click.command(epilog=EPILOG)
+@click.command(short_help="Look at flights and logs in rerun.", epilog=EPILOG)
 @click.argument("flights", metavar="FLIGHT...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--plan", "plan_file", type=click.Path(path_type=Path), help="Lay the flights over this path or plan.")
 @click.option("--subject", "names", multiple=True, help="Show this subject of a mocap log only; may be repeated.")

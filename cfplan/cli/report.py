@@ -9,11 +9,12 @@ from cfplan.cli.output import Steps, print_json
 
 
 @click.command(
+    short_help="A page with a flight's figures.",
     epilog="""\b
 Examples:
   cfplan report records/2026-11-21_101500-figure-eight
   cfplan report records/toppquad records/learned -o comparison.html
-  cfplan report records/learned --json"""
+  cfplan report records/learned --json""",
 )
 @click.argument("records", metavar="RECORD...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(

@@ -9,7 +9,7 @@ from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.cli.rehearsal import PlanOptions, certify_bytes, obtain_plan, rehearse
 
 
-@click.command(epilog="Example: cfplan sim flights/slalom.yaml")
+@click.command(short_help="The dry run alone.", epilog="Example: cfplan sim flights/slalom.yaml")
 @options.path_or_plan
 @options.planning
 @options.as_json
