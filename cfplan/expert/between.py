@@ -14,13 +14,18 @@ from cfplan.vehicle.profile import SpeedProfile
 
 COUNT = 17
 # places an interval
-END_COUNT = 65
-# in the END_INTERVALS at each end, where the thrust axis may swing to and fro within one interval
+FINE_COUNT = 65
+# in brisk intervals: the END_INTERVALS at each end, where the thrust axis may swing to and fro within one, and
+# where the path turns by more than SHARP
 END_INTERVALS = 4
-ALLOWANCE = 1e-3
+SHARP = 0.25
+# rad, an interval
+ALLOWANCE = 1.5e-3
 # of the rows, kept free: certificates allow for their own sampling
-END_ALLOWANCE = 4e-3
-# likewise in the END_INTERVALS, where all changes fastest
+THRUST_ALLOWANCE = 3e-3
+# likewise, of thrusts, which change fastest
+FINE_ALLOWANCE = 4e-3
+# likewise in brisk intervals
 
 SPEED = stage.ROWS
 # column of the squared speed, after the rows of the optimiser
@@ -48,11 +53,16 @@ class Excess:
 class DensePath:
     """A path's derivatives at many places of every interval, evaluated once."""
 
-    def __init__(self, path: Path, nodes: int) -> None:
+    def __init__(self, path: Path, nodes: int, held: NDArray) -> None:
+        """`held`, (N,): how far, 0 to 1, each interval is bound by a boundary state and had better be left alone."""
+        self.held = held[:, None]
         step = path.end / nodes
-        counts = np.full(nodes, COUNT)
-        counts[:END_INTERVALS] = counts[-END_INTERVALS:] = END_COUNT
-        self.allowance = np.where(counts == END_COUNT, END_ALLOWANCE, ALLOWANCE)[:, None]
+        brisk = turns(path, nodes) > SHARP
+        brisk[:END_INTERVALS] = brisk[-END_INTERVALS:] = True
+        counts = np.where(brisk, FINE_COUNT, COUNT)
+        self.allowance = np.full((nodes, COLUMNS), ALLOWANCE)
+        self.allowance[:, list(stage.JUMPING)] = THRUST_ALLOWANCE
+        self.allowance[brisk] = FINE_ALLOWANCE
         self.first = np.cumsum(counts) - counts
         self.interval = np.repeat(np.arange(nodes), counts)
         # Chebyshev-Lobatto: both ends of an interval, and closer together near them
@@ -71,7 +81,17 @@ class DensePath:
         highest, lowest = np.maximum.reduceat(rows, self.first, axis=1), np.minimum.reduceat(rows, self.first, axis=1)
         above = np.append(stage.UPPER, 1.0)
         below = np.append(stage.LOWER, -np.inf)
-        return Excess(highest.T - above + self.allowance, below - lowest.T + self.allowance)
+        upper, lower = highest.T - above + self.allowance, below - lowest.T + self.allowance
+        return Excess(upper - self.held * np.maximum(upper, 0.0), lower - self.held * np.maximum(lower, 0.0))
+
+
+def turns(path: Path, nodes: int) -> NDArray:
+    """(N,) rad, by how much the direction of the path differs from one end of each interval to the other."""
+    s = np.linspace(0.0, path.end, nodes + 1)
+    s[[0, -1]] = s[[1, -2]]  # at rest there is no direction
+    tangent = path(s, 1)
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-12)[:, None]
+    return np.arccos(np.clip(np.sum(tangent[1:] * tangent[:-1], axis=1), -1.0, 1.0))
 
 
 def _squared(vector: tuple[NDArray, NDArray, NDArray]) -> NDArray:

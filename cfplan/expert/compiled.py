@@ -47,6 +47,7 @@ def cache_folder() -> FilePath:
     return FilePath(os.environ.get("XDG_CACHE_HOME") or FilePath.home() / ".cache") / "cfplan"
 
 
+@lru_cache(maxsize=1)
 def library() -> FilePath | None:
     """The compiled point functions, made now if need be; None where that is not possible."""
     try:

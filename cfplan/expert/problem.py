@@ -20,6 +20,10 @@ MARGIN = 1e-3
 # share by which limits are tightened, for what happens between points
 FADE = 5
 # intervals over which that margin grows from nothing, next to a boundary state that may lie at a limit
+LEAD = 3.0
+# intervals over which the guess comes away from a boundary state
+HASTE = 1.5
+# times an excess between points, by which the limits around it are lowered: lower points lower the peak by less
 CEILING = 20.0
 # h at most, where the path nearly stands still, in squares of the speed limit
 FLOOR = 1e-4
@@ -72,10 +76,11 @@ def pose(
     nodes = layout.shape.nodes
     step, unit = path.end / nodes, limits.speed**2
     p = _parameters(layout, path, airframe, limits, track, penalties, unit, step)
-    margin = _margin(nodes, ends)
+    margin = MARGIN * (1.0 - held_by(ends, nodes))
     lbx, ubx = _variable_bounds(layout, path, limits, unit, step, margin)
     lbg, ubg = _constraint_bounds(layout, path, limits, unit, step, margin, ends)
-    x0 = _start(layout, guess_spline(path, airframe, limits, nodes, CEILING * unit) / unit)
+    spline = guess_spline(path, airframe, limits, nodes, CEILING * unit) / unit
+    x0 = _start(layout, _joined(spline, ends, unit, step))
     if layout.shape.free_yaw:
         lbx[3], ubx[3] = yaw_angle, yaw_angle + math.pi / 2
         x0[np.arange(nodes + 1) * layout.block + 3] = ends.start.yaw if ends.start else yaw_angle + math.pi / 4
@@ -87,7 +92,7 @@ def pose(
 def tightened(problem: Problem, excess: Excess) -> Problem:
     """The problem with limits lowered, in each interval that exceeds one between the points, by what it exceeds."""
     layout = problem.layout
-    upper, lower = spread(excess.upper), spread(excess.lower)
+    upper, lower = HASTE * spread(excess.upper), HASTE * spread(excess.lower)
     lbg, ubg, ubx = problem.lbg.copy(), problem.ubg.copy(), problem.ubx.copy()
     point, row = np.divmod(layout.selected, stage.ROWS)
     interval = layout.interval[point]
@@ -150,15 +155,18 @@ def _parameters(
     return np.concatenate([data.ravel(), common, astuple(penalties)])
 
 
-def _margin(nodes: int, ends: Ends) -> NDArray:
-    """(N,) share of tightening in each interval."""
-    fade = np.ones(nodes)
+def held_by(ends: Ends, nodes: int) -> NDArray:
+    """(N,) 1 next to a boundary state, 0 from FADE intervals on.
+
+    A state may lie at a limit, and what follows is all but decided: there is no room to lower limits there.
+    """
+    free = np.ones(nodes)
     distance = np.arange(nodes) + 0.5
     if ends.start:
-        fade = np.minimum(fade, (distance - 1.5) / FADE)
+        free = np.minimum(free, (distance - 1.5) / FADE)
     if ends.end:
-        fade = np.minimum(fade, (nodes - distance - 1.5) / FADE)
-    return MARGIN * np.clip(fade, 0.0, 1.0)
+        free = np.minimum(free, (nodes - distance - 1.5) / FADE)
+    return 1.0 - np.clip(free, 0.0, 1.0)
 
 
 def _highest(path: Path, limits: PlanLimits, s: NDArray, margin: NDArray, unit: float) -> NDArray:
@@ -196,6 +204,21 @@ def _constraint_bounds(
     lbg[layout.speed_rows] = FLOOR
     ubg[layout.speed_rows] = _highest(path, limits, s, margin[:, None], unit)
     return lbg, ubg
+
+
+def _joined(spline: NDArray, ends: Ends, unit: float, step: float) -> NDArray:
+    """The guess, led into boundary states over some intervals."""
+    joined = spline.copy()
+    for boundary, coefficients, towards in ((ends.start, joined, 1.0), (ends.end, joined[::-1], -1.0)):
+        if not boundary:
+            continue
+        h, slope, bend = boundary.h / unit, towards * boundary.dh * step / unit, boundary.ddh * step**2 / unit
+        first = np.array([h - slope + bend / 3, h - bend / 6, h + slope + bend / 3])
+        if (first > 0).all():
+            weight = np.exp(-np.arange(len(coefficients) - 3) / LEAD)
+            coefficients[3:] *= (first[2] / coefficients[3:]) ** weight
+            coefficients[:3] = first
+    return joined
 
 
 def _start(layout: Layout, spline: NDArray) -> NDArray:

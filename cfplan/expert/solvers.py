@@ -16,7 +16,9 @@ TOLERANCE = 1e-2
 # of the scaled problem: 1e-5 s in the cost's gradient
 
 # From an answer to a problem almost the same: near the bounds from the start, so 3 to 8 iterations instead of 17.
-NEARBY = {"mu_init": 3e-3, "bound_push": 1e-5, "bound_frac": 1e-5}
+NEARBY = {"mu_init": 3e-3, "bound_push": 1e-5, "bound_frac": 1e-5, "max_iter": 40}
+NEARBY_NODES = 1000
+# beyond, setting up a second solver (quadratic in the nodes, in CasADi's interface) takes longer than it saves
 
 
 class Attempt(NamedTuple):
@@ -32,8 +34,8 @@ class Attempt(NamedTuple):
 
 def fatrop(shape: Shape, problem: Problem, backend: Backend | None, x: NDArray | None = None) -> Attempt:
     """Solve from the problem's own guess, or from `x`, the answer to a problem almost the same."""
-    name = "fatrop" if x is None else "fatrop again"
-    return _run(name, _fatrop(shape, backend, x is not None), problem, problem.x0 if x is None else x)
+    nearby = x is not None and shape.nodes <= NEARBY_NODES
+    return _run("fatrop", _fatrop(shape, backend, nearby), problem, problem.x0 if x is None else x)
 
 
 def ipopt(shape: Shape, problem: Problem, backend: Backend | None) -> Attempt:

@@ -31,6 +31,7 @@ UPPER = np.array([1.0, 1.0, 1.0, np.inf, 1.0, 1.0, 1.0, 1.0, 1.0])
 
 POINT_DATA = 17  # γ' to γ'''' (12), place in the interval 0 to 1, weight of the penalties, ψ, ψ', ψ''
 COMMON_DATA = 16
+LEAST = 1e-6  # x below this counts as this: a solver that tries h < 0 must not meet what is not a number
 UNBOUNDED = 1e4  # rad/s², stands for no limit of angular acceleration
 
 # Gauss-Legendre places and weights on [0, 1], for the time spent in an interval.
@@ -101,9 +102,7 @@ def point_expressions(free_yaw: bool) -> tuple[list[casadi.SX], casadi.SX, casad
     (mass, jx, jy, jz, arm, thrust_to_torque, drag, axial_drag, acceleration, angular_velocity, tilt,
      specific_thrust_min, thrust_min, thrust_max, scale, angular_acceleration) = _entries(common)  # fmt: skip
     zero: Any = casadi.SX(0)
-    airframe = Airframe(
-        "symbolic", mass, (jx, jy, jz), arm, thrust_to_torque, zero, zero, zero, (drag, axial_drag), ""
-    )
+    airframe = Airframe("symbolic", mass, (jx, jy, jz), arm, thrust_to_torque, zero, zero, zero, (drag, axial_drag), "")
     limits = PlanLimits(
         speed=zero, acceleration=acceleration, angular_velocity=angular_velocity, tilt=tilt,
         motor_thrust_min=thrust_min, motor_thrust_max=thrust_max, specific_thrust_min=specific_thrust_min,
@@ -113,6 +112,7 @@ def point_expressions(free_yaw: bool) -> tuple[list[casadi.SX], casadi.SX, casad
     derivatives: Any = tuple(tuple(entries[3 * k : 3 * k + 3]) for k in range(4))
     place, weight = entries[12:14]
     x, yaw = local_variables(z, free_yaw, place)
+    x[0] = _positive(x[0])
     h: Any = tuple(scale * value for value in x)
     turn: Any = tuple(yaw if free_yaw else entries[14:17])
     flat = flat_state(airframe, derivatives, h, turn, casadi.cos, casadi.sin)
@@ -122,6 +122,10 @@ def point_expressions(free_yaw: bool) -> tuple[list[casadi.SX], casadi.SX, casad
         penalty += weights[1] * h[0] * yaw[1] ** 2
     penalty = penalty / casadi.sqrt(h[0]) + weights[2] * (x[3] / x[0]) ** 2
     return [z, point, common, weights], casadi.vertcat(*rows(flat, limits, casadi.cos)), weight * penalty
+
+
+def _positive(x: casadi.SX) -> casadi.SX:
+    return casadi.fmax(x, LEAST)
 
 
 def _entries(vector: casadi.SX) -> list[Any]:
@@ -151,7 +155,7 @@ def point_functions(free_yaw: bool) -> list[casadi.Function]:
     def function(title: str, arguments: list[casadi.SX], results: list[casadi.SX]) -> casadi.Function:
         return casadi.Function(f"{name}_{title}", arguments, casadi.cse([casadi.densify(r) for r in results]))
 
-    h = [local_variables(z, free_yaw, place)[0][0] for place in GAUSS_PLACES]
+    h = [_positive(local_variables(z, free_yaw, place)[0][0]) for place in GAUSS_PLACES]
     time = sum(w / casadi.sqrt(value) for w, value in zip(GAUSS_WEIGHTS, h, strict=True))
     time_hessian, time_gradient = casadi.hessian(time, z)
     return [
