@@ -89,15 +89,24 @@ def pose(
     return Problem(layout, unit, step, x0, p, lbx, ubx, lbg, ubg)
 
 
-def tightened(problem: Problem, excess: Excess) -> Problem:
-    """The problem with limits lowered, in each interval that exceeds one between the points, by what it exceeds."""
+def tightened(problem: Problem, excess: Excess, g: NDArray) -> Problem:
+    """The problem with limits lowered, in each interval that exceeds one between the points, by what it exceeds.
+
+    `g` is what the constraints came to: a peak far from every point lowers the limits from there.
+    """
     layout = problem.layout
     upper, lower = HASTE * spread(excess.upper), HASTE * spread(excess.lower)
     lbg, ubg, ubx = problem.lbg.copy(), problem.ubg.copy(), problem.ubx.copy()
     point, row = np.divmod(layout.selected, stage.ROWS)
     interval = layout.interval[point]
-    ubg[layout.point_rows] -= np.maximum(upper[interval, row], 0.0)
-    lbg[layout.point_rows] += np.maximum(lower[interval, row], 0.0)
+    least = np.full(excess.upper.shape, np.inf)
+    most = -least
+    np.minimum.at(least, (interval, row), g[layout.point_rows])
+    np.maximum.at(most, (interval, row), g[layout.point_rows])
+    below = np.where(excess.upper > 0, most, np.inf)[interval, row]
+    above = np.where(excess.lower > 0, least, -np.inf)[interval, row]
+    ubg[layout.point_rows] = np.minimum(ubg[layout.point_rows], below) - np.maximum(upper[interval, row], 0.0)
+    lbg[layout.point_rows] = np.maximum(lbg[layout.point_rows], above) + np.maximum(lower[interval, row], 0.0)
     slower = 1.0 - np.maximum(upper[:, SPEED], 0.0)
     ubg[layout.speed_rows] *= slower[:, None]
     first = np.arange(layout.shape.nodes + 1) * layout.block

@@ -123,7 +123,7 @@ def _tightened_between(attempt: Attempt, problem: Problem, task: _Task) -> tuple
         excess = dense.excess(profile, task.airframe, task.limits)
         if excess.worst <= ENOUGH:
             return profile, done, iterations
-        problem = tightened(problem, excess)
+        problem = tightened(problem, excess, attempt.g)
         again = fatrop(task.shape, problem, task.backend, attempt.x)
         iterations += again.iterations
         if _flaw(again, problem, task):  # what there is is nearly right; slowing will do the rest

@@ -26,6 +26,8 @@ class Attempt(NamedTuple):
 
     solver: str
     x: NDArray
+    g: NDArray
+    # what the constraints come to
     solved: bool
     iterations: int
     words: str
@@ -84,7 +86,7 @@ def _run(name: str, solver: casadi.Function, problem: Problem, x0: NDArray) -> A
         result = solver(x0=x0, p=problem.p, lbx=problem.lbx, ubx=problem.ubx, lbg=problem.lbg, ubg=problem.ubg)
         said = solver.stats()
     except RuntimeError as error:
-        return Attempt(name, x0, False, 0, str(error).splitlines()[0])
+        return Attempt(name, x0, problem.lbg, False, 0, str(error).splitlines()[0])
     words = f"{said['return_status']} after {said['iter_count']} iterations"
-    x = np.array(result["x"]).ravel()
-    return Attempt(name, x, bool(said["success"]) and bool(np.isfinite(x).all()), int(said["iter_count"]), words)
+    x, g = np.array(result["x"]).ravel(), np.array(result["g"]).ravel()
+    return Attempt(name, x, g, bool(said["success"]) and bool(np.isfinite(x).all()), int(said["iter_count"]), words)
