@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from cfplan.cli import options
-from cfplan.cli.output import print_json, print_table
+from cfplan.cli.output import finite, print_json, print_table
 from cfplan.errors import InputError
 
 _output = click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the result here, as JSON.")
@@ -137,7 +137,7 @@ def _require_free(output: Path | None) -> None:
 def _publish(result: Any, output: Path | None, as_json: bool) -> None:
     document = result.to_dict()
     if output is not None:
-        output.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        output.write_text(json.dumps(finite(document), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     if as_json:
         print_json(document)
     else:

@@ -52,7 +52,7 @@ class Steps:
 
 def print_json(document: Any) -> None:
     """One document on standard output; what is not finite becomes null, as JSON has no word for it."""
-    click.echo(json.dumps(_finite(document), indent=2, ensure_ascii=False))
+    click.echo(json.dumps(finite(document), indent=2, ensure_ascii=False))
 
 
 def print_error(error: CfplanError, *, as_json: bool) -> None:
@@ -81,11 +81,12 @@ def print_table(title: str, columns: list[str], rows: Sequence[Sequence[str]]) -
     console.print(table)
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """The same as JSON knows it: what is not finite becomes None."""
     if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
+        return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     if isinstance(value, bool | str | int) or value is None:
         return value
     number = float(value)
