@@ -52,7 +52,7 @@ def plan_toppquad(
     if nodes < NODES_LEAST:
         return Solution(Status.NOT_CONVERGED, None, f"{nodes} intervals are too few, take {NODES_LEAST} at least")
     begun = time.perf_counter()
-    prepared = program(nodes + 1, airframe, MAX_ITERATIONS, MAX_SECONDS)
+    prepared = program(nodes + 1, airframe, limits.angular_acceleration, MAX_ITERATIONS, MAX_SECONDS)
     built = time.perf_counter()
     grid = np.linspace(0.0, path.end, nodes + 1)
     if start is not None and yaw is YawMode.FREE:
@@ -139,7 +139,7 @@ def _bounds(
     rows_low, rows_high = np.zeros((count, ROWS)), np.zeros((count, ROWS))
     rows_low[:, 6:], rows_high[:, 6:] = -np.inf, np.inf
     rows_high[:, 6], rows_high[:, 7] = limits.acceleration**2, limits.angular_velocity**2
-    rows_high[:, 12] = limits.angular_acceleration**2
+    rows_high[:, 12] = 1.0
     rows_low[:, 8], rows_low[:, 9] = np.cos(limits.tilt), limits.specific_thrust_min
     if yaw is not YawMode.FREE:
         rows_low[:, 10] = rows_high[:, 10] = 0.0

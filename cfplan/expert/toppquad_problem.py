@@ -17,6 +17,7 @@ least value. Fixing h = 0 there would leave no way out of rest, since ω is per 
 as well: a first step of Eq. 23 from ω = 0 could not tilt the vehicle.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -26,7 +27,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 VARIABLES = 16
 ROWS = 13
 # a node: 3 force, 3 torque, acceleration², angular velocity², tilt, specific thrust, yaw fixed, yaw at the start,
-# angular acceleration²
+# angular acceleration² as a share
 STEP_ROWS = 8
 # an interval: h, q, ω
 H_LEAST = 1e-3
@@ -46,8 +47,14 @@ class Program:
 
 
 @lru_cache(maxsize=CACHED_PROBLEMS)
-def program(nodes: int, airframe: Airframe, max_iterations: int, max_seconds: float) -> Program:
-    """Built once for a number of grid points and an airframe; path, limits and grid are its parameters and bounds."""
+def program(
+    nodes: int, airframe: Airframe, angular_acceleration: float, max_iterations: int, max_seconds: float
+) -> Program:
+    """Built once for a number of grid points, an airframe and its limit of angular acceleration, rad/s².
+
+    Path, grid and the other limits are parameters and bounds. That limit is not, because without one its row must go:
+    left in, but unbounded, it takes IPOPT ten times as long.
+    """
     import casadi
 
     x = casadi.MX.sym("x", VARIABLES, nodes)
@@ -55,7 +62,7 @@ def program(nodes: int, airframe: Airframe, max_iterations: int, max_seconds: fl
     # γ' and γ'', cosine and sine of half the yaw where it is fixed
     step = casadi.MX.sym("step")
 
-    rows = _node(airframe).map(nodes)(x, path)
+    rows = _node(airframe, angular_acceleration).map(nodes)(x, path)
     steps = _interval().map(nodes - 1)(x[:, :-1], x[:, 1:], casadi.repmat(step, 1, nodes - 1))
     first = casadi.sumsqr(x[2:6, 0])
     h, alpha = x[0, :], x[9:12, :]
@@ -82,7 +89,7 @@ def program(nodes: int, airframe: Airframe, max_iterations: int, max_seconds: fl
     return Program(casadi.nlpsol("toppquad", "ipopt", nlp, options), nodes)
 
 
-def _node(airframe: Airframe) -> Any:
+def _node(airframe: Airframe, angular_acceleration: float) -> Any:
     """What holds at one grid point: rows of the dynamics in units of g and of a motor's hover torque, then limits."""
     import casadi
 
@@ -113,7 +120,7 @@ def _node(airframe: Airframe) -> Any:
         # Hopf: q = q(b₃) ⊗ q_yaw has z : w = sin : cos of half the yaw
         q[2] * path[6] - q[3] * path[7],
         q[3] - q[2],
-        casadi.sumsqr(turning),
+        casadi.sumsqr(turning) / angular_acceleration**2 if math.isfinite(angular_acceleration) else casadi.SX(0),
     )
     return casadi.Function("node", [x, path], [rows])
 
