@@ -1,5 +1,6 @@
 """TOPPQuad's equations hold against scipy's rotations and finite differences; its answers only count once certified."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -74,7 +75,7 @@ def test_the_coupling_is_newton_and_euler_in_time(variables):
     torque_gap = inertia * turning + np.cross(now, inertia * now) - wrench[1:]
 
     parameters = np.concatenate([first, second, [1.0, 0.0]])
-    rows = np.array(toppquad_problem._node(airframe)(variables, parameters)).ravel()
+    rows = np.array(toppquad_problem._node(airframe, math.inf)(variables, parameters)).ravel()
     np.testing.assert_allclose(rows[:3] * GRAVITY, force_gap, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(rows[3:6] * airframe.arm * airframe.hover_thrust, torque_gap, rtol=1e-6, atol=1e-10)
     assert rows[6] == pytest.approx(acceleration @ acceleration, rel=1e-6)
