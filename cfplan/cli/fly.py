@@ -201,6 +201,7 @@ def _print_outcome(flight: PlannedFlight, outcome: "FlightOutcome", summary: dic
     settled = f"{outcome.settled_after:.2f} s" if math.isfinite(outcome.settled_after) else "–"
     rows = [
         ["ended", outcome.reason],
+        ["preflight", f"{sum(check.passed for check in outcome.checks)} of {len(outcome.checks)} checks passed"],
         ["travel time, planned", f"{flight.plan.trajectory.duration:.2f} s"],
         ["travel time, streamed", f"{outcome.flown:.2f} s"],
         ["settled after", settled],
