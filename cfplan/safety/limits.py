@@ -134,6 +134,8 @@ class Limits:
     pose: PoseLimits
     firmware: FirmwareSettings
     ground: GroundManoeuvres
+    lateness: float = 0.005
+    # s, by which this computer may miss its deadlines before take-off, 99th percentile
 
 
 def load_limits(file: Path | str) -> Limits:

@@ -108,6 +108,7 @@ class _SafetyFile(_Section):
     pose: _Pose
     firmware: _Firmware
     ground: _Ground
+    lateness: Annotated[float, Field(gt=0.0, le=0.1)]
 
 
 Kind = TypeVar("Kind")
@@ -137,6 +138,7 @@ def read_limits(file: Path | str) -> Limits:
         pose=PoseLimits(**pose, yaw_agreement=yaw_agreement),
         firmware=_made(FirmwareSettings, content.firmware, oldest=tuple(map(int, content.firmware.oldest.split(".")))),
         ground=_made(GroundManoeuvres, content.ground),
+        lateness=content.lateness,
     )
     _check_vehicle_can(limits, places)
     return limits

@@ -46,7 +46,7 @@ def limits() -> Limits:
     limits = load_limits(SAFETY_FILE)
     # The computer that runs tests stands still now and then; that this ends a flight is tested on the pilot's own.
     patient = replace(limits.pose, age_brake=0.5, age_land=1.5)
-    return replace(limits, ground=quick, pose=patient)
+    return replace(limits, ground=quick, pose=patient, lateness=0.1)
 
 
 @pytest.fixture(scope="session")
