@@ -1,5 +1,9 @@
 """`cfplan replay`: look at flights in rerun."""
 
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,6 +12,7 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json
 from cfplan.cli.rehearsal import PLAN_SUFFIX, PlanOptions, obtain_plan
+from cfplan.errors import InputError
 
 if TYPE_CHECKING:
     from cfplan.recording.importers.mocap_log import Subject
@@ -17,7 +22,8 @@ EPILOG = """\b
 Examples:
   cfplan replay records/2026-11-21_101500-figure-eight --save flight.rrd
   cfplan replay vicon.csv --subject cf1 --plan flights/figure8.yaml
-  cfplan replay records/toppquad records/learned"""
+  cfplan replay records/toppquad records/learned
+  cfplan replay records/learned --png flight.png --at 12"""
 
 
 @click.command(short_help="Look at flights and logs in rerun.", epilog=EPILOG)
@@ -30,6 +36,8 @@ Examples:
     help="What the three angles of a Vicon CSV are where its header does not say.",
 )
 @click.option("--save", type=click.Path(path_type=Path), help="Write a rerun file here instead of opening the viewer.")
+@click.option("--png", type=click.Path(path_type=Path), help="Draw the view into this picture; needs no screen.")
+@click.option("--at", "moment", type=float, help="s on the timeline, of the picture; else amid the path.")
 @click.option("--force", is_flag=True, help="Overwrite the file.")
 @options.as_json
 def replay(
@@ -38,6 +46,8 @@ def replay(
     names: tuple[str, ...],
     angles: str | None,
     save: Path | None,
+    png: Path | None,
+    moment: float | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -48,18 +58,53 @@ def replay(
     """
     from cfplan.recording.reader import is_record
 
+    if moment is not None and (png is None or not math.isfinite(moment)):
+        raise InputError("--at says when a picture is taken, in s", hint="add --png flight.png")
     steps = Steps(as_json=as_json)
+    files = Files(save, png, moment, force)
     if len(flights) == 1 and plan_file is None and is_record(flights[0]):
-        document = _replay_record(flights[0], save, force, steps)
+        document = _replay_record(flights[0], files, steps)
     else:
-        document = _replay_trials(flights, plan_file, names, angles, save, force, steps)
+        document = _replay_trials(flights, plan_file, names, angles, files, steps)
     if as_json:
-        print_json({**document, "rrd": str(save) if save else None})
+        print_json({**document, "rrd": str(save) if save else None, "png": str(png) if png else None})
 
 
-def _replay_record(place: Path, save: Path | None, force: bool, steps: Steps) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Files:
+    """What to write; where it is nothing, the viewer opens."""
+
+    save: Path | None
+    png: Path | None
+    moment: float | None
+    # s
+    force: bool
+
+    def make(
+        self, steps: Steps, write: "Callable[..., None]", picture: "Callable[..., tuple[str, ...]]", show: Callable
+    ) -> None:
+        """Write or show."""
+        if self.save is not None:
+            with steps.step("rerun file") as said:
+                write(self.save, overwrite=self.force)
+                said.append(f"{self.save} ({_size(self.save)}); open it with: rerun {self.save}")
+        if self.png is not None:
+            with steps.step("picture") as said:
+                complaints = picture(self.png, moment=self.moment, overwrite=self.force)
+                said.append(f"{self.png} ({_size(self.png)})")
+                said.extend(complaints)
+        if self.save is None and self.png is None:
+            with steps.step("viewer"):
+                show()
+
+
+def _size(file: Path) -> str:
+    return f"{file.stat().st_size / 1e6:.1f} MB"
+
+
+def _replay_record(place: Path, files: Files, steps: Steps) -> dict[str, Any]:
     from cfplan.recording.reader import read_record
-    from cfplan.recording.rerun_view import show, write_rrd
+    from cfplan.recording.rerun_view import picture, show, write_rrd
     from cfplan.recording.summary import summarise
 
     with steps.step("read") as said:
@@ -67,13 +112,7 @@ def _replay_record(place: Path, save: Path | None, force: bool, steps: Steps) ->
         said.append(f"{flight.header.name}, {flight.duration:.1f} s, {len(flight.setpoints.time)} setpoints")
         if flight.truncated:
             said.append("truncated: what follows the last whole chunk is lost")
-    if save is not None:
-        with steps.step("rerun file") as said:
-            write_rrd(flight, save, overwrite=force)
-            said.append(_saved(save))
-    else:
-        with steps.step("viewer"):
-            show(flight)
+    files.make(steps, partial(write_rrd, flight), partial(picture, flight), partial(show, flight))
     return {"record": str(place), **summarise(flight).to_json()}
 
 
@@ -82,11 +121,10 @@ def _replay_trials(
     plan_file: Path | None,
     names: tuple[str, ...],
     angles: str | None,
-    save: Path | None,
-    force: bool,
+    files: Files,
     steps: Steps,
 ) -> dict[str, Any]:
-    from cfplan.recording.overlay_view import show_overlay, write_overlay
+    from cfplan.recording.overlay_view import picture_overlay, show_overlay, write_overlay
 
     reference = _reference(plan_file, steps) if plan_file is not None else None
     trials: list[Trial] = []
@@ -95,18 +133,8 @@ def _replay_trials(
         for trial, said in _trials(place, reference, names, angles, steps):
             trials.append(trial)
             told.append({"file": str(place), "name": trial.name, **said})
-    if save is not None:
-        with steps.step("rerun file") as said_of_file:
-            write_overlay(trials, save, overwrite=force)
-            said_of_file.append(_saved(save))
-    else:
-        with steps.step("viewer"):
-            show_overlay(trials)
+    files.make(steps, partial(write_overlay, trials), partial(picture_overlay, trials), partial(show_overlay, trials))
     return {"trials": told}
-
-
-def _saved(file: Path) -> str:
-    return f"{file} ({file.stat().st_size / 1e6:.1f} MB); open it with: rerun {file}"
 
 
 def _reference(plan_file: Path, steps: Steps) -> "Reference":

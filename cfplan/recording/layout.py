@@ -15,22 +15,27 @@ PATH = f"{WORLD}/path"
 FLOWN = f"{WORLD}/flown"
 TAIL = f"{WORLD}/flown_tail"
 BODY = f"{WORLD}/vehicle"
+THRUST = f"{BODY}/thrust"
 GHOST = f"{WORLD}/setpoint"
 WANTED_TAIL = f"{WORLD}/setpoint_tail"
+JOINTS = f"{WORLD}/plan/joints"
+LIMITS = f"{WORLD}/plan/limit"
 PLOTS = "plots"
 PHASES = "phase"
 SUPERVISOR = "supervisor"
+ACTIVE_LIMIT = "limit"
 EVENTS = "events"
 SUMMARY = "summary"
 
 TAIL_SECONDS = 2.0
+_STATES = "Phases, limit that holds the plan back, supervisor"
 
 
 def blueprint(record: Record) -> rrb.Blueprint:
     """3-D at the left, the plots beside it in two columns, phases, events and the summary below."""
     grid = rrb.Grid(*(_plot(plot.name, plot.title) for plot in plots(record)), grid_columns=2)
     below = rrb.Horizontal(
-        rrb.StateTimelineView(contents=[PHASES, SUPERVISOR], name="Phases"),
+        rrb.StateTimelineView(contents=[PHASES, ACTIVE_LIMIT, SUPERVISOR], name=_STATES),
         rrb.Tabs(
             rrb.TextLogView(origin=EVENTS, name="Events", columns=_event_columns()),
             rrb.TextDocumentView(origin=SUMMARY, name="Summary"),
@@ -48,7 +53,7 @@ def blueprint(record: Record) -> rrb.Blueprint:
 
 def _event_columns() -> rrb.TextLogColumns:
     return rrb.TextLogColumns(
-        timeline_columns=[TimelineColumn(TIMELINE)],
+        timeline_columns=[TimelineColumn(TIMELINE, visible=False)],
         text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
     )
 
@@ -61,7 +66,8 @@ def _room(record: Record) -> rrb.Spatial3DView:
     """The room from above one of its long sides, such that the whole fence is in sight."""
     low, high = np.array(record.header.fence)
     centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
-    aside = (0.7, -0.25, 0.45) if high[1] - low[1] > high[0] - low[0] else (-0.25, -0.7, 0.45)
+    target = (*centre[:2], low[2] + 0.1 * (high - low)[2])
+    aside = (0.66, -0.17, 0.45) if high[1] - low[1] > high[0] - low[0] else (-0.17, -0.66, 0.45)
     tail = rrb.VisibleTimeRange(
         TIMELINE,
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TAIL_SECONDS),
@@ -73,6 +79,6 @@ def _room(record: Record) -> rrb.Spatial3DView:
         overrides={entity: [rrb.VisibleTimeRanges([tail])] for entity in (TAIL, WANTED_TAIL)},
         line_grid=False,
         eye_controls=rrb.EyeControls3D(
-            position=centre + size * np.array(aside), look_target=centre, eye_up=(0.0, 0.0, 1.0)
+            position=centre + size * np.array(aside), look_target=target, eye_up=(0.0, 0.0, 1.0)
         ),
     )

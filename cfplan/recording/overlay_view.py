@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from cfplan.recording.layout import PLOTS, TAIL_SECONDS, TIMELINE, WORLD
 from cfplan.recording.overlay import Reference, Trial, extent
+from cfplan.recording.picture import write_png
 from cfplan.recording.plots import FOUR, WANTED, Colour
 from cfplan.recording.rerun_view import FLOOR_COLOUR, PATH_COLOUR, TRACK_RADIUS, floor_lines, log_outline, log_tail
 from cfplan.recording.viewer import open_viewer, save
 
 COLOURS: tuple[Colour, ...] = (FOUR[0], WANTED, *FOUR[1:], (213, 94, 0), (0, 114, 178))
-ARM = 0.05  # m, of the vehicle as drawn: a log does not know its size
+ARM = 0.0375  # m, of the vehicle as drawn: a log does not know its size
 DASH = 0.05  # m, of the reference as drawn, and as much between two
 DRAWN_RATE = 100.0  # Hz: more poses than that are not drawn in 3-D, where nobody could tell
 _REFERENCE, _TRIAL = f"{WORLD}/reference", f"{WORLD}/trial"
@@ -31,6 +32,19 @@ def write_overlay(trials: Sequence[Trial], file: Path, *, overwrite: bool = Fals
 def show_overlay(trials: Sequence[Trial]) -> None:
     """Open the viewer on the trials. Raises InputError where there is no screen."""
     open_viewer(blueprint(trials), partial(log_trials, trials=trials))
+
+
+def picture_overlay(
+    trials: Sequence[Trial], file: Path, *, moment: float | None = None, overwrite: bool = False
+) -> tuple[str, ...]:
+    """Write a PNG of the view at a moment, s from the begin of the path; else half-way. What the viewer complains of.
+
+    Raises InputError as write_png does.
+    """
+    ends = [reference.time[-1] for reference in references(trials)] or [trial.time[-1] for trial in trials]
+    middle = float(max(ends)) / 2
+    draw = partial(log_trials, trials=trials)
+    return write_png(file, blueprint(trials), draw, middle if moment is None else moment, overwrite=overwrite)
 
 
 def blueprint(trials: Sequence[Trial]) -> rrb.Blueprint:

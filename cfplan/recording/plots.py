@@ -95,7 +95,15 @@ def plots(record: Record) -> tuple[Plot, ...]:
             (_flown("voltage", status.time, status.battery_voltage, "voltage"),),
             (bounds.battery_voltage,),
         ),
-        Plot("pose_age", "Pose age, ms", (_flown("worst", aged, age * 1e3, "oldest"),), (bounds.pose_age * 1e3,)),
+        Plot(
+            "age",
+            "Age of poses and of the vehicle's log, ms",
+            (
+                _flown("pose", aged, age * 1e3, "pose"),
+                Line("log", status.time[1:], 1e3 * np.diff(status.time), ("log by radio",), ((150, 150, 150),)),
+            ),
+            (bounds.pose_age * 1e3,),
+        ),
         Plot(
             "lateness",
             "Lateness of setpoints, ms",

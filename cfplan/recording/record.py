@@ -12,6 +12,7 @@ from cfplan.recording.header import RecordHeader
 
 FLIGHT_FILE = "flight.mcap"
 SUMMARY_FILE = "summary.json"
+PLAN_FILE = "plan.parquet"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

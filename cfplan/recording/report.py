@@ -10,11 +10,10 @@ from typing import Any
 from cfplan.errors import CfplanError
 from cfplan.planning.files import load_plan
 from cfplan.recording.reader import read_record
-from cfplan.recording.record import Record
+from cfplan.recording.record import PLAN_FILE, Record
 from cfplan.recording.summary import FlightSummary, summarise
 from cfplan.safety.certificate import Certificate
 
-PLAN_FILE = "plan.parquet"
 UNKNOWN = "–"
 
 

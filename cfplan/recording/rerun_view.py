@@ -14,18 +14,23 @@ from numpy.typing import NDArray
 
 from cfplan.flight.telemetry import Level
 from cfplan.recording import layout
+from cfplan.recording.picture import write_png
+from cfplan.recording.plan_view import log_plan
 from cfplan.recording.plots import FLOWN as FLOWN_COLOUR
-from cfplan.recording.plots import LIMIT, Colour, Plot, finite_limits, plots
+from cfplan.recording.plots import LIMIT, Colour, Plot, finite_limits, motor_thrust, plots
 from cfplan.recording.plots import WANTED as WANTED_COLOUR
 from cfplan.recording.record import Record
 from cfplan.recording.states import PHASE_COLOURS, SUPERVISOR_COLOURS, supervisor_states
-from cfplan.recording.summary import dropouts, pose_gaps
+from cfplan.recording.summary import dropouts, pose_gaps, reference_span
 from cfplan.recording.summary_text import summary_text
 from cfplan.recording.viewer import open_viewer, save
+from cfplan.vehicle.airframe import GRAVITY
 
-AXIS_LENGTH = 0.2  # m, of the body axes as drawn
-BODY_SCALE = 3.0  # the vehicle is drawn larger than it is, or it could not be seen in its room
-TRACK_RADIUS, TAIL_RADIUS, PATH_RADIUS = 0.004, 0.012, 0.006  # m, of the lines
+AXIS_LENGTH = 0.25  # m, of the body axes as drawn
+BODY_SCALE = 4.0  # the vehicle is drawn larger than it is, or it could not be seen in its room
+TRACK_RADIUS, TAIL_RADIUS, WANTED_RADIUS, PATH_RADIUS = 0.004, 0.02, 0.01, 0.006  # m, of the lines
+HOVER_ARROW = 0.35  # m, of the thrust in hover
+THRUST_COLOUR: Colour = (240, 228, 66)
 FENCE_COLOUR: Colour = (170, 90, 90)
 FLOOR_COLOUR: Colour = (62, 66, 74)
 PATH_COLOUR: Colour = (130, 130, 140)
@@ -43,12 +48,25 @@ def show(record: Record) -> None:
     open_viewer(layout.blueprint(record), partial(log_record, record=record))
 
 
+def picture(record: Record, file: Path, *, moment: float | None = None, overwrite: bool = False) -> tuple[str, ...]:
+    """Write a PNG of the view at a moment, s since the record's start; else amid the path.
+
+    What the viewer complains of. Raises InputError as write_png does.
+    """
+    begin, end = reference_span(record)
+    middle = (begin + end) / 2 - record.start if np.isfinite(begin) else record.duration / 2
+    draw = partial(log_record, record=record)
+    return write_png(file, layout.blueprint(record), draw, middle if moment is None else moment, overwrite=overwrite)
+
+
 def log_record(stream: rr.RecordingStream, record: Record) -> None:
     """Send all of a record."""
     stream.send_recording_name(record.header.name)
     _log_room(stream, record)
     _log_vehicle(stream, record)
+    _log_thrust(stream, record)
     _log_ghost(stream, record)
+    log_plan(stream, record)
     for plot in plots(record):
         _log_plot(stream, plot, record)
     _log_states(stream, record)
@@ -96,6 +114,18 @@ def _log_vehicle(stream: rr.RecordingStream, record: Record) -> None:
     log_tail(stream, layout.TAIL, poses.time - record.start, poses.position, FLOWN_COLOUR)
 
 
+def _log_thrust(stream: rr.RecordingStream, record: Record) -> None:
+    """An arrow along the body's z axis, by what the four motors are told: in hover as long as HOVER_ARROW."""
+    status, poses = record.status, record.poses
+    if len(status.time) == 0 or len(poses.time) == 0:
+        return
+    seen = (status.time >= poses.time[0]) & (status.time <= poses.time[-1])
+    length = motor_thrust(record)[seen].sum(axis=1) / (record.header.vehicle.mass * GRAVITY) * HOVER_ARROW
+    stream.log(layout.THRUST, rr.Arrows3D.from_fields(colors=[THRUST_COLOUR], radii=[0.008]), static=True)
+    columns = rr.Arrows3D.columns(vectors=np.stack([0 * length, 0 * length, length], axis=1))
+    stream.send_columns(layout.THRUST, [_since_start(record, status.time[seen])], columns, strict=True)
+
+
 def _log_ghost(stream: rr.RecordingStream, record: Record) -> None:
     """The setpoint that was in force, as a second vehicle, and where it has just been."""
     setpoints = record.setpoints
@@ -104,7 +134,8 @@ def _log_ghost(stream: rr.RecordingStream, record: Record) -> None:
     columns = rr.Transform3D.columns(translation=setpoints.position, quaternion=setpoints.quaternion)
     stream.send_columns(layout.GHOST, [_since_start(record, setpoints.due)], columns, strict=True)
     log_outline(stream, layout.GHOST, record.header.vehicle.arm, setpoints.due - record.start, WANTED_COLOUR)
-    log_tail(stream, layout.WANTED_TAIL, setpoints.due - record.start, setpoints.position, WANTED_COLOUR)
+    since = setpoints.due - record.start
+    log_tail(stream, layout.WANTED_TAIL, since, setpoints.position, WANTED_COLOUR, WANTED_RADIUS)
 
 
 def log_outline(stream: rr.RecordingStream, entity: str, arm: float, times: NDArray, colour: Colour) -> None:
@@ -125,9 +156,16 @@ def vehicle_outline(arm: float) -> list[NDArray]:
     return [corners[[0, 2]], corners[[1, 3]], *(corner + circle for corner in corners)]
 
 
-def log_tail(stream: rr.RecordingStream, entity: str, times: NDArray, positions: NDArray, colour: Colour) -> None:
+def log_tail(
+    stream: rr.RecordingStream,
+    entity: str,
+    times: NDArray,
+    positions: NDArray,
+    colour: Colour,
+    radius: float = TAIL_RADIUS,
+) -> None:
     """Each step as a short line at its own time; the layout shows those of the last seconds."""
-    stream.log(entity, rr.LineStrips3D.from_fields(colors=[colour], radii=[TAIL_RADIUS]), static=True)
+    stream.log(entity, rr.LineStrips3D.from_fields(colors=[colour], radii=[radius]), static=True)
     if len(times) > 1:
         columns = rr.LineStrips3D.columns(strips=_steps(positions))
         stream.send_columns(entity, [rr.TimeColumn(layout.TIMELINE, duration=times[1:])], columns, strict=True)
@@ -180,7 +218,10 @@ def _log_events(stream: rr.RecordingStream, record: Record) -> None:
     events = record.events
     if len(events.time):
         levels = [LEVEL_NAMES.get(level, "INFO") for level in events.level]
-        columns = rr.TextLog.columns(text=list(events.text), level=levels)
+        texts = [
+            f"{time - record.start:6.2f} s  {text}" for time, text in zip(events.time, events.text, strict=True)
+        ]  # the viewer's own column of times is too narrow to read
+        columns = rr.TextLog.columns(text=texts, level=levels)
         stream.send_columns(layout.EVENTS, [_since_start(record, events.time)], columns, strict=True)
 
 

@@ -154,6 +154,17 @@ def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = No
     )
 
 
+def shares(trajectory: Trajectory, limits: PlanLimits, time: NDArray) -> dict[str, NDArray]:
+    """How much of each limit is used at each time, (N,) each; counted as in the certificate, the walls left out."""
+    quantities = _quantities(trajectory.at(time), trajectory, limits, None)
+    return {
+        quantity.name: ((np.atleast_2d(quantity.values) - quantity.at_rest) / (quantity.limit - quantity.at_rest)).max(
+            axis=0
+        )
+        for quantity in quantities
+    }
+
+
 def _quantities(
     state: FullState, trajectory: Trajectory, limits: PlanLimits, space: Space | None
 ) -> Iterator[_Quantity]:

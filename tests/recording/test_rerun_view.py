@@ -2,10 +2,10 @@
 
 import dataclasses
 import io
+import itertools
 import os
-import socket
+import shutil
 import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
@@ -14,17 +14,40 @@ import rerun_cli
 from PIL import Image
 from rerun.chunk import RrdReader
 from rerun.components import AggregationPolicy
-from rerun.experimental import ViewerClient
 
 from cfplan.errors import InputError
+from cfplan.geometry.min_snap import min_snap
+from cfplan.planning.files import save_plan
+from cfplan.planning.plan import plan
 from cfplan.recording import layout
+from cfplan.recording.picture import SIZE, HeadlessViewer
+from cfplan.recording.plan_view import ACTIVE, FREE, active_limits
 from cfplan.recording.plots import finite_limits, motor_thrust, plots
 from cfplan.recording.reader import read_record
-from cfplan.recording.rerun_view import floor_lines, show, vehicle_outline, write_rrd
+from cfplan.recording.record import PLAN_FILE
+from cfplan.recording.rerun_view import HOVER_ARROW, floor_lines, picture, show, vehicle_outline, write_rrd
 from cfplan.recording.writer import RecordWriter
+from cfplan.safety.limits import load_limits
 
 RERUN = Path(rerun_cli.__file__).with_name("rerun")
 VULKAN = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
+
+
+@pytest.fixture(scope="module")
+def made_plan():
+    limits = load_limits(Path(__file__).parents[2] / "safety.yaml")
+    path = min_snap([[-1, -1, 0.8], [0, 0.5, 1.2], [1, -0.5, 0.9]])
+    return plan(path, limits.airframe, limits, planner="min-snap", nodes=60)
+
+
+@pytest.fixture(scope="module")
+def rrd_with_plan(flight, made_plan, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("planned") / "flight"
+    shutil.copytree(flight.folder, folder)
+    save_plan(made_plan, folder / PLAN_FILE)
+    file = folder / "flight.rrd"
+    write_rrd(read_record(folder), file)
+    return file
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +125,9 @@ def test_phases_and_events_read_back_equal(flight, rrd):
     assert [phase for (phase,) in phases] == flight.record.phases.phase.tolist()
     np.testing.assert_allclose(times, flight.record.phases.time - flight.record.start, atol=2e-9)
     _, texts = rows(rrd, f"/{layout.EVENTS}", "TextLog:text")
-    assert [text for (text,) in texts] == flight.record.events.text.tolist()
+    assert [text for (text,) in texts] == [
+        "  0.11 s  connected to sim://0", " 10.11 s  no pose for 0.1 s", " 17.01 s  the path is flown",
+    ]  # fmt: skip
     _, levels = rows(rrd, f"/{layout.EVENTS}", "TextLog:level")
     assert [level for (level,) in levels] == ["INFO", "WARN", "INFO"]
 
@@ -174,30 +199,94 @@ def software_vulkan():
     return any(list(folder.glob("lvp_icd*.json")) for folder in VULKAN)
 
 
+needs_driver = pytest.mark.skipif(
+    not software_vulkan(), reason="no software Vulkan driver (Debian: mesa-vulkan-drivers)"
+)
+
+
+def colours(picture):
+    return len(Image.open(io.BytesIO(picture)).convert("RGB").getcolors(maxcolors=1 << 24))
+
+
 @pytest.mark.integration
-@pytest.mark.skipif(not software_vulkan(), reason="no software Vulkan driver (Debian: mesa-vulkan-drivers)")
-def test_every_view_renders_without_reports_and_is_not_blank(rrd, tmp_path, monkeypatch):
-    monkeypatch.setenv("RERUN_ANALYTICS", "false")
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    viewer = ViewerClient.spawn(headless=True, port=port, hide_welcome_screen=True, executable_path=str(RERUN))
-    try:
-        viewer.open(str(rrd))
-        deadline = time.monotonic() + 30
-        while viewer.get_state().loading and time.monotonic() < deadline:
-            time.sleep(0.1)
-        viewer.set_time(layout.TIMELINE, duration=12.0)
-        time.sleep(1.0)
-        views = viewer.get_state().views
+@needs_driver
+def test_every_view_renders_without_reports_and_is_not_blank(rrd_with_plan):
+    with HeadlessViewer.opened(rrd_with_plan) as viewer:
+        viewer.go_to(12.0)
+        views = viewer.views()
         assert len(views) == 12
         for view in views:
-            assert view.reports == [], view.name
+            assert view.reports == (), view.name
             if view.name != "Summary":  # behind the events, in the same tabs
-                image = Image.open(io.BytesIO(viewer.take_screenshot(view.view_id))).convert("RGB")
-                colours = image.getcolors(maxcolors=1 << 24)
-                assert len(colours) > 20, view.name
-        assert [entry.message for entry in viewer.get_logs() if entry.level == "ERROR"] == []
-    finally:
-        viewer.quit()
+                assert colours(viewer.picture(view)) > 20, view.name
+        assert viewer.complaints() == ()
+
+
+@pytest.mark.integration
+@needs_driver
+def test_a_picture_is_the_whole_window_at_its_moment(flight, tmp_path):
+    for name, moment in (("early", 8.0), ("late", None)):
+        assert picture(flight.record, tmp_path / name, moment=moment) == ()
+    images = {file.name: Image.open(file).convert("RGB") for file in tmp_path.iterdir()}
+    assert {image.size for image in images.values()} == {SIZE}
+    assert len({image.tobytes() for image in images.values()}) == 2
+
+
+@pytest.mark.integration
+def test_without_a_driver_a_picture_is_an_error_with_a_way_out(flight, tmp_path, monkeypatch):
+    monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "none.json"))
+    monkeypatch.setenv("VK_ICD_FILENAMES", str(tmp_path / "none.json"))
+    with pytest.raises(InputError, match="no Vulkan driver") as caught:
+        picture(flight.record, tmp_path / "a.png")
+    assert "mesa-vulkan-drivers" in caught.value.hint
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_is_not_overwritten_unasked(flight, tmp_path):
+    (tmp_path / "a.png").write_text("mine")
+    with pytest.raises(InputError, match="already"):
+        picture(flight.record, tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_text() == "mine"
+
+
+def test_where_a_limit_is_active_is_where_the_plan_uses_nearly_all_of_it(made_plan):
+    active = active_limits(made_plan)
+    state, limits = made_plan.trajectory.at(active.time), made_plan.limits.plan
+    used = {
+        "speed": np.linalg.norm(state.velocity, axis=1) / limits.speed,
+        "acceleration": np.linalg.norm(state.acceleration, axis=1) / limits.acceleration,
+    }
+    for name, share in used.items():
+        assert np.all(share[active.name == name] >= ACTIVE)
+        assert np.all(share[active.name == FREE] < ACTIVE)
+    assert made_plan.certificate.worst.name in active.name
+
+
+def test_stretches_of_active_limits_are_in_order_and_leave_nothing_out(made_plan):
+    active = active_limits(made_plan)
+    covered = [(rows.start, rows.stop) for _, rows in active.stretches()]
+    assert covered[0][0] == 0
+    assert covered[-1][1] == len(active.time)
+    assert all(begin == end - 1 for (_, end), (begin, _) in itertools.pairwise(covered))
+    for name, rows in active.stretches():
+        assert set(active.name[rows.start : rows.stop - 1]) <= {name}
+
+
+def test_joints_and_active_limits_of_the_plan_are_in_the_recording(rrd_with_plan, made_plan):
+    joints = [
+        value
+        for chunk in RrdReader(rrd_with_plan).stream().filter(content=[f"/{layout.JOINTS}"])
+        for value in chunk.to_record_batch().column("Points3D:positions").to_pylist()
+    ]
+    np.testing.assert_allclose(joints[0], made_plan.path(made_plan.path.breaks), atol=1e-6)
+    times, names = rows(rrd_with_plan, f"/{layout.ACTIVE_LIMIT}", "StateChange:state")
+    assert [name for (name,) in names] == [name for name, _ in active_limits(made_plan).stretches()] + [FREE]
+    assert times[-1] - times[0] == pytest.approx(made_plan.trajectory.duration)
+
+
+def test_the_thrust_arrow_in_hover_has_its_length(flight, rrd):
+    times, arrows = rows(rrd, f"/{layout.THRUST}", "Arrows3D:vectors")
+    length = np.array(arrows)[:, 0, 2]
+    hovering = (times > 18.5) & (times < 19.5)
+    assert np.mean(length[hovering]) == pytest.approx(HOVER_ARROW, rel=0.01)
+    assert np.all(length[times < 2.9] == 0.0)
