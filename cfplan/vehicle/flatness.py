@@ -23,6 +23,10 @@ Scalar = Any  # float, NDArray or casadi.SX
 Vector = tuple[Scalar, Scalar, Scalar]
 
 
+# Compiled into the loop that calls it, so that the loop can work on several points at once.
+_within_the_loop = register_jitable(forceinline=True)
+
+
 class Body(NamedTuple):
     """What the map needs of an airframe, in a form that compiles; fields as in Airframe."""
 
@@ -54,33 +58,33 @@ class Flat(NamedTuple):
     # N
 
 
-@register_jitable
+@_within_the_loop
 def _scaled(a: Scalar, u: Vector) -> Vector:
     return a * u[0], a * u[1], a * u[2]
 
 
-@register_jitable
+@_within_the_loop
 def _sum2(a: Scalar, u: Vector, b: Scalar, v: Vector) -> Vector:
     return a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2]
 
 
-@register_jitable
+@_within_the_loop
 def _sum3(a: Scalar, u: Vector, b: Scalar, v: Vector, c: Scalar, w: Vector) -> Vector:
     return a * u[0] + b * v[0] + c * w[0], a * u[1] + b * v[1] + c * w[1], a * u[2] + b * v[2] + c * w[2]
 
 
-@register_jitable
+@_within_the_loop
 def _dot(a: Vector, b: Vector) -> Scalar:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@register_jitable
+@_within_the_loop
 def motion(d1: Vector, d2: Vector, h: Scalar, dh: Scalar) -> tuple[Vector, Vector]:
     """Velocity and acceleration from γ', γ'', h, h'."""
     return _scaled(h**0.5, d1), _sum2(h, d2, 0.5 * dh, d1)
 
 
-@register_jitable
+@_within_the_loop
 def flat_state(
     airframe: Airframe | Body,
     derivatives: tuple[Vector, Vector, Vector, Vector],
@@ -152,7 +156,7 @@ def flat_state(
     )
 
 
-@register_jitable
+@_within_the_loop
 def motor_thrusts(
     airframe: Airframe | Body, collective: Scalar, torque: Vector
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:
@@ -171,6 +175,26 @@ def motor_thrusts(
     )
 
 
+@_within_the_loop
+def profile_within(
+    x: Scalar, h: Scalar, dh: Scalar, ddh: Scalar, dddh: Scalar, yaw: Scalar, dyaw: Scalar, ddyaw: Scalar
+) -> tuple[tuple[Scalar, Scalar, Scalar, Scalar], Vector]:
+    """h with three derivatives and yaw with two, at x from the grid point where they have the values given."""
+    return (
+        (h + x * (dh + x * (ddh / 2 + x * dddh / 6)), dh + x * (ddh + x * dddh / 2), ddh + x * dddh, dddh),
+        (yaw + x * (dyaw + x * ddyaw / 2), dyaw + x * ddyaw, ddyaw),
+    )
+
+
+def compiled_body(airframe: Airframe) -> Body:
+    """The airframe for compiled code, which is made for one type of each number."""
+    (jx, jy, jz), (planar, axial) = airframe.inertia, airframe.drag
+    return Body(
+        float(airframe.mass), (float(jx), float(jy), float(jz)), float(airframe.arm),
+        float(airframe.thrust_to_torque), (float(planar), float(axial)),
+    )  # fmt: skip
+
+
 COLUMNS: dict[str, slice | int] = {
     "position": slice(0, 3), "velocity": slice(3, 6), "acceleration": slice(6, 9), "jerk": slice(9, 12),
     "snap": slice(12, 15), "thrust_axis": slice(15, 18), "body_rate": slice(18, 21),
@@ -186,15 +210,10 @@ def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArra
     `interval` tells whose polynomials of the profile hold; a break of the path belongs to the piece on its right.
     """
     out = np.empty((len(s), WIDTH))
-    (jx, jy, jz), (planar, axial) = airframe.inertia, airframe.drag
-    body = Body(
-        float(airframe.mass), (float(jx), float(jy), float(jz)), float(airframe.arm),
-        float(airframe.thrust_to_torque), (float(planar), float(axial)),
-    )  # fmt: skip
     piece = np.clip(np.searchsorted(path.breaks, s, side="right") - 1, 0, len(path.breaks) - 2)
     offset = s - np.where(piece == len(path.breaks) - 2, path.breaks[-1], path.breaks[piece])
     _fill(
-        out, body, path.coefficients, piece, offset, s - profile.s[interval], interval,
+        out, compiled_body(airframe), path.coefficients, piece, offset, s - profile.s[interval], interval,
         profile.h, profile.dh, profile.ddh, profile.dddh, profile.yaw, profile.dyaw, profile.ddyaw,
     )  # fmt: skip
     return out
@@ -216,20 +235,10 @@ def _fill(
             p4, p3, p2, p1 = _sum2(x, p4, 1.0, p3), _sum2(x, p3, 1.0, p2), _sum2(x, p2, 1.0, p1), _sum2(x, p1, 1.0, p0)
             p0 = _sum2(x, p0, 1.0, (table[k, 0], table[k, 1], table[k, 2]))
         i, x = intervals[n], places[n]
-        psi = yaw[i] + x * (dyaw[i] + x * ddyaw[i] / 2)
-        flat = flat_state(
-            body,
-            (p1, _scaled(2.0, p2), _scaled(6.0, p3), _scaled(24.0, p4)),
-            (
-                h[i] + x * (dh[i] + x * (ddh[i] / 2 + x * dddh[i] / 6)),
-                dh[i] + x * (ddh[i] + x * dddh[i] / 2),
-                ddh[i] + x * dddh[i],
-                dddh[i],
-            ),
-            (psi, dyaw[i] + x * ddyaw[i], ddyaw[i]),
-            math.cos,
-            math.sin,
-        )
+        speed, turn = profile_within(x, h[i], dh[i], ddh[i], dddh[i], yaw[i], dyaw[i], ddyaw[i])
+        psi = turn[0]
+        derivatives = (p1, _scaled(2.0, p2), _scaled(6.0, p3), _scaled(24.0, p4))
+        flat = flat_state(body, derivatives, speed, turn, math.cos, math.sin)
         row = out[n]
         for k in range(3):
             row[k] = p0[k]
