@@ -31,8 +31,9 @@ MOTOR_THRUST = 7
 ROWS = 11
 
 WIDTH = 16
-_H, _YAW = 12, 16  # rows of a panel, behind γ' to γ''''
-_RESULT = 19
+_X, _NODE, _RESULT = 12, 13, 20
+# rows of a panel: behind γ' to γ'''' the place in the interval, the seven numbers of the profile where that begins, and
+# what comes of them
 _SIZE = (_RESULT + ROWS) * WIDTH
 
 
@@ -43,7 +44,11 @@ def dense_rows(
 
     `places`, (N,), is s less that of the grid point at which each point's `interval`, (N,), begins.
     """
-    out = np.empty((ROWS, len(places)))
+    count = len(places)
+    if count < WIDTH:  # less than a panel: the first point again and again
+        more = np.r_[:count, np.zeros(WIDTH - count, dtype=int)]
+        return dense_rows(airframe, derivatives[:, :, more], profile, places[more], interval[more])[:, :count]
+    out = np.empty((ROWS, count))
     _at_points(
         out, compiled_body(airframe), np.ascontiguousarray(derivatives, dtype=float).reshape(12, -1), places, interval,
         profile.h, profile.dh, profile.ddh, profile.dddh, profile.yaw, profile.dyaw, profile.ddyaw,
@@ -52,29 +57,32 @@ def dense_rows(
 
 
 def _compile(sources: int) -> Callable[..., int]:
-    """The loops, which return `sources`: a checksum of the files of what they call, as numba's cache does not look there."""
+    """The loop, which returns `sources`: a checksum of what it calls, as numba's cache does not look there."""
 
     @njit(cache=True, error_model="numpy")
     def at_points(
         out: NDArray, body: Body, derivatives: NDArray, places: NDArray, interval: NDArray,
         h: NDArray, dh: NDArray, ddh: NDArray, dddh: NDArray, yaw: NDArray, dyaw: NDArray, ddyaw: NDArray,
     ) -> int:  # fmt: skip
-        panel = np.zeros(_SIZE)
-        for begin in range(0, len(places), WIDTH):
-            count = min(WIDTH, len(places) - begin)
+        panel = np.empty(_SIZE)
+        for start in range(0, len(places), WIDTH):
+            begin = min(start, len(places) - WIDTH)
             for row in range(12):
-                for n in range(count):
+                for n in range(WIDTH):
                     panel[row * WIDTH + n] = derivatives[row, begin + n]
-            for n in range(count):
+            for n in range(WIDTH):
                 i = interval[begin + n]
-                speed, turn = profile_within(places[begin + n], h[i], dh[i], ddh[i], dddh[i], yaw[i], dyaw[i], ddyaw[i])
-                for k in range(4):
-                    panel[(_H + k) * WIDTH + n] = speed[k]
-                for k in range(3):
-                    panel[(_YAW + k) * WIDTH + n] = turn[k]
+                panel[_X * WIDTH + n] = places[begin + n]
+                panel[(_NODE + 0) * WIDTH + n] = h[i]
+                panel[(_NODE + 1) * WIDTH + n] = dh[i]
+                panel[(_NODE + 2) * WIDTH + n] = ddh[i]
+                panel[(_NODE + 3) * WIDTH + n] = dddh[i]
+                panel[(_NODE + 4) * WIDTH + n] = yaw[i]
+                panel[(_NODE + 5) * WIDTH + n] = dyaw[i]
+                panel[(_NODE + 6) * WIDTH + n] = ddyaw[i]
             _flatten(panel, body)
             for row in range(ROWS):
-                for n in range(count):
+                for n in range(WIDTH):
                     out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
         return sources
 
@@ -85,12 +93,17 @@ def _compile(sources: int) -> Callable[..., int]:
 def _flatten(panel: NDArray, body: Body) -> None:
     """Fill the rows of results from those of the path and the profile, at every place of the panel."""
     for n in range(WIDTH):
-        speed = _vector(panel, _H, n)
+        speed, turn = profile_within(
+            panel[_X * WIDTH + n],
+            *_vector(panel, _NODE, n),
+            panel[(_NODE + 3) * WIDTH + n],
+            *_vector(panel, _NODE + 4, n),
+        )
         flat = flat_state(
             body,
             (_vector(panel, 0, n), _vector(panel, 3, n), _vector(panel, 6, n), _vector(panel, 9, n)),
-            (speed[0], speed[1], speed[2], panel[(_H + 3) * WIDTH + n]),
-            _vector(panel, _YAW, n),
+            speed,
+            turn,
             cosine,
             sine,
         )

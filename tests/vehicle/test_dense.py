@@ -1,0 +1,75 @@
+"""Rows for many points at a time against the flatness map in plain numpy."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cfplan.geometry.min_snap import min_snap
+from cfplan.vehicle import dense
+from cfplan.vehicle.airframes import AIRFRAMES
+from cfplan.vehicle.flatness import flat_state
+from cfplan.vehicle.trigonometry import cosine, sine, slope_angle
+
+WAYPOINTS = [[0, 0, 1], [1.5, 1, 1.4], [1, -1.5, 0.6], [-1, 0.5, 1.2]]
+
+
+def plain_rows(airframe, derivatives, profile, s, interval):
+    """What dense_rows gives, by numpy."""
+    at = profile.at(s, interval)
+    flat = flat_state(airframe, tuple(map(tuple, derivatives)), at[:4], at[4:], np.cos, np.sin)
+    x, y, z = flat.thrust_axis
+    squares = [sum(c * c for c in v) for v in (flat.velocity, flat.acceleration, flat.body_rate)]
+    turning = sum(c * c for c in flat.angular_acceleration)
+    return np.stack([*squares, turning, z, x * x + y * y, flat.specific_thrust, *flat.motor_thrust])
+
+
+@pytest.mark.parametrize("airframe", AIRFRAMES.values(), ids=lambda airframe: airframe.name)
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 1000])
+def test_dense_rows_are_those_of_the_flatness_map(make_profile, airframe, count):
+    path, random = min_snap(WAYPOINTS), np.random.default_rng(3)
+    profile = make_profile(path.end, random.uniform(0.3, 2.6, 40), random.uniform(-0.5, 0.5, 39).cumsum())
+    s = random.uniform(0.0, path.end, count)
+    interval = profile.interval(s)
+    derivatives = np.stack([path(s, order).T for order in (1, 2, 3, 4)])
+    rows = dense.dense_rows(airframe, derivatives, profile, s - profile.s[interval], interval)
+    expected = plain_rows(airframe, derivatives, profile, s, interval)
+    assert rows.shape == (dense.ROWS, count)
+    scale = 1.0 + np.abs(expected).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(rows / scale, expected / scale, rtol=0.0, atol=1e-14)
+
+
+def test_one_point_that_is_not_a_number_leaves_its_neighbours_alone(make_profile):
+    airframe, path = AIRFRAMES["crazyflie-2.1+"], min_snap(WAYPOINTS)
+    profile = make_profile(path.end, np.ones(30))
+    s = np.linspace(0.1, 0.9, 40) * path.end
+    interval = profile.interval(s)
+    derivatives = np.stack([path(s, order).T for order in (1, 2, 3, 4)])
+    sound = dense.dense_rows(airframe, derivatives, profile, s - profile.s[interval], interval)
+    derivatives[0, 1, 20] = np.nan
+    rows = dense.dense_rows(airframe, derivatives, profile, s - profile.s[interval], interval)
+    others = np.arange(40) != 20
+    np.testing.assert_array_equal(rows[:, others], sound[:, others])
+    assert np.isnan(rows[:, 20]).all()
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.floats(-1e6, 1e6))
+def test_sine_and_cosine_are_those_of_the_library(angle):
+    assert sine(angle) == pytest.approx(math.sin(angle), rel=0.0, abs=2.3e-16)
+    assert cosine(angle) == pytest.approx(math.cos(angle), rel=0.0, abs=2.3e-16)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.floats(0.0, 1e9), st.floats(-1e9, 1e9))
+def test_the_angle_of_a_slope_is_that_of_the_library(rise, run):
+    assert slope_angle(rise, run) == pytest.approx(math.atan2(rise, abs(run) if run == 0.0 else run), rel=1e-15)
+
+
+@pytest.mark.parametrize(("rise", "run"), [(math.nan, 1.0), (0.0, math.nan), (1.0, math.nan), (math.nan, 0.0)])
+def test_what_is_no_number_has_no_angle(rise, run):
+    assert math.isnan(slope_angle(rise, run))
+    assert math.isnan(sine(math.nan))
+    assert math.isnan(cosine(math.nan))
