@@ -16,6 +16,7 @@ from cfplan.cli.plan import plan
 from cfplan.cli.replay import replay
 from cfplan.cli.report import report
 from cfplan.cli.sim import sim
+from cfplan.cli.train import train
 from cfplan.errors import CfplanError
 
 EPILOG = """\b
@@ -35,7 +36,7 @@ def cfplan() -> None:
     """Plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
 
 
-for command in (plan, check, sim, fly, replay, report, mocap, dataset, bench, study, doctor):
+for command in (plan, check, sim, fly, replay, report, mocap, dataset, train, bench, study, doctor):
     cfplan.add_command(command)
 
 

@@ -1,0 +1,92 @@
+"""`cfplan train`: from a dataset to a model."""
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+
+from cfplan.cli import options
+from cfplan.cli.output import print_json
+from cfplan.errors import InputError
+
+
+@click.command(
+    short_help="A model of the expert from a dataset.",
+    epilog="Example: cfplan train datasets/hardware -o models/hardware --epsilon 0.001",
+)
+@click.argument("dataset", metavar="DATASET", type=click.Path(path_type=Path))
+@click.option("-o", "--output", "folder", type=click.Path(path_type=Path), required=True, help="Model folder to write.")
+@click.option(
+    "--architecture",
+    type=click.Choice(["bilstm", "attention"]),
+    default="bilstm",
+    show_default=True,
+    help="Bidirectional LSTM, or the paper's encoder-decoder with attention.",
+)
+@click.option("--hidden", type=int, default=64, show_default=True, help="Size of each LSTM, in each direction.")
+@click.option("--layers", type=int, default=2, show_default=True)
+@click.option("--window", type=int, default=64, show_default=True, help="Intervals that the network sees at once.")
+@click.option("--epochs", type=int, default=60, show_default=True)
+@click.option("--windows", type=int, default=2, show_default=True, help="Windows of each path, an epoch.")
+@click.option("--batch", type=int, default=64, show_default=True, help="Windows a step.")
+@click.option("--rate", type=float, default=2e-3, show_default=True, help="Learning rate at its highest.")
+@click.option("--epsilon", type=float, default=0.0, help="Perturb the paths of half the windows by at most this, m.")
+@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--device", default="cpu", show_default=True, help="cpu or cuda; several GPUs under torchrun.")
+@options.as_json
+def train(dataset: Path, folder: Path, device: str, as_json: bool, **what: Any) -> None:
+    """Train a model on DATASET. Given again after a stop, it goes on where the last whole epoch ended."""
+    try:
+        from cfplan.learning.networks import Architecture
+        from cfplan.learning.training import Epoch, Options, train
+    except ModuleNotFoundError as error:
+        if error.name not in ("torch", "safetensors", "matplotlib"):
+            raise
+        raise InputError(
+            f"training needs {error.name}", where="cfplan train", hint='pip install "cfplan[learn]"'
+        ) from None
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    chosen = Options(**what | {"architecture": Architecture(what["architecture"])})
+    columns = (
+        TextColumn("epochs"), BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}"),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(elapsed_when_finished=False),
+    )  # fmt: skip
+    console = Console(stderr=True, quiet=as_json)
+    with Progress(*columns, console=console, speed_estimate_period=600) as progress:
+        task = progress.add_task("", total=chosen.epochs)
+
+        def show(epoch: Epoch) -> None:
+            progress.update(task, completed=epoch.epoch, description=_line(epoch))
+            if not console.is_terminal:
+                console.print(f"epoch {epoch.epoch} of {chosen.epochs}: {_line(epoch)}, {epoch.seconds:.1f} s")
+
+        card = train(dataset, folder, chosen, device=device, command=_command(), on_epoch=show)
+    if card is None:
+        return
+    if as_json:
+        print_json(asdict(card))
+    else:
+        scores = card.scores
+        click.echo(
+            f"{folder}: travel time of unseen paths off by {scores['time_error_mean']:.2%} in the mean, "
+            f"{scores['time_error_p95']:.2%} at the 95th percentile"
+        )
+
+
+def _line(epoch: Any) -> str:
+    return f"loss {epoch.loss:.2e}, time off by {epoch.time_error_mean:.2%}, p95 {epoch.time_error_p95:.2%}"
+
+
+def _command() -> str:
+    return " ".join(["cfplan", *sys.argv[1:]])

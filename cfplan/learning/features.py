@@ -1,0 +1,184 @@
+"""What the networks see of a path, and how their answer becomes h: one way for training and for flight.
+
+Everything is told per step of the grid, so that only the geometry of the nodes counts: with g⁽ᵏ⁾ = γ⁽ᵏ⁾Δsᵏ, neither
+the place nor the heading of a window matters, nor in what unit s runs. h is told as the coefficients of its cubic
+B-spline on the grid (uᵢ = hᵢ - h″ᵢΔs²/6), as log √u/Δs, intervals a second, less a cheap reference: what each limit
+alone would allow if h stood still, a soft minimum (expert/guess.py has the same bounds). Where the path rests, only its
+fourth derivative bounds the reference, as it bounds h.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from cfplan.geometry.path import Path
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.profile import BoundaryState
+
+VERSION = 1
+# of everything in this file: a model only understands the features that it was trained on
+SOFTNESS = 6.0
+# power of the soft minimum
+ROOM = 4.0
+# in log, beyond which a bound that is far from binding is not told apart
+TINY = 1e-9
+# m, below which a derivative per step counts as this
+LEAST_SHARE = 0.1
+# of h, to which a coefficient is held from below where h bends sharply within a step
+
+# Columns of a node table: g, g', g'', g''', the reference rate, and how far above it each limit's own bound is.
+POSITION, REFERENCE, ROOMS, COLUMNS = slice(0, 3), 12, slice(13, 17), 17
+# After them, the same in every row of a window: rest at start and end, start known, its rate and two differences.
+INPUTS = COLUMNS + 6
+OUTPUTS = 3
+# a node: log rate over the reference, cos and sin of twice the yaw from the heading at the start of the window
+
+
+class Bounds(NamedTuple):
+    """What the limits come to for motion with h' = 0 and the thrust axis about vertical."""
+
+    speed: float
+    # m/s, |γ'|√h
+    acceleration: float
+    # m/s², |γ''|h
+    jerk: float
+    # m/s³, |γ'''|h^1.5
+    snap: float
+    # m/s⁴, |γ''''|h²
+
+
+def bounds(airframe: Airframe, limits: PlanLimits) -> Bounds:
+    """The bounds of a vehicle within limits."""
+    up = limits.motor_thrust_max - airframe.hover_thrust
+    down = airframe.hover_thrust - limits.motor_thrust_min
+    turning = 2.0 * min(up, down) * airframe.arm / max(airframe.inertia[:2])
+    return Bounds(
+        speed=float(limits.speed),
+        acceleration=float(min(limits.acceleration, GRAVITY * math.tan(min(limits.tilt, 1.0)), 4 * up / airframe.mass)),
+        jerk=float(GRAVITY * limits.angular_velocity),
+        snap=float(GRAVITY * min(limits.angular_acceleration, turning)),
+    )
+
+
+def start_coefficients(state: BoundaryState, step: float) -> tuple[float, float, float]:
+    """u₋₁, u₀, u₁ of the spline with this state at its first node."""
+    slope, bend = state.dh * step, state.ddh * step * step
+    return state.h - slope + bend / 3, state.h - bend / 6, state.h + slope + bend / 3
+
+
+def start_logs(state: BoundaryState, step: float) -> tuple[float, float, float]:
+    """log √u/Δs of the three."""
+    return coefficient_logs(state.h, state.dh * step, state.ddh * step * step, step)
+
+
+@njit(cache=True)
+def coefficient_logs(h: float, slope: float, bend: float, step: float) -> tuple[float, float, float]:
+    """log √u/Δs of u₋₁, u₀, u₁ from h, h'Δs, h''Δs²; what would be hardly positive is raised."""
+    least, unit = LEAST_SHARE * h, math.log(step)
+    return (
+        0.5 * math.log(max(h - slope + bend / 3, least)) - unit,
+        0.5 * math.log(max(h - bend / 6, least)) - unit,
+        0.5 * math.log(max(h + slope + bend / 3, least)) - unit,
+    )
+
+
+@njit(cache=True)
+def told(before: float, first: float, after: float) -> tuple[float, float, float]:
+    """The start of a window as the network hears of it: a log rate, and its first and second difference."""
+    return first, after - before, after + before - 2.0 * first
+
+
+def rests(path: Path, s: float) -> bool:
+    """Whether the path stands still there."""
+    return bool(np.linalg.norm(path(s, 1)) < TINY)
+
+
+def node_table(path: Path, first: float, step: float, count: int, bound: Bounds) -> NDArray:
+    """(count, COLUMNS): what is told of the nodes first, first + step, …"""
+    table = np.empty((count, COLUMNS))
+    fill_nodes(table, path.breaks, path.coefficients, first, step, bound)
+    return table
+
+
+def window_inputs(
+    table: NDArray, rest_start: bool, rest_end: bool, start: tuple[float, float, float] | None
+) -> NDArray:
+    """(len(table), INPUTS) float32: the nodes of one window as the network takes them; `start` as from told()."""
+    out = np.empty((len(table), INPUTS), dtype=np.float32)
+    fill_inputs(out, table, rest_start, rest_end, start is not None, start or (0.0, 0.0, 0.0))
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def fill_nodes(out: NDArray, breaks: NDArray, coefficients: NDArray, first: float, step: float, bound: Bounds) -> None:
+    """See node_table. Beyond its end a path stays where it ends, by the derivatives that it has there."""
+    pieces, powers = coefficients.shape[0], coefficients.shape[1]
+    piece = 0
+    g = np.empty((5, 3))
+    for n in range(len(out)):
+        s = min(max(first + n * step, 0.0), breaks[pieces])
+        while piece < pieces - 1 and s >= breaks[piece + 1]:
+            piece += 1
+        x = s - (breaks[pieces] if piece == pieces - 1 else breaks[piece])
+        for axis in range(3):
+            p0 = p1 = p2 = p3 = p4 = 0.0  # Horner's scheme for the derivatives over their factorials
+            for k in range(powers - 1, -1, -1):
+                p4 = x * p4 + p3
+                p3 = x * p3 + p2
+                p2 = x * p2 + p1
+                p1 = x * p1 + p0
+                p0 = x * p0 + coefficients[piece, k, axis]
+            g[0, axis], g[1, axis], g[2, axis] = p0, p1 * step, 2.0 * p2 * step**2
+            g[3, axis], g[4, axis] = 6.0 * p3 * step**3, 24.0 * p4 * step**4
+        row = out[n]
+        for order in range(4):
+            for axis in range(3):
+                row[3 * order + axis] = g[order, axis]
+        limits = (bound.speed, bound.acceleration, bound.jerk, bound.snap)
+        least = np.inf
+        for k in range(4):
+            size = math.sqrt(g[k + 1, 0] ** 2 + g[k + 1, 1] ** 2 + g[k + 1, 2] ** 2)
+            row[13 + k] = math.log(limits[k] / max(size, TINY)) / (k + 1)
+            least = min(least, row[13 + k])
+        total = 0.0
+        for k in range(4):
+            total += math.exp(-SOFTNESS * (row[13 + k] - least))
+        row[REFERENCE] = least - math.log(total) / SOFTNESS
+        for k in range(4):
+            row[13 + k] = min(row[13 + k] - row[REFERENCE], ROOM)
+
+
+@njit(cache=True)
+def fill_inputs(
+    out: NDArray, table: NDArray, rest_start: bool, rest_end: bool, known: bool, start: tuple[float, float, float]
+) -> None:
+    """See window_inputs: the window is moved to the origin, and its first step turned into the x-z plane."""
+    x, y = table[1, 0] - table[0, 0], table[1, 1] - table[0, 1]
+    size = math.sqrt(x * x + y * y)
+    cos, sin = (x / size, y / size) if size > TINY else (1.0, 0.0)
+    for n in range(len(table)):
+        for order in range(4):
+            k = 3 * order
+            x, y, z = table[n, k], table[n, k + 1], table[n, k + 2]
+            if order == 0:
+                x, y, z = x - table[0, 0], y - table[0, 1], z - table[0, 2]
+            out[n, k], out[n, k + 1], out[n, k + 2] = cos * x + sin * y, cos * y - sin * x, z
+        for k in range(REFERENCE, COLUMNS):
+            out[n, k] = table[n, k]
+        out[n, COLUMNS] = 1.0 if rest_start else 0.0
+        out[n, COLUMNS + 1] = 1.0 if rest_end else 0.0
+        out[n, COLUMNS + 2] = 1.0 if known else 0.0
+        out[n, COLUMNS + 3] = start[0] - table[0, REFERENCE] if known else 0.0
+        out[n, COLUMNS + 4] = start[1]
+        out[n, COLUMNS + 5] = start[2]
+
+
+@njit(cache=True)
+def heading(table: NDArray) -> float:
+    """rad, of a window's first step over the ground; 0 where it goes straight up."""
+    x, y = table[1, 0] - table[0, 0], table[1, 1] - table[0, 1]
+    return math.atan2(y, x) if math.sqrt(x * x + y * y) > TINY else 0.0

@@ -1,0 +1,188 @@
+"""The networks without torch: one thread, no autograd, compiled loops over weights laid out for them.
+
+What does not depend on the step before, the input projections of a layer, is one matrix product; what does is a loop
+over the steps in which sixteen rows of the recurrent weights are added up at a time.
+"""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from cfplan.learning.features import INPUTS, OUTPUTS
+
+# tanh as a rational function of degree 13 over 6 (the minimax fit that Eigen uses), within 2e-7 where it is not ±1.
+_REACH = np.float32(7.90531)
+_A1, _A3, _A5, _A7, _A9, _A11, _A13 = np.array(
+    [4.89352455891786e-03, 6.37261928875436e-04, 1.48572235717979e-05, 5.12229709037114e-08, -8.60467152213735e-11,
+     2.00018790482477e-13, -2.76076847742355e-16], dtype=np.float32,
+)  # fmt: skip
+_B0, _B2, _B4, _B6 = np.array(
+    [4.89352518554385e-03, 2.26843463243900e-03, 1.18534705686654e-04, 1.19825839466702e-06], dtype=np.float32
+)
+_HALF = np.float32(0.5)
+_ZERO = np.float32(0.0)
+
+
+class Network(Protocol):
+    """A network ready to answer."""
+
+    def __call__(self, inputs: NDArray) -> NDArray:
+        """(W+1, INPUTS) float32 to (W+1, OUTPUTS) float32."""
+
+
+class Layer:
+    """An LSTM layer in one or both directions."""
+
+    def __init__(self, weights: Mapping[str, NDArray], prefix: str, number: int, directions: int) -> None:
+        endings = [f"_l{number}" + ("_reverse" if reverse else "") for reverse in range(directions)]
+        bias = [weights[f"{prefix}bias_ih{end}"] + weights[f"{prefix}bias_hh{end}"] for end in endings]
+        self.inward = np.ascontiguousarray(np.concatenate([weights[f"{prefix}weight_ih{end}"] for end in endings]).T)
+        self.bias = np.concatenate(bias)
+        # (directions, H, 4H): a row is what one hidden number adds to all gates
+        self.recurrent = np.ascontiguousarray(
+            np.stack([weights[f"{prefix}weight_hh{end}"] for end in endings]).transpose(0, 2, 1)
+        )
+
+    def __call__(self, inputs: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """(T, I) to (T, directions · H), and the last hidden and cell numbers, (directions, H)."""
+        directions, hidden = self.recurrent.shape[:2]
+        out = np.empty((len(inputs), directions * hidden), np.float32)
+        h, c = np.zeros((directions, hidden), np.float32), np.zeros((directions, hidden), np.float32)
+        _run(out, inputs @ self.inward + self.bias, self.recurrent, h, c)
+        return out, h, c
+
+
+class BiLstm:
+    """See networks.BiLstm."""
+
+    def __init__(self, weights: Mapping[str, NDArray]) -> None:
+        self.layers = [Layer(weights, "lstm.", number, 2) for number in range(_layers(weights, "lstm."))]
+        _normalise(self.layers[0], weights)
+        self.head, self.bias = np.ascontiguousarray(weights["head.weight"].T), weights["head.bias"]
+
+    def __call__(self, inputs: NDArray) -> NDArray:
+        """See Network."""
+        values = inputs
+        for layer in self.layers:
+            values, _, _ = layer(values)
+        return values @ self.head + self.bias
+
+
+class Attention:
+    """See networks.Attention."""
+
+    def __init__(self, weights: Mapping[str, NDArray]) -> None:
+        count = _layers(weights, "encoder.")
+        self.encoder = [Layer(weights, "encoder.", number, 1) for number in range(count)]
+        self.decoder = [Layer(weights, "decoder.", number, 1) for number in range(count)]
+        _normalise(self.encoder[0], weights)
+        self.head, self.bias = np.ascontiguousarray(weights["head.weight"].T), weights["head.bias"]
+
+    def __call__(self, inputs: NDArray) -> NDArray:
+        """See Network."""
+        memory = inputs
+        states = []
+        for layer in self.encoder:
+            memory, h, c = layer(memory)
+            states.append((h, c))
+        answer = np.zeros((1, len(self.bias)), np.float32)
+        out = np.empty((len(inputs), len(self.bias)), np.float32)
+        step = np.empty((1, memory.shape[1]), np.float32)
+        scale = np.float32(memory.shape[1] ** -0.5)
+        for n in range(len(inputs)):
+            values = answer
+            for layer, (h, c) in zip(self.decoder, states, strict=True):
+                _run(step, values @ layer.inward + layer.bias, layer.recurrent, h, c)
+                values = step.copy()
+            weights = memory @ (values[0] * scale)
+            weights = np.exp(weights - weights.max())
+            context = (weights / weights.sum()) @ memory
+            answer = np.concatenate([values[0], context])[None] @ self.head + self.bias
+            out[n] = answer[0]
+        return out
+
+
+NETWORKS: Mapping[str, type[BiLstm] | type[Attention]] = {"bilstm": BiLstm, "attention": Attention}
+
+
+def warm_up(network: Network, window: int) -> None:
+    """Have everything compiled that answering needs."""
+    network(np.zeros((window + 1, INPUTS), np.float32))
+
+
+def _layers(weights: Mapping[str, NDArray], prefix: str) -> int:
+    return sum(1 for name in weights if name.startswith(f"{prefix}weight_hh_l") and not name.endswith("_reverse"))
+
+
+def _normalise(layer: Layer, weights: Mapping[str, NDArray]) -> None:
+    """Let the layer take inputs as they are."""
+    inward = layer.inward.astype(float) * weights["scale"].astype(float)[:, None]
+    layer.bias = (layer.bias - weights["mean"].astype(float) @ inward).astype(np.float32)
+    layer.inward = inward.astype(np.float32)
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _tanh(x: np.float32) -> np.float32:
+    x = max(min(x, _REACH), -_REACH)
+    y = x * x
+    above = x * (_A1 + y * (_A3 + y * (_A5 + y * (_A7 + y * (_A9 + y * (_A11 + y * _A13))))))
+    return above / (_B0 + y * (_B2 + y * (_B4 + y * _B6)))
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _run(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, cell: NDArray) -> None:
+    """An LSTM layer over all steps; gates in torch's order: input, forget, cell, output."""
+    steps, hidden = out.shape[0], last.shape[1]
+    gates = np.empty(4 * hidden, np.float32)
+    for direction in range(recurrent.shape[0]):
+        h, c, weights = last[direction], cell[direction], recurrent[direction]
+        column = direction * hidden
+        for n in range(steps):
+            t = n if direction == 0 else steps - 1 - n
+            gates[:] = projected[t, 4 * column : 4 * column + 4 * hidden]
+            whole = hidden - hidden % 8
+            for j in range(0, whole, 8):
+                h0, h1, h2, h3, h4, h5, h6, h7 = (
+                    h[j], h[j + 1], h[j + 2], h[j + 3], h[j + 4], h[j + 5], h[j + 6], h[j + 7],
+                )  # fmt: skip
+                w0, w1, w2, w3 = weights[j], weights[j + 1], weights[j + 2], weights[j + 3]
+                w4, w5, w6, w7 = weights[j + 4], weights[j + 5], weights[j + 6], weights[j + 7]
+                for k in range(4 * hidden):
+                    gates[k] += (h0 * w0[k] + h1 * w1[k] + h2 * w2[k] + h3 * w3[k]) + (
+                        h4 * w4[k] + h5 * w5[k] + h6 * w6[k] + h7 * w7[k]
+                    )
+            for j in range(whole, hidden):
+                for k in range(4 * hidden):
+                    gates[k] += h[j] * weights[j, k]
+            for k in range(hidden):
+                let_in = _HALF + _HALF * _tanh(_HALF * gates[k])
+                keep = _HALF + _HALF * _tanh(_HALF * gates[hidden + k])
+                value = keep * c[k] + let_in * _tanh(gates[2 * hidden + k])
+                c[k] = value
+                h[k] = (_HALF + _HALF * _tanh(_HALF * gates[3 * hidden + k])) * _tanh(value)
+            out[t, column : column + hidden] = h
+
+
+def shapes(architecture: str, hidden: int, layers: int) -> dict[str, tuple[int, ...]]:
+    """The tensors that a network of this kind has, as torch names them."""
+    parts: dict[str, list[tuple[str, int, tuple[str, ...]]]] = {
+        "bilstm": [("lstm.", INPUTS, ("", "_reverse"))],
+        "attention": [("encoder.", INPUTS, ("",)), ("decoder.", OUTPUTS, ("",))],
+    }
+    if architecture not in parts:
+        return {}
+    found: dict[str, tuple[int, ...]] = {
+        "mean": (INPUTS,), "scale": (INPUTS,), "head.weight": (OUTPUTS, 2 * hidden), "head.bias": (OUTPUTS,),
+    }  # fmt: skip
+    for prefix, inputs, directions in parts[architecture]:
+        for layer in range(layers):
+            into = inputs if layer == 0 else len(directions) * hidden
+            for direction in directions:
+                end = f"_l{layer}{direction}"
+                found[f"{prefix}weight_ih{end}"] = (4 * hidden, into)
+                found[f"{prefix}weight_hh{end}"] = (4 * hidden, hidden)
+                found[f"{prefix}bias_ih{end}"] = found[f"{prefix}bias_hh{end}"] = (4 * hidden,)
+    return found

@@ -1,0 +1,137 @@
+"""The learned planner: a chain of windows over a path of any length, each in a millisecond.
+
+The network answers for a window; its answers are smoothed into coefficients of the spline of h (smooth.py) and the
+first part of them is kept. The next window begins there, from the boundary state that the kept coefficients make, so
+that h, h' and h'' are continuous by construction. Each window costs the same, and nothing but the result grows.
+
+The profile is what the network makes of the path, no more: it becomes a flight only through repair and certificate.
+"""
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import InputError
+from cfplan.expert.preconditions import broken_by, check_arguments, unsolvable
+from cfplan.expert.solution import Solution, Status
+from cfplan.expert.yaw_track import fixed_yaw, tangent_yaw
+from cfplan.geometry.path import Path
+from cfplan.geometry.yaw import YawMode
+from cfplan.learning.features import (
+    LEAST_SHARE,
+    REFERENCE,
+    Bounds,
+    bounds,
+    node_table,
+    rests,
+    start_coefficients,
+    start_logs,
+    told,
+    window_inputs,
+)
+from cfplan.learning.inference import Network
+from cfplan.learning.model_files import Model, find_model
+from cfplan.learning.smooth import Begin, profile_by, smoother
+from cfplan.learning.windows import KEEP, chain
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.profile import BoundaryState
+
+LEAST_NODES = 10
+LEAD = 3.0
+# intervals over which the profile comes to a state given for the end
+
+
+def plan_learned(
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    *,
+    nodes: int = 100,
+    yaw: YawMode = YawMode.FIXED,
+    yaw_angle: float = 0.0,
+    start: BoundaryState | None = None,
+    end: BoundaryState | None = None,
+    model: Model | None = None,
+) -> Solution:
+    """Plan over `nodes` intervals uniform in s, or over one window's where those are more; see Planner.
+
+    Speed is the model's, at its own limits where they are looser than `limits`: repair does the rest.
+
+    Raises:
+        InputError: fewer than ten nodes, arguments that are not numbers, or no model for this vehicle and these limits.
+    """
+    began = time.perf_counter()
+    if nodes < LEAST_NODES:
+        raise InputError(f"{nodes} nodes; the learned planner needs {LEAST_NODES}", where="nodes", hint="100 is usual")
+    model = model or find_model(airframe, limits)
+    if model is None:
+        raise InputError(
+            f"no model for {airframe.name} within these limits",
+            where="models",
+            hint="train one with `cfplan train`, or take another planner",
+        )
+    nodes = max(nodes, model.window)
+    check_arguments(path, nodes, yaw_angle, start, end)
+    if reason := unsolvable(airframe, limits):
+        return Solution(Status.INFEASIBLE, None, reason)
+    for name, boundary, s in (("start", start, 0.0), ("end", end, path.end)):
+        if boundary and (reason := broken_by(boundary, path, s, airframe, limits)):
+            return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
+
+    coefficients = predict(path, model.network, bounds(airframe, model.card.limits), nodes, model.window, start, end)
+    if not (np.isfinite(coefficients).all() and (coefficients[1:-1] > 0).all()):
+        return Solution(Status.NOT_CONVERGED, None, f"the network {model.name} answered what is not a number")
+    track = (tangent_yaw if yaw is YawMode.TANGENT else fixed_yaw)(path, nodes, yaw_angle, start, end)
+    stats: dict[str, float | int | str] = {
+        "solve_seconds": time.perf_counter() - began,
+        "iterations": 0,
+        "solver": "learned",
+        "model": model.name,
+    }
+    return Solution(Status.SOLVED, profile_by(coefficients, path.end, track), "", stats)
+
+
+def predict(
+    path: Path,
+    network: Network,
+    bound: Bounds,
+    nodes: int,
+    window: int,
+    start: BoundaryState | None = None,
+    end: BoundaryState | None = None,
+    keep: int = KEEP,
+) -> NDArray:
+    """(N+3,) coefficients of the spline of h, NaN where the network fails. `nodes` is at least `window`."""
+    step = path.end / nodes
+    table = node_table(path, 0.0, step, nodes + 1, bound)
+    rest_start, rest_end = start is None and rests(path, 0.0), end is None and rests(path, path.end)
+    logs = np.empty(nodes + 3)  # log √u/Δs
+    settled = np.zeros(3)
+    begin = Begin.REST if rest_start else Begin.FREE
+    if start is not None:
+        begin, settled = Begin.KNOWN, np.array(start_logs(start, step))
+    for part in chain(nodes, window, keep):
+        shown = table[part.first : part.first + window + 1]
+        heard = told(*settled) if begin is Begin.KNOWN else None
+        answer = network(window_inputs(shown, begin is Begin.REST, part.last and rest_end, heard))
+        rates = answer[:, 0] + shown[:, REFERENCE]
+        smooth = smoother(window, begin, part.last and rest_end)(rates, settled)
+        logs[part.first : part.first + window + 3] = smooth
+        begin, settled = Begin.KNOWN, smooth[part.keep : part.keep + 3]
+    coefficients = np.exp(2.0 * (logs + np.log(step)))
+    if start is not None:
+        coefficients[:3] = start_coefficients(start, step)
+    if end is not None:
+        _lead_to(coefficients, end, step)
+    return coefficients
+
+
+def _lead_to(coefficients: NDArray, end: BoundaryState, step: float) -> None:
+    """Bend the last coefficients to the state that is asked for."""
+    last = np.array(start_coefficients(end, step))
+    backwards = coefficients[::-1]
+    share = max(last[0], LEAST_SHARE * end.h) / backwards[2]
+    backwards[3:] *= share ** np.exp(-np.arange(1, len(coefficients) - 2) / LEAD)
+    coefficients[-3:] = last

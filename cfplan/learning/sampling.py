@@ -1,0 +1,219 @@
+"""What a network is trained on: windows drawn from the labelled paths of a dataset, afresh for each epoch.
+
+A window begins at the path's start, ends at its end, or lies anywhere between, with nodes as close as flights have
+them or as wide as the labels, and its start is told a little wrong, as it will be in a chain.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numba import njit
+from numpy.typing import NDArray
+
+from cfplan.errors import InputError
+from cfplan.expert.limit_sets import LIMIT_SETS
+from cfplan.expert.solution import Status
+from cfplan.geometry.path import Path
+from cfplan.geometry.random_paths import perturbed
+from cfplan.learning.dataset import read_dataset
+from cfplan.learning.dataset_spec import DatasetSpec
+from cfplan.learning.features import (
+    COLUMNS,
+    INPUTS,
+    OUTPUTS,
+    REFERENCE,
+    Bounds,
+    bounds,
+    coefficient_logs,
+    fill_inputs,
+    fill_nodes,
+    heading,
+    told,
+)
+
+LEAST_CERTIFIED = 0.97
+# share of its speed at which a label must be certified to be learned from
+CLOSEST = 0.08
+# m of path between nodes, the closest windows
+WIDEST = 1.05
+# times the label's own interval, the widest
+AT_START, AT_END = 0.25, 0.25
+# shares of the windows
+UNKNOWN = 0.05
+# share of windows inside a path whose start is not told
+START_NOISE = (0.01, 0.01, 0.005)
+# standard deviations of what is told of the start: rate, slope, bend
+TAIL = 16
+# nodes at the end of a window inside a path, whose speed is decided by what the window does not show
+TAIL_WEIGHT = 0.1
+
+
+class Labels(NamedTuple):
+    """R labelled paths side by side."""
+
+    pieces: NDArray
+    # (R+1,) where each path's coefficients begin
+    breaks: NDArray
+    # (sum of pieces + R,) path by path
+    coefficients: NDArray
+    # (sum of pieces, D, 3)
+    length: NDArray
+    # (R,) m
+    h: NDArray
+    # (R, 4, N+1) h, h', h'', h'''
+    yaw: NDArray
+    # (R, 3, N+1) ψ, ψ', ψ''
+
+
+class Batch(NamedTuple):
+    """B windows."""
+
+    inputs: NDArray
+    # (B, W+1, INPUTS) float32
+    targets: NDArray
+    # (B, W+1, OUTPUTS) float32
+    weights: NDArray
+    # (B, W+1) float32, of the squared errors
+    times: NDArray
+    # (B, W+1) float32, share of the window's time that is spent about each node
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Material:
+    """The usable rows of a dataset, and what their labels were made for."""
+
+    spec: DatasetSpec
+    bound: Bounds
+    rows: NDArray
+    # (R,) numbers of the rows
+    paths: tuple[Path, ...]
+    labels: Labels
+    travel_time: NDArray
+    # (R,) s
+
+    def part(self, chosen: NDArray) -> "Material":
+        """Some of the rows, by index."""
+        paths = tuple(self.paths[i] for i in chosen)
+        h, yaw, length = self.labels.h[chosen], self.labels.yaw[chosen], self.labels.length[chosen]
+        labels = Labels(*_joined(paths), length, h, yaw)
+        return replace(self, rows=self.rows[chosen], paths=paths, labels=labels, travel_time=self.travel_time[chosen])
+
+    def noisy(self, epsilon: float, seed: np.random.SeedSequence) -> Labels:
+        """The labels with every path perturbed by at most epsilon, m: same answers to slightly other questions."""
+        seeds = seed.spawn(len(self.paths))
+        paths = tuple(perturbed(path, epsilon, own) for path, own in zip(self.paths, seeds, strict=True))
+        return Labels(*_joined(paths), *self.labels[3:])
+
+
+def read_material(folder: FilePath) -> Material:
+    """What can be learned from in a dataset.
+
+    Raises:
+        InputError: no dataset, a damaged one, or no row that was solved and certified.
+    """
+    spec, rows = read_dataset(folder)
+    if spec.limits not in LIMIT_SETS:
+        raise InputError(f"unknown limit set {spec.limits!r}", where=str(folder), hint="make the dataset again")
+    solved = pa.compute.equal(rows["status"], Status.SOLVED.name)
+    usable = rows.filter(pa.compute.and_(solved, pa.compute.greater_equal(rows["certified_share"], LEAST_CERTIFIED)))
+    if usable.num_rows < 2:
+        raise InputError(
+            f"{usable.num_rows} of {rows.num_rows} rows are usable (solved, and certified at {LEAST_CERTIFIED:.0%} of "
+            "their speed); two are the least",
+            where=str(folder),
+            hint="see `cfplan dataset info`, and make another",
+        )
+    breaks, coefficients = usable["breaks"].to_pylist(), usable["coefficients"].to_pylist()
+    paths = tuple(
+        Path(np.array(b), np.array(c).reshape(len(b) - 1, -1, 3)) for b, c in zip(breaks, coefficients, strict=True)
+    )
+    h = np.stack([_table(usable, name, spec.nodes) for name in ("h", "dh", "ddh", "dddh")], axis=1)
+    yaw = np.stack([_table(usable, name, spec.nodes) for name in ("yaw", "dyaw", "ddyaw")], axis=1)
+    chosen = LIMIT_SETS[spec.limits]
+    length, travel_time = usable["length"].to_numpy(), usable["travel_time"].to_numpy()
+    return Material(
+        spec, bounds(chosen.airframe, chosen.limits), usable["row"].to_numpy(), paths,
+        Labels(*_joined(paths), length, h, yaw), travel_time,
+    )  # fmt: skip
+
+
+def _table(rows: pa.Table, name: str, nodes: int) -> NDArray:
+    """(R, N+1); what has a value an interval is padded at the end."""
+    values = np.array(rows[name].to_pylist())
+    return np.pad(values, ((0, 0), (0, nodes + 1 - values.shape[1])), mode="edge")
+
+
+def _joined(paths: tuple[Path, ...]) -> tuple[NDArray, NDArray, NDArray]:
+    pieces = np.cumsum([0] + [len(path.coefficients) for path in paths])
+    powers = max(path.coefficients.shape[1] for path in paths)
+    coefficients = np.zeros((pieces[-1], powers, 3))
+    for path, first in zip(paths, pieces, strict=False):
+        coefficients[first : first + len(path.coefficients), : path.coefficients.shape[1]] = path.coefficients
+    return pieces, np.concatenate([path.breaks for path in paths]), coefficients
+
+
+def draw(labels: Labels, bound: Bounds, rows: NDArray, window: int, random: np.random.Generator) -> Batch:
+    """One window from each of these rows, (B,)."""
+    count, nodes = len(rows), labels.h.shape[2] - 1
+    widest = WIDEST * labels.length[rows] / nodes
+    spacing = np.exp(random.uniform(np.log(np.minimum(CLOSEST, 0.8 * widest)), np.log(widest)))
+    share = np.minimum(spacing / labels.length[rows], 1.0 / window)  # of the path, an interval
+    where = random.uniform(size=count)
+    room = 1.0 - window * share
+    first = room * np.clip((where - AT_START) / (1.0 - AT_START - AT_END), 0.0, 1.0)
+    knows = random.uniform(size=count) >= UNKNOWN
+    noise = random.normal(size=(count, 3)) * START_NOISE
+    batch = Batch(
+        np.empty((count, window + 1, INPUTS), np.float32), np.empty((count, window + 1, OUTPUTS), np.float32),
+        np.empty((count, window + 1), np.float32), np.empty((count, window + 1), np.float32),
+    )  # fmt: skip
+    _fill(*batch, labels, bound, rows, first, share, knows, noise)
+    return batch
+
+
+@njit(cache=True, error_model="numpy")
+def _fill(
+    inputs: NDArray, targets: NDArray, weights: NDArray, times: NDArray, labels: Labels, bound: Bounds, rows: NDArray,
+    first: NDArray, share: NDArray, knows: NDArray, noise: NDArray,
+) -> None:  # fmt: skip
+    count = inputs.shape[1]
+    grid = labels.h.shape[2] - 1
+    table = np.empty((count, COLUMNS))
+    for b in range(len(rows)):
+        row = rows[b]
+        low, high = labels.pieces[row], labels.pieces[row + 1]
+        breaks = labels.breaks[low + row : high + row + 1]
+        end = breaks[-1]
+        step = share[b] * end
+        fill_nodes(table, breaks, labels.coefficients[low:high], first[b] * end, step, bound)
+        rest_start, rest_end = first[b] <= 0.0, first[b] + (count - 1) * share[b] >= 1.0 - 1e-9
+        turned = heading(table)
+        total = 0.0
+        start = (0.0, 0.0, 0.0)
+        for n in range(count):
+            place = min((first[b] + n * share[b]) * grid, grid * 1.0)
+            i = min(int(place), grid - 1)
+            x = (place - i) * end / grid
+            h0, h1, h2, h3 = labels.h[row, 0, i], labels.h[row, 1, i], labels.h[row, 2, i], labels.h[row, 3, i]
+            h = h0 + x * (h1 + x * (h2 / 2 + x * h3 / 6))
+            slope, bend = (h1 + x * (h2 + x * h3 / 2)) * step, (h2 + x * h3) * step * step
+            if n == 0:
+                start = told(*coefficient_logs(h, slope, bend, step))
+                start = (start[0] + noise[b, 0], start[1] + noise[b, 1], start[2] + noise[b, 2])
+            rate = coefficient_logs(h, slope, bend, step)[1]
+            psi = labels.yaw[row, 0, i] + x * (labels.yaw[row, 1, i] + x * labels.yaw[row, 2, i] / 2)
+            targets[b, n, 0] = rate - table[n, REFERENCE]
+            targets[b, n, 1] = np.cos(2.0 * (psi - turned))
+            targets[b, n, 2] = np.sin(2.0 * (psi - turned))
+            duration = np.exp(-rate) * (0.5 if n in (0, count - 1) else 1.0)
+            times[b, n] = duration
+            total += duration
+            fading = 0 if rest_end else max(0, n + 1 + TAIL - count)
+            weights[b, n] = 1.0 - (1.0 - TAIL_WEIGHT) * fading / TAIL
+        known = knows[b] and not rest_start
+        fill_inputs(inputs[b], table, rest_start, rest_end, known, start if known else (0.0, 0.0, 0.0))
+        for n in range(count):
+            times[b, n] /= total

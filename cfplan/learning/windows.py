@@ -1,0 +1,33 @@
+"""Windows: the one length of path that networks take, and how a chain of them covers a path of any length."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+WINDOW = 64
+# intervals of a window
+KEEP = 48
+# intervals of a window that are kept where the path goes on: what is behind lies further ahead than braking takes
+
+
+class Window(NamedTuple):
+    """Where a window lies on the grid of a path, and which of its nodes are kept."""
+
+    first: int
+    # node at which it begins
+    keep: int
+    # intervals of it that are kept; the next window begins there
+    last: bool
+    # ends where the path ends
+
+
+def chain(nodes: int, window: int = WINDOW, keep: int = KEEP) -> Iterator[Window]:
+    """The windows over `nodes` intervals, at least `window`: each begins where the kept part of the one before ends.
+
+    The last one ends where the path ends, so the one before it keeps less.
+    """
+    first = 0
+    while first + window < nodes:
+        following = min(first + keep, nodes - window)
+        yield Window(first, following - first, False)
+        first = following
+    yield Window(first, window, True)
