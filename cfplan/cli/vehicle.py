@@ -39,7 +39,7 @@ def vehicle(uri: str, mocap_uri: str | None, limits: "Limits") -> "Iterator[tupl
     from cfplan.simulation.lab import start_lab
     from cfplan.simulation.room import RoomPoseSource, RoomSettings
     from cfplan.simulation.sim_driver import SimDriver, lab_number
-    from cfplan.simulation.virtual_vicon import ViconSettings
+    from cfplan.simulation.virtual_cameras import ViconSettings
 
     number = lab_number(uri)
     if mocap is None:

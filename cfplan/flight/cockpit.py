@@ -79,6 +79,7 @@ class Cockpit:
         self.checks: tuple[Check, ...] = ()
         self.pose_fault = ""
         # why the last pose was not good
+        self._source_fault = ""
         self.recent: deque[Pose] = deque()
         # the good poses of the last second
         self.waking: deque[float] = deque(maxlen=200)
@@ -118,6 +119,9 @@ class Cockpit:
                 self.recent.append(pose)
                 self._forecast.add(pose)
                 self._note_deviation(pose)
+        if self.source.fault != self._source_fault:
+            self._source_fault = self.source.fault
+            self.say(Level.WARNING, f"motion capture: {self._source_fault or 'good again'}")
         now = self.now()
         if newest is not None and now - newest.time < self.limits.pose.age_brake:
             self.link.send_pose(self._forecast.position(now), newest.quaternion)
@@ -141,6 +145,7 @@ class Cockpit:
             order=self._orders.worst,
             main_gone=self._orders.gone,
             pose=pose,
+            pose_fault=self.source.fault or self.pose_fault,
             wanted=stream.position(pose.time - self.mission.lead) if stream is not None and pose is not None else None,
             estimate=link.estimate,
             status=link.status,

@@ -1,6 +1,8 @@
 """Connecting to a Crazyflie, within bounds of time, and refusing with a hint what cannot be reached."""
 
+import contextlib
 import os
+import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -8,11 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from cfplan.errors import LinkError
+from cfplan.flight.claim import claim
 from cfplan.flight.link import Link
 from cfplan.flight.telemetry import Telemetry
 
 FIRST_ANSWER = 4.0  # s, from opening the link to the first packet
 WHOLE_CONNECTION = 30.0  # s, to the last parameter, over a lossy radio without a cache
+PATIENCE = 0.005  # s that a packet in flight waits for a radio that is busy; then the next, fresher one counts
+_RETRIES = 5000  # transmissions that may fail in a row, some 10 s: a vehicle that hovers alone is worth waiting for
 
 
 def connect(
@@ -29,6 +34,7 @@ def connect(
     """
     from cflib import crtp
     from cflib.crazyflie import Crazyflie
+    from cflib.crtp.radiodriver import set_retries_before_disconnect
 
     if not crtp.CLASSES:
         crtp.init_drivers()
@@ -36,6 +42,8 @@ def connect(
         if driver not in crtp.CLASSES:
             crtp.CLASSES.insert(0, driver)
 
+    claimed = claim(uri)
+    set_retries_before_disconnect(_RETRIES)
     answered, complete, failed = threading.Event(), threading.Event(), threading.Event()
     reasons: list[str] = []
 
@@ -67,10 +75,13 @@ def connect(
             raise LinkError("the vehicle answers, but its tables do not come through", where=uri,
                             hint="move closer, or choose a freer channel")  # fmt: skip
     except BaseException:
+        if claimed is not None:
+            claimed.close()
         threading.Thread(target=crazyflie.close_link, daemon=True).start()
         raise
 
     link = Link(crazyflie, uri, report)
+    link.claim = claimed
 
     def note_loss(_: str, reason: str = "the link was closed") -> None:
         link.lost = link.lost or reason
@@ -111,18 +122,32 @@ def _table_cache() -> str | None:
 
 
 class _Serialized:
-    """A link driver that sends for one thread at a time, and gives a packet up rather than wait for a stuck one."""
+    """A link driver that sends for one thread at a time, and in flight gives a packet up rather than wait for long.
+
+    cflib's radio driver has a queue of one and waits for 2 s where the radio is dead. A setpoint or a pose that waited
+    so long would be taken for a fresh one.
+    """
 
     def __init__(self, driver: Any):
         self._driver, self._lock = driver, threading.Lock()
         self.needs_resending = driver.needs_resending
 
     def send_packet(self, packet: Any) -> None:
+        """For cflib itself."""
         if self._lock.acquire(timeout=0.1):
             try:
                 self._driver.send_packet(packet)
             finally:
                 self._lock.release()
+
+    def send_soon(self, packet: Any) -> None:
+        """For what is out of date in a moment."""
+        waiting = getattr(self._driver, "out_queue", None)
+        if isinstance(waiting, queue.Queue):
+            with contextlib.suppress(queue.Full):
+                waiting.put(packet, timeout=PATIENCE)
+        else:
+            self.send_packet(packet)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._driver, name)

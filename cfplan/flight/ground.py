@@ -9,7 +9,7 @@ from cfplan.flight.link import Link
 from cfplan.flight.mission import yaw_of
 from cfplan.flight.pace import Lateness
 from cfplan.flight.preflight import Ground, run_checks
-from cfplan.flight.supervisor import ARMED, CAN_FLY
+from cfplan.flight.supervisor import ARMED, CAN_BE_ARMED, CAN_FLY
 from cfplan.flight.telemetry import Level, Phase
 
 CONVERGED_WITHIN = 0.03  # m, estimate from pose
@@ -124,7 +124,7 @@ def _look_around(cockpit: Cockpit, wanted: dict[str, float], read_back: dict[str
 
     def look() -> bool:
         nonlocal could_fly
-        could_fly = could_fly or bool(cockpit.bits(CAN_FLY))
+        could_fly = could_fly or bool(cockpit.bits(CAN_FLY | CAN_BE_ARMED))
         return False
 
     cockpit.until(look, 1.0)

@@ -4,6 +4,7 @@ cflib connects, fetches the tables and carries parameters and logs. What is sent
 driver: cflib's own sending holds a lock while a dying link joins the thread that waits for it.
 """
 
+import math
 import struct
 import threading
 import time
@@ -22,22 +23,30 @@ TAKE_OFF, LAND, STOP, GO_TO = 7, 8, 3, 12  # commands of the on-board commander
 EXTERNAL_POSE = 8
 
 _MILLI = 1e-3
+_CLOCK_DRIFT = 5e-4  # by which the vehicle's clock may differ
+_STAMPS_WRAP = (1 << 24) * _MILLI  # s
 _ESTIMATE = [f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az")]
-_ESTIMATE_LOG = ([(name, "int16_t") for name in _ESTIMATE] + [("stateEstimateZ.quat", "uint32_t")], 10)
-_STATUS_LOG = (
+ESTIMATE_LOG = ([(name, "int16_t") for name in _ESTIMATE] + [("stateEstimateZ.quat", "uint32_t")], 10)
+STATUS_LOG = (
     [(f"stateEstimateZ.{name}", "int16_t") for name in ("rateRoll", "ratePitch", "rateYaw")]
     + [(f"motor.m{motor}", "uint16_t") for motor in (1, 2, 3, 4)]
     + [("pm.vbatMV", "uint16_t"), ("supervisor.info", "uint16_t")],
     20,
 )
-_VARIANCE_LOG = ([(f"kalman.var{axis}", "float") for axis in "XYZ"], 10)
+VARIANCE_LOG = ([(f"kalman.var{axis}", "float") for axis in "XYZ"], 10)
 
 
 class Link:
     """A connected Crazyflie. Made by `connection.connect`."""
 
-    def __init__(self, crazyflie: Any, uri: str, report: Callable[[Telemetry], None]):
-        self._crazyflie, self.uri, self._report = crazyflie, uri, report
+    def __init__(
+        self,
+        crazyflie: Any,
+        uri: str,
+        report: Callable[[Telemetry], None],
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._crazyflie, self.uri, self._report, self._clock = crazyflie, uri, report, clock
         self.lost = ""
         # why the link is gone; empty while it stands
         self.estimate: Estimate | None = None
@@ -47,7 +56,11 @@ class Link:
         self.replies: dict[int, int] = {}
         # command of the on-board commander: the code that it answered, 0 for done
         self.firmware = ""
+        self.claim: Any = None
+        # keeps others from the radio until it is closed
         self._variance_block: Any = None
+        self._log_zero, self._log_heard = math.inf, 0.0
+        # s, when the vehicle's clock of ms was zero, as the quickest messages have it; the last message
         crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
         crazyflie.add_port_callback(PLATFORM_PORT, self._on_platform)
 
@@ -69,7 +82,7 @@ class Link:
         """Send a packet made by `packet`. A link that is gone takes it silently: watch `lost`."""
         driver = self._crazyflie.link
         if driver is not None:
-            driver.send_packet(prepared)
+            driver.send_soon(prepared)
 
     def send_pose(self, position: Sequence[float], quaternion: Sequence[float]) -> None:
         self._send(LOCALIZATION_PORT, 1, struct.pack("<B7f", EXTERNAL_POSE, *position, *quaternion))
@@ -92,6 +105,10 @@ class Link:
     def stop_motors(self) -> None:
         """End what the on-board commander does; motors off."""
         self._command(STOP, b"\0")
+
+    def stop_setpoint(self) -> None:
+        """Motors off until another setpoint comes."""
+        self._send(GENERIC_PORT, 0, b"\0")
 
     def _command(self, command: int, arguments: bytes) -> None:
         self.replies.pop(command, None)
@@ -142,9 +159,9 @@ class Link:
 
     def start_logs(self) -> None:
         """From here on `estimate`, `status` and `position_variance` are kept, and the first two reported."""
-        self._log("estimate", _ESTIMATE_LOG, self._on_estimate)
-        self._log("status", _STATUS_LOG, self._on_status)
-        self._variance_block = self._log("variance", _VARIANCE_LOG, self._on_variance)
+        self._log("estimate", ESTIMATE_LOG, self._on_estimate)
+        self._log("status", STATUS_LOG, self._on_status)
+        self._variance_block = self._log("variance", VARIANCE_LOG, self._on_variance)
 
     def stop_variance_log(self) -> None:
         if self._variance_block is not None:
@@ -174,14 +191,26 @@ class Link:
         closing = threading.Thread(target=self._crazyflie.close_link, daemon=True)
         closing.start()
         closing.join(timeout=2.0)
+        if self.claim is not None:
+            self.claim.close()
 
     # What comes in: these run in cflib's thread and must be quick.
 
-    def _on_estimate(self, _: int, data: dict[str, int], __: Any) -> None:
+    def _when(self, stamp_ms: int) -> float:
+        """When the vehicle wrote a message, as the quickest ones tell; a radio that was dead delivers old ones."""
+        now = self._clock()
+        zero = now - stamp_ms * _MILLI
+        if abs(zero - self._log_zero) > _STAMPS_WRAP / 2:  # the first, or the vehicle's 24 bits began anew
+            self._log_zero = zero
+        self._log_zero = min(self._log_zero + _CLOCK_DRIFT * (now - self._log_heard), zero)
+        self._log_heard = now
+        return self._log_zero + stamp_ms * _MILLI
+
+    def _on_estimate(self, stamp_ms: int, data: dict[str, int], _: Any) -> None:
         x, y, z, vx, vy, vz, ax, ay, az = (data[name] * _MILLI for name in _ESTIMATE)
         q = decompress_quaternion(np.array([data["stateEstimateZ.quat"]], dtype=np.uint32))[0]
         self.estimate = Estimate(
-            time=time.monotonic(),
+            time=self._when(stamp_ms),
             position=(x, y, z),
             velocity=(vx, vy, vz),
             acceleration=(ax, ay, az - GRAVITY),  # the log counts gravity in
@@ -189,10 +218,10 @@ class Link:
         )
         self._report(self.estimate)
 
-    def _on_status(self, _: int, data: dict[str, int], __: Any) -> None:
+    def _on_status(self, stamp_ms: int, data: dict[str, int], _: Any) -> None:
         roll, pitch, yaw = (data[f"stateEstimateZ.{name}"] * _MILLI for name in ("rateRoll", "ratePitch", "rateYaw"))
         self.status = VehicleStatus(
-            time=time.monotonic(),
+            time=self._when(stamp_ms),
             body_rate=(roll, -pitch, yaw),  # the log's pitch rate is nose up
             motor=(data["motor.m1"], data["motor.m2"], data["motor.m3"], data["motor.m4"]),
             battery_voltage=data["pm.vbatMV"] * _MILLI,

@@ -1,5 +1,6 @@
 """Deadlines at a fixed rate that do not drift, and how well they were met."""
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -43,8 +44,9 @@ class Pace:
 
     @property
     def upcoming(self) -> float:
-        """s, the next deadline."""
-        return self._first + (self._count + 1) * self._period
+        """s, the next deadline that is still to come."""
+        passed = math.floor((self._clock() - self._first) / self._period)
+        return self._first + (max(self._count, passed) + 1) * self._period
 
     def wait(self) -> float:
         """Sleep until the next deadline that is still to come; its time."""

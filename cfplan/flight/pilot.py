@@ -10,9 +10,10 @@ from collections.abc import Callable
 
 from cfplan.errors import CfplanError, ExitCode, PreflightError
 from cfplan.flight.cockpit import REPLY, TRIES, Cockpit, LinkLost, OrdersFrom, Tripped
+from cfplan.flight.descent import encode_descent
 from cfplan.flight.ground import prepare
 from cfplan.flight.link import GO_TO, LAND, TAKE_OFF, Link
-from cfplan.flight.mission import Mission, manoeuvre_time
+from cfplan.flight.mission import Mission, manoeuvre_time, yaw_of
 from cfplan.flight.outcome import Deviation, FlightOutcome, Rung, settle_time
 from cfplan.flight.pace import Lateness
 from cfplan.flight.poses import PoseSource
@@ -24,9 +25,12 @@ from cfplan.flight.watch import Trip
 SETTLED_WITHIN = 0.03  # m, from where the motion ended
 _AT_START_WITHIN = 0.06  # m
 _AT_START_FOR = 0.5  # s
+_BEHIND = 0.15  # m from its setpoint, from where on a stop begins where the vehicle is
 _BRAKE_HOLD = 1.0  # s of hover after a stop
 _ON_THE_FLOOR = 0.15  # m above where it took off
 _BELOW_FLOOR = 0.03  # m that landings aim below it, so that motors stop on the floor and not above
+_BLIND_LAND_SPEED = 0.6  # m/s, mean, at least: without poses the vehicle drifts half a metre in 2 s
+_TOUCH = 0.3  # s on the floor before motors stop
 _MOTORS_STOPPED = 4.0  # s; the vehicle calls itself landed 2 s after they did
 
 
@@ -143,11 +147,14 @@ class Pilot:
         cockpit = self._cockpit
         cockpit.enter(Phase.HAND_BACK)
         end, yaw = self._mission.end
-        self._hand_over(lambda: cockpit.link.go_to(end, yaw, 1.0), GO_TO, "to hover")
-        cockpit.pause(1.0)
+        if self._hand_over(lambda: cockpit.link.go_to(end, yaw, 1.0), GO_TO):
+            cockpit.pause(1.0)
 
-    def _hand_over(self, command: Callable[[], None], number: int, what: str) -> None:
-        """From the stream to the on-board commander. A setpoint would undo the command, so none is sent meanwhile."""
+    def _hand_over(self, command: Callable[[], None], number: int) -> bool:
+        """From the stream to the on-board commander; whether it takes over. Where not, the stream goes on.
+
+        A setpoint would undo the command, so none is sent meanwhile.
+        """
         cockpit = self._cockpit
         for _ in range(TRIES):
             cockpit.muted = True
@@ -157,12 +164,14 @@ class Pilot:
             cockpit.muted = False  # hover on while asking again
             cockpit.pause(0.05)
         else:
-            raise Tripped(_safety(Rung.CUT, f"the vehicle refuses {what} (code {code})"))
+            cockpit.say(Level.WARNING, f"the on-board commander does not take over (code {code})")
+            return False
         cockpit.stream, cockpit.muted = None, False
         for _ in range(TRIES):
             cockpit.link.release_priority()
             if cockpit.until(lambda: bool(cockpit.bits(HIGH_LEVEL_ACTIVE)), REPLY):
-                return
+                break
+        return True
 
     def _land(self) -> None:
         """Down, where it is, until the vehicle says that it no longer flies."""
@@ -176,15 +185,16 @@ class Pilot:
     def _touch_down(self) -> bool:
         cockpit = self._cockpit
         height = max(cockpit.pose().position[2] - cockpit.floor, 0.0)
-        duration = manoeuvre_time(height, self._limits.ground.land_speed)
+        blind = cockpit.now() - cockpit.pose().time > self._limits.pose.age_brake
+        speed = max(self._limits.ground.land_speed, _BLIND_LAND_SPEED if blind else 0.0)
+        duration = manoeuvre_time(height, speed)
 
         def land() -> None:
             cockpit.link.land(cockpit.floor - _BELOW_FLOOR, duration)
 
-        if cockpit.stream is not None:
-            self._hand_over(land, LAND, "to land")
-        else:
-            cockpit.ask(land, LAND)
+        if not self._commanded(land):
+            self._descend(duration)
+            return self._motors_stop()
         cockpit.pause(duration)
         if self._motors_stop():
             return True
@@ -193,6 +203,27 @@ class Pilot:
         cockpit.say(Level.WARNING, "on the floor with turning motors: stopping them")
         cockpit.link.stop_motors()
         return self._motors_stop()
+
+    def _commanded(self, land: Callable[[], None]) -> bool:
+        """Whether the on-board commander lands; one that does not answer may."""
+        if self._cockpit.stream is not None:
+            return self._hand_over(land, LAND)
+        return not self._cockpit.ask(land, LAND)
+
+    def _descend(self, duration: float) -> None:
+        """Down by setpoints from where it hovers, and motors off at the end."""
+        cockpit = self._cockpit
+        begin, hover, pose = cockpit.pace.upcoming, cockpit.stream, cockpit.pose()
+        place, quaternion = (pose.position, pose.quaternion) if hover is None else hover.states[hover.last][0::3][:2]
+        floor = cockpit.floor - _BELOW_FLOOR
+        down = encode_descent(place, yaw_of(quaternion), floor, duration, self._mission.rate)
+        cockpit.stream = Stream(down, self._mission.rate, begin)
+        cockpit.pause(duration + _TOUCH)
+        cockpit.stream = None
+        for _ in range(TRIES):
+            cockpit.link.stop_setpoint()
+            cockpit.pause(0.02)
+        cockpit.link.release_priority()
 
     def _motors_stop(self) -> bool:
         return self._cockpit.until(lambda: not self._cockpit.bits(FLYING), _MOTORS_STOPPED)
@@ -236,12 +267,31 @@ class Pilot:
         """Along the path to a hover, or to the end of a stop that has begun; without a stream it is slow already."""
         cockpit = self._cockpit
         if cockpit.stream is cockpit.plan:
-            index = cockpit.plan.index(cockpit.now())
-            self._stopped_at = cockpit.plan.start + index / self._mission.rate
+            index = self._present_index()
+            self._stopped_at = cockpit.pace.upcoming
             cockpit.stream = Stream(self._mission.stops[index], self._mission.rate, self._stopped_at)
         if cockpit.stream is not None:
             end = cockpit.stream.end
             cockpit.until(lambda: cockpit.now() > end, math.inf)
+
+    def _present_index(self) -> int:
+        """The setpoint from which to stop: that of the moment, or the nearest before it if the vehicle fell behind."""
+        cockpit = self._cockpit
+        due = cockpit.plan.index(cockpit.now())
+        pose = cockpit.pose()
+        if cockpit.now() - pose.time > self._limits.pose.age_warning:
+            return due
+        lead = self._mission.lead
+        if math.dist(pose.position, cockpit.plan.position(pose.time - lead)) < _BEHIND:
+            return due
+        nearest, least = due, math.inf
+        for index in range(due, -1, -1):
+            distance = math.dist(pose.position, cockpit.plan.states[index][0])
+            if distance < least:
+                nearest, least = index, distance
+            elif distance > least + _BEHIND:  # what comes nearer again is another turn of the path
+                break
+        return nearest
 
     def _cut(self) -> None:
         cockpit = self._cockpit

@@ -21,6 +21,9 @@ class Pose:
 class PoseSource(Protocol):
     """Gives poses as they come; never the same one twice. Opened in the process that uses it."""
 
+    fault: str
+    # why none comes; "" while good ones do, or where it cannot tell
+
     def open(self) -> None:
         """Begin. Raises a CfplanError within 5 s where nothing can come."""
 

@@ -31,7 +31,7 @@ class Ground:
     round_trip: float
     # s
     could_fly: bool
-    # the supervisor said so at least once in the last second
+    # the supervisor said so at least once in the last second, or that it waits to be armed, as brushless vehicles do
     status: VehicleStatus
     wanted: Mapping[str, float]
     # parameters as they were set

@@ -36,11 +36,13 @@ def fly(
     pose_source: PoseSource,
     drivers: Sequence[type] = (),
     on_telemetry: Callable[[Telemetry], None] = lambda _: None,
+    more_orders: Callable[[], Sequence[Order]] = tuple,
 ) -> FlightOutcome:
     """Fly a mission and come back when the vehicle is down. Call from the main thread, so that Ctrl-C lands.
 
     `pose_source` and `drivers` (cflib link drivers tried before cflib's own) go to the pilot's process by pickle.
     `on_telemetry` gets every message, in order; what it raises is raised here after the vehicle has landed.
+    `more_orders` tells what was ordered otherwise than by key or signal since it was last asked; it must not wait.
     Raises LinkError where the vehicle cannot be reached or the pilot's process dies, and what the pose source raises.
     """
     context = multiprocessing.get_context("spawn")
@@ -55,7 +57,7 @@ def fly(
         telemetry_end.close()
         orders_end.close()
         try:
-            return _attend(process, telemetry, orders, keyboard, on_telemetry)
+            return _attend(process, telemetry, orders, keyboard, on_telemetry, more_orders)
         finally:
             orders.close()  # where this end fails, the pilot notices and lands
             telemetry.close()
@@ -70,6 +72,7 @@ def _attend(
     orders: Connection,
     keyboard: Keyboard,
     on_telemetry: Callable[[Telemetry], None],
+    more_orders: Callable[[], Sequence[Order]],
 ) -> FlightOutcome:
     """Pass telemetry one way and orders the other until the pilot's last message."""
     failure: BaseException | None = None
@@ -78,7 +81,7 @@ def _attend(
         watched.append(keyboard.descriptor)
     while True:
         ready = wait(watched, _POLL)
-        for order in keyboard.orders():
+        for order in (*keyboard.orders(), *more_orders()):
             _send(orders, order)
         if telemetry not in ready:
             continue

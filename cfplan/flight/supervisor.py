@@ -1,5 +1,6 @@
 """The bits of the log variable supervisor.info, as the firmware's supervisor.c sets them."""
 
+CAN_BE_ARMED = 1 << 0
 ARMED = 1 << 1
 CAN_FLY = 1 << 3
 FLYING = 1 << 4

@@ -14,7 +14,7 @@ from cfplan.safety.limits import Ladder, Limits
 
 LATEST_SETPOINT = 0.25  # s; the vehicle gives up following after 0.5 s
 OLDEST_LOG = 0.5  # s without the vehicle's log
-LINK_GONE = 1.5  # s without it, after which the link counts as lost
+LINK_GONE = 10.0  # s without it, after which the link counts as lost; until then the vehicle may be hovering
 DISAGREEMENT_FACTOR = 5.0  # in the air estimate and pose may be apart by so many times what preflight allows
 
 
@@ -38,6 +38,8 @@ class Seen:
     link_lost: str = ""
     pose: Pose | None = None
     # the last good one
+    pose_fault: str = ""
+    # why none has come since
     wanted: Triple | None = None
     # m, where the vehicle should have been when the pose was taken; None where no setpoint says so
     estimate: Estimate | None = None
@@ -88,7 +90,8 @@ class Watch:
         age = seen.now - seen.pose.time
         if age > limits.age_brake:
             rung = Rung.LAND if age > limits.age_land else Rung.BRAKE
-            yield _safety(rung, f"the last good pose is {age:.2f} s old")
+            why = f" ({seen.pose_fault})" if seen.pose_fault else ""
+            yield _safety(rung, f"the last good pose is {age:.2f} s old{why}")
 
     def _vehicle(self, seen: Seen) -> Iterator[Trip]:
         if seen.estimate is None or seen.status is None:
@@ -123,7 +126,8 @@ class Watch:
                 yield _rung(limits.deviation, deviation, f"{deviation:.2f} m from the setpoint")
         if seen.estimate is None or seen.status is None:
             return
-        if seen.pose is not None and seen.now - seen.pose.time <= self._limits.pose.age_warning:
+        newest = self._limits.pose.age_warning
+        if seen.pose is not None and seen.now - min(seen.pose.time, seen.estimate.time) <= newest:
             apart = math.dist(seen.pose.position, seen.estimate.position)
             if apart > DISAGREEMENT_FACTOR * self._limits.pose.agreement:
                 yield _safety(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")

@@ -25,7 +25,7 @@ MOTORS = slice(13, 17)
 STATE_SIZE = 17
 
 # Where each parameter lies in the array that `pack_body` makes.
-_MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, THRUST_MAX, _LAG, _DRAG, _AXIAL_DRAG, FLOOR, _REACTION = range(12)
+MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, THRUST_MAX, _LAG, _DRAG, _AXIAL_DRAG, FLOOR, _REACTION = range(12)
 
 STILL_AIR = np.zeros(3)
 ALL_WELL = np.ones(4)
@@ -102,7 +102,7 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
     # On the floor the ground takes all torque and every force that does not lift the body off it.
     turn = rotation(state[6:10])
     on_floor = state[2] <= body[FLOOR]
-    if on_floor and state[5] <= 0.0 and thrust * turn[2, 2] <= body[_MASS] * GRAVITY:
+    if on_floor and state[5] <= 0.0 and thrust * turn[2, 2] <= body[MASS] * GRAVITY:
         _rest(state, body[FLOOR])
         return
 
@@ -121,7 +121,7 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
     force_z = thrust - body[_AXIAL_DRAG] * (turn[0, 2] * ax + turn[1, 2] * ay + turn[2, 2] * az)
     for axis in range(3):
         force = turn[axis, 0] * force_x + turn[axis, 1] * force_y + turn[axis, 2] * force_z
-        state[3 + axis] += TIME_STEP * force / body[_MASS]
+        state[3 + axis] += TIME_STEP * force / body[MASS]
     state[5] -= TIME_STEP * GRAVITY
     for axis in range(3):
         state[axis] += TIME_STEP * state[3 + axis]

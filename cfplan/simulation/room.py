@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InputError, LinkError
 from cfplan.flight.poses import Pose
-from cfplan.simulation.virtual_vicon import ViconSettings
+from cfplan.simulation.virtual_cameras import ViconSettings
 
 SUBSCRIBE, UNSUBSCRIBE = b"\1", b"\0"
 SUBSCRIPTION_LASTS = 2.0  # s without a renewal
@@ -116,6 +116,7 @@ class RoomPoseSource:
 
     number: int = 0
     # of the lab, as in sim://0
+    fault: str = ""
     _socket: socket.socket | None = None
     _first: list[Pose] | None = None
     _renewed: float = 0.0

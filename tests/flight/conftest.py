@@ -95,6 +95,7 @@ class World:
     protocol: int = 12
     uri: str = "fake://0"
     lost: str = ""
+    fault: str = ""
     round_trip: float = 0.002
     refuses: dict[int, int] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
@@ -258,6 +259,10 @@ class World:
     def stop_motors(self) -> None:
         self.calls.append("stop")
         self._curve = None
+
+    def stop_setpoint(self) -> None:
+        self.calls.append("stop setpoint")
+        self.stopped = True
 
     def _command(self, number: int, name: str, end, duration: float) -> None:
         self.calls.append(name)

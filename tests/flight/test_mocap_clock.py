@@ -31,6 +31,14 @@ def test_a_delay_that_begins_is_seen_as_age():
     assert min(ages[:150]) > 0.2 + LATENCY - 1e-3
 
 
+def test_a_delay_that_lasts_is_seen_until_long_after_any_landing():
+    clock = FrameClock(LATENCY)
+    for number, received in arrivals(300):
+        clock.taken(received, number, RATE)
+    late = [received + 0.2 - clock.taken(received + 0.2, number, RATE) for number, received in arrivals(6300)[300:]]
+    assert min(late) > 0.17
+
+
 def test_clocks_that_drift_apart_do_not_age_the_poses():
     for drift in (-1e-4, 1e-4):
         clock = FrameClock(LATENCY)

@@ -8,7 +8,8 @@ from click.testing import CliRunner
 from cfplan.cli import cfplan
 from cfplan.cli.vehicle import check_mocap
 from cfplan.errors import CfplanError, InputError, LinkError
-from cfplan.simulation.virtual_vicon import ViconSettings, serve
+from cfplan.simulation.virtual_cameras import ViconSettings
+from cfplan.simulation.virtual_vicon import serve
 from cfplan.simulation.virtual_vicon_faults import FaultKind, ViconFault
 
 

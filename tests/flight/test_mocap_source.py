@@ -19,7 +19,8 @@ from cfplan.flight.mocap.datastream import Block, kinds, packet
 from cfplan.flight.mocap.sorting import Verdict
 from cfplan.flight.mocap.source import pose_source
 from cfplan.safety.limits import PoseLimits
-from cfplan.simulation.virtual_vicon import ViconSettings, serve
+from cfplan.simulation.virtual_cameras import ViconSettings
+from cfplan.simulation.virtual_vicon import serve
 from cfplan.simulation.virtual_vicon_faults import FaultKind, ViconFault
 
 pytestmark = pytest.mark.integration

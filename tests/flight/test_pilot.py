@@ -7,7 +7,7 @@ import pytest
 
 from cfplan.errors import ExitCode, InputError
 from cfplan.flight.keys import Order
-from cfplan.flight.link import LAND, TAKE_OFF
+from cfplan.flight.link import GO_TO, LAND, TAKE_OFF
 from cfplan.flight.outcome import Rung
 from cfplan.flight.telemetry import Phase, PoseReceived, SetpointSent
 
@@ -247,11 +247,27 @@ def test_a_refused_take_off_ends_on_the_ground(world, fly):
     assert world.calls[-3:-1] == ["disarm", "close"]
 
 
-def test_a_vehicle_that_refuses_to_land_is_cut_at_last(world, fly):
+def test_a_vehicle_whose_commander_refuses_to_land_is_brought_down_by_setpoints(world, fly):
     world.refuses[LAND] = 16
     outcome = fly()
-    assert outcome.rung is Rung.CUT
-    assert outcome.exit_code is ExitCode.ENDED_BY_SAFETY
+    assert outcome.exit_code is ExitCode.OK
+    assert outcome.rung is Rung.NONE
+    assert world.position[2] < 0.05
+    assert world.motors_off_in_the_air == 0.0
+    assert "stop setpoint" in world.calls
+    assert "emergency stop" not in world.calls
+
+
+def test_a_refused_hand_over_leaves_the_stream_flying_and_lands_by_it(world, fly):
+    def refuse():
+        world.refuses.update({GO_TO: 16, LAND: 16})
+
+    world.when(Phase.HOLD, 0.1, refuse)
+    outcome = fly()
+    assert outcome.rung is Rung.NONE
+    assert "does not take over" in world.said
+    assert world.position[2] < 0.05
+    assert world.motors_off_in_the_air == 0.0
 
 
 def test_a_source_without_poses_is_an_error_with_a_hint(world, fly):

@@ -17,7 +17,8 @@ from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Frame
 from cfplan.flight.mocap.survey import survey
 from cfplan.flight.mocap.uri import parse_uri
-from cfplan.simulation.virtual_vicon import ViconSettings, VirtualVicon, serve
+from cfplan.simulation.virtual_cameras import ViconSettings
+from cfplan.simulation.virtual_vicon import VirtualVicon, serve
 from cfplan.simulation.virtual_vicon_faults import FaultKind, Faults, ViconFault
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)

@@ -9,7 +9,7 @@ from cfplan.flight.mocap.source import pose_source
 from cfplan.safety.limits import PoseLimits
 from cfplan.simulation.lab import start_lab
 from cfplan.simulation.room import RoomSettings
-from cfplan.simulation.virtual_vicon import ViconSettings
+from cfplan.simulation.virtual_cameras import ViconSettings
 from cfplan.simulation.virtual_vicon_faults import FaultKind, ViconFault
 from cfplan.vehicle.airframes import load_airframe
 

@@ -1,16 +1,16 @@
 """When a frame was taken, from when it came.
 
 A frame comes late by what the network and the computers add at that moment. Frame numbers count at the cameras' steady
-rate, so the earliest arrival seen lately tells when each number should have come, and what is later than that was
-delayed on its way: its pose is older than it looks. The rate that a system announces is believed once its numbers were
-seen to count at it.
+rate, so the earliest arrival tells when each number should have come, and what is later than that was delayed on its
+way: its pose is older than it looks, however long the delay lasts. The rate that a system announces is believed once
+its numbers were seen to count at it.
 """
 
 import math
 
 _PROOF = 1.0  # s; over two of these the numbers must count at the announced rate
-_TOLERANCE = 0.003  # of that rate, as the earliest arrivals of both tell
-_WINDOW = 2.0  # s; between one and two of these are remembered, so that clocks may drift apart
+_DRIFT = 5e-4  # by which the two clocks may differ: so fast is what was earliest forgotten
+_TOLERANCE = _DRIFT  # of that rate, as the earliest arrivals of both tell
 
 
 class FrameClock:
@@ -24,8 +24,8 @@ class FrameClock:
         self._proof: list[float] | None = None
         # s, the earliest of the first and of the second time of proof; None once the rate is proven
         self._proof_begin = math.nan
-        self._earliest = [math.inf, math.inf]
-        self._window_end = math.inf
+        self._earliest = self._heard = math.inf
+        # s, when number 0 came, as the earliest arrivals have it; the last arrival
 
     @property
     def sure(self) -> bool:
@@ -41,16 +41,15 @@ class FrameClock:
             self._begin(received)
         self._number, self._rate = number, rate
         start = received - number / rate
-        if received > self._window_end:
-            self._earliest, self._window_end = [start, self._earliest[0]], received + _WINDOW
-        self._earliest[0] = min(self._earliest[0], start)
+        self._earliest = min(self._earliest + _DRIFT * max(received - self._heard, 0.0), start)
+        self._heard = received
         if self._proof is not None and not self._proven(received, start):
             return received - behind
-        return min(self._earliest) + number / rate - behind
+        return self._earliest + number / rate - behind
 
     def _begin(self, received: float) -> None:
         self._proof, self._proof_begin = [math.inf, math.inf], received
-        self._earliest, self._window_end = [math.inf, math.inf], received + _WINDOW
+        self._earliest, self._heard = math.inf, received
 
     def _proven(self, received: float, start: float) -> bool:
         assert self._proof is not None

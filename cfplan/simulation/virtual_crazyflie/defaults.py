@@ -20,6 +20,7 @@ PRIOR_PARAMETERS = tuple(
         "initialZ", "initialYaw", "maxPos", "maxVel", "dragB_x", "dragB_y", "dragB_z",
     )
 )  # fmt: skip
+PRIOR_DRAG = tuple(name for name in PRIOR_PARAMETERS if name.startswith("kalman.drag"))
 
 _GAIN_NAMES = ("p", "i", "d")
 # The PID controller's gains in the order of its loops, and its limits; the limits inside the loops are scaled ones.

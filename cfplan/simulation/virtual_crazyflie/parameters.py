@@ -1,7 +1,7 @@
 """Parameters: the table, reading, writing, defaults and storing (CRTP port 2)."""
 
 import errno
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from struct import calcsize, error, unpack_from
 from struct import pack as bytes_of
 
@@ -20,11 +20,13 @@ _TOC, _READ, _WRITE, _MISC = range(4)
 _IS_STORED_TYPE = 1
 
 
-def parameter_toc() -> Toc:
-    """The table of all parameters."""
+def parameter_toc(without: Collection[str] = ()) -> Toc:
+    """The table of all parameters but those that this firmware lacks."""
     variables = []
     for group, kind, marked in read_catalogue(PARAMETERS):
         code, layout = _TYPES[kind]
+        if f"{group}.{marked.rstrip('*!')}" in without:
+            continue
         stored, read_only = "*" in marked, "!" in marked
         code |= (_EXTENDED if stored else 0) | (_READ_ONLY if read_only else 0)
         variables.append(Variable(group, marked.rstrip("*!"), code, layout, stored, read_only))
@@ -32,14 +34,19 @@ def parameter_toc() -> Toc:
 
 
 class Parameters:
-    """The values, by name. `watch` has a function called with each new value that a client writes."""
+    """The values, by name. `watch` has a function called with each new value that a client writes.
 
-    def __init__(self, defaults: Mapping[str, float]):
-        self.toc = parameter_toc()
+    `without` are those that this firmware lacks, `stubborn` those that writing does not change.
+    """
+
+    def __init__(self, defaults: Mapping[str, float], *, without: Collection[str] = (), stubborn: Collection[str] = ()):
+        self.toc = parameter_toc(without)
         self._ids = self.toc.index()
         self._values: list[float] = [0] * len(self.toc.variables)
         for name, value in defaults.items():
-            self[name] = value
+            if name not in without:
+                self[name] = value
+        self._stubborn = {self._ids[name] for name in stubborn}
         self._defaults = list(self._values)
         self._stored: dict[int, float] = {}
         self._watchers: dict[int, Callable[[float], None]] = {}
@@ -53,8 +60,9 @@ class Parameters:
         self._values[number] = unpack_from(layout, bytes_of(layout, value if layout == "<f" else int(value)))[0]
 
     def watch(self, name: str, changed: Callable[[float], None]) -> None:
-        """Call `changed` with the new value whenever a client writes it."""
-        self._watchers[self._ids[name]] = changed
+        """Call `changed` with the new value whenever a client writes it; never where this firmware lacks it."""
+        if name in self._ids:
+            self._watchers[self._ids[name]] = changed
 
     def receive(self, channel: int, payload: bytes) -> bytes | None:
         """The payload that answers, on the same channel; None where the firmware is silent."""
@@ -87,6 +95,8 @@ class Parameters:
         return payload
 
     def _set(self, number: int, value: float) -> None:
+        if number in self._stubborn:
+            return
         self._values[number] = value
         if number in self._watchers:
             self._watchers[number](value)

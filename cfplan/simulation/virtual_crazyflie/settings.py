@@ -40,3 +40,9 @@ class VehicleSettings:
     firmware: str = FIRMWARE_VERSION
     seed: int = 1
     # of the sensors' noise
+    stubborn: tuple[str, ...] = ()
+    # parameters that writing does not change
+    parameter_delay: float = 0.0
+    # s that it takes to answer a write
+    busy: bool = False
+    # it refuses every command to the on-board commander

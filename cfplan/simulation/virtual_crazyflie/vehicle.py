@@ -1,10 +1,13 @@
 """The virtual Crazyflie: packets go in and come out, time goes on when it is told to. No threads, no clock."""
 
+import re
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from cfplan.simulation.body import MASS, THRUST_MAX
 from cfplan.simulation.mellinger import euler_yaw
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.commander import Commander, Priority
@@ -18,8 +21,10 @@ from cfplan.simulation.virtual_crazyflie.defaults import (
     PID_GAIN_PARAMETERS,
     PID_LIMIT_PARAMETERS,
     PID_SPEED_PARAMETERS,
+    PRIOR_DRAG,
     PRIOR_PARAMETERS,
 )
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.high_level import Goal, HighLevelCommander, Planner
 from cfplan.simulation.virtual_crazyflie.localization import Localization
 from cfplan.simulation.virtual_crazyflie.log_blocks import DATA_CHANNEL, LogBlocks
@@ -44,6 +49,10 @@ _RESPONSE = 0x80
 _LEGACY_ARM, _LEGACY_RECOVER = 1, 2  # platform commands
 _NO_POSES = np.zeros((0, 9))
 
+_SUPERVISOR_SINCE = 12  # protocol: before it there is no such port
+_DRAG_SINCE = (2026, 4)  # firmware
+_RESIDUAL_RIGHT_SINCE = (2025, 9, 1)
+
 
 class VirtualCrazyflie:
     """A vehicle of this airframe, switched on at tick 0."""
@@ -51,11 +60,13 @@ class VirtualCrazyflie:
     def __init__(self, airframe: Airframe, settings: VehicleSettings | None = None):
         self.settings = settings or VehicleSettings()
         self.tick = 0
-        self.parameters = Parameters(DEFAULTS)
+        self._version = tuple(int(part) for part in re.findall(r"\d+", self.settings.firmware))
+        lacking = PRIOR_DRAG if self._version < _DRAG_SINCE else ()
+        self.parameters = Parameters(DEFAULTS, without=lacking, stubborn=self.settings.stubborn)
         self.stabilizer = Stabilizer(
             airframe,
             self.settings,
-            prior=np.array([self.parameters[name] for name in PRIOR_PARAMETERS]),
+            prior=np.array([0.0 if name in lacking else self.parameters[name] for name in PRIOR_PARAMETERS]),
             gains=np.array([self.parameters[name] for name in GAIN_PARAMETERS]),
         )
         wanted = self.settings.auto_arming
@@ -69,8 +80,18 @@ class VirtualCrazyflie:
         self.setpoint = Setpoint()  # what the controller is given
         self._attitude_setpoints = AttitudeSetpoints()
         self._out: list[bytes] = []
+        self._answers: list[tuple[int, bytes]] = []
+        # to writes of parameters, with the tick from which on they may leave
         self.log = LogBlocks(getters(self))
+        self._airframe = airframe
+        self._faults: list[tuple[int, float, VehicleFault]] = []
+        # with the ticks of their begin and end
         self._watch_parameters()
+
+    def inject(self, fault: VehicleFault) -> None:
+        """Let something go wrong; its start counts from now."""
+        begin = self.tick + round(1000 * fault.start)
+        self._faults.append((begin, begin + 1000 * fault.duration, fault))
 
     def sent(self) -> list[bytes]:
         """The packets sent since the last call."""
@@ -107,10 +128,17 @@ class VirtualCrazyflie:
             answer = self.log.receive(channel, payload, self.tick)
         elif port == Port.PARAMETERS:
             answer = self.parameters.receive(channel, payload)
+            if answer is not None and self.settings.parameter_delay:
+                self._answers.append(
+                    (self.tick + round(1000 * self.settings.parameter_delay), bytes((channel,)) + answer)
+                )
+                answer = None
         elif port == Port.MEMORY:
             answer = self.memories.receive(channel, payload)
         elif port == Port.HIGH_LEVEL:
-            answer = self.planner.receive(payload, self.tick / 1000, blocked=not self.supervisor.can_fly)
+            answer = self.planner.receive(
+                payload, self.tick / 1000, blocked=self.settings.busy or not self.supervisor.can_fly
+            )
         elif port == Port.SUPERVISOR:
             answer = self._supervise(channel, payload)
         elif port == Port.LOCALIZATION:
@@ -132,6 +160,7 @@ class VirtualCrazyflie:
 
     def _command(self) -> None:
         """The slower loops: planner and log blocks at 100 Hz, supervisor at 25 Hz."""
+        self._suffer()
         loop = self.stabilizer.loop
         can_fly = self.supervisor.can_fly
         if can_fly:
@@ -142,8 +171,31 @@ class VirtualCrazyflie:
                 self.tick, self.commander.setpoint.tick if can_fly else 0, self.acceleration / GRAVITY, loop.motors
             )
         self.battery.drain(float(loop.truth[13:17].sum()), COMMANDER_PERIOD / 1000)
+        self.stabilizer.body[THRUST_MAX] = self.battery.strength * self._airframe.motor_thrust_max
+        while self._answers and self._answers[0][0] <= self.tick:
+            _, answer = self._answers.pop(0)
+            self._send(Port.PARAMETERS, answer[0], answer[1:])
         for payload in self.log.due(self.tick):
             self._send(Port.LOG, DATA_CHANNEL, payload)
+
+    def _suffer(self) -> None:
+        """What the faults of this moment make of the vehicle."""
+        if not self._faults:
+            return
+        loop, mass = self.stabilizer.loop, self._airframe.mass
+        acting = {fault.kind: fault.strength for begin, end, fault in self._faults if begin <= self.tick < end}
+        loop.efficiency[:] = 1.0
+        loop.efficiency[0] = acting.get(VehicleFaultKind.MOTOR, 1.0)
+        if VehicleFaultKind.TUMBLE in acting:
+            loop.efficiency[2:4] = 0.0
+        loop.wind[1] = acting.get(VehicleFaultKind.GUST, 0.0)
+        self.stabilizer.body[MASS] = mass * acting.get(VehicleFaultKind.MASS, 1.0)
+        if VehicleFaultKind.BATTERY not in acting:
+            self.battery.sag = 0.0
+        elif self.battery.sag == 0.0:
+            self.battery.sag = max(self.battery.voltage - acting[VehicleFaultKind.BATTERY], 0.0)
+        if VehicleFaultKind.LOCK in acting and not self.supervisor.locked:
+            self.supervisor.lock()
 
     @property
     def acceleration(self) -> NDArray:
@@ -154,6 +206,8 @@ class VirtualCrazyflie:
         supervisor = self.supervisor
         self.setpoint = self.commander.setpoint if supervisor.motors_allowed else Setpoint()
         poses = self.localization.take(self.parameters["locSrv.extPosStdDev"], self.parameters["locSrv.extQuatStdDev"])
+        if len(poses) and self._version < _RESIDUAL_RIGHT_SINCE:
+            _take_in_world_axes(poses, self.stabilizer.loop.belief[6:10])
         self.stabilizer.run(
             self.tick,
             ticks,
@@ -210,7 +264,7 @@ class VirtualCrazyflie:
         return answer_platform(channel, payload, protocol=self.settings.protocol, firmware=self.settings.firmware)
 
     def _supervise(self, channel: int, payload: bytes) -> bytes | None:
-        if not payload:
+        if not payload or self.settings.protocol < _SUPERVISOR_SINCE:
             return None
         command = payload[0]
         head = bytes((command | _RESPONSE,))
@@ -276,3 +330,16 @@ class VirtualCrazyflie:
         if value:
             self.stabilizer.reset_estimator()
             self.parameters["kalman.resetEstimation"] = 0
+
+
+def _take_in_world_axes(poses: NDArray, belief: NDArray) -> None:
+    """Change measured quaternions so that their residual, in body axes, is what it should be in world axes.
+
+    So the filter erred before 2025.09.1 (crazyflie-firmware #1292): with yaw beyond 90° it corrects roll and pitch the
+    wrong way.
+    """
+    believed = Rotation.from_quat(belief)
+    for row in poses:
+        if np.any(row[3:7]):
+            measured = Rotation.from_quat(row[3:7])
+            row[3:7] = (believed * measured * believed.inv()).as_quat()

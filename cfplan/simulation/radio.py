@@ -1,0 +1,130 @@
+"""The radio between computer and vehicle: polled, retried until acknowledged, and sometimes dead.
+
+A Crazyradio sends one packet, gets at most one back with the acknowledgement, and repeats both until it has got it
+(cflib's safelink). Loss therefore costs time and nothing else, until one side's queue is full: the computer's holds
+the packet in the air and one more, the vehicle's 120. What a dead radio held comes out when it returns, and is old.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from cfplan.errors import InputError
+
+TRANSACTION = 0.001  # s a transmission and its acknowledgement: 1,000 a second, as cflib gets
+COMPUTER_QUEUE = 2  # packets: the one in the air, and cflib's queue of one
+_VEHICLE_QUEUE = 120
+
+
+class RadioFaultKind(StrEnum):
+    """What goes wrong."""
+
+    LOSS = "loss"  # a share of `size` of the transmissions fails
+    DELAY = "delay"  # packets take `size` s longer, either way
+    DEAD = "dead"  # none gets through
+
+
+_SIZES = {RadioFaultKind.LOSS: 0.3, RadioFaultKind.DELAY: 0.02}
+
+
+@dataclass(frozen=True, slots=True)
+class RadioFault:
+    """One fault."""
+
+    kind: RadioFaultKind
+    start: float = 0.0
+    # s since it was injected
+    duration: float = math.inf
+    # s
+    size: float | None = None
+    # in the unit of its kind; None for the usual one
+
+    def __post_init__(self) -> None:
+        share = self.kind is RadioFaultKind.LOSS and not 0.0 <= self.strength < 1.0
+        if math.isnan(self.start) or not self.duration > 0 or share or not 0.0 <= self.strength < math.inf:
+            raise InputError(f"{self} makes no sense", hint="loss is a share from 0 to less than 1, delay in s")
+
+    @property
+    def strength(self) -> float:
+        """The size, or the usual one."""
+        return _SIZES.get(self.kind, 0.0) if self.size is None else self.size
+
+
+class Radio:
+    """Both directions. Whoever owns it lets time go on with `step`, in s on any clock."""
+
+    def __init__(self, now: float, seed: int = 11):
+        self._chance = np.random.default_rng(seed)
+        self._next = now
+        self._faults: list[tuple[float, float, RadioFault]] = []
+        self._up: deque[bytes] = deque()
+        self._down: deque[bytes] = deque()
+        self._on_way_up: deque[tuple[float, bytes]] = deque()
+        self._on_way_down: deque[tuple[float, bytes]] = deque()
+        self.dropped = 0
+        # packets that a full queue turned away
+
+    def inject(self, fault: RadioFault, now: float) -> None:
+        """Let something go wrong; its start counts from now."""
+        self._faults.append((now + fault.start, now + fault.start + fault.duration, fault))
+
+    @property
+    def full(self) -> bool:
+        """Whether the computer's queue takes no more."""
+        return len(self._up) >= COMPUTER_QUEUE
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything is on its way."""
+        return bool(self._up or self._down or self._on_way_up or self._on_way_down)
+
+    def send(self, packet: bytes) -> None:
+        """From the computer; turned away where the queue is full."""
+        if self.full:
+            self.dropped += 1
+        else:
+            self._up.append(packet)
+
+    def answer(self, packet: bytes) -> None:
+        """From the vehicle, likewise."""
+        if len(self._down) >= _VEHICLE_QUEUE:
+            self.dropped += 1
+        else:
+            self._down.append(packet)
+
+    def step(self, now: float) -> tuple[list[bytes], list[bytes]]:
+        """What reaches the vehicle, and what the computer, by now."""
+        if not (self._up or self._down):
+            self._next = max(self._next, now)
+        while self._next <= now and (self._up or self._down):
+            self._transact(self._next)
+            self._next += TRANSACTION
+        return _arrived(self._on_way_up, now), _arrived(self._on_way_down, now)
+
+    def _transact(self, time: float) -> None:
+        if self._acting(RadioFaultKind.DEAD, time) is not None:
+            return
+        loss, delay = self._acting(RadioFaultKind.LOSS, time), self._acting(RadioFaultKind.DELAY, time)
+        if loss is not None and self._chance.random() < loss.strength:
+            return
+        due = time + (delay.strength if delay is not None else 0.0)
+        if self._up:
+            self._on_way_up.append((due, self._up.popleft()))
+        if self._down:
+            self._on_way_down.append((due, self._down.popleft()))
+
+    def _acting(self, kind: RadioFaultKind, time: float) -> RadioFault | None:
+        for begin, end, fault in self._faults:
+            if fault.kind is kind and begin <= time < end:
+                return fault
+        return None
+
+
+def _arrived(way: deque[tuple[float, bytes]], now: float) -> list[bytes]:
+    found = []
+    while way and way[0][0] <= now:
+        found.append(way.popleft()[1])
+    return found

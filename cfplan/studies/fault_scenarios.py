@@ -1,0 +1,127 @@
+"""What goes wrong, when, and which rung of the abort ladder it must come to: the rows of the fault table."""
+
+from dataclasses import dataclass, field
+from math import pi
+from typing import Any
+
+from cfplan.flight.keys import Order
+from cfplan.flight.outcome import Rung
+from cfplan.flight.telemetry import Phase
+from cfplan.simulation.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.stepped_lab import Fault
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_vicon_faults import FaultKind, ViconFault
+
+FULL_SPEED = 1.5  # s after the stream began: the path's cruise
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """One row."""
+
+    name: str
+    rung: Rung
+    # that it must come to, and no graver one
+    faults: tuple[Fault, ...] = ()
+    # their starts count from the moment
+    phase: Phase = Phase.STREAM
+    moment: float = FULL_SPEED
+    # s after the phase began
+    stall: float = 0.0
+    # s for which the pilot's computer stands still
+    order: Order | None = None
+    # of the operator
+    main_killed: bool = False
+    pilot_killed: bool = False
+    disk_full: bool = False
+    from_start: bool = False
+    # the faults are there before anything is connected
+    vehicle: VehicleSettings = field(default_factory=lambda: VehicleSettings(auto_arming=False))
+    # armed by request alone, so that one can see whether it was disarmed
+    falls: bool = False
+    # the vehicle's own supervisor stops the motors, whatever the pilot does
+    grounded: bool = False
+    # it must never take off
+
+
+def _poses(name: str, kind: FaultKind, rung: Rung, duration: float, size: float | None = None) -> Scenario:
+    return Scenario(name, rung, (ViconFault(kind, 0.0, duration, size),))
+
+
+def _radio(name: str, kind: RadioFaultKind, rung: Rung, duration: float, size: float | None = None) -> Scenario:
+    return Scenario(name, rung, (RadioFault(kind, 0.0, duration, size),))
+
+
+def _vehicle(name: str, kind: VehicleFaultKind, rung: Rung, duration: float, **changes: Any) -> Scenario:
+    return Scenario(name, rung, (VehicleFault(kind, 0.0, duration),), **changes)
+
+
+def _odd(name: str, *, grounded: bool = False, **settings: Any) -> Scenario:
+    """A vehicle that is not as it should be."""
+    return Scenario(name, Rung.NONE, vehicle=VehicleSettings(auto_arming=False, **settings), grounded=grounded)
+
+
+_REST = 60.0  # s, beyond the end of any flight of the table
+
+SCENARIOS: tuple[Scenario, ...] = (
+    _poses("poses stop for 0.05 s", FaultKind.OCCLUDE, Rung.NONE, 0.05),
+    _poses("poses stop for 0.1 s", FaultKind.OCCLUDE, Rung.NONE, 0.1),
+    _poses("poses stop for 0.3 s", FaultKind.OCCLUDE, Rung.BRAKE, 0.3),
+    _poses("poses stop for 1 s", FaultKind.OCCLUDE, Rung.LAND, 1.0),
+    _poses("poses stop for 5 s", FaultKind.OCCLUDE, Rung.LAND, 5.0),
+    _poses("poses stop for good", FaultKind.STALL, Rung.LAND, _REST),
+    _poses("frozen pose for good", FaultKind.FREEZE, Rung.LAND, _REST),
+    _poses("frozen pose for 0.3 s", FaultKind.FREEZE, Rung.BRAKE, 0.3),
+    _poses("same frame again for 1 s", FaultKind.REPEAT, Rung.LAND, 1.0),
+    _poses("pose 5 cm off for 1 s", FaultKind.JUMP, Rung.NONE, 1.0, 0.05),
+    _poses("pose 1 m off for 1 s", FaultKind.JUMP, Rung.LAND, 1.0, 1.0),
+    _poses("pose 1 m off for good", FaultKind.JUMP, Rung.LAND, _REST, 1.0),
+    _poses("yaw turned by 180° for 1 s", FaultKind.FLIP, Rung.LAND, 1.0, pi),
+    _poses("yaw turned by 180° for good", FaultKind.FLIP, Rung.LAND, _REST, pi),
+    _poses("NaN pose for 1 s", FaultKind.BREAK, Rung.LAND, 1.0),
+    _poses("poses 200 ms late for 1 s", FaultKind.DELAY, Rung.BRAKE, 1.0, 0.2),
+    _poses("poses 200 ms late for good", FaultKind.DELAY, Rung.BRAKE, _REST, 0.2),
+    _poses("Vicon's connection reset, back after 0.5 s", FaultKind.CLOSE, Rung.LAND, 0.5),
+    _radio("radio loses 10 %", RadioFaultKind.LOSS, Rung.NONE, _REST, 0.1),
+    _radio("radio loses 30 %", RadioFaultKind.LOSS, Rung.NONE, _REST, 0.3),
+    _radio("radio loses 50 %", RadioFaultKind.LOSS, Rung.NONE, _REST, 0.5),
+    _radio("radio 30 ms slower", RadioFaultKind.DELAY, Rung.NONE, _REST, 0.03),
+    _radio("radio dead for 0.3 s", RadioFaultKind.DEAD, Rung.NONE, 0.3),
+    _radio("radio dead for 1 s", RadioFaultKind.DEAD, Rung.LAND, 1.0),
+    Scenario(
+        "radio dead for 3 s", Rung.CUT, (RadioFault(RadioFaultKind.DEAD, 0.0, 3.0),), falls=True
+    ),
+    Scenario(
+        "radio dead for 3 s while going to the start",
+        Rung.LAND, (RadioFault(RadioFaultKind.DEAD, 0.0, 3.0),), phase=Phase.GO_TO_START, moment=0.5,
+    ),
+    Scenario("stream stalled for 0.2 s", Rung.NONE, stall=0.2),
+    Scenario("stream stalled for 0.6 s", Rung.BRAKE, stall=0.6),
+    Scenario("stream stalled for 2.5 s", Rung.CUT, stall=2.5, falls=True),
+    Scenario("main process killed", Rung.LAND, main_killed=True),
+    Scenario("pilot killed", Rung.NONE, pilot_killed=True, falls=True),
+    _vehicle("battery sags to 3.1 V", VehicleFaultKind.BATTERY, Rung.LAND, _REST),
+    _vehicle("one motor at 70 %", VehicleFaultKind.MOTOR, Rung.NONE, _REST),
+    _vehicle("mass +20 %", VehicleFaultKind.MASS, Rung.NONE, _REST, from_start=True),
+    _vehicle("gust of 1 m/s for 1 s", VehicleFaultKind.GUST, Rung.NONE, 1.0),
+    _vehicle("supervisor locks", VehicleFaultKind.LOCK, Rung.CUT, _REST, falls=True),
+    _vehicle("vehicle tumbles", VehicleFaultKind.TUMBLE, Rung.CUT, 0.3, falls=True),
+    _odd("parameter refused", grounded=True, stubborn=("stabilizer.controller",)),
+    _odd("parameters answered 0.5 s late", parameter_delay=0.5),
+    _odd("take-off refused", grounded=True, busy=True),
+    _odd("firmware of 2025.09", grounded=True, protocol=10, firmware="2025.09"),
+    _odd("firmware of 2025.12", protocol=10, firmware="2025.12"),
+    _odd("start place 0.5 m off", position=(0.35, -2.85, 0.0)),
+    Scenario(
+        "space bar during preflight", Rung.NONE, order=Order.LAND, phase=Phase.PREFLIGHT, moment=0.2, grounded=True,
+    ),
+    Scenario("space bar during take-off", Rung.LAND, order=Order.LAND, phase=Phase.TAKE_OFF, moment=0.7),
+    Scenario("space bar on the way to the start", Rung.LAND, order=Order.LAND, phase=Phase.GO_TO_START, moment=0.5),
+    Scenario("space bar in the stream", Rung.LAND, order=Order.LAND),
+    Scenario("space bar in the hover behind it", Rung.LAND, order=Order.LAND, phase=Phase.HOLD, moment=0.2),
+    Scenario("space bar at the hand-over", Rung.LAND, order=Order.LAND, phase=Phase.HAND_BACK, moment=0.01),
+    Scenario("space bar while landing", Rung.LAND, order=Order.LAND, phase=Phase.LAND, moment=0.5),
+    Scenario("Esc in the stream", Rung.CUT, order=Order.CUT),
+    Scenario("disk full", Rung.NONE, disk_full=True),
+)  # fmt: skip

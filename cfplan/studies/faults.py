@@ -1,0 +1,294 @@
+"""The fault table: what the pilot makes of each fault, by the truth of the virtual lab.
+
+Flown in the stepped lab (`cfplan.simulation.stepped_lab`): the pilot, the packets, the pose sorting, the virtual
+Crazyflie and the virtual cameras are those of a flight in real time; processes and sockets are not there.
+"""
+
+import math
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cfplan import __version__
+from cfplan.errors import CfplanError, ExitCode
+from cfplan.flight.keys import Order
+from cfplan.flight.mission import Mission
+from cfplan.flight.outcome import FlightOutcome, Rung
+from cfplan.flight.packets import decode
+from cfplan.flight.pilot import Pilot
+from cfplan.flight.telemetry import Event, Phase, PhaseEntered, Telemetry
+from cfplan.recording.header import FlightBounds, RecordHeader
+from cfplan.recording.reader import read_record
+from cfplan.recording.writer import RecordWriter
+from cfplan.simulation.lab import Truth
+from cfplan.simulation.stepped_lab import SteppedLab
+from cfplan.simulation.stepped_link import SteppedPoses, connect
+from cfplan.simulation.virtual_crazyflie.supervisor import State
+from cfplan.studies.fault_scenarios import SCENARIOS, Scenario
+from cfplan.studies.machine import Machine, this_machine
+
+COLUMNS = ("fault", "must come to", "rung", "reacts after", "off the plan", "to the wall", "end", "record")
+_AFTERWARDS = 6.0  # s in which what the pilot left behind comes to rest
+_ARMED = (State.ARMING, State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
+_RUNGS = {f"{rung.name.lower()}:": rung for rung in Rung}
+
+
+class PilotKilled(BaseException):
+    """Nothing of the pilot runs any more."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultFlight:
+    """One row, flown."""
+
+    name: str
+    expected: str
+    rung: str
+    reaction: float | None
+    # s from the fault to the rung; None where there was none
+    off_plan: float
+    # m, largest distance of the true position from the planned path, from landing on horizontally
+    to_wall: float
+    # m, least distance of the true position from the walls and the ceiling; negative beyond them
+    motors_off: int
+    # ms with all motors off in the air
+    landed: bool
+    # on the floor, motors off
+    disarmed: bool
+    readable: bool
+    # what was recorded can be read
+    reason: str
+    fault: str = ""
+    # what is wrong with that; "" where it is as it must be
+
+    def texts(self) -> list[str]:
+        """As COLUMNS has it."""
+        reaction = "–" if self.reaction is None else f"{self.reaction:.2f} s"
+        end = (
+            ", ".join(text for text, said in (("landed", self.landed), ("disarmed", self.disarmed)) if said)
+            or "in the air"
+        )
+        return [
+            self.name, self.expected, self.rung, reaction, f"{100 * self.off_plan:.0f} cm", f"{self.to_wall:.2f} m",
+            end + (f", {self.motors_off} ms without motors" if self.motors_off else ""),
+            "readable" if self.readable else "not readable",
+        ]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class FaultTable:
+    """A whole run."""
+
+    command: str
+    machine: Machine
+    path: str
+    flights: tuple[FaultFlight, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
+        """Title, columns and rows of the one table."""
+        return [("Faults at full speed", list(COLUMNS), [flight.texts() for flight in self.flights])]
+
+
+@dataclass(slots=True)
+class Orders:
+    """Of the operator."""
+
+    worst: Order | None = None
+    gone: bool = False
+
+
+@dataclass(slots=True)
+class Flown:
+    """What a flight left behind."""
+
+    outcome: FlightOutcome | None
+    # None where the pilot was killed, or never flew
+    reason: str
+    truth: Truth
+    struck: float
+    # s, when it went wrong; NaN where it did before anything else, or never
+    events: list[tuple[float, str]] = field(default_factory=list)
+    landing: float = math.inf
+    # s, when the last phase of landing began
+
+
+def fault_table(
+    mission: Mission,
+    path: str,
+    *,
+    scenarios: Iterable[Scenario] = SCENARIOS,
+    command: str = "",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> FaultTable:
+    """Fly every scenario."""
+    rows, all_of_them = [], tuple(scenarios)
+    for done, scenario in enumerate(all_of_them):
+        progress(done, len(all_of_them))
+        rows.append(fly_scenario(scenario, mission))
+    progress(len(all_of_them), len(all_of_them))
+    return FaultTable(command, this_machine(), path, tuple(rows))
+
+
+def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0) -> FaultFlight:
+    """Fly one, with a record, and judge it by the truth."""
+    with tempfile.TemporaryDirectory() as folder:
+        writer = RecordWriter(
+            Path(folder),
+            _header(mission),
+            warn=lambda _: None,
+            **({"open_file": _FullDisk} if scenario.disk_full else {}),
+        )
+        with writer:
+            flown = fly_stepped(scenario, mission, listen=writer.write, seed=seed)
+        try:
+            readable = len(read_record(Path(folder)).phases.time) > 0
+        except CfplanError:
+            readable = False
+    return judge(scenario, flown, mission, readable)
+
+
+def fly_stepped(
+    scenario: Scenario, mission: Mission, *, listen: Callable[[Telemetry], None] = lambda _: None, seed: int = 0
+) -> Flown:
+    """Fly one in the stepped lab, and let what is left behind come to rest."""
+    lab = SteppedLab(mission.limits.airframe, vehicle=scenario.vehicle, seed=seed)
+    orders, flown = Orders(), Flown(None, "", lab.truth(), math.nan)
+
+    def strike() -> None:
+        flown.struck = lab.now
+        for fault in scenario.faults if not scenario.from_start else ():
+            lab.disturb(fault)
+        lab.stall(scenario.stall)
+        orders.worst, orders.gone = scenario.order, scenario.main_killed
+        if scenario.pilot_killed:
+            raise PilotKilled
+
+    def hear(message: Telemetry) -> None:
+        listen(message)
+        if isinstance(message, Event):
+            flown.events.append((message.time, message.text))
+        elif isinstance(message, PhaseEntered):
+            if message.phase is Phase.LAND:
+                flown.landing = message.time
+            if message.phase is scenario.phase and math.isnan(flown.struck):
+                lab.at(message.time + scenario.moment, strike)
+
+    if scenario.from_start:
+        for fault in scenario.faults:
+            lab.disturb(fault)
+    pilot = Pilot(
+        mission,
+        connect=lambda waiting: connect(lab, hear),
+        source=SteppedPoses(lab, mission.limits.pose),
+        report=hear,
+        orders=orders,
+        clock=lab.clock,
+        sleep=lab.sleep,
+    )
+    try:
+        flown.outcome = pilot.fly()
+        flown.reason = flown.outcome.reason
+    except PilotKilled:
+        flown.reason = "the pilot was killed"
+    except CfplanError as error:
+        flown.reason = str(error)
+    lab.sleep(_AFTERWARDS)
+    flown.truth = lab.truth()
+    return flown
+
+
+def judge(scenario: Scenario, flown: Flown, mission: Mission, readable: bool) -> FaultFlight:
+    """Hold what really happened against what must."""
+    truth, outcome = flown.truth, flown.outcome
+    rung = outcome.rung if outcome is not None else Rung.NONE
+    reaction = next(
+        (time - flown.struck for time, text in flown.events if time >= flown.struck and _rung_of(text)), None
+    )
+    flew = (
+        outcome is not None and Phase.TAKE_OFF in dict(outcome.phases) and outcome.exit_code is not ExitCode.PREFLIGHT
+    )
+    return FaultFlight(
+        name=scenario.name,
+        expected="no take-off" if scenario.grounded else scenario.rung.name.lower(),
+        rung=rung.name.lower() if flew or scenario.pilot_killed else "no take-off",
+        reaction=reaction,
+        off_plan=_off_plan(flown, mission),
+        to_wall=float(-_beyond_walls(truth, mission).max()),
+        motors_off=int(truth.off_in_air[-1]),
+        landed=bool(truth.position[-1, 2] < 0.05 and not truth.motor[-1].any()),
+        disarmed=truth.supervisor[-1] not in _ARMED,
+        readable=readable,
+        reason=flown.reason,
+    )
+
+
+def _rung_of(text: str) -> Rung | None:
+    return next((rung for name, rung in _RUNGS.items() if text.startswith(name)), None)
+
+
+def _off_plan(flown: Flown, mission: Mission) -> float:
+    outcome, truth = flown.outcome, flown.truth
+    begin = flown.struck if not math.isnan(flown.struck) else outcome.first_setpoint if outcome is not None else 0.0
+    if outcome is not None and (not outcome.first_setpoint or begin < outcome.first_setpoint):
+        return 0.0
+    planned = decode(mission.payloads).position
+    after = truth.time >= begin
+    flying = after & (truth.time < flown.landing) & (truth.position[:, 2] > 0.02)
+    down = after & (truth.time >= flown.landing)
+    near = cKDTree(planned).query(truth.position[flying])[0]
+    beside = cKDTree(planned[:, :2]).query(truth.position[down][:, :2])[0]
+    return float(max(near.max(initial=0.0), beside.max(initial=0.0)))
+
+
+def _beyond_walls(truth: Truth, mission: Mission) -> np.ndarray:
+    space = mission.limits.space
+    low, high = np.array(space.low), np.array(space.high)
+    low[2] = -np.inf  # the floor is where it lands
+    return np.maximum(low - truth.position, truth.position - high).max(axis=1)
+
+
+class _FullDisk:
+    """A file on a disk that is full after the header."""
+
+    def __init__(self, path: Path):
+        self._file = path.open("xb", buffering=0)
+        self._left = 200_000
+
+    def write(self, data: bytes, /) -> int | None:
+        if len(data) > self._left:
+            raise OSError(28, "No space left on device")
+        self._left -= len(data)
+        return self._file.write(data)
+
+    def truncate(self, size: int, /) -> int:
+        return self._file.truncate(size)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _header(mission: Mission) -> RecordHeader:
+    limits = mission.limits
+    return RecordHeader(
+        name="fault",
+        version=__version__,
+        uri="stepped://0",
+        planner="",
+        vehicle=limits.airframe,
+        thrust_at_full_command=limits.airframe.motor_thrust_max,
+        plan_limits=limits.plan,
+        bounds=FlightBounds(),
+        travel_time=mission.motion_ends,
+        path=decode(mission.payloads).position[::5],
+        fence=(limits.space.low, limits.space.high),
+        wall_time_at_zero=0.0,
+    )
