@@ -63,7 +63,8 @@ def _optional(name: str) -> dict[str, str]:
 
 def _expert() -> dict[str, str]:
     """How the expert's functions are evaluated here; compiles them if that was never done."""
-    from cfplan.expert.compiled import Backend, backend, compiler
+    from cfplan.expert.compiled import Backend, compiler
+    from cfplan.expert.kernel import backend
 
     used = backend()
     if used is Backend.COMPILED:

@@ -1,6 +1,6 @@
-"""The point functions, as machine code where there is a C compiler, else through CasADi's virtual machine.
+"""C source as machine code, where there is a C compiler.
 
-The C source is generated and compiled once a machine, and kept in the user's cache folder under a name that hashes
+Source is generated and compiled once a machine, and kept in the user's cache folder under a name that hashes
 everything it depends on; a second process that compiles at the same time ends with the same file.
 """
 
@@ -11,23 +11,19 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from enum import StrEnum
-from functools import lru_cache
 from pathlib import Path as FilePath
 
 import casadi
 
-from cfplan.expert import stage
-from cfplan.vehicle import airframe, flatness
-
-COMPILER_OPTIONS = ("-O2", "-fno-math-errno", "-fPIC", "-shared")
+COMPILER_OPTIONS = ("-O2", "-march=native", "-fno-math-errno", "-fPIC", "-shared")
 COMPILE_TIMEOUT = 120.0
 # s
 
 
 class Backend(StrEnum):
-    """How the point functions are evaluated."""
+    """How generated functions are evaluated."""
 
     COMPILED = "compiled"
     VIRTUAL_MACHINE = "virtual machine"
@@ -47,60 +43,48 @@ def cache_folder() -> FilePath:
     return FilePath(os.environ.get("XDG_CACHE_HOME") or FilePath.home() / ".cache") / "cfplan"
 
 
-@lru_cache(maxsize=1)
-def library() -> FilePath | None:
-    """The compiled point functions, made now if need be; None where that is not possible."""
+def shared_library(name: str, depends_on: Sequence[FilePath], source: Callable[[], str]) -> FilePath | None:
+    """The compiled source, made now if need be; None where that is not possible.
+
+    `source` is asked only then; it must depend on nothing but the files `depends_on`.
+    """
     try:
         folder = cache_folder()
-        target = folder / f"stage-{_key()}.so"
+        target = folder / f"{name}-{_key(depends_on)}.so"
         if not target.exists():
             folder.mkdir(parents=True, exist_ok=True)
-            _compile(target)
+            _compile(target, source())
         return target
     except (OSError, RuntimeError, subprocess.SubprocessError):
         return None
 
 
-def backend() -> Backend:
-    """Which one `functions()` uses here; compiles if that was never done."""
-    return Backend.COMPILED if library() else Backend.VIRTUAL_MACHINE
-
-
-@lru_cache(maxsize=4)
-def functions(chosen: Backend | None = None) -> Mapping[str, casadi.Function]:
-    """The point functions by name, see `stage.point_functions`."""
-    interpreted = _interpreted()
-    if chosen == Backend.VIRTUAL_MACHINE or not (path := library()):
-        return interpreted
-    try:
-        return {name: casadi.external(name, str(path)) for name in interpreted}
-    except RuntimeError:  # a library that this machine cannot load
-        return interpreted
-
-
-@lru_cache(maxsize=1)
-def _interpreted() -> Mapping[str, casadi.Function]:
-    return {f.name(): f for free_yaw in (False, True) for f in stage.point_functions(free_yaw)}
-
-
-def _key() -> str:
-    sources = [FilePath(module.__file__).read_bytes() for module in (stage, flatness, airframe) if module.__file__]
-    machine = f"{casadi.CasadiMeta.version()} {platform.platform()} {platform.machine()} {COMPILER_OPTIONS}"
+def _key(depends_on: Sequence[FilePath]) -> str:
+    sources = [file.read_bytes() for file in (FilePath(__file__), *depends_on)]
+    machine = f"{casadi.CasadiMeta.version()} {platform.platform()} {_processor()} {compiler()} {COMPILER_OPTIONS}"
     return hashlib.sha256(b"".join([*sources, machine.encode()])).hexdigest()[:20]
 
 
-def _compile(target: FilePath) -> None:
+def _processor() -> str:
+    """What -march=native depends on: a cache folder may be shared by machines that differ."""
+    try:
+        lines = FilePath("/proc/cpuinfo").read_text().splitlines()
+        return "".join(
+            line for line in lines[: lines.index("")] if line.startswith(("flags", "Features", "model name"))
+        )
+    except OSError:
+        return f"{platform.machine()} {platform.processor()}"
+
+
+def _compile(target: FilePath, source: str) -> None:
     tool = compiler()
     if tool is None:
         raise FileNotFoundError("no C compiler")
     with tempfile.TemporaryDirectory(dir=target.parent, prefix="compile-") as name:
-        generator = casadi.CodeGenerator("stage.c")
-        for function in _interpreted().values():
-            generator.add(function)
-        generator.generate(name + os.sep)
-        made = FilePath(name) / "stage.so"
+        file, made = FilePath(name) / "source.c", FilePath(name) / "made.so"
+        file.write_text(source)
         subprocess.run(
-            [tool, *COMPILER_OPTIONS, str(FilePath(name) / "stage.c"), "-o", str(made), "-lm"],
+            [tool, *COMPILER_OPTIONS, str(file), "-o", str(made), "-lm"],
             check=True, capture_output=True, timeout=COMPILE_TIMEOUT,
         )  # fmt: skip
         os.replace(made, target)  # at once, so that no other process sees half of it

@@ -33,6 +33,14 @@ REST = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
+class Ends:
+    """Boundary states, None where the end is free."""
+
+    start: BoundaryState | None
+    end: BoundaryState | None
+
+
+@dataclass(frozen=True, slots=True)
 class Problem:
     """As the solvers take it; see Layout for the order of variables and constraints."""
 
@@ -47,14 +55,11 @@ class Problem:
     ubx: NDArray
     lbg: NDArray
     ubg: NDArray
-
-
-@dataclass(frozen=True, slots=True)
-class Ends:
-    """Boundary states, None where the end is free."""
-
-    start: BoundaryState | None
-    end: BoundaryState | None
+    ends: Ends
+    rests: tuple[bool, bool]
+    # whether the path stands still at its start and end
+    table: NDArray
+    # (N+3, 1 or 2) spline coefficients of x, and of yaw where it is free, from which to search
 
 
 def rests(path: Path, s: float) -> bool:
@@ -79,20 +84,21 @@ def pose(
     margin = MARGIN * (1.0 - held_by(ends, nodes))
     lbx, ubx = _variable_bounds(layout, path, limits, unit, step, margin)
     lbg, ubg = _constraint_bounds(layout, path, limits, unit, step, margin, ends)
-    spline = guess_spline(path, airframe, limits, nodes, CEILING * unit) / unit
-    x0 = _start(layout, _joined(spline, ends, unit, step))
+    table = _guess(layout, path, airframe, limits, yaw_angle, ends, unit, step)
+    x0 = variables_of(table, layout)
     if layout.shape.free_yaw:
         lbx[3], ubx[3] = yaw_angle, yaw_angle + math.pi / 2
-        x0[np.arange(nodes + 1) * layout.block + 3] = ends.start.yaw if ends.start else yaw_angle + math.pi / 4
     for variable, value in _held(layout, path, ends, unit, step):
         lbx[variable] = ubx[variable] = x0[variable] = value
-    return Problem(layout, unit, step, x0, p, lbx, ubx, lbg, ubg)
+    at_rest = (rests(path, 0.0), rests(path, path.end))
+    return Problem(layout, unit, step, x0, p, lbx, ubx, lbg, ubg, ends, at_rest, table)
 
 
-def tightened(problem: Problem, excess: Excess, g: NDArray) -> Problem:
+def tightened(problem: Problem, excess: Excess, at_points: NDArray) -> Problem:
     """The problem with limits lowered, in each interval that exceeds one between the points, by what it exceeds.
 
-    `g` is what the constraints came to: a peak far from every point lowers the limits from there.
+    `at_points` is what the rows came to, as layout.selected has them: a peak far from every point lowers the limits
+    from there.
     """
     layout = problem.layout
     upper, lower = HASTE * spread(excess.upper), HASTE * spread(excess.lower)
@@ -101,8 +107,8 @@ def tightened(problem: Problem, excess: Excess, g: NDArray) -> Problem:
     interval = layout.interval[point]
     least = np.full(excess.upper.shape, np.inf)
     most = -least
-    np.minimum.at(least, (interval, row), g[layout.point_rows])
-    np.maximum.at(most, (interval, row), g[layout.point_rows])
+    np.minimum.at(least, (interval, row), at_points)
+    np.maximum.at(most, (interval, row), at_points)
     below = np.where(excess.upper > 0, most, np.inf)[interval, row]
     above = np.where(excess.lower > 0, least, -np.inf)[interval, row]
     ubg[layout.point_rows] = np.minimum(ubg[layout.point_rows], below) - np.maximum(upper[interval, row], 0.0)
@@ -116,25 +122,46 @@ def tightened(problem: Problem, excess: Excess, g: NDArray) -> Problem:
     return replace(problem, lbg=lbg, ubg=ubg, ubx=ubx)
 
 
-def profile_of(x: NDArray, problem: Problem, track: YawTrack, end: float) -> SpeedProfile:
-    """The solution as a profile, continuous to the last digit: through the splines whose coefficients it implies."""
-    layout, step, unit = problem.layout, problem.step, problem.unit
-    nodes, block = layout.shape.nodes, layout.block
-    table = np.append(x, np.zeros(layout.controls)).reshape(nodes + 1, block)
-    h, dh, ddh = table[:, 0], table[:, 1], table[:, 2]
-    inner = h - ddh / 6
-    cubic = np.concatenate([[inner[1] - 2 * dh[0]], inner, [inner[-2] + 2 * dh[-1]]])
+def table_of(x: NDArray, layout: Layout) -> NDArray:
+    """(N+3, 1 or 2) the spline coefficients that a solver's variables imply."""
+    rows = np.append(x, np.zeros(layout.controls)).reshape(layout.shape.nodes + 1, layout.block)
+    inner = rows[:, 0] - rows[:, 2] / 6
+    cubic = np.concatenate([[inner[1] - 2 * rows[0, 1]], inner, [inner[-2] + 2 * rows[-1, 1]]])
+    if not layout.shape.free_yaw:
+        return cubic[:, None]
+    half = rows[:, 4] / 2
+    return np.stack([cubic, np.concatenate([rows[:, 3] - half, [rows[-1, 3] + half[-1], 0.0]])], axis=1)
+
+
+def variables_of(table: NDArray, layout: Layout) -> NDArray:
+    """A solver's variables that follow these splines, so that the dynamics hold."""
+    first = np.arange(layout.shape.nodes + 1) * layout.block
+    x = np.zeros(layout.variables)
+    cubic = table[:, 0]
+    x[first] = (cubic[:-2] + 4 * cubic[1:-1] + cubic[2:]) / 6
+    x[first + 1] = (cubic[2:] - cubic[:-2]) / 2
+    x[first + 2] = np.diff(cubic, 2)
+    x[first[:-1] + layout.states] = np.diff(cubic, 3)
+    if layout.shape.free_yaw:
+        quadratic = table[:-1, 1]
+        x[first + 3], x[first + 4] = (quadratic[:-1] + quadratic[1:]) / 2, np.diff(quadratic)
+        x[first[:-1] + layout.states + 1] = np.diff(quadratic, 2)
+    return x
+
+
+def profile_of(table: NDArray, problem: Problem, track: YawTrack, end: float) -> SpeedProfile:
+    """The profile of these splines."""
+    step, unit, cubic = problem.step, problem.unit, table[:, 0]
     grid = {
-        "s": np.linspace(0.0, end, nodes + 1),
+        "s": np.linspace(0.0, end, problem.layout.shape.nodes + 1),
         "h": (cubic[:-2] + 4 * cubic[1:-1] + cubic[2:]) / 6 * unit,
         "dh": (cubic[2:] - cubic[:-2]) / 2 * unit / step,
         "ddh": np.diff(cubic, 2) * unit / step**2,
         "dddh": np.diff(cubic, 3) * unit / step**3,
     }
-    if not layout.shape.free_yaw:
+    if not problem.layout.shape.free_yaw:
         return SpeedProfile(**grid, yaw=track.yaw, dyaw=track.dyaw, ddyaw=track.ddyaw)
-    psi, dpsi = table[:, 3], table[:, 4]
-    quadratic = np.append(psi - dpsi / 2, psi[-1] + dpsi[-1] / 2)
+    quadratic = table[:-1, 1]
     return SpeedProfile(
         **grid,
         yaw=(quadratic[:-1] + quadratic[1:]) / 2,
@@ -215,30 +242,36 @@ def _constraint_bounds(
     return lbg, ubg
 
 
-def _joined(spline: NDArray, ends: Ends, unit: float, step: float) -> NDArray:
-    """The guess, led into boundary states over some intervals."""
-    joined = spline.copy()
-    for boundary, coefficients, towards in ((ends.start, joined, 1.0), (ends.end, joined[::-1], -1.0)):
+def _guess(
+    layout: Layout,
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    yaw_angle: float,
+    ends: Ends,
+    unit: float,
+    step: float,
+) -> NDArray:
+    """(N+3, 1 or 2) coefficients of the guess, led into boundary states over some intervals."""
+    nodes = layout.shape.nodes
+    cubic = guess_spline(path, airframe, limits, nodes, CEILING * unit) / unit
+    for boundary, coefficients, towards in ((ends.start, cubic, 1.0), (ends.end, cubic[::-1], -1.0)):
         if not boundary:
             continue
         h, slope, bend = boundary.h / unit, towards * boundary.dh * step / unit, boundary.ddh * step**2 / unit
         first = np.array([h - slope + bend / 3, h - bend / 6, h + slope + bend / 3])
-        if (first > 0).all():
+        if first[2] > 0:
             weight = np.exp(-np.arange(len(coefficients) - 3) / LEAD)
             coefficients[3:] *= (first[2] / coefficients[3:]) ** weight
-            coefficients[:3] = first
-    return joined
-
-
-def _start(layout: Layout, spline: NDArray) -> NDArray:
-    """Variables that follow a cubic B-spline with these coefficients, so the dynamics hold from the start."""
-    first = np.arange(layout.shape.nodes + 1) * layout.block
-    x0 = np.zeros(layout.variables)
-    x0[first] = (spline[:-2] + 4 * spline[1:-1] + spline[2:]) / 6
-    x0[first + 1] = (spline[2:] - spline[:-2]) / 2
-    x0[first + 2] = np.diff(spline, 2)
-    x0[first[:-1] + layout.states] = np.diff(spline, 3)
-    return x0
+        coefficients[:3] = first
+    if not layout.shape.free_yaw:
+        return cubic[:, None]
+    yaw = ends.start.yaw if ends.start else yaw_angle + math.pi / 4
+    quadratic = np.linspace(yaw, ends.end.yaw if ends.end else yaw, nodes + 3)
+    for boundary, at in ((ends.start, [0, 1]), (ends.end, [nodes, nodes + 1])):
+        if boundary:
+            quadratic[at] = boundary.yaw + boundary.dyaw * step * np.array([-0.5, 0.5])
+    return np.stack([cubic, quadratic], axis=1)
 
 
 def _held(layout: Layout, path: Path, ends: Ends, unit: float, step: float) -> list[tuple[int, float]]:

@@ -1,8 +1,9 @@
 """The nonlinear program of a speed profile: sparse structure and derivatives, built once a shape.
 
-Variables in the order that fatrop wants: (state, control) of each interval, then the last state. Every cost and
-constraint belongs to one interval, because the state at its right end follows from its own variables. Derivatives
-are put together from the point functions' blocks, so nothing is differentiated here and nothing is compiled.
+Variables are (state, control) of each interval, then the last state. Every cost and constraint belongs to one interval,
+because the state at its right end follows from its own variables. Derivatives are put together from the point
+functions' blocks, so nothing is differentiated here and nothing is compiled. Only IPOPT, the second try, needs it all;
+the layout serves both solvers.
 """
 
 from dataclasses import dataclass, field
@@ -13,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.expert import stage
-from cfplan.expert.compiled import Backend, functions
 
 DYNAMICS_GIVEN = np.array([[1, 1, 1 / 2, 1 / 6], [0, 1, 1, 1 / 2], [0, 0, 1, 1]])
 # x, x', x'' at the right end from (x, x', x'', x''') at the left, in node units
@@ -23,7 +23,7 @@ DYNAMICS_FREE[3, [3, 4, 6]] = 1, 1, 1 / 2
 DYNAMICS_FREE[4, [4, 6]] = 1, 1
 
 OBJECTIVE_SCALE = 1000.0
-# of the cost in seconds, so that multipliers are about 1, where fatrop starts them
+# of the cost in seconds, so that multipliers are about 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,13 +135,19 @@ class Layout:
         return weights
 
 
+@lru_cache(maxsize=32)
+def layout_of(shape: Shape) -> Layout:
+    """The layout of a shape, made once a process."""
+    return Layout(shape)
+
+
 class Program:
     """f, g and their derivatives as CasADi functions over all points at once."""
 
-    def __init__(self, shape: Shape, chosen: Backend | None = None) -> None:
-        self.layout = layout = Layout(shape)
+    def __init__(self, shape: Shape) -> None:
+        self.layout = layout = layout_of(shape)
         n, block, count = shape.nodes, layout.block, len(layout.interval)
-        self._functions = functions(chosen)
+        self._functions = stage.point_functions(shape.free_yaw)
         self._name = stage.family(shape.free_yaw)
 
         x = casadi.MX.sym("x", layout.variables)
@@ -196,16 +202,12 @@ class Program:
         self.f = casadi.Function("nlp_f", [x, p], [f], names[0], ["f"])
         self.g = casadi.Function("nlp_g", [x, p], [g], names[0], ["g"])
         gradient = [f, gradient_f]
-        self.gradient_only = casadi.Function("nlp_grad_f", [x, p], gradient[1:], names[0], ["grad_f_x"])
         self.gradient = casadi.Function("nlp_grad_f", [x, p], gradient, names[0], ["f", "grad_f_x"])
         self.jacobian = casadi.Function(
             "nlp_jac_g", [x, p], [self._constraints(casadi.vec(rows_again), linear, x), jacobian], names[0],
             ["g", "jac_g_x"],
         )  # fmt: skip
         arguments = [x, p, factor, multipliers]
-        self.hessian = casadi.Function(
-            "nlp_hess_l", arguments, [gradient_l, hessian], names[0] + names[1], ["grad_gamma_x", "hess_gamma_x_x"]
-        )
         self.multipliers = casadi.Function(
             "nlp_grad", arguments, [f, g, gradient_l, casadi.MX(layout.parameters, 1)], names[0] + names[1],
             ["f", "g", "grad_gamma_x", "grad_gamma_p"],
@@ -287,6 +289,6 @@ def _sparse(values: casadi.MX, entries: NDArray, rows: NDArray, cols: NDArray, m
 
 
 @lru_cache(maxsize=32)
-def program(shape: Shape, chosen: Backend | None = None) -> Program:
+def program(shape: Shape) -> Program:
     """The program of a shape, made once a process."""
-    return Program(shape, chosen)
+    return Program(shape)

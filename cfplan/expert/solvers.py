@@ -1,4 +1,4 @@
-"""The solvers of a program: fatrop first, which knows its stages, and IPOPT as a second try."""
+"""The solvers of a problem: our own interior point method first, IPOPT as a second try."""
 
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -8,68 +8,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.expert.compiled import Backend
-from cfplan.expert.problem import Problem
+from cfplan.expert.interior_point import Search, minimise
+from cfplan.expert.problem import Problem, table_of
 from cfplan.expert.program import Shape, program
+from cfplan.expert.spline_problem import SplineProblem
 
-QUIET = {"print_time": False, "show_eval_warnings": False, "calc_lam_p": False, "error_on_fail": False}
 TOLERANCE = 1e-2
 # of the scaled problem: 1e-5 s in the cost's gradient
-
-# From an answer to a problem almost the same: near the bounds from the start, so 3 to 8 iterations instead of 17.
-NEARBY = {"mu_init": 3e-3, "bound_push": 1e-5, "bound_frac": 1e-5, "max_iter": 40}
-NEARBY_NODES = 1000
-# beyond, setting up a second solver (quadratic in the nodes, in CasADi's interface) takes longer than it saves
+FROM_AFAR = Search()
+NEARBY = Search(barrier=3e-3, push=1e-4, iterations=40)
+# from an answer to a problem almost the same: near the bounds from the start
 
 
 class Attempt(NamedTuple):
     """What a solver made of a problem."""
 
     solver: str
-    x: NDArray
-    g: NDArray
-    # what the constraints come to
+    table: NDArray
+    # (N+3, 1 or 2) spline coefficients
+    at_points: NDArray
+    # what the rows come to, as layout.selected has them
     solved: bool
     iterations: int
     words: str
     # the solver's own, for people
 
 
-def fatrop(shape: Shape, problem: Problem, backend: Backend | None, x: NDArray | None = None) -> Attempt:
-    """Solve from the problem's own guess, or from `x`, the answer to a problem almost the same."""
-    nearby = x is not None and shape.nodes <= NEARBY_NODES
-    return _run("fatrop", _fatrop(shape, backend, nearby), problem, problem.x0 if x is None else x)
+def interior_point(problem: Problem, backend: Backend | None, table: NDArray | None = None) -> Attempt:
+    """Search from the problem's own guess, or from `table`, the answer to a problem almost the same."""
+    posed = SplineProblem(problem, backend)
+    ended = minimise(
+        posed, posed.rows, posed.v_of(problem.table if table is None else table), FROM_AFAR if table is None else NEARBY
+    )
+    return Attempt(
+        "interior point", posed.table_of(ended.v), posed.at_points(ended.g), ended.solved, ended.iterations, ended.words
+    )
 
 
-def ipopt(shape: Shape, problem: Problem, backend: Backend | None) -> Attempt:
-    """Solve from the problem's own guess."""
-    return _run("ipopt", _ipopt(shape, backend), problem, problem.x0)
+def ipopt(problem: Problem, backend: Backend | None) -> Attempt:
+    """Search from the problem's own guess, by another formulation: states and controls, tied by dynamics.
+
+    It evaluates through CasADi's virtual machine whatever `backend` says.
+    """
+    try:
+        result = _ipopt(problem.layout.shape)(
+            x0=problem.x0, p=problem.p, lbx=problem.lbx, ubx=problem.ubx, lbg=problem.lbg, ubg=problem.ubg
+        )
+        said = _ipopt(problem.layout.shape).stats()
+    except RuntimeError as error:
+        return Attempt("ipopt", problem.table, problem.lbg, False, 0, str(error).splitlines()[0])
+    x, g = np.array(result["x"]).ravel(), np.array(result["g"]).ravel()
+    words = f"{said['return_status']} after {said['iter_count']} iterations"
+    solved = bool(said["success"]) and bool(np.isfinite(x).all())
+    at_points = g[problem.layout.point_rows]
+    return Attempt("ipopt", table_of(x, problem.layout), at_points, solved, int(said["iter_count"]), words)
 
 
 @lru_cache(maxsize=32)
-def _fatrop(shape: Shape, backend: Backend | None, nearby: bool) -> casadi.Function:
-    p = program(shape, backend)
-    n, layout = shape.nodes, p.layout
-    equality = np.zeros(layout.constraints, dtype=bool)
-    equality[layout.dynamics_rows] = True
+def _ipopt(shape: Shape) -> casadi.Function:
+    p = program(shape)
     options: dict[str, Any] = {
-        **QUIET,
-        "structure_detection": "manual",
-        "N": n,
-        "nx": [layout.states] * (n + 1),
-        "nu": [layout.controls] * n + [0],
-        "ng": list(layout.counts),
-        "equality": equality.tolist(),
-        "fatrop": {"print_level": 0, "max_iter": 200, "tol": TOLERANCE, **(NEARBY if nearby else {})},
-        "cache": {f.name(): f for f in (p.f, p.g, p.gradient_only, p.jacobian, p.hessian, p.multipliers)},
-    }
-    return casadi.nlpsol("expert", "fatrop", p.nlp, options)
-
-
-@lru_cache(maxsize=32)
-def _ipopt(shape: Shape, backend: Backend | None) -> casadi.Function:
-    p = program(shape, backend)
-    options: dict[str, Any] = {
-        **QUIET,
+        "print_time": False, "show_eval_warnings": False, "calc_lam_p": False, "error_on_fail": False,
         "ipopt": {
             "print_level": 0, "sb": "yes", "max_iter": 400, "tol": TOLERANCE, "constr_viol_tol": 1e-6,
             "dual_inf_tol": 10 * TOLERANCE, "compl_inf_tol": TOLERANCE,
@@ -79,14 +78,3 @@ def _ipopt(shape: Shape, backend: Backend | None) -> casadi.Function:
         "cache": {f.name(): f for f in (p.f, p.g, p.gradient, p.jacobian, p.upper_hessian, p.multipliers)},
     }  # fmt: skip
     return casadi.nlpsol("expert", "ipopt", p.nlp, options)
-
-
-def _run(name: str, solver: casadi.Function, problem: Problem, x0: NDArray) -> Attempt:
-    try:
-        result = solver(x0=x0, p=problem.p, lbx=problem.lbx, ubx=problem.ubx, lbg=problem.lbg, ubg=problem.ubg)
-        said = solver.stats()
-    except RuntimeError as error:
-        return Attempt(name, x0, problem.lbg, False, 0, str(error).splitlines()[0])
-    words = f"{said['return_status']} after {said['iter_count']} iterations"
-    x, g = np.array(result["x"]).ravel(), np.array(result["g"]).ravel()
-    return Attempt(name, x, g, bool(said["success"]) and bool(np.isfinite(x).all()), int(said["iter_count"]), words)

@@ -10,7 +10,9 @@ same for every path and every N:
 Path, airframe and limits are arguments, so the same compiled functions serve every problem.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import casadi
@@ -142,8 +144,9 @@ def family(free_yaw: bool) -> str:
     return "free" if free_yaw else "given"
 
 
-def point_functions(free_yaw: bool) -> list[casadi.Function]:
-    """Values, first and second derivatives at a point; and those of the time spent in an interval."""
+@lru_cache(maxsize=2)
+def point_functions(free_yaw: bool) -> Mapping[str, casadi.Function]:
+    """By name: values, first and second derivatives at a point; and those of the time spent in an interval."""
     inputs, bounded, penalty = point_expressions(free_yaw)
     z = inputs[0]
     name = family(free_yaw)
@@ -158,7 +161,7 @@ def point_functions(free_yaw: bool) -> list[casadi.Function]:
     h = [_positive(local_variables(z, free_yaw, place)[0][0]) for place in GAUSS_PLACES]
     time = sum(w / casadi.sqrt(value) for w, value in zip(GAUSS_WEIGHTS, h, strict=True))
     time_hessian, time_gradient = casadi.hessian(time, z)
-    return [
+    made = [
         function("rows", inputs, [bounded]),
         function("penalty", inputs, [penalty]),
         function("penalty_gradient", inputs, [casadi.gradient(penalty, z)]),
@@ -168,3 +171,4 @@ def point_functions(free_yaw: bool) -> list[casadi.Function]:
         function("time_gradient", [z], [time_gradient]),
         function("time_hessian", [z], [time_gradient, time_hessian]),
     ]
+    return {f.name(): f for f in made}

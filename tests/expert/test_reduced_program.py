@@ -1,4 +1,4 @@
-"""The program behind the expert: derivatives, backends, solvers, and what lies between the points."""
+"""The problems behind the expert: derivatives, backends, solvers, and what lies between the points."""
 
 import shutil
 
@@ -6,15 +6,16 @@ import casadi
 import numpy as np
 import pytest
 
-from cfplan.expert import compiled, reduced, stage
+from cfplan.expert import compiled, kernel, reduced, stage
 from cfplan.expert.between import Excess
 from cfplan.expert.compiled import Backend
 from cfplan.expert.limit_sets import LIMIT_SETS
-from cfplan.expert.problem import Ends, pose, profile_of, tightened
-from cfplan.expert.program import Program, Shape, program
+from cfplan.expert.problem import Ends, pose, profile_of, table_of, tightened, variables_of
+from cfplan.expert.program import Program, Shape, layout_of
 from cfplan.expert.reduced import plan_reduced
 from cfplan.expert.solution import Status
-from cfplan.expert.solvers import Attempt, fatrop, ipopt
+from cfplan.expert.solvers import Attempt, interior_point, ipopt
+from cfplan.expert.spline_problem import SplineProblem
 from cfplan.expert.stage import Penalties
 from cfplan.expert.yaw_track import fixed_yaw
 from cfplan.geometry.min_snap import min_snap
@@ -25,17 +26,18 @@ HARDWARE = LIMIT_SETS["hardware"]
 PATH = min_snap(np.array([[0.5, 0.5, 1.0], [3.5, 1.0, 1.5], [3.0, 4.0, 0.8]]))
 
 
-def posed(shape: Shape, backend: Backend | None = None):
+def posed(shape: Shape):
     track = fixed_yaw(PATH, shape.nodes, 0.2, None, None)
-    layout = program(shape, backend).layout
-    return pose(layout, PATH, HARDWARE.airframe, HARDWARE.limits, track, 0.2, Ends(None, None), Penalties()), track
+    return pose(
+        layout_of(shape), PATH, HARDWARE.airframe, HARDWARE.limits, track, 0.2, Ends(None, None), Penalties()
+    ), track
 
 
 @pytest.mark.parametrize("free_yaw", [False, True])
 def test_derivatives_put_together_from_blocks_are_those_of_the_whole(free_yaw):
     shape = Shape(8, free_yaw, turning_limited=True)
-    pieced = Program(shape, Backend.VIRTUAL_MACHINE)
-    problem, _ = posed(shape, Backend.VIRTUAL_MACHINE)
+    pieced = Program(shape)
+    problem, _ = posed(shape)
     rng = np.random.default_rng(3)
     x = problem.x0 + 0.01 * rng.normal(size=len(problem.x0))
     multipliers = rng.normal(size=pieced.layout.constraints)
@@ -50,23 +52,81 @@ def test_derivatives_put_together_from_blocks_are_those_of_the_whole(free_yaw):
     )  # fmt: skip
     gradient_f, jacobian, hessian, gradient_l = (np.array(value) for value in whole(x))
 
-    ours_l, ours_h = pieced.hessian(x, problem.p, 0.7, multipliers)
-    np.testing.assert_allclose(np.array(pieced.gradient_only(x, problem.p)), gradient_f, rtol=1e-9, atol=1e-7)
+    ours_l = pieced.multipliers(x, problem.p, 0.7, multipliers)[2]
+    np.testing.assert_allclose(np.array(pieced.gradient(x, problem.p)[1]), gradient_f, rtol=1e-9, atol=1e-7)
     np.testing.assert_allclose(np.array(pieced.jacobian(x, problem.p)[1]), jacobian, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(np.array(ours_l), gradient_l, rtol=1e-9, atol=1e-7)
-    np.testing.assert_allclose(np.array(ours_h), hessian, rtol=1e-9, atol=1e-6)
+    ours_h = np.array(pieced.upper_hessian(x, problem.p, 0.7, multipliers))
+    np.testing.assert_allclose(ours_h, np.triu(hessian), rtol=1e-9, atol=1e-6)
+
+
+def near_the_guess(problem, size: float, seed: int = 5):
+    splines = SplineProblem(problem)
+    v = splines.v_of(problem.table)
+    return splines, v * (1 + size * np.random.default_rng(seed).uniform(-1, 1, len(v)))
+
+
+@pytest.mark.parametrize("free_yaw", [False, True])
+def test_both_formulations_are_the_same_problem(free_yaw):
+    shape = Shape(12, free_yaw, turning_limited=True)
+    problem, _ = posed(shape)
+    splines, v = near_the_guess(problem, 0.02)
+    cost, g = splines.values(v)
+    f, constraints = Program(shape).nlp(variables_of(splines.table_of(v), problem.layout), problem.p)
+    constraints = np.array(constraints).ravel()
+    assert cost == pytest.approx(float(f), rel=1e-10)
+    np.testing.assert_allclose(splines.at_points(g), constraints[problem.layout.point_rows], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(constraints[problem.layout.dynamics_rows], 0.0, atol=1e-12)
+
+
+def test_splines_and_a_solvers_variables_are_the_same_thing():
+    problem, _ = posed(Shape(12, True))
+    table = problem.table + 0.01 * np.random.default_rng(1).normal(size=problem.table.shape)
+    table[-1, 1] = 0.0  # nobody's
+    np.testing.assert_allclose(table_of(variables_of(table, problem.layout), problem.layout), table, atol=1e-12)
+
+
+@pytest.mark.parametrize("free_yaw", [False, True])
+def test_derivatives_by_the_splines_are_those_of_differences(free_yaw):
+    problem, _ = posed(Shape(9, free_yaw, turning_limited=True))
+    splines, v = near_the_guess(problem, 0.02)
+    rng = np.random.default_rng(7)
+    direction = rng.normal(size=len(v))
+    y, stiffness = rng.normal(size=len(splines.rows.lower)), rng.uniform(size=len(splines.rows.lower))
+    slots, interval = splines.rows.slots, splines.rows.interval
+    step = np.append(direction, 0.0)[slots]  # -1 is the zero at the end
+
+    def slopes(at):
+        around = splines.expand(at, y, stiffness)
+        of_g = np.einsum("mk,mk->m", around.jacobian, step[interval])
+        of_v = np.zeros(len(v) + 1)
+        np.add.at(of_v, slots, around.gradient)
+        np.add.at(of_v, slots[interval], y[:, None] * around.jacobian)
+        return np.einsum("nk,nk", around.gradient, step), of_g, of_v[:-1], around
+
+    size = 1e-5
+    (before, g_before), (after, g_after) = (splines.values(v + k * size * direction) for k in (-1, 1))
+    of_f, of_g, _, around = slopes(v)
+    assert of_f == pytest.approx((after - before) / (2 * size), rel=1e-5)
+    np.testing.assert_allclose(of_g, (g_after - g_before) / (2 * size), rtol=1e-4, atol=1e-5)
+
+    curvature = (slopes(v + size * direction)[2] - slopes(v - size * direction)[2]) / (2 * size)
+    whole = np.tril(around.hessian) + np.transpose(np.tril(around.hessian, -1), (0, 2, 1))
+    product = np.zeros(len(v) + 1)
+    np.add.at(product, slots, np.einsum("nab,nb->na", whole, step))
+    np.add.at(product, slots[interval], -(stiffness * of_g)[:, None] * around.jacobian)  # expand() adds J'ΣJ
+    np.testing.assert_allclose(product[:-1], curvature, rtol=1e-3, atol=1e-4 * np.abs(curvature).max())
 
 
 def test_rows_of_the_program_are_what_the_flatness_map_gives():
     shape = Shape(30, False)
     problem, track = posed(shape)
-    pieces = program(shape)
-    attempt = fatrop(shape, problem, None)
-    profile = profile_of(attempt.x, problem, track, PATH.end)
+    attempt = interior_point(problem, None)
+    profile = profile_of(attempt.table, problem, track, PATH.end)
     trajectory = Trajectory(PATH, profile, HARDWARE.airframe)
-    point, row = np.divmod(pieces.layout.selected, stage.ROWS)
-    values = attempt.g[pieces.layout.point_rows]
-    s = (pieces.layout.interval + pieces.layout.place) * problem.step
+    point, row = np.divmod(problem.layout.selected, stage.ROWS)
+    values = attempt.at_points
+    s = (problem.layout.interval + problem.layout.place) * problem.step
     state = trajectory.at(trajectory.time_at(s[point]))
     limits = HARDWARE.limits
     for which, expected in (
@@ -79,7 +139,7 @@ def test_rows_of_the_program_are_what_the_flatness_map_gives():
 
 @pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler")
 def test_compiled_code_and_virtual_machine_agree():
-    assert compiled.backend() is Backend.COMPILED
+    assert kernel.backend() is Backend.COMPILED
     profiles = [
         plan_reduced(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=30, backend=backend).profile for backend in Backend
     ]
@@ -89,49 +149,47 @@ def test_compiled_code_and_virtual_machine_agree():
 def test_without_a_compiler_the_virtual_machine_plans(monkeypatch, tmp_path):
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "empty"))
     monkeypatch.setattr(shutil, "which", lambda *_: None)
-    compiled.library.cache_clear()
-    compiled.functions.cache_clear()
+    kernel.library.cache_clear()
     try:
-        assert compiled.backend() is Backend.VIRTUAL_MACHINE
+        assert kernel.backend() is Backend.VIRTUAL_MACHINE
         solution = plan_reduced(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=31)
         assert solution.status is Status.SOLVED
         assert solution.stats["backend"] == "virtual machine"
     finally:
-        compiled.library.cache_clear()
-        compiled.functions.cache_clear()
+        kernel.library.cache_clear()
 
 
 def test_a_cache_folder_that_cannot_be_written_falls_back(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "file" / "below"))
-    compiled.library.cache_clear()
+    kernel.library.cache_clear()
     try:
-        assert compiled.library() is None
+        assert kernel.library() is None
     finally:
-        compiled.library.cache_clear()
+        kernel.library.cache_clear()
 
 
 @pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler")
 def test_the_library_is_made_once_and_left_alone(monkeypatch, tmp_path):
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path))
-    compiled.library.cache_clear()
+    kernel.library.cache_clear()
     try:
-        made = compiled.library()
+        made = kernel.library()
         assert made is not None
         before = made.stat().st_mtime_ns
-        compiled.library.cache_clear()
-        assert compiled.library() == made
+        kernel.library.cache_clear()
+        assert kernel.library() == made
         assert made.stat().st_mtime_ns == before
         assert [entry.name for entry in tmp_path.iterdir()] == [made.name]  # nothing half-made beside it
     finally:
-        compiled.library.cache_clear()
+        kernel.library.cache_clear()
 
 
-def test_ipopt_takes_over_where_fatrop_fails(monkeypatch):
-    def gives_up(shape, problem, backend, x=None):
-        return Attempt("fatrop", problem.x0, problem.lbg, False, 3, "gave up")
+def test_ipopt_takes_over_where_the_first_solver_fails(monkeypatch):
+    def gives_up(problem, backend, table=None):
+        return Attempt("interior point", problem.table, problem.lbg, False, 3, "gave up")
 
-    monkeypatch.setattr(reduced, "fatrop", gives_up)
+    monkeypatch.setattr(reduced, "interior_point", gives_up)
     solution = plan_reduced(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=40)
     assert solution.status is Status.SOLVED
     assert solution.stats["solver"] == "ipopt"
@@ -142,17 +200,17 @@ def test_both_solvers_find_the_same_flight():
     shape = Shape(40, False, turning_limited=True)
     problem, track = posed(shape)
     times = []
-    for attempt in (fatrop(shape, problem, None), ipopt(shape, problem, None)):
+    for attempt in (interior_point(problem, None), ipopt(problem, None)):
         assert attempt.solved, attempt.words
-        times.append(Trajectory(PATH, profile_of(attempt.x, problem, track, PATH.end), HARDWARE.airframe).duration)
+        times.append(Trajectory(PATH, profile_of(attempt.table, problem, track, PATH.end), HARDWARE.airframe).duration)
     assert times[0] == pytest.approx(times[1], rel=1e-3)
 
 
 def test_an_answer_that_is_not_a_flight_is_not_believed(monkeypatch):
-    def claims(shape, problem, backend, x=None):
-        return Attempt("liar", np.full_like(problem.x0, np.nan), problem.lbg, True, 1, "solved")
+    def claims(problem, backend, table=None):
+        return Attempt("liar", np.full_like(problem.table, np.nan), problem.lbg, True, 1, "solved")
 
-    monkeypatch.setattr(reduced, "fatrop", claims)
+    monkeypatch.setattr(reduced, "interior_point", claims)
     monkeypatch.setattr(reduced, "ipopt", claims)
     solution = plan_reduced(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=40)
     assert solution.status is Status.NOT_CONVERGED
@@ -165,7 +223,7 @@ def test_limits_are_lowered_only_around_what_exceeds_them():
     problem, _ = posed(shape)
     upper = np.full((30, 10), -1.0)
     upper[12, 0] = 0.02
-    lowered = tightened(problem, Excess(upper, np.full((30, 10), -1.0)), problem.ubg)
+    lowered = tightened(problem, Excess(upper, np.full((30, 10), -1.0)), problem.ubg[problem.layout.point_rows])
     layout = problem.layout
     changed = np.flatnonzero(lowered.ubg != problem.ubg)
     intervals = layout.interval[layout.selected // 9][np.isin(layout.point_rows, changed)]
@@ -174,9 +232,9 @@ def test_limits_are_lowered_only_around_what_exceeds_them():
     assert (lowered.ubx == problem.ubx).all()
 
 
-def test_many_more_nodes_need_no_other_functions():
-    before = set(compiled.functions())
+def test_many_more_nodes_need_no_other_library():
+    before = kernel.library()
     solution = plan_reduced(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=400)
     assert solution.status is Status.SOLVED
     assert certify(Trajectory(PATH, solution.profile, HARDWARE.airframe), HARDWARE.limits).passed
-    assert set(compiled.functions()) == before
+    assert kernel.library() == before

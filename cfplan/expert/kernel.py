@@ -1,0 +1,247 @@
+"""What must hold at a point, by the spline coefficients of its interval, with derivatives; eight points at a time.
+
+In an interval h is made of four coefficients of a cubic B-spline and yaw of three of a quadratic one, so everything
+physical at a point follows from at most seven numbers (stage.py). CasADi differentiates those expressions; this module
+writes them out as C on vectors of eight doubles, computes what is the same at all points once, and divides by each
+number once. Without a C compiler CasADi's virtual machine evaluates the same expressions, point by point.
+
+Arrays hold a quantity a row and a point a column; columns are a multiple of LANES.
+"""
+
+import ctypes
+from collections.abc import Callable
+from functools import lru_cache, partial
+from pathlib import Path as FilePath
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.expert import stage
+from cfplan.expert.compiled import Backend, shared_library
+from cfplan.vehicle import airframe, flatness
+
+LANES = 8
+H_SPLINE = np.array([[1 / 6, 4 / 6, 1 / 6, 0], [-1 / 2, 0, 1 / 2, 0], [1, -2, 1, 0], [-1, 3, -3, 1]])
+# x, x', x'', x''' at an interval's left end, from the four coefficients that matter there, in node units
+YAW_SPLINE = np.array([[1 / 2, 1 / 2, 0], [-1, 1, 0], [1, -2, 1]])
+# ψ, ψ', ψ'' likewise
+
+_PREAMBLE = """
+typedef double wide __attribute__((vector_size(64), aligned(8)));
+#define LANEWISE(name, of) static inline wide name(wide x) { for (int i = 0; i < 8; ++i) x[i] = of(x[i]); return x; }
+LANEWISE(w_sqrt, __builtin_sqrt)
+LANEWISE(w_cos, __builtin_cos)
+LANEWISE(w_sin, __builtin_sin)
+static inline wide w_max(wide x, double y) { for (int i = 0; i < 8; ++i) x[i] = x[i] > y ? x[i] : y; return x; }
+static inline wide w_le(wide x, wide y) { for (int i = 0; i < 8; ++i) x[i] = x[i] <= y[i]; return x; }
+"""
+
+
+def coefficients(free_yaw: bool) -> int:
+    """Number of spline coefficients that matter in an interval."""
+    return 7 if free_yaw else 4
+
+
+@lru_cache(maxsize=2)
+def point_kernels(free_yaw: bool) -> tuple[casadi.Function, casadi.Function]:
+    """Values and derivatives at one point, as CasADi functions; see Points for what they take and give."""
+    w = casadi.SX.sym("w", coefficients(free_yaw))
+    z = casadi.mtimes(casadi.DM(H_SPLINE), w[:4])
+    if free_yaw:
+        turn = casadi.mtimes(casadi.DM(YAW_SPLINE), w[4:])
+        z = casadi.vertcat(z[:3], turn[:2], z[3], turn[2])
+    inputs, rows, penalty = stage.point_expressions(free_yaw)
+    of_z = casadi.Function("of_z", inputs, [rows, penalty])
+    inputs[0] = w
+    rows, penalty = of_z(z, *inputs[1:])
+    multipliers, stiffness = casadi.SX.sym("multipliers", stage.ROWS), casadi.SX.sym("stiffness", stage.ROWS)
+    jacobian = casadi.densify(casadi.jacobian(rows, w))
+    hessian, _ = casadi.hessian(penalty + casadi.dot(multipliers, rows), w)
+    hessian += casadi.mtimes(jacobian.T, casadi.repmat(stiffness, 1, w.numel()) * jacobian)
+    size = range(w.numel())
+    lower = casadi.vertcat(*(hessian[i, j] for j in size for i in size if i >= j))
+
+    def function(title: str, arguments: list[casadi.SX], results: list[casadi.SX]) -> casadi.Function:
+        dense = [casadi.densify(result) for result in results]
+        return casadi.Function(f"{stage.family(free_yaw)}_{title}", arguments, casadi.cse(dense))
+
+    return (
+        function("values", inputs, [rows, penalty]),
+        function(
+            "derivatives",
+            [*inputs, multipliers, stiffness],
+            [rows, casadi.vec(jacobian), casadi.gradient(penalty, w), lower],
+        ),
+    )
+
+
+UNIFORM = (2, 3)
+# arguments that are the same at all points
+
+
+def source() -> str:
+    """The C source of all kernels."""
+    return _PREAMBLE + "\n".join(_c_function(f) for free_yaw in (False, True) for f in point_kernels(free_yaw))
+
+
+_BINARY = {casadi.OP_ADD: "+", casadi.OP_SUB: "-", casadi.OP_MUL: "*"}
+_CALLS = {casadi.OP_SQRT: "w_sqrt", casadi.OP_COS: "w_cos", casadi.OP_SIN: "w_sin"}
+
+
+def _c_function(f: casadi.Function) -> str:
+    """One loop over all points around the function's instructions; what is uniform is computed before it."""
+    before: list[str] = []
+    inside: list[str] = []
+    slot: dict[int, str] = {}  # what each of the virtual machine's registers holds
+    uniform: set[str] = set()
+    reciprocals: dict[str, str] = {}
+
+    def emit(expression: str, *operands: str, varies: bool = False) -> str:
+        name = f"t{len(before) + len(inside)}"
+        if varies or any(operand not in uniform for operand in operands):
+            inside.append(f"const wide {name} = {expression};")
+        else:
+            uniform.add(name)
+            before.append(f"const double {name} = {expression.replace('w_', '__builtin_')};")
+        return name
+
+    def inverse(name: str) -> str:
+        if name not in reciprocals:
+            reciprocals[name] = emit(f"1.0 / {name}", name)
+        return reciprocals[name]
+
+    for k in range(f.n_instructions()):
+        operation, outputs = f.instruction_id(k), f.instruction_output(k)
+        arguments = f.instruction_input(k)
+        if operation == casadi.OP_INPUT:
+            argument, row = arguments
+            if argument in UNIFORM:
+                value = emit(f"in{argument}[{row}]")
+            else:
+                value = emit(f"*(const wide *)(in{argument} + {row} * stride + p)", varies=True)
+        elif operation == casadi.OP_OUTPUT:
+            result, row = outputs
+            inside.append(f"*(wide *)(out{result} + {row} * stride + p) = {slot[arguments[0]]} + (wide){{0}};")
+            continue
+        elif operation == casadi.OP_CONST:
+            value = emit(repr(float(f.instruction_constant(k))))
+        else:
+            a, *rest = (slot[register] for register in arguments)
+            b = rest[0] if rest else ""
+            if operation in _BINARY:
+                value = emit(f"{a} {_BINARY[operation]} {b}", a, b)
+            elif operation == casadi.OP_DIV:
+                b = inverse(b)
+                value = emit(f"{a} * {b}", a, b)
+            elif operation == casadi.OP_INV:
+                value = inverse(a)
+            elif operation == casadi.OP_TWICE:
+                value = emit(f"2.0 * {a}", a)
+            elif operation == casadi.OP_SQ:
+                value = emit(f"{a} * {a}", a)
+            elif operation == casadi.OP_NEG:
+                value = emit(f"-{a}", a)
+            elif operation in _CALLS:
+                value = emit(f"{_CALLS[operation]}({a})", a)
+            elif operation == casadi.OP_FMAX:
+                a, b = (a, b) if b in uniform else (b, a)
+                value = emit(f"w_max({a}, {b})", a, b)
+            elif operation == casadi.OP_LE:
+                value = emit(f"w_le({a} + (wide){{0}}, {b} + (wide){{0}})", a, b, varies=True)
+            else:
+                raise NotImplementedError(f"{f.name()}: instruction {operation}")
+        slot[outputs[0]] = value
+    inputs = "".join(f", const double *in{i}" for i in range(f.n_in()))
+    results = "".join(f", double *restrict out{i}" for i in range(f.n_out()))
+    body = "\n  ".join(before) + "\n  for (long p = 0; p < stride; p += 8) {\n    " + "\n    ".join(inside)
+    return f"void {f.name()}(long stride{inputs}{results}) {{\n  {body}\n  }}\n}}\n"
+
+
+@lru_cache(maxsize=1)
+def library() -> FilePath | None:
+    """The compiled kernels, or None where that is not possible."""
+    files = [FilePath(str(file)) for file in (__file__, stage.__file__, flatness.__file__, airframe.__file__)]
+    return shared_library("kernels", files, source)
+
+
+def backend() -> Backend:
+    """What evaluates kernels here; compiles if that was never done."""
+    return Backend.COMPILED if library() else Backend.VIRTUAL_MACHINE
+
+
+_Function = Callable[[list[NDArray], list[NDArray]], None]
+# from the arrays that it reads to those that it writes
+
+
+def _functions(free_yaw: bool, points: int, chosen: Backend | None) -> tuple[_Function, _Function]:
+    """Values and derivatives at that many points."""
+    kernels = point_kernels(free_yaw) if chosen == Backend.VIRTUAL_MACHINE or not library() else None
+    if kernels:
+        return _interpreted(kernels[0], points), _interpreted(kernels[1], points)
+    loaded, family = ctypes.CDLL(str(library())), stage.family(free_yaw)
+    return _compiled(loaded[f"{family}_values"], points), _compiled(loaded[f"{family}_derivatives"], points)
+
+
+def _compiled(function: Any, points: int) -> _Function:
+    def run(reads: list[NDArray], writes: list[NDArray]) -> None:
+        function(ctypes.c_long(points), *(ctypes.c_void_p(array.ctypes.data) for array in (*reads, *writes)))
+
+    return run
+
+
+def _interpreted(function: casadi.Function, points: int) -> _Function:
+    everywhere = function.map(points)
+
+    def run(reads: list[NDArray], writes: list[NDArray]) -> None:
+        wide = [np.tile(a[:, None], points) if i in UNIFORM else a for i, a in enumerate(reads)]
+        for array, result in zip(writes, everywhere(*wide), strict=True):
+            array[:] = np.array(result)
+
+    return run
+
+
+class Points:
+    """The kernels at the points of a problem, with the arrays that they read and write.
+
+    Fill what they read, call evaluate() or differentiate(), and find the results in place.
+    """
+
+    def __init__(
+        self, free_yaw: bool, data: NDArray, common: NDArray, weights: NDArray, chosen: Backend | None
+    ) -> None:
+        """`data` is (POINT_DATA, P), `common` (COMMON_DATA,), `weights` (3,) those of the penalties."""
+        k, points = coefficients(free_yaw), data.shape[1]
+        self.coefficients = np.ones((k, points))
+        # to read
+        self.multipliers = np.zeros((stage.ROWS, points))
+        # to read; differentiate() alone needs them
+        self.stiffness = np.zeros((stage.ROWS, points))
+        # likewise
+        self.rows = np.empty((stage.ROWS, points))
+        self.penalty = np.empty((1, points))
+        # by evaluate() alone
+        self.jacobian = np.empty((stage.ROWS * k, points))
+        # all rows by the first coefficient first
+        self.gradient = np.empty((k, points))
+        # of the penalty
+        self.hessian = np.empty((k * (k + 1) // 2, points))
+        # of penalty + multipliers · rows, plus Σ stiffness · (row of the Jacobian)² as an outer product: the lower
+        # triangle, column by column
+        given = [np.ascontiguousarray(a, dtype=float) for a in (data, common, weights)]
+        first = [self.coefficients, *given], [self.rows, self.penalty]
+        second = (
+            [self.coefficients, *given, self.multipliers, self.stiffness],
+            [self.rows, self.jacobian, self.gradient, self.hessian],
+        )
+        values, derivatives = _functions(free_yaw, points, chosen)
+        self._evaluate, self._differentiate = partial(values, *first), partial(derivatives, *second)
+
+    def evaluate(self) -> None:
+        """Rows and penalty."""
+        self._evaluate()
+
+    def differentiate(self) -> None:
+        """Rows, their Jacobian, the penalty's gradient, and the Hessian."""
+        self._differentiate()
