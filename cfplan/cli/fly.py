@@ -15,6 +15,7 @@ from cfplan.cli.flight_progress import FlightProgress
 from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.cli.rehearsal import PlannedFlight, PlanOptions, certify_bytes, obtain_plan, rehearse
 from cfplan.cli.vehicle import check_mocap, vehicle
+from cfplan.cli.watchers import check_watchers, watchers
 from cfplan.errors import CfplanError, ExitCode
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ _PATH_SAMPLES = 500  # of the drawn path
 Examples:
   cfplan fly flights/figure8.yaml
   cfplan fly flights/figure8.yaml --speed 0.3
+  cfplan fly flights/figure8.yaml --live --mavlink udp:127.0.0.1:14550
 
 Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts.""",
 )
@@ -51,6 +53,11 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
     show_default=True,
     help="Folder in which the flight's record gets a folder of its own.",
 )
+@click.option("--live", is_flag=True, help="Show the flight in rerun while it goes on.")
+@click.option(
+    "--mavlink",
+    help="Tell a ground station of the flight and obey its orders to stop, as udp:127.0.0.1:14550, where it listens.",
+)
 @options.as_json
 def fly(
     path_or_plan: Path,
@@ -61,11 +68,14 @@ def fly(
     uri: str,
     mocap_uri: str | None,
     records: Path,
+    live: bool,
+    mavlink: str | None,
     as_json: bool,
 ) -> int:
     """Fly along PATH: plan, certify, rehearse, then take off, stream the flight, land, and keep a record."""
     steps = Steps(as_json=as_json)
     check_mocap(uri, mocap_uri)
+    check_watchers(live=live, mavlink=mavlink)
     flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
     encoded = certify_bytes(flight, steps)
     rehearsed = rehearse(flight, encoded, steps)
@@ -85,8 +95,10 @@ def fly(
         progress = FlightProgress(duration=mission.duration, steps=steps)
         try:
             save_plan(flight.plan, folder / "plan.parquet", {"name": flight.name, "path file": str(path_or_plan)})
+            header = _header(flight, uri, path_or_plan)
             with (
-                RecordWriter(folder, _header(flight, uri, path_or_plan)) as writer,
+                RecordWriter(folder, header) as writer,
+                watchers(header, folder, live=live, mavlink=mavlink) as watching,
                 progress,
             ):
                 outcome = fly_mission(
@@ -94,7 +106,8 @@ def fly(
                     uri=uri,
                     drivers=drivers,
                     pose_source=pose_source,
-                    on_telemetry=_both(writer.write, progress.show),
+                    on_telemetry=_all(writer.write, progress.show, *watching.listeners),
+                    more_orders=watching.orders,
                 )
         except CfplanError:
             if progress.heard_vehicle:
@@ -104,6 +117,8 @@ def fly(
             raise
     if writer.failure:
         steps.failed("record", writer.failure)
+    for failure in watching.failures():
+        steps.failed("watching", failure)
     summary = {"outcome": _outcome_to_dict(outcome), **summarise(read_record(folder)).to_json()}
     write_summary(folder, summary)
 
@@ -121,12 +136,12 @@ def fly(
     return int(outcome.exit_code)
 
 
-def _both(first: "Callable[[Telemetry], None]", second: "Callable[[Telemetry], None]") -> "Callable[[Telemetry], None]":
-    """Tell two listeners."""
+def _all(*listeners: "Callable[[Telemetry], None]") -> "Callable[[Telemetry], None]":
+    """Tell each of them."""
 
     def tell(message: "Telemetry") -> None:
-        first(message)
-        second(message)
+        for listener in listeners:
+            listener(message)
 
     return tell
 

@@ -1,5 +1,7 @@
 """Where each part of the rerun view stands."""
 
+from typing import Literal
+
 import numpy as np
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
@@ -28,10 +30,11 @@ EVENTS = "events"
 SUMMARY = "summary"
 
 TAIL_SECONDS = 2.0
+PlayState = Literal["paused", "playing", "following"]
 _STATES = "Phases, limit that holds the plan back, supervisor"
 
 
-def blueprint(record: Record) -> rrb.Blueprint:
+def blueprint(record: Record, *, play_state: PlayState = "paused") -> rrb.Blueprint:
     """3-D at the left, the plots beside it in two columns, phases, events and the summary below."""
     grid = rrb.Grid(*(_plot(plot.name, plot.title) for plot in plots(record)), grid_columns=2)
     below = rrb.Horizontal(
@@ -44,7 +47,7 @@ def blueprint(record: Record) -> rrb.Blueprint:
     )
     return rrb.Blueprint(
         rrb.Vertical(rrb.Horizontal(_room(record), grid, column_shares=[6, 5]), below, row_shares=[5, 1]),
-        rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="paused"),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state=play_state),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
@@ -73,10 +76,17 @@ def _room(record: Record) -> rrb.Spatial3DView:
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TAIL_SECONDS),
         end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0),
     )
+    ever = rrb.VisibleTimeRange(
+        TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0)
+    )
     return rrb.Spatial3DView(
         origin=WORLD,
         name=record.header.name,
-        overrides={entity: [rrb.VisibleTimeRanges([tail])] for entity in (TAIL, WANTED_TAIL)},
+        overrides={
+            TAIL: [rrb.VisibleTimeRanges([tail])],
+            WANTED_TAIL: [rrb.VisibleTimeRanges([tail])],
+            FLOWN: [rrb.VisibleTimeRanges([ever])],
+        },
         line_grid=False,
         eye_controls=rrb.EyeControls3D(
             position=centre + size * np.array(aside), look_target=target, eye_up=(0.0, 0.0, 1.0)

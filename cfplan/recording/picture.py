@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import socket
 import subprocess
 import tempfile
 import time
@@ -15,7 +14,7 @@ import rerun.blueprint as rrb
 
 from cfplan.errors import InputError
 from cfplan.recording.layout import TIMELINE
-from cfplan.recording.viewer import Draw, refuse_existing, save, viewer_program, whole_file
+from cfplan.recording.viewer import Draw, free_port, refuse_existing, save, viewer_program, whole_file
 
 SIZE = (1920, 1080)  # points, of the window that is never shown
 _STARTS_WITHIN = 30.0  # s
@@ -64,7 +63,7 @@ class HeadlessViewer:
     @contextlib.contextmanager
     def opened(cls, recording: Path, size: tuple[int, int] = SIZE) -> "Iterator[HeadlessViewer]":
         """With a recording loaded. Raises InputError where there is no driver, or where it does not load."""
-        port = _free_port()
+        port = free_port()
         with tempfile.TemporaryDirectory(prefix="cfplan-") as folder, (Path(folder) / "said").open("wb+") as said:
             process = subprocess.Popen(
                 [
@@ -113,12 +112,6 @@ class HeadlessViewer:
         told = [f"{view.name}: {report}" for view in self.views() for report in view.reports]
         told += [entry.message for entry in self._client.get_logs() if entry.level.upper() == "ERROR"]
         return tuple(told)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _client(port: int, process: subprocess.Popen) -> Any:

@@ -4,6 +4,7 @@ Everything is sent as whole columns after the flight; the stream's process never
 since the record's first message, on the one timeline `flight`.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -14,10 +15,11 @@ from numpy.typing import NDArray
 
 from cfplan.flight.telemetry import Level
 from cfplan.recording import layout
+from cfplan.recording.header import RecordHeader
 from cfplan.recording.picture import write_png
 from cfplan.recording.plan_view import log_plan
 from cfplan.recording.plots import FLOWN as FLOWN_COLOUR
-from cfplan.recording.plots import LIMIT, Colour, Plot, finite_limits, motor_thrust, plots
+from cfplan.recording.plots import LIMIT, Colour, finite_limits, motor_thrust, plots
 from cfplan.recording.plots import WANTED as WANTED_COLOUR
 from cfplan.recording.record import Record
 from cfplan.recording.states import PHASE_COLOURS, SUPERVISOR_COLOURS, supervisor_states
@@ -62,27 +64,32 @@ def picture(record: Record, file: Path, *, moment: float | None = None, overwrit
 def log_record(stream: rr.RecordingStream, record: Record) -> None:
     """Send all of a record."""
     stream.send_recording_name(record.header.name)
-    _log_room(stream, record)
-    _log_vehicle(stream, record)
-    _log_thrust(stream, record)
-    _log_ghost(stream, record)
+    log_room(stream, record.header)
+    log_styles(stream, record)
+    log_columns(stream, record, record.start)
     log_plan(stream, record)
-    for plot in plots(record):
-        _log_plot(stream, plot, record)
-    _log_states(stream, record)
-    _log_events(stream, record)
+    _log_whole_track(stream, record)
+    for entity, times, colour in (
+        (layout.BODY, record.poses.time, FLOWN_COLOUR),
+        (layout.GHOST, record.setpoints.due, WANTED_COLOUR),
+    ):
+        if len(times):
+            log_outline(stream, entity, record.header.vehicle.arm, times - record.start, colour)
+    if record.duration > 0:
+        log_limits(stream, record, [0.0, record.duration])
     stream.log(layout.SUMMARY, rr.TextDocument(summary_text(record), media_type=rr.MediaType.MARKDOWN), static=True)
 
 
-def _log_room(stream: rr.RecordingStream, record: Record) -> None:
-    low, high = np.array(record.header.fence)
+def log_room(stream: rr.RecordingStream, header: RecordHeader) -> None:
+    """Send what stands still: fence, floor, and the path."""
+    low, high = np.array(header.fence)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[FENCE_COLOUR], fill_mode="MajorWireframe")
     stream.log(layout.FENCE, box, static=True)
     floor = rr.LineStrips3D(floor_lines(low, high), colors=[FLOOR_COLOUR], radii=rr.Radius.ui_points(0.5))
     stream.log(layout.FLOOR, floor, static=True)
-    if len(record.header.path):
-        path = rr.LineStrips3D([record.header.path], colors=[PATH_COLOUR], radii=PATH_RADIUS)
+    if len(header.path):
+        path = rr.LineStrips3D([header.path], colors=[PATH_COLOUR], radii=PATH_RADIUS)
         stream.log(layout.PATH, path, static=True)
 
 
@@ -94,57 +101,76 @@ def floor_lines(low: NDArray, high: NDArray) -> list[NDArray]:
     return across + [np.array([[low[0], y, 0.0], [high[0], y, 0.0]]) for y in ys]
 
 
-def _log_vehicle(stream: rr.RecordingStream, record: Record) -> None:
-    """The vehicle where the poses had it, its track, and its latest stretch as a tail."""
-    poses = record.poses
-    if len(poses.time) == 0:
-        return
-    time = _since_start(record, poses.time)
-    stream.send_columns(
-        layout.BODY,
-        [time],
-        rr.Transform3D.columns(translation=poses.position, quaternion=poses.quaternion),
-        strict=True,
-    )
+def log_styles(stream: rr.RecordingStream, record: Record) -> None:
+    """Send how everything is drawn that has a time."""
     stream.log(layout.BODY, rr.TransformAxes3D(AXIS_LENGTH), static=True)
-    log_outline(stream, layout.BODY, record.header.vehicle.arm, poses.time - record.start, FLOWN_COLOUR)
-    stretches = np.split(poses.position, dropouts(pose_gaps(poses.time)) + 1)
-    track = rr.LineStrips3D(stretches, colors=[_dimmed(FLOWN_COLOUR)], radii=TRACK_RADIUS)
-    stream.log(layout.FLOWN, track, static=True)
-    log_tail(stream, layout.TAIL, poses.time - record.start, poses.position, FLOWN_COLOUR)
+    stream.log(layout.THRUST, rr.Arrows3D.from_fields(colors=[THRUST_COLOUR], radii=[0.008]), static=True)
+    for plot in plots(record):
+        for line in plot.lines:
+            style = rr.SeriesLines(
+                colors=line.colours, names=line.labels, widths=[1.5] * len(line.labels), aggregation_policy="MinMax"
+            )
+            stream.log(f"{layout.PLOTS}/{plot.name}/{line.name}", style, static=True)
+        count = len(finite_limits(plot))
+        style = rr.SeriesLines(colors=[LIMIT] * count, names=["limit"] * count, widths=[1.0] * count)
+        stream.log(f"{layout.PLOTS}/{plot.name}/limit", style, static=True)
+    for entity, colours in ((layout.PHASES, PHASE_COLOURS), (layout.SUPERVISOR, SUPERVISOR_COLOURS)):
+        states = rr.StateConfiguration(values=list(colours), labels=list(colours), colors=list(colours.values()))
+        stream.log(entity, states, static=True)
 
 
-def _log_thrust(stream: rr.RecordingStream, record: Record) -> None:
+def log_columns(stream: rr.RecordingStream, record: Record, start: float) -> None:
+    """Send all rows of a record, or of a part of one; `start` is the time, s, that the timeline calls 0."""
+    poses, setpoints = record.poses, record.setpoints
+    for entity, tail, times, moving, colour, radius in (
+        (layout.BODY, layout.TAIL, poses.time, poses, FLOWN_COLOUR, TAIL_RADIUS),
+        (layout.GHOST, layout.WANTED_TAIL, setpoints.due, setpoints, WANTED_COLOUR, WANTED_RADIUS),
+    ):
+        if len(times):
+            columns = rr.Transform3D.columns(translation=moving.position, quaternion=moving.quaternion)
+            stream.send_columns(entity, [_since(start, times)], columns, strict=True)
+            log_tail(stream, tail, times - start, moving.position, colour, radius)
+    _log_thrust(stream, record, start)
+    for plot in plots(record):
+        for line in plot.lines:
+            if len(line.time):
+                values = rr.Scalars.columns(scalars=line.values.reshape(-1))
+                columns = values.partition([len(line.labels)] * len(line.time))
+                entity = f"{layout.PLOTS}/{plot.name}/{line.name}"
+                stream.send_columns(entity, [_since(start, line.time)], columns, strict=True)
+    _log_states(stream, record, start)
+    _log_events(stream, record, start)
+
+
+def _log_whole_track(stream: rr.RecordingStream, record: Record) -> None:
+    poses = record.poses
+    if len(poses.time):
+        stretches = np.split(poses.position, dropouts(pose_gaps(poses.time)) + 1)
+        track = rr.LineStrips3D(stretches, colors=[_dimmed(FLOWN_COLOUR)], radii=TRACK_RADIUS)
+        stream.log(layout.FLOWN, track, static=True)
+
+
+def _log_thrust(stream: rr.RecordingStream, record: Record, start: float) -> None:
     """An arrow along the body's z axis, by what the four motors are told: in hover as long as HOVER_ARROW."""
     status, poses = record.status, record.poses
     if len(status.time) == 0 or len(poses.time) == 0:
         return
     seen = (status.time >= poses.time[0]) & (status.time <= poses.time[-1])
     length = motor_thrust(record)[seen].sum(axis=1) / (record.header.vehicle.mass * GRAVITY) * HOVER_ARROW
-    stream.log(layout.THRUST, rr.Arrows3D.from_fields(colors=[THRUST_COLOUR], radii=[0.008]), static=True)
     columns = rr.Arrows3D.columns(vectors=np.stack([0 * length, 0 * length, length], axis=1))
-    stream.send_columns(layout.THRUST, [_since_start(record, status.time[seen])], columns, strict=True)
-
-
-def _log_ghost(stream: rr.RecordingStream, record: Record) -> None:
-    """The setpoint that was in force, as a second vehicle, and where it has just been."""
-    setpoints = record.setpoints
-    if len(setpoints.time) == 0:
-        return
-    columns = rr.Transform3D.columns(translation=setpoints.position, quaternion=setpoints.quaternion)
-    stream.send_columns(layout.GHOST, [_since_start(record, setpoints.due)], columns, strict=True)
-    log_outline(stream, layout.GHOST, record.header.vehicle.arm, setpoints.due - record.start, WANTED_COLOUR)
-    since = setpoints.due - record.start
-    log_tail(stream, layout.WANTED_TAIL, since, setpoints.position, WANTED_COLOUR, WANTED_RADIUS)
+    stream.send_columns(layout.THRUST, [_since(start, status.time[seen])], columns, strict=True)
 
 
 def log_outline(stream: rr.RecordingStream, entity: str, arm: float, times: NDArray, colour: Colour) -> None:
-    """The outline of the vehicle from the first of the times to the last, so that it never stands at the origin."""
+    """The outline of the vehicle from the first of the times to the last, so that it never stands at the origin.
+
+    With one time alone it stands from then on.
+    """
     strips = vehicle_outline(arm * BODY_SCALE)
+    ends = rr.TimeColumn(layout.TIMELINE, duration=times[[0, -1]] if len(times) > 1 else times)
     columns = rr.LineStrips3D.columns(
         strips=strips, colors=[colour] * len(strips), radii=[0.008] * len(strips)
-    ).partition([len(strips), 0])
-    ends = rr.TimeColumn(layout.TIMELINE, duration=times[[0, -1]])
+    ).partition([len(strips), 0][: len(times)])
     stream.send_columns(f"{entity}/outline", [ends], columns, strict=True)
 
 
@@ -178,55 +204,45 @@ def _steps(positions: NDArray) -> pa.ListArray:
     return pa.ListArray.from_arrays(pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32)), points, type=_STRIP)
 
 
-def _log_plot(stream: rr.RecordingStream, plot: Plot, record: Record) -> None:
-    for line in plot.lines:
-        entity = f"{layout.PLOTS}/{plot.name}/{line.name}"
-        style = rr.SeriesLines(
-            colors=line.colours, names=line.labels, widths=[1.5] * len(line.labels), aggregation_policy="MinMax"
-        )
-        stream.log(entity, style, static=True)
-        if len(line.time):
-            values = rr.Scalars.columns(scalars=line.values.reshape(-1))
-            columns = values.partition([len(line.labels)] * len(line.time))
-            stream.send_columns(entity, [_since_start(record, line.time)], columns, strict=True)
-    levels = finite_limits(plot)
-    if levels and record.duration > 0:
-        entity = f"{layout.PLOTS}/{plot.name}/limit"
-        count = len(levels)
-        style = rr.SeriesLines(colors=[LIMIT] * count, names=["limit"] * count, widths=[1.0] * count)
-        stream.log(entity, style, static=True)
-        ends = rr.TimeColumn(layout.TIMELINE, duration=[0.0, record.duration])
-        columns = rr.Scalars.columns(scalars=np.tile(levels, 2)).partition([count] * 2)
-        stream.send_columns(entity, [ends], columns, strict=True)
+def log_limits(stream: rr.RecordingStream, record: Record, times: Sequence[float]) -> None:
+    """The level lines of every plot, at some times, s on the timeline."""
+    for plot in plots(record):
+        levels = finite_limits(plot)
+        if levels:
+            columns = rr.Scalars.columns(scalars=np.tile(levels, len(times))).partition([len(levels)] * len(times))
+            stream.send_columns(
+                f"{layout.PLOTS}/{plot.name}/limit",
+                [rr.TimeColumn(layout.TIMELINE, duration=times)],
+                columns,
+                strict=True,
+            )
 
 
-def _log_states(stream: rr.RecordingStream, record: Record) -> None:
+def _log_states(stream: rr.RecordingStream, record: Record, start: float) -> None:
     supervisor = supervisor_states(record.status.supervisor)
     changes = np.flatnonzero(np.r_[True, supervisor[1:] != supervisor[:-1]]) if len(supervisor) else np.empty(0, int)
-    for entity, time, states, colours in (
-        (layout.PHASES, record.phases.time, record.phases.phase, PHASE_COLOURS),
-        (layout.SUPERVISOR, record.status.time[changes], supervisor[changes], SUPERVISOR_COLOURS),
+    for entity, time, states in (
+        (layout.PHASES, record.phases.time, record.phases.phase),
+        (layout.SUPERVISOR, record.status.time[changes], supervisor[changes]),
     ):
-        style = rr.StateConfiguration(values=list(colours), labels=list(colours), colors=list(colours.values()))
-        stream.log(entity, style, static=True)
         if len(time):
             columns = rr.StateChange.columns(state=list(states))
-            stream.send_columns(entity, [_since_start(record, time)], columns, strict=True)
+            stream.send_columns(entity, [_since(start, time)], columns, strict=True)
 
 
-def _log_events(stream: rr.RecordingStream, record: Record) -> None:
+def _log_events(stream: rr.RecordingStream, record: Record, start: float) -> None:
     events = record.events
     if len(events.time):
         levels = [LEVEL_NAMES.get(level, "INFO") for level in events.level]
         texts = [
-            f"{time - record.start:6.2f} s  {text}" for time, text in zip(events.time, events.text, strict=True)
+            f"{time - start:6.2f} s  {text}" for time, text in zip(events.time, events.text, strict=True)
         ]  # the viewer's own column of times is too narrow to read
         columns = rr.TextLog.columns(text=texts, level=levels)
-        stream.send_columns(layout.EVENTS, [_since_start(record, events.time)], columns, strict=True)
+        stream.send_columns(layout.EVENTS, [_since(start, events.time)], columns, strict=True)
 
 
-def _since_start(record: Record, times: NDArray) -> rr.TimeColumn:
-    return rr.TimeColumn(layout.TIMELINE, duration=times - record.start)
+def _since(start: float, times: NDArray) -> rr.TimeColumn:
+    return rr.TimeColumn(layout.TIMELINE, duration=times - start)
 
 
 def _dimmed(colour: Colour) -> tuple[int, int, int, int]:

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any, get_args, get_origin, get_type_hints
@@ -93,6 +94,14 @@ def columns_from_json(topic: Topic, payloads: list[bytes]) -> Any:
     hints = get_type_hints(topic.message)
     return topic.columns(
         **{f.name: _column([m[f.name] for m in messages], hints[f.name]) for f in fields(topic.columns)}
+    )
+
+
+def columns_of(topic: Topic, messages: Sequence[telemetry.Telemetry]) -> Any:
+    """Messages of one topic as arrays, as they would be read back from a record."""
+    hints = get_type_hints(topic.message)
+    return topic.columns(
+        **{f.name: _column([getattr(m, f.name) for m in messages], hints[f.name]) for f in fields(topic.columns)}
     )
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import socket
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,8 +31,7 @@ def save(file: Path, blueprint: rrb.Blueprint, draw: Draw, *, overwrite: bool = 
 
 def open_viewer(blueprint: rrb.Blueprint, draw: Draw) -> None:
     """Open the viewer on what `draw` sends; it stays open by itself. Raises InputError where there is no screen."""
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError("there is no screen to open the viewer on", hint="save the recording: --save flight.rrd")
+    require_screen("save the recording: --save flight.rrd, or draw it: --png flight.png")
     with rr.RecordingStream(APPLICATION) as stream:
         rr.spawn(
             hide_welcome_screen=True,
@@ -41,6 +41,19 @@ def open_viewer(blueprint: rrb.Blueprint, draw: Draw) -> None:
         )
         draw(stream)
         stream.flush()
+
+
+def require_screen(hint: str) -> None:
+    """Raises InputError with this hint where no window can be opened."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise InputError("there is no screen to open the viewer on", hint=hint)
+
+
+def free_port() -> int:
+    """A port on this machine that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def refuse_existing(file: Path, *, overwrite: bool) -> None:

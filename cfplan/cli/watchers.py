@@ -1,0 +1,65 @@
+"""Who watches a flight besides its record: a live view in rerun, a ground station."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cfplan.flight.keys import Order
+    from cfplan.flight.telemetry import Telemetry
+    from cfplan.recording.header import RecordHeader
+    from cfplan.recording.live import LiveView
+    from cfplan.recording.mavlink import GroundStation
+
+TLOG_FILE = "telemetry.tlog"
+
+
+@dataclass(frozen=True, slots=True)
+class Watching:
+    """Those that watch."""
+
+    view: "LiveView | None"
+    station: "GroundStation | None"
+
+    @property
+    def listeners(self) -> "list[Callable[[Telemetry], None]]":
+        """To be told of everything."""
+        return [watcher.show for watcher in (self.view, self.station) if watcher is not None]
+
+    def orders(self) -> "Sequence[Order]":
+        """What the ground station commanded since the last call."""
+        return self.station.orders() if self.station is not None else ()
+
+    def failures(self) -> list[str]:
+        """What went wrong with watching; none of it touched the flight."""
+        return [watcher.failure for watcher in (self.view, self.station) if watcher is not None and watcher.failure]
+
+
+def check_watchers(*, live: bool, mavlink: str | None) -> None:
+    """Raises InputError, before anything is planned, where a watcher cannot be had."""
+    if live:
+        from cfplan.recording.viewer import require_screen
+
+        require_screen("leave out --live; `cfplan replay` shows the record afterwards")
+    if mavlink is not None:
+        from cfplan.recording.mavlink import check_place
+
+        check_place(mavlink)
+
+
+@contextlib.contextmanager
+def watchers(header: "RecordHeader", folder: Path, *, live: bool, mavlink: str | None) -> Iterator[Watching]:
+    """The watchers that were asked for, for as long as the block lasts; the .tlog lies in the record's folder."""
+    with contextlib.ExitStack() as stack:
+        view = station = None
+        if live:
+            from cfplan.recording.live import open_live
+
+            view = stack.enter_context(open_live(header, folder))
+        if mavlink is not None:
+            from cfplan.recording.mavlink import GroundStation, parse_place
+
+            station = stack.enter_context(GroundStation(parse_place(mavlink), folder / TLOG_FILE))
+        yield Watching(view, station)

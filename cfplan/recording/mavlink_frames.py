@@ -1,0 +1,46 @@
+"""Between our axes (world z up, body forward, left, up) and MAVLink's (north, east, down; body forward, right, down).
+
+A laboratory has no north: its y axis is sent as north and its x axis as east, so that yaw turns the right way and a
+log that is read back lies as the flight did. Quaternions are x y z w here and w x y z there.
+"""
+
+import math
+
+from cfplan.flight.telemetry import Quaternion, Triple
+
+_HALF = math.sqrt(0.5)
+
+
+def ned(vector: Triple) -> Triple:
+    """A vector in world axes."""
+    x, y, z = vector
+    return y, x, -z
+
+
+def frd(vector: Triple) -> Triple:
+    """A vector in body axes."""
+    x, y, z = vector
+    return x, -y, -z
+
+
+def attitude(quaternion: Quaternion) -> Quaternion:
+    """body→world, x y z w, as (w, x, y, z) from forward, right, down to north, east, down."""
+    x, y, z, w = quaternion
+    return _HALF * (w + z), _HALF * (x + y), _HALF * (x - y), _HALF * (w - z)
+
+
+def in_body(vector: Triple, quaternion: Quaternion) -> Triple:
+    """A vector in world axes, turned into the axes of the body that has this attitude."""
+    x, y, z, w = quaternion
+    vx, vy, vz = vector
+    # v + 2 u × (u × v + w v) with the conjugate, u = (-x, -y, -z)
+    cx, cy, cz = -(y * vz - z * vy) + w * vx, -(z * vx - x * vz) + w * vy, -(x * vy - y * vx) + w * vz
+    return vx - 2 * (y * cz - z * cy), vy - 2 * (z * cx - x * cz), vz - 2 * (x * cy - y * cx)
+
+
+def euler(wxyz: Quaternion) -> Triple:
+    """rad: roll, pitch, yaw of an attitude as MAVLink has it; yaw is clockwise from north."""
+    w, x, y, z = wxyz
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x))))
+    return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
