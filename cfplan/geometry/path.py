@@ -29,8 +29,8 @@ class Path:
     # (M+1,) ascending from 0
     coefficients: NDArray
     # (M, D, 3) m, ascending powers of s - breaks[i], in the last piece of s - breaks[-1]
-    _origins: NDArray = field(init=False, repr=False)
-    # (M,)
+    origins: NDArray = field(init=False, repr=False)
+    # (M,) s about which each piece is expanded
     _tables: tuple[NDArray, ...] = field(init=False, repr=False)
     # one an order: (M, D - order, 3) coefficients of the derivative
 
@@ -53,7 +53,7 @@ class Path:
         for array in (breaks, origins, *tables):
             array.setflags(write=False)
         for name, value in (
-            ("breaks", breaks), ("coefficients", table), ("_origins", origins), ("_tables", tuple(tables)),
+            ("breaks", breaks), ("coefficients", table), ("origins", origins), ("_tables", tuple(tables)),
         ):  # fmt: skip
             object.__setattr__(self, name, value)
 
@@ -78,8 +78,8 @@ class Path:
         if not 0 <= order <= MAX_ORDER:
             raise ValueError(f"a path has derivatives of order 0 to {MAX_ORDER}, not {order}")
         s = np.clip(np.asarray(s, dtype=float), 0.0, self.breaks[-1])
-        piece = np.minimum(np.searchsorted(self.breaks, s, side="right") - 1, len(self._origins) - 1)
-        x = (s - self._origins[piece])[..., None]
+        piece = np.minimum(np.searchsorted(self.breaks, s, side="right") - 1, len(self.origins) - 1)
+        x = (s - self.origins[piece])[..., None]
         terms = self._tables[order][piece]
         value = terms[..., -1, :]
         for power in range(terms.shape[-2] - 2, -1, -1):

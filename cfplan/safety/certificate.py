@@ -7,7 +7,7 @@ the larger of them by at most an eighth of its second difference there; that is 
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.space import Space
+from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.trajectory import FullState, Trajectory, state_at
+from cfplan.vehicle.dense import Stretches, sampled_rows
+from cfplan.vehicle.trajectory import FullState, Trajectory
 
 TIME_STEP = 1e-3  # s, the most between two samples
-BATCH = 20_000  # samples at a time, about
+BATCH = 4_000  # samples at a time, about: as many as stay near the processor
 LEAST_POINTS = 11  # of a piece, its ends included
 WALLS = "distance to the walls"
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
@@ -104,7 +106,7 @@ class _Quantity:
     unit: str
     sign: int
     values: NDArray
-    # (N,) or (k, N) where k must keep the same limit
+    # (k, N), of which all must keep the same limit
     limit: float
     at_rest: float
     # what it is in hover, which counts as share 0
@@ -117,38 +119,27 @@ class _Peak(NamedTuple):
     value: float
     # its sign times the value
     s: float
-    position: NDArray
-
-
-class _Pieces(NamedTuple):
-    """Stretches of the trajectory on which everything is smooth, (K,) each."""
-
-    left: NDArray
-    right: NDArray
-    interval: NDArray
-    counts: NDArray
-    # samples, ends included
 
 
 def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Certificate:
     """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
-    pieces = _pieces(trajectory)
-    ends = np.cumsum(pieces.counts)
+    stretches = _stretches(trajectory)
+    ends = np.cumsum(stretches.counts)
     worst: dict[str, _Peak] = {}
-    for batch in np.split(np.arange(len(ends)), np.flatnonzero(np.diff(ends // BATCH)) + 1):
-        s, interval, starts = _samples(pieces, batch)
-        with np.errstate(all="ignore"):
-            state = state_at(trajectory.path, trajectory.profile, trajectory.airframe, s, time=s, interval=interval)
-            for quantity in _quantities(state, trajectory, limits, space):
-                rows = np.ascontiguousarray(np.atleast_2d(quantity.sign * quantity.values))
-                index, value = _peak(rows, starts, pieces.counts[batch])
-                known = worst.get(quantity.name)
-                if known is None or not value <= known.value:  # NaN is worse than everything and stays
-                    worst[quantity.name] = known if known and np.isnan(known.value) else _Peak(
-                        quantity, value, float(s[index]), state.position[index]
-                    )  # fmt: skip
+    first = 0
+    for last in [*(1 + np.flatnonzero(np.diff(ends // BATCH))).tolist(), len(ends)]:
+        batch = Stretches(*(values[first:last] for values in stretches))
+        rows = sampled_rows(trajectory.airframe, trajectory.path, trajectory.profile, batch)
+        for quantity in _quantities(rows, trajectory.airframe.hover_thrust, limits, space):
+            index, value = _peak(quantity.values, quantity.sign, batch.counts)
+            known = worst.get(quantity.name)
+            if known is None or not (np.isnan(known.value) or value <= known.value):  # NaN is the worst and stays
+                worst[quantity.name] = _Peak(quantity, value, float(rows[dense.PLACE, index]))
+        first = last
+    places = np.array([peak.s for peak in worst.values()])
+    when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     return Certificate(
-        margins=tuple(_margin(peak, trajectory) for peak in worst.values()),
+        margins=tuple(_margin(*each) for each in zip(worst.values(), when, where, strict=True)),
         duration=trajectory.duration,
         samples=int(ends[-1]),
     )
@@ -156,104 +147,107 @@ def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = No
 
 def shares(trajectory: Trajectory, limits: PlanLimits, time: NDArray) -> dict[str, NDArray]:
     """How much of each limit is used at each time, (N,) each; counted as in the certificate, the walls left out."""
-    quantities = _quantities(trajectory.at(time), trajectory, limits, None)
+    rows = _rows(trajectory.at(time))
     return {
-        quantity.name: ((np.atleast_2d(quantity.values) - quantity.at_rest) / (quantity.limit - quantity.at_rest)).max(
-            axis=0
-        )
-        for quantity in quantities
+        quantity.name: ((quantity.values - quantity.at_rest) / (quantity.limit - quantity.at_rest)).max(axis=0)
+        for quantity in _quantities(rows, trajectory.airframe.hover_thrust, limits, None)
     }
 
 
-def _quantities(
-    state: FullState, trajectory: Trajectory, limits: PlanLimits, space: Space | None
-) -> Iterator[_Quantity]:
-    hover = trajectory.airframe.hover_thrust
-    tilt = np.arctan2(np.hypot(state.thrust_axis[:, 0], state.thrust_axis[:, 1]), state.thrust_axis[:, 2])
-    motors = state.motor_thrust.T
-    yield _Quantity("speed", "m/s", 1, _norm(state.velocity), limits.speed, 0.0)
-    yield _Quantity("acceleration", "m/s²", 1, _norm(state.acceleration), limits.acceleration, 0.0)
-    yield _Quantity("angular velocity", "rad/s", 1, _norm(state.body_rate), limits.angular_velocity, 0.0)
+def _rows(state: FullState) -> NDArray:
+    """What `sampled_rows` gives, of full states."""
+    rows = np.empty((dense.SAMPLED_ROWS, len(state.s)))
+    x, y, z = state.thrust_axis.T
+    rows[dense.SPEED] = np.linalg.norm(state.velocity, axis=1)
+    rows[dense.ACCELERATION] = np.linalg.norm(state.acceleration, axis=1)
+    rows[dense.BODY_RATE] = np.linalg.norm(state.body_rate, axis=1)
+    rows[dense.ANGULAR_ACCELERATION] = np.linalg.norm(state.angular_acceleration, axis=1)
+    rows[dense.TILT] = np.arctan2(np.hypot(x, y), z)
+    rows[dense.SPECIFIC_THRUST] = state.specific_thrust
+    rows[dense.MOTOR_THRUST : dense.MOTOR_THRUST + 4] = state.motor_thrust.T
+    rows[dense.POSITION : dense.POSITION + 3] = state.position.T
+    rows[dense.PLACE] = state.s
+    return rows
+
+
+def _quantities(rows: NDArray, hover: float, limits: PlanLimits, space: Space | None) -> Iterator[_Quantity]:
+    def part(first: int, count: int = 1) -> NDArray:
+        return rows[first : first + count]
+
+    motors = part(dense.MOTOR_THRUST, 4)
+    yield _Quantity("speed", "m/s", 1, part(dense.SPEED), limits.speed, 0.0)
+    yield _Quantity("acceleration", "m/s²", 1, part(dense.ACCELERATION), limits.acceleration, 0.0)
+    yield _Quantity("angular velocity", "rad/s", 1, part(dense.BODY_RATE), limits.angular_velocity, 0.0)
     if limits.angular_acceleration != math.inf:
-        turning = _norm(state.angular_acceleration)
+        turning = part(dense.ANGULAR_ACCELERATION)
         yield _Quantity("angular acceleration", "rad/s²", 1, turning, limits.angular_acceleration, 0.0)
-    yield _Quantity("tilt", "rad", 1, tilt, limits.tilt, 0.0)
+    yield _Quantity("tilt", "rad", 1, part(dense.TILT), limits.tilt, 0.0)
     yield _Quantity("motor thrust, most", "N", 1, motors, limits.motor_thrust_max, 0.0)
     yield _Quantity("motor thrust, least", "N", -1, motors, limits.motor_thrust_min, hover)
-    yield _Quantity("specific thrust, least", "m/s²", -1, state.specific_thrust, limits.specific_thrust_min, GRAVITY)
+    specific = part(dense.SPECIFIC_THRUST)
+    yield _Quantity("specific thrust, least", "m/s²", -1, specific, limits.specific_thrust_min, GRAVITY)
     if space is not None:
         low, high = np.array(space.low), np.array(space.high)
         middle, half = (low + high) / 2, (high - low) / 2
         # The walls of one axis after the other; the least of the distances is kept.
-        distance = (half - np.abs(state.position - middle)).T
+        distance = half[:, None] - np.abs(part(dense.POSITION, 3) - middle[:, None])
         yield _Quantity(WALLS, "m", -1, distance, space.margin, float(half.min()))
-
-
-def _norm(vectors: NDArray) -> NDArray:
-    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
 def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _margin(peak: _Peak, trajectory: Trajectory) -> Margin:
+def _margin(peak: _Peak, time: float, position: Sequence[float]) -> Margin:
     quantity = peak.quantity
     worst = quantity.sign * peak.value
     room = quantity.limit - quantity.at_rest
-    share = (worst - quantity.at_rest) / room if room * quantity.sign > 0 else np.inf
-    x, y, z = (float(v) for v in peak.position)
+    share = (worst - quantity.at_rest) / room if room * quantity.sign > 0 else math.inf
+    x, y, z = position
     return Margin(
         name=quantity.name,
         unit=quantity.unit,
         worst=float(worst),
         limit=float(quantity.limit),
-        share=max(0.0, float(share)) if np.isfinite(worst) and np.isfinite(quantity.limit) else float("nan"),
-        time=float(trajectory.time_at(peak.s)),
+        share=max(0.0, float(share)) if math.isfinite(worst) and math.isfinite(quantity.limit) else math.nan,
+        time=time,
         s=peak.s,
         position=(x, y, z),
     )
 
 
-def _pieces(trajectory: Trajectory) -> _Pieces:
+def _stretches(trajectory: Trajectory) -> Stretches:
     """Cut at the grid points, at the breaks of the path, and where the timing was refined because h changes fast."""
     timing, path = trajectory.timing, trajectory.path
-    edges = np.union1d(timing.s, path.breaks)
-    edges = edges[np.r_[True, np.diff(edges) > 1e-12 * edges[-1]]]
+    edges = np.concatenate([timing.s, path.breaks])
+    edges.sort()
+    edges = edges[np.append(True, np.diff(edges) > 1e-12 * edges[-1])]
     edges[-1] = timing.s[-1]
     width = np.diff(edges)
-    interval = timing.interval[np.searchsorted(timing.s, edges[:-1] + width / 2) - 1]
-    inside = [trajectory.profile.at(edges[:-1] + share * width, interval).h for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    needed = width / (TIME_STEP * np.sqrt(np.min(inside, axis=0)))
+    middle = edges[:-1] + width / 2
+    interval = timing.interval[np.searchsorted(timing.s, middle) - 1]
+    piece = np.clip(np.searchsorted(path.breaks, middle) - 1, 0, len(path.breaks) - 2)
+    h = trajectory.profile.at(edges[:-1] + np.array([[0.0], [0.25], [0.5], [0.75], [1.0]]) * width, interval).h
+    needed = width / (TIME_STEP * np.sqrt(h.min(axis=0)))
     counts = np.maximum(np.ceil(needed).astype(int) + 1, LEAST_POINTS)
-    return _Pieces(edges[:-1], edges[1:], interval, counts)
-
-
-def _samples(pieces: _Pieces, batch: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """s, (N,), the profile's interval of each, and where each piece starts."""
-    left, right, interval, counts = (values[batch] for values in pieces)
-    starts = np.cumsum(counts) - counts
-    piece = np.repeat(np.arange(len(counts)), counts)
-    share = (np.arange(len(piece)) - starts[piece]) / (counts[piece] - 1)
-    s = left[piece] + share * (right - left)[piece]
-    # The last sample of a piece must fall on its own side of a break of the path.
-    s[starts + counts - 1] = np.nextafter(right, -np.inf)
-    return s, interval[piece], starts
+    return Stretches(edges[:-1], edges[1:], interval, piece, counts)
 
 
 @njit(cache=True)
-def _peak(rows: NDArray, starts: NDArray, counts: NDArray) -> tuple[int, float]:
-    """Index of the largest of (k, N) values, and that value with what may rise above it between samples.
+def _peak(rows: NDArray, sign: int, counts: NDArray) -> tuple[int, float]:
+    """Index of the largest of `sign` times (k, N) values, and that with what may rise above it between samples.
 
-    Pieces begin at `starts` and have `counts` samples each, at least three. NaN is larger than everything.
+    Stretches have `counts` samples each, at least three, one stretch behind the other. NaN is larger than everything.
     """
     index, peak = 0, -np.inf
     for row in rows:
-        for piece in range(len(starts)):
-            start, count = starts[piece], counts[piece]
-            # Each inner sample answers for both gaps beside it, so all gaps of the piece are covered.
-            for n in range(start + 1, start + count - 1):
-                before, here, after = row[n - 1], row[n], row[n + 1]
+        end = 0
+        for count in counts:
+            start, end = end, end + count
+            here, after = sign * row[start], sign * row[start + 1]
+            # Each inner sample answers for both gaps beside it, so all gaps of the stretch are covered.
+            for n in range(start + 1, end - 1):
+                before, here, after = here, after, sign * row[n + 1]
                 sag = 2.0 * here - before - after
                 bound = max(before, here, after) + _ALLOWANCE * (0.0 if sag <= 0.0 else sag)
                 if not bound <= peak:

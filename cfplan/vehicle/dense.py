@@ -1,23 +1,25 @@
-"""What limits bind, at thousands of points: some 50 ns each where the map of `flatness` alone takes three times that.
+"""What limits bind, at thousands of points: some 40 ns each, where full states take several times that.
 
-Points are taken side by side, WIDTH at a time. A panel holds the rows of one quantity each, WIDTH long, one behind the
-other in one array: at a fixed distance from each other, so that the compiler knows that they do not overlap, and
-works on several points with one instruction.
+Points are taken side by side, up to WIDTH at a time. A panel holds rows of one quantity each, WIDTH long, one behind
+the other in one array: so the compiler knows that they do not overlap, and works on several points with one
+instruction. How many places of the rows are in use is known at run time only, else it would write the loops out.
 """
 
 import zlib
 from collections.abc import Callable
 from pathlib import Path as FilePath
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.geometry.path import Path
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.flatness import Body, compiled_body, flat_state, profile_within
 from cfplan.vehicle.profile import SpeedProfile
-from cfplan.vehicle.trigonometry import cosine, sine
+from cfplan.vehicle.trigonometry import cosine, sine, slope_angle
 
 # What `dense_rows` gives, by row: squares of norms, components, and thrusts of motors 1 to 4.
 SPEED, ACCELERATION, BODY_RATE, ANGULAR_ACCELERATION = range(4)
@@ -30,11 +32,36 @@ MOTOR_THRUST = 7
 # N, and the three rows behind
 ROWS = 11
 
-WIDTH = 16
-_X, _NODE, _RESULT = 12, 13, 20
-# rows of a panel: behind γ' to γ'''' the place in the interval, the seven numbers of the profile where that begins, and
-# what comes of them
+# What `sampled_rows` gives: the first four as norms, SPECIFIC_THRUST and MOTOR_THRUST as above, and
+TILT = 4
+# rad, in place of AXIS_HEIGHT
+POSITION = 11
+# m, and the two rows behind
+PLACE = 14
+# s
+SAMPLED_ROWS = 15
+
+WIDTH = 64
+LANES = 16  # points that the compiler may want to take at once: the places in use are a multiple
+_CURVE, _X, _NODE, _RESULT = 0, 15, 16, 23
+# rows of a panel: γ to γ'''', the place in the interval, the profile where that begins, and what comes of them
 _SIZE = (_RESULT + ROWS) * WIDTH
+_BLOCK = 8  # coefficients at a time
+_Derivatives = tuple[float, float, float, float, float]
+
+
+class Stretches(NamedTuple):
+    """Parts of a flight on which everything is smooth, (K,) each, and how many samples are taken of each."""
+
+    left: NDArray
+    right: NDArray
+    # s of the ends
+    interval: NDArray
+    # of the profile
+    piece: NDArray
+    # of the path
+    counts: NDArray
+    # samples, evenly spaced, both ends included; at least two
 
 
 def dense_rows(
@@ -45,63 +72,138 @@ def dense_rows(
     `places`, (N,), is s less that of the grid point at which each point's `interval`, (N,), begins.
     """
     count = len(places)
-    if count < WIDTH:  # less than a panel: the first point again and again
-        more = np.r_[:count, np.zeros(WIDTH - count, dtype=int)]
+    if count < LANES:  # the first point again and again
+        more = np.r_[:count, np.zeros(LANES - count, dtype=int)]
         return dense_rows(airframe, derivatives[:, :, more], profile, places[more], interval[more])[:, :count]
     out = np.empty((ROWS, count))
-    _at_points(
-        out, compiled_body(airframe), np.ascontiguousarray(derivatives, dtype=float).reshape(12, -1), places, interval,
-        profile.h, profile.dh, profile.ddh, profile.dddh, profile.yaw, profile.dyaw, profile.ddyaw,
+    curves = np.ascontiguousarray(derivatives, dtype=float).reshape(12, count)
+    _at_points(out, compiled_body(airframe), curves, profile.starts(), places, interval)
+    return out
+
+
+def sampled_rows(airframe: Airframe, path: Path, profile: SpeedProfile, stretches: Stretches) -> NDArray:
+    """(SAMPLED_ROWS, N) at the samples of all stretches, one stretch behind the other.
+
+    The last sample of a stretch is the last number below its right end, so that it falls on its own side of a break.
+    """
+    out = np.empty((SAMPLED_ROWS, int(stretches.counts.sum())))
+    coefficients = path.coefficients
+    if missing := -coefficients.shape[1] % _BLOCK:
+        coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
+        coefficients.setflags(write=False)
+    _along(
+        out, compiled_body(airframe), coefficients, path.origins[stretches.piece], profile.starts(),
+        profile.s[stretches.interval], *stretches,
     )  # fmt: skip
     return out
 
 
-def _compile(sources: int) -> Callable[..., int]:
-    """The loop, which returns `sources`: a checksum of what it calls, as numba's cache does not look there."""
+def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
+    """The loops, which return `sources`: a checksum of what they call, as numba's cache does not look there."""
 
     @njit(cache=True, error_model="numpy")
     def at_points(
-        out: NDArray, body: Body, derivatives: NDArray, places: NDArray, interval: NDArray,
-        h: NDArray, dh: NDArray, ddh: NDArray, dddh: NDArray, yaw: NDArray, dyaw: NDArray, ddyaw: NDArray,
-    ) -> int:  # fmt: skip
+        out: NDArray, body: Body, derivatives: NDArray, nodes: NDArray, places: NDArray, interval: NDArray
+    ) -> int:
         panel = np.empty(_SIZE)
         for start in range(0, len(places), WIDTH):
-            begin = min(start, len(places) - WIDTH)
+            lanes = min(WIDTH, _whole(len(places) - start))
+            begin = min(start, len(places) - lanes)
             for row in range(12):
-                for n in range(WIDTH):
-                    panel[row * WIDTH + n] = derivatives[row, begin + n]
-            for n in range(WIDTH):
-                i = interval[begin + n]
+                for n in range(lanes):
+                    panel[(_CURVE + 3 + row) * WIDTH + n] = derivatives[row, begin + n]
+            for n in range(lanes):
                 panel[_X * WIDTH + n] = places[begin + n]
-                panel[(_NODE + 0) * WIDTH + n] = h[i]
-                panel[(_NODE + 1) * WIDTH + n] = dh[i]
-                panel[(_NODE + 2) * WIDTH + n] = ddh[i]
-                panel[(_NODE + 3) * WIDTH + n] = dddh[i]
-                panel[(_NODE + 4) * WIDTH + n] = yaw[i]
-                panel[(_NODE + 5) * WIDTH + n] = dyaw[i]
-                panel[(_NODE + 6) * WIDTH + n] = ddyaw[i]
-            _flatten(panel, body)
+                for row in range(7):
+                    panel[(_NODE + row) * WIDTH + n] = nodes[interval[begin + n], row]
+            _flatten(panel, body, lanes)
             for row in range(ROWS):
-                for n in range(WIDTH):
+                for n in range(lanes):
                     out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
         return sources
 
-    return at_points
+    @njit(cache=True, error_model="numpy")
+    def along(
+        out: NDArray, body: Body, coefficients: NDArray, origins: NDArray, nodes: NDArray, grid: NDArray,
+        left: NDArray, right: NDArray, interval: NDArray, piece: NDArray, counts: NDArray,
+    ) -> int:  # fmt: skip
+        panel, s = np.empty(_SIZE), np.empty(WIDTH)
+        end = 0
+        for k in range(len(counts)):
+            begin, end = end, end + counts[k]
+            last, first_s, width, last_s = counts[k] - 1, left[k], right[k] - left[k], np.nextafter(right[k], -np.inf)
+            for row in range(7):
+                for n in range(WIDTH):
+                    panel[(_NODE + row) * WIDTH + n] = nodes[interval[k], row]
+            for done in range(0, counts[k], WIDTH):
+                lanes = min(WIDTH, _whole(counts[k] - done))
+                for n in range(lanes):
+                    s[n] = first_s + (done + n) / last * width if done + n < last else last_s
+                    panel[_X * WIDTH + n] = s[n] - origins[k]
+                _trace(panel, coefficients[piece[k]], lanes)
+                for n in range(lanes):
+                    panel[_X * WIDTH + n] = s[n] - grid[k]
+                _flatten(panel, body, lanes)
+                _finish(panel, lanes)
+                at, count = begin + done, min(WIDTH, counts[k] - done)
+                for row in range(ROWS):
+                    out[row, at : at + count] = panel[(_RESULT + row) * WIDTH : (_RESULT + row) * WIDTH + count]
+                for row in range(3):
+                    out[POSITION + row, at : at + count] = panel[row * WIDTH : row * WIDTH + count]
+                out[PLACE, at : at + count] = s[:count]
+        return sources
+
+    return at_points, along
 
 
 @register_jitable
-def _flatten(panel: NDArray, body: Body) -> None:
-    """Fill the rows of results from those of the path and the profile, at every place of the panel."""
-    for n in range(WIDTH):
+def _trace(panel: NDArray, table: NDArray, lanes: int) -> None:
+    """γ to γ'''' from the coefficients, (D, 3), at x from where they count: Horner's scheme, for factorial shares."""
+    lanes = min(lanes, WIDTH)  # the compiler must see that no index overflows
+    for row in range(15):
+        for n in range(lanes):
+            panel[(_CURVE + row) * WIDTH + n] = 0.0
+    for axis in range(3):
+        for k in range(len(table) - _BLOCK, -1, -_BLOCK):
+            c0, c1, c2, c3 = table[k, axis], table[k + 1, axis], table[k + 2, axis], table[k + 3, axis]
+            c4, c5, c6, c7 = table[k + 4, axis], table[k + 5, axis], table[k + 6, axis], table[k + 7, axis]
+            for n in range(lanes):
+                x, at = panel[_X * WIDTH + n], axis * WIDTH + n
+                p = (
+                    panel[at], panel[3 * WIDTH + at], panel[6 * WIDTH + at], panel[9 * WIDTH + at],
+                    panel[12 * WIDTH + at],
+                )  # fmt: skip
+                p = _step(x, c4, _step(x, c5, _step(x, c6, _step(x, c7, p))))
+                p = _step(x, c0, _step(x, c1, _step(x, c2, _step(x, c3, p))))
+                panel[at] = p[0]
+                panel[3 * WIDTH + at] = p[1]
+                panel[6 * WIDTH + at] = p[2]
+                panel[9 * WIDTH + at] = p[3]
+                panel[12 * WIDTH + at] = p[4]
+    for row in range(6, 9):
+        for n in range(lanes):
+            panel[row * WIDTH + n] *= 2.0
+            panel[(row + 3) * WIDTH + n] *= 6.0
+            panel[(row + 6) * WIDTH + n] *= 24.0
+
+
+@register_jitable(forceinline=True)
+def _step(x: float, c: float, p: _Derivatives) -> _Derivatives:
+    return x * p[0] + c, x * p[1] + p[0], x * p[2] + p[1], x * p[3] + p[2], x * p[4] + p[3]
+
+
+@register_jitable
+def _flatten(panel: NDArray, body: Body, lanes: int) -> None:
+    """The results from path and profile."""
+    lanes = min(lanes, WIDTH)
+    for n in range(lanes):
+        h, dh, ddh = _vector(panel, _NODE, n)
         speed, turn = profile_within(
-            panel[_X * WIDTH + n],
-            *_vector(panel, _NODE, n),
-            panel[(_NODE + 3) * WIDTH + n],
-            *_vector(panel, _NODE + 4, n),
+            panel[_X * WIDTH + n], h, dh, ddh, panel[(_NODE + 3) * WIDTH + n], *_vector(panel, _NODE + 4, n)
         )
         flat = flat_state(
             body,
-            (_vector(panel, 0, n), _vector(panel, 3, n), _vector(panel, 6, n), _vector(panel, 9, n)),
+            (_vector(panel, 3, n), _vector(panel, 6, n), _vector(panel, 9, n), _vector(panel, 12, n)),
             speed,
             turn,
             cosine,
@@ -121,6 +223,23 @@ def _flatten(panel: NDArray, body: Body) -> None:
         panel[(_RESULT + MOTOR_THRUST + 3) * WIDTH + n] = flat.motor_thrust[3]
 
 
+@register_jitable
+def _finish(panel: NDArray, lanes: int) -> None:
+    """Norms and tilt in place of squares and components."""
+    lanes = min(lanes, WIDTH)
+    for row in range(_RESULT, _RESULT + 4):
+        for n in range(lanes):
+            panel[row * WIDTH + n] = panel[row * WIDTH + n] ** 0.5
+    for n in range(lanes):
+        width, height = panel[(_RESULT + AXIS_WIDTH) * WIDTH + n], panel[(_RESULT + AXIS_HEIGHT) * WIDTH + n]
+        panel[(_RESULT + TILT) * WIDTH + n] = slope_angle(width**0.5, height)
+
+
+@register_jitable
+def _whole(count: int) -> int:
+    return (count + LANES - 1) // LANES * LANES
+
+
 @register_jitable(forceinline=True)
 def _vector(panel: NDArray, row: int, n: int) -> tuple[float, float, float]:
     return panel[row * WIDTH + n], panel[(row + 1) * WIDTH + n], panel[(row + 2) * WIDTH + n]
@@ -132,4 +251,4 @@ def _squared(vector: tuple[float, float, float]) -> float:
 
 
 _CALLED = [FilePath(__file__).with_name(name).read_bytes() for name in ("flatness.py", "trigonometry.py")]
-_at_points = _compile(zlib.crc32(b"".join(_CALLED)))
+_at_points, _along = _compile(zlib.crc32(b"".join(_CALLED)))

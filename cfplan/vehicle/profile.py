@@ -74,6 +74,14 @@ class SpeedProfile:
             ddyaw=turn,
         )
 
+    def starts(self) -> NDArray:
+        """(N, 7), for compiled code: h with three derivatives and yaw with two where each interval begins."""
+        count = len(self.dddh)
+        table = np.empty((count, 7))
+        for k, values in enumerate((self.h, self.dh, self.ddh, self.dddh, self.yaw, self.dyaw, self.ddyaw)):
+            table[:, k] = values[:count]
+        return table
+
     def boundary(self, node: int) -> BoundaryState:
         """The state at a grid point."""
         return BoundaryState(*(float(values[node]) for values in (self.h, self.dh, self.ddh, self.yaw, self.dyaw)))

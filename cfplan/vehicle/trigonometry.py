@@ -44,11 +44,13 @@ def cosine(angle: float) -> float:
 def slope_angle(rise: float, run: float) -> float:
     """atan2(rise, run), rad, for rise ≥ 0; 0 where both are 0."""
     width = abs(run)
-    large, small = (rise, width) if rise > width else (width, rise)
-    ratio = small / large if large != 0.0 else small
-    # atan(ratio) = π/4 + atan((ratio - 1) / (ratio + 1))
-    wide = ratio > _EIGHTH
-    x = (ratio - 1.0) / (ratio + 1.0) if wide else ratio
+    large = rise if rise > width else width
+    small = width if rise > width else rise
+    # atan(small / large) = π/4 + atan((small - large) / (small + large))
+    wide = small > _EIGHTH * large
+    over = small - large if wide else small
+    under = small + large if wide else large
+    x = over / (under if under != 0.0 else 1.0)
     z = x * x
     angle = x - x * _series(z)
     angle = math.pi / 4 + angle if wide else angle

@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
-from cfplan.safety.certificate import _peak, _pieces, _samples, certify
+from cfplan.safety.certificate import _peak, _stretches, certify
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.airframes import AIRFRAMES
+from cfplan.vehicle.dense import PLACE, sampled_rows
 from cfplan.vehicle.trajectory import Trajectory, state_at
 
 AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
@@ -115,24 +116,24 @@ def trajectory(make_profile):
 
 
 def test_a_smooth_peak_between_samples_is_not_missed():
-    whole = np.array([0]), np.array([20])
     for shift in np.linspace(0, 1, 21):
         angles = (np.arange(20) - 9.5 + shift) * 0.2
-        assert 1.0 <= _peak(np.cos(angles)[None], *whole)[1] <= 1.02
+        assert 1.0 <= _peak(np.cos(angles)[None], 1, np.array([20]))[1] <= 1.02
         # A valley has no peak inside: nothing is added to what stands at its ends.
-        assert _peak(-np.cos(angles[5:15])[None], np.array([0]), np.array([10]))[1] == -np.cos(angles[[5, 14]]).min()
+        valley = np.cos(angles[5:15])[None]
+        assert _peak(valley, -1, np.array([10]))[1] == _peak(-valley, 1, np.array([10]))[1] == -valley[0, [0, -1]].min()
 
 
 def test_a_peak_in_the_first_or_last_gap_of_a_piece_is_not_missed():
     for shift in np.linspace(0, 1, 21):
         angles = (np.arange(10) - shift) * 0.2
         for values in (np.cos(angles), np.cos(angles)[::-1]):
-            assert 1.0 <= _peak(np.ascontiguousarray(values)[None], np.array([0]), np.array([10]))[1] <= 1.02
+            assert 1.0 <= _peak(np.ascontiguousarray(values)[None], 1, np.array([10]))[1] <= 1.02
 
 
 def test_a_jump_between_pieces_is_no_peak():
     values = np.array([[0.0, 0.0, 0.0, 5.0, 5.0, 5.0]])
-    index, peak = _peak(values, np.array([0, 3]), np.array([3, 3]))
+    index, peak = _peak(values, 1, np.array([3, 3]))
     assert index in (3, 4, 5)
     assert peak == 5.0
 
@@ -142,15 +143,15 @@ def test_one_value_that_is_not_finite_fails(wrong):
     for place in range(6):
         values = np.ones((2, 6))
         values[1, place] = wrong
-        assert not np.isfinite(_peak(values, np.array([0, 3]), np.array([3, 3]))[1])
+        assert not np.isfinite(_peak(values, 1, np.array([3, 3]))[1])
 
 
 def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval(trajectory):
-    pieces = _pieces(trajectory)
-    s, interval, starts = _samples(pieces, np.arange(len(pieces.counts)))
+    stretches = _stretches(trajectory)
+    s = sampled_rows(trajectory.airframe, trajectory.path, trajectory.profile, stretches)[PLACE]
     assert np.diff(trajectory.time_at(s)).max() <= 1.001e-3
-    assert np.bincount(interval).min() >= 10
-    assert len(starts) >= len(np.union1d(trajectory.profile.s, trajectory.path.breaks)) - 1
+    assert np.bincount(np.repeat(stretches.interval, stretches.counts)).min() >= 10
+    assert len(stretches.counts) >= len(np.union1d(trajectory.profile.s, trajectory.path.breaks)) - 1
     fast = Trajectory(trajectory.path, trajectory.profile.slowed(50.0), AIRFRAME)
     assert certify(fast, LIMITS).samples >= 10 * (len(trajectory.profile.s) - 1)
 
