@@ -15,7 +15,11 @@ def dataset() -> None:
     """Make datasets of paths labelled by the expert, and look into them."""
 
 
-def _box(_: click.Context, __: click.Parameter, text: str) -> tuple[float, ...]:
+def _boxes(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> tuple[tuple[float, ...], ...]:
+    return tuple(_box(text) for text in texts)
+
+
+def _box(text: str) -> tuple[float, ...]:
     try:
         sides = tuple(float(side) for side in text.split("x"))
     except ValueError:
@@ -40,7 +44,15 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
 @click.option("--count", type=int, required=True, help="Clean paths.")
 @click.option("--limits", required=True, help="Limit set: hardware (2 m/s) or simulation (5 m/s).")
 @click.option("--seed", type=int, default=0, show_default=True)
-@click.option("--box", callback=_box, default="10x10x10", show_default=True, help="Where waypoints are drawn, m.")
+@click.option(
+    "--box",
+    "boxes",
+    callback=_boxes,
+    multiple=True,
+    default=("10x10x10", "4.5x8x2"),
+    show_default=True,
+    help="Where waypoints are drawn, m; of several, paths take one each in turn.",
+)
 @click.option("--waypoints", callback=_range, default="3-6", show_default=True, help="Least and most a path.")
 @click.option("--nodes", type=int, default=100, show_default=True, help="Grid intervals.")
 @click.option("--yaw", type=click.Choice(["fixed", "tangent", "free"]), default="free", show_default=True)

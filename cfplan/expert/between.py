@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from cfplan.expert import stage
 from cfplan.geometry.path import Path
 from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.flatness import flat_state
 from cfplan.vehicle.profile import SpeedProfile
 
 COUNT = 17
@@ -22,9 +22,9 @@ SHARP = 0.25
 # rad, an interval
 ALLOWANCE = 1.5e-3
 # of the rows, kept free: certificates allow for their own sampling
-THRUST_ALLOWANCE = 3e-3
+THRUST_ALLOWANCE = 4e-3
 # likewise, of thrusts, which change fastest
-FINE_ALLOWANCE = 4e-3
+FINE_ALLOWANCE = 5e-3
 # likewise in brisk intervals
 
 SPEED = stage.ROWS
@@ -67,17 +67,23 @@ class DensePath:
         self.interval = np.repeat(np.arange(nodes), counts)
         # Chebyshev-Lobatto: both ends of an interval, and closer together near them
         share = (np.arange(counts.sum()) - self.first[self.interval]) / (counts[self.interval] - 1)
-        self.s = (self.interval + (1.0 - np.cos(np.pi * share)) / 2.0) * step
-        self.derivatives = tuple(tuple(path(self.s, order).T) for order in (1, 2, 3, 4))
+        self.places = (1.0 - np.cos(np.pi * share)) / 2.0 * step
+        s = self.interval * step + self.places
+        self.derivatives = np.stack([path(s, order).T for order in (1, 2, 3, 4)])
 
     def excess(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Excess:
         """Of a profile with as many intervals; h must be positive."""
-        at = profile.at(self.s, self.interval)
-        flat = flat_state(
-            airframe, self.derivatives, (at.h, at.dh, at.ddh, at.dddh),  # type: ignore[arg-type]
-            (at.yaw, at.dyaw, at.ddyaw), np.cos, np.sin,
-        )  # fmt: skip
-        rows = np.stack([*stage.rows(flat, limits, np.cos), _squared(flat.velocity) / limits.speed**2])
+        at = dense.dense_rows(airframe, self.derivatives, profile, self.places, self.interval)
+        middle = 0.5 * (limits.motor_thrust_max + limits.motor_thrust_min)
+        half = 0.5 * (limits.motor_thrust_max - limits.motor_thrust_min)
+        rows = np.empty((COLUMNS, at.shape[1]))
+        rows[stage.ACCELERATION] = at[dense.ACCELERATION] / limits.acceleration**2
+        rows[stage.ANGULAR_VELOCITY] = at[dense.BODY_RATE] / limits.angular_velocity**2
+        rows[stage.TILT] = (1 - at[dense.AXIS_HEIGHT]) / (1 - np.cos(limits.tilt))
+        rows[stage.SPECIFIC_THRUST] = at[dense.SPECIFIC_THRUST] / limits.specific_thrust_min
+        rows[stage.ANGULAR_ACCELERATION] = at[dense.ANGULAR_ACCELERATION] / limits.angular_acceleration**2
+        rows[stage.THRUSTS] = (at[dense.MOTOR_THRUST : dense.MOTOR_THRUST + 4] - middle) / half
+        rows[SPEED] = at[dense.SPEED] / limits.speed**2
         highest, lowest = np.maximum.reduceat(rows, self.first, axis=1), np.minimum.reduceat(rows, self.first, axis=1)
         above = np.append(stage.UPPER, 1.0)
         below = np.append(stage.LOWER, -np.inf)
@@ -92,10 +98,6 @@ def turns(path: Path, nodes: int) -> NDArray:
     tangent = path(s, 1)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-12)[:, None]
     return np.arccos(np.clip(np.sum(tangent[1:] * tangent[:-1], axis=1), -1.0, 1.0))
-
-
-def _squared(vector: tuple[NDArray, NDArray, NDArray]) -> NDArray:
-    return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
 
 def spread(excess: NDArray) -> NDArray:

@@ -82,7 +82,7 @@ class Search:
 
     barrier: float = 1.0
     # at first
-    last_barrier: float = 1e-3
+    last_barrier: float = 3e-3
     gradient: float = 1e-2
     # of the Lagrangian, at the end
     feasibility: float = 1e-5

@@ -171,11 +171,11 @@ def backend() -> Backend:
     return Backend.COMPILED if library() else Backend.VIRTUAL_MACHINE
 
 
-_Function = Callable[[list[NDArray], list[NDArray]], None]
-# from the arrays that it reads to those that it writes
+_Bind = Callable[[list[NDArray], list[NDArray]], Callable[[], None]]
+# settles the arrays that a function reads and those that it writes
 
 
-def _functions(free_yaw: bool, points: int, chosen: Backend | None) -> tuple[_Function, _Function]:
+def _functions(free_yaw: bool, points: int, chosen: Backend | None) -> tuple[_Bind, _Bind]:
     """Values and derivatives at that many points."""
     kernels = point_kernels(free_yaw) if chosen == Backend.VIRTUAL_MACHINE or not library() else None
     if kernels:
@@ -184,22 +184,26 @@ def _functions(free_yaw: bool, points: int, chosen: Backend | None) -> tuple[_Fu
     return _compiled(loaded[f"{family}_values"], points), _compiled(loaded[f"{family}_derivatives"], points)
 
 
-def _compiled(function: Any, points: int) -> _Function:
-    def run(reads: list[NDArray], writes: list[NDArray]) -> None:
-        function(ctypes.c_long(points), *(ctypes.c_void_p(array.ctypes.data) for array in (*reads, *writes)))
+def _compiled(function: Any, points: int) -> _Bind:
+    def bind(reads: list[NDArray], writes: list[NDArray]) -> Callable[[], None]:
+        pointers = [ctypes.c_void_p(array.ctypes.data) for array in (*reads, *writes)]
+        return partial(function, ctypes.c_long(points), *pointers)
 
-    return run
+    return bind
 
 
-def _interpreted(function: casadi.Function, points: int) -> _Function:
+def _interpreted(function: casadi.Function, points: int) -> _Bind:
     everywhere = function.map(points)
 
-    def run(reads: list[NDArray], writes: list[NDArray]) -> None:
-        wide = [np.tile(a[:, None], points) if i in UNIFORM else a for i, a in enumerate(reads)]
-        for array, result in zip(writes, everywhere(*wide), strict=True):
-            array[:] = np.array(result)
+    def bind(reads: list[NDArray], writes: list[NDArray]) -> Callable[[], None]:
+        def run() -> None:
+            wide = [np.tile(a[:, None], points) if i in UNIFORM else a for i, a in enumerate(reads)]
+            for array, result in zip(writes, everywhere(*wide), strict=True):
+                array[:] = np.array(result)
 
-    return run
+        return run
+
+    return bind
 
 
 class Points:
@@ -230,13 +234,10 @@ class Points:
         # of penalty + multipliers · rows, plus Σ stiffness · (row of the Jacobian)² as an outer product: the lower
         # triangle, column by column
         given = [np.ascontiguousarray(a, dtype=float) for a in (data, common, weights)]
-        first = [self.coefficients, *given], [self.rows, self.penalty]
-        second = (
-            [self.coefficients, *given, self.multipliers, self.stiffness],
-            [self.rows, self.jacobian, self.gradient, self.hessian],
-        )
+        self._reads = [self.coefficients, *given, self.multipliers, self.stiffness]  # kept, as C has their addresses
         values, derivatives = _functions(free_yaw, points, chosen)
-        self._evaluate, self._differentiate = partial(values, *first), partial(derivatives, *second)
+        self._evaluate = values(self._reads[:4], [self.rows, self.penalty])
+        self._differentiate = derivatives(self._reads, [self.rows, self.jacobian, self.gradient, self.hessian])
 
     def evaluate(self) -> None:
         """Rows and penalty."""

@@ -28,8 +28,8 @@ class DatasetSpec:
     seed: int
     limits: str
     # name of a limit set, which names its vehicle too
-    box: tuple[float, float, float] = (10.0, 10.0, 10.0)
-    # m, where waypoints are drawn
+    boxes: tuple[tuple[float, float, float], ...] = ((10.0, 10.0, 10.0), (4.5, 8.0, 2.0))
+    # m, where waypoints are drawn; paths take them in turn
     waypoints: tuple[int, int] = (3, 6)
     # least and most
     nodes: int = 100
@@ -48,7 +48,7 @@ class DatasetSpec:
         wrong = [
             ("count", self.count < 1, "at least 1"),
             ("seed", self.seed < 0, "at least 0"),
-            ("box", len(self.box) != 3 or not all(0 < side < float("inf") for side in self.box), "three lengths in m"),
+            ("boxes", not self.boxes or not all(_is_box(box) for box in self.boxes), "of three lengths in m each"),
             ("waypoints", not 2 <= low <= high, "two or more, least first"),
             ("nodes", self.nodes < 4, "at least 4"),
             ("copies", self.copies < 0, "at least 0"),
@@ -85,6 +85,10 @@ class DatasetSpec:
         temporary.replace(folder / SPEC_FILE)
 
 
+def _is_box(sides: tuple[float, ...]) -> bool:
+    return len(sides) == 3 and all(0 < side < float("inf") for side in sides)
+
+
 def load_spec(folder: Path) -> DatasetSpec:
     """The spec of a dataset folder. Raises InputError where there is none or it cannot be read."""
     file = folder / SPEC_FILE
@@ -97,7 +101,7 @@ def load_spec(folder: Path) -> DatasetSpec:
         known = {field.name for field in fields(DatasetSpec)}
         if not isinstance(content, dict) or set(content) != known:
             raise ValueError(f"its keys are not those of cfplan {__version__}")
-        content |= {"box": tuple(content["box"]), "waypoints": tuple(content["waypoints"])}
+        content |= {"boxes": tuple(tuple(b) for b in content["boxes"]), "waypoints": tuple(content["waypoints"])}
         return DatasetSpec(**content | {"yaw": YawMode(content["yaw"]), "relabel": Relabel(content["relabel"])})
     except (ValueError, TypeError, UnicodeDecodeError) as error:
         raise InputError(

@@ -72,7 +72,7 @@ def make_rows(spec: DatasetSpec, rows: range) -> tuple[pa.Table, pa.Table]:
 
 def clean_path(spec: DatasetSpec, number: int) -> Path:
     """The path of that number, from the dataset's seed."""
-    half = np.array(spec.box) / 2
+    half = np.array(spec.boxes[number % len(spec.boxes)]) / 2
     return min_snap(random_waypoints(_seed(spec, number, 0), np.array([-half, half]), spec.waypoints))
 
 

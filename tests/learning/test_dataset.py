@@ -20,7 +20,14 @@ from cfplan.learning.dataset_spec import DatasetSpec, Relabel, load_spec
 from cfplan.learning.labels import row_path
 
 SMALL = DatasetSpec(
-    count=6, seed=3, limits="hardware", box=(4.5, 8.0, 2.0), waypoints=(2, 3), nodes=40, yaw=YawMode.FIXED, shard_rows=2
+    count=6,
+    seed=3,
+    limits="hardware",
+    boxes=((4.5, 8.0, 2.0),),
+    waypoints=(2, 3),
+    nodes=40,
+    yaw=YawMode.FIXED,
+    shard_rows=2,
 )
 
 
@@ -123,7 +130,7 @@ def test_a_folder_with_another_dataset_is_refused_naming_what_differs(made):
 
 
 def test_paths_that_cannot_be_are_rows_with_a_reason(tmp_path):
-    spec = replace(SMALL, count=2, box=(0.1, 0.1, 0.1))
+    spec = replace(SMALL, count=2, boxes=((0.1, 0.1, 0.1),))
     make_dataset(tmp_path, spec)
     _, rows = read_dataset(tmp_path)
     assert rows["status"].to_pylist() == ["PATH", "PATH"]
