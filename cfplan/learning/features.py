@@ -32,10 +32,11 @@ LEAST_SHARE = 0.1
 
 # Columns of a node table: g, g', g'', g''', the reference rate, and how far above it each limit's own bound is.
 POSITION, REFERENCE, ROOMS, COLUMNS = slice(0, 3), 12, slice(13, 17), 17
-# After them, the same in every row of a window: rest at start and end, start known, its rate and two differences.
-INPUTS = COLUMNS + 6
+# After them, the same in every row of a window: rest at start and end, start known, its rate and two differences, its
+# yaw from the heading, as cos and sin of twice it because half a turn changes nothing, and its change of yaw a step.
+INPUTS = COLUMNS + 9
 OUTPUTS = 3
-# a node: log rate over the reference, cos and sin of twice the yaw from the heading at the start of the window
+# a node: log rate over the reference, cos and sin of the yaw turned since the start of the window
 
 
 class Bounds(NamedTuple):
@@ -105,11 +106,20 @@ def node_table(path: Path, first: float, step: float, count: int, bound: Bounds)
 
 
 def window_inputs(
-    table: NDArray, rest_start: bool, rest_end: bool, start: tuple[float, float, float] | None
+    table: NDArray,
+    rest_start: bool,
+    rest_end: bool,
+    start: tuple[float, float, float] | None,
+    yaw: float = 0.0,
+    turning: float = 0.0,
 ) -> NDArray:
-    """(len(table), INPUTS) float32: the nodes of one window as the network takes them; `start` as from told()."""
+    """(len(table), INPUTS) float32: the nodes of one window as the network takes them.
+
+    `start` is as from told(); `yaw`, rad, and `turning`, ψ'Δs, are those at the first node.
+    """
     out = np.empty((len(table), INPUTS), dtype=np.float32)
-    fill_inputs(out, table, rest_start, rest_end, start is not None, start or (0.0, 0.0, 0.0))
+    known = start is not None
+    fill_inputs(out, table, rest_start, rest_end, known, start or (0.0, 0.0, 0.0), yaw, turning if known else 0.0)
     return out
 
 
@@ -154,12 +164,14 @@ def fill_nodes(out: NDArray, breaks: NDArray, coefficients: NDArray, first: floa
 
 @njit(cache=True)
 def fill_inputs(
-    out: NDArray, table: NDArray, rest_start: bool, rest_end: bool, known: bool, start: tuple[float, float, float]
-) -> None:
+    out: NDArray, table: NDArray, rest_start: bool, rest_end: bool, known: bool, start: tuple[float, float, float],
+    yaw: float, turning: float,
+) -> None:  # fmt: skip
     """See window_inputs: the window is moved to the origin, and its first step turned into the x-z plane."""
     x, y = table[1, 0] - table[0, 0], table[1, 1] - table[0, 1]
     size = math.sqrt(x * x + y * y)
     cos, sin = (x / size, y / size) if size > TINY else (1.0, 0.0)
+    relative = yaw - math.atan2(sin, cos)
     for n in range(len(table)):
         for order in range(4):
             k = 3 * order
@@ -175,10 +187,6 @@ def fill_inputs(
         out[n, COLUMNS + 3] = start[0] - table[0, REFERENCE] if known else 0.0
         out[n, COLUMNS + 4] = start[1]
         out[n, COLUMNS + 5] = start[2]
-
-
-@njit(cache=True)
-def heading(table: NDArray) -> float:
-    """rad, of a window's first step over the ground; 0 where it goes straight up."""
-    x, y = table[1, 0] - table[0, 0], table[1, 1] - table[0, 1]
-    return math.atan2(y, x) if math.sqrt(x * x + y * y) > TINY else 0.0
+        out[n, COLUMNS + 6] = math.cos(2.0 * relative)
+        out[n, COLUMNS + 7] = math.sin(2.0 * relative)
+        out[n, COLUMNS + 8] = turning

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.expert.preconditions import broken_by, check_arguments, unsolvable
 from cfplan.expert.solution import Solution, Status
-from cfplan.expert.yaw_track import fixed_yaw, tangent_yaw
+from cfplan.expert.yaw_track import YawTrack, fixed_yaw, tangent_yaw
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.features import (
@@ -32,8 +32,8 @@ from cfplan.learning.features import (
 )
 from cfplan.learning.inference import Network
 from cfplan.learning.model_files import Model, find_model
-from cfplan.learning.smooth import Begin, profile_by, smoother
-from cfplan.learning.windows import KEEP, chain
+from cfplan.learning.smooth import Begin, profile_by, smoothed, track_through
+from cfplan.learning.windows import chain, kept
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
@@ -80,16 +80,22 @@ def plan_learned(
         if boundary and (reason := broken_by(boundary, path, s, airframe, limits)):
             return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
 
-    coefficients = predict(path, model.network, bounds(airframe, model.card.limits), nodes, model.window, start, end)
-    if not (np.isfinite(coefficients).all() and (coefficients[1:-1] > 0).all()):
+    track = None
+    if yaw is not YawMode.FREE:
+        track = (tangent_yaw if yaw is YawMode.TANGENT else fixed_yaw)(path, nodes, yaw_angle, start, end)
+    coefficients, turned = predict(
+        path, model.network, bounds(airframe, model.card.limits), nodes, model.window,
+        start=start, end=end, track=track, yaw_angle=yaw_angle,
+    )  # fmt: skip
+    if not (np.isfinite(coefficients).all() and np.isfinite(turned).all() and (coefficients[1:-1] > 0).all()):
         return Solution(Status.NOT_CONVERGED, None, f"the network {model.name} answered what is not a number")
-    track = (tangent_yaw if yaw is YawMode.TANGENT else fixed_yaw)(path, nodes, yaw_angle, start, end)
     stats: dict[str, float | int | str] = {
         "solve_seconds": time.perf_counter() - began,
         "iterations": 0,
         "solver": "learned",
         "model": model.name,
     }
+    track = track or track_through(turned, path.end / nodes, start, end)
     return Solution(Status.SOLVED, profile_by(coefficients, path.end, track), "", stats)
 
 
@@ -99,33 +105,48 @@ def predict(
     bound: Bounds,
     nodes: int,
     window: int,
+    *,
     start: BoundaryState | None = None,
     end: BoundaryState | None = None,
-    keep: int = KEEP,
-) -> NDArray:
-    """(N+3,) coefficients of the spline of h, NaN where the network fails. `nodes` is at least `window`."""
+    track: YawTrack | None = None,
+    yaw_angle: float = 0.0,
+) -> tuple[NDArray, NDArray]:
+    """(N+3,) coefficients of the spline of h, and (N+1,) yaw at the nodes, rad: that of the track, else the network's.
+
+    Not finite where the network fails. `nodes` is at least `window`.
+    """
     step = path.end / nodes
     table = node_table(path, 0.0, step, nodes + 1, bound)
     rest_start, rest_end = start is None and rests(path, 0.0), end is None and rests(path, path.end)
     logs = np.empty(nodes + 3)  # log √u/Δs
+    yaw = np.empty(nodes + 1) if track is None else track.yaw
+    angle, turning = (yaw_angle, 0.0) if start is None else (start.yaw, start.dyaw * step)
     settled = np.zeros(3)
     begin = Begin.REST if rest_start else Begin.FREE
     if start is not None:
         begin, settled = Begin.KNOWN, np.array(start_logs(start, step))
-    for part in chain(nodes, window, keep):
-        shown = table[part.first : part.first + window + 1]
+    for part in chain(nodes, window, kept(window)):
+        first, stop = part.first, part.first + part.keep
+        shown = table[first : first + window + 1]
         heard = told(*settled) if begin is Begin.KNOWN else None
-        answer = network(window_inputs(shown, begin is Begin.REST, part.last and rest_end, heard))
+        if track is not None:
+            angle, turning = track.yaw[first], track.dyaw[first] * step
+        answer = network(window_inputs(shown, begin is Begin.REST, part.last and rest_end, heard, angle, turning))
         rates = answer[:, 0] + shown[:, REFERENCE]
-        smooth = smoother(window, begin, part.last and rest_end)(rates, settled)
-        logs[part.first : part.first + window + 3] = smooth
+        smooth = smoothed(rates, settled, int(begin), part.last and rest_end)
+        logs[first : first + window + 3] = smooth
         begin, settled = Begin.KNOWN, smooth[part.keep : part.keep + 3]
-    coefficients = np.exp(2.0 * (logs + np.log(step)))
+        if track is None:
+            turned = np.unwrap(np.arctan2(answer[:, 2], answer[:, 1]))[: part.keep + 1]
+            yaw[first : stop + 1] = angle + turned - turned[0]
+            angle, turning = yaw[stop], yaw[stop] - yaw[stop - 1]
+    with np.errstate(over="ignore"):  # then they are not finite
+        coefficients = np.exp(2.0 * (logs + np.log(step)))
     if start is not None:
         coefficients[:3] = start_coefficients(start, step)
     if end is not None:
         _lead_to(coefficients, end, step)
-    return coefficients
+    return coefficients, yaw
 
 
 def _lead_to(coefficients: NDArray, end: BoundaryState, step: float) -> None:

@@ -8,7 +8,7 @@ BENDS = 1.0
 # likewise of the second difference
 DURATION = 1.0
 # weight of the squared relative error of a window's time
-YAW = 0.003
+YAW = 0.01
 # weight of the squared errors of the yaw's cosine and sine
 
 

@@ -30,7 +30,6 @@ from cfplan.learning.features import (
     coefficient_logs,
     fill_inputs,
     fill_nodes,
-    heading,
     told,
 )
 
@@ -190,8 +189,7 @@ def _fill(
         step = share[b] * end
         fill_nodes(table, breaks, labels.coefficients[low:high], first[b] * end, step, bound)
         rest_start, rest_end = first[b] <= 0.0, first[b] + (count - 1) * share[b] >= 1.0 - 1e-9
-        turned = heading(table)
-        total = 0.0
+        total = yaw = turning = 0.0
         start = (0.0, 0.0, 0.0)
         for n in range(count):
             place = min((first[b] + n * share[b]) * grid, grid * 1.0)
@@ -206,14 +204,18 @@ def _fill(
             rate = coefficient_logs(h, slope, bend, step)[1]
             psi = labels.yaw[row, 0, i] + x * (labels.yaw[row, 1, i] + x * labels.yaw[row, 2, i] / 2)
             targets[b, n, 0] = rate - table[n, REFERENCE]
-            targets[b, n, 1] = np.cos(2.0 * (psi - turned))
-            targets[b, n, 2] = np.sin(2.0 * (psi - turned))
+            if n == 0:
+                yaw, turning = psi, (labels.yaw[row, 1, i] + x * labels.yaw[row, 2, i]) * step
+            targets[b, n, 1] = np.cos(psi - yaw)
+            targets[b, n, 2] = np.sin(psi - yaw)
             duration = np.exp(-rate) * (0.5 if n in (0, count - 1) else 1.0)
             times[b, n] = duration
             total += duration
             fading = 0 if rest_end else max(0, n + 1 + TAIL - count)
             weights[b, n] = 1.0 - (1.0 - TAIL_WEIGHT) * fading / TAIL
         known = knows[b] and not rest_start
-        fill_inputs(inputs[b], table, rest_start, rest_end, known, start if known else (0.0, 0.0, 0.0))
+        if not known:
+            start, turning = (0.0, 0.0, 0.0), 0.0
+        fill_inputs(inputs[b], table, rest_start, rest_end, known, start, yaw, turning)
         for n in range(count):
             times[b, n] /= total

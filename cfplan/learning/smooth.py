@@ -1,66 +1,107 @@
 """From a network's answer to a smooth profile: the coefficients of a cubic B-spline, one window at a time.
 
 A window's answers are joined to the three coefficients that are settled already, or to a rest, and smoothed by the
-least sum of squared changes and squared third differences. Where the path rests, four coefficients are equal, so that h
-stays constant over the first or last interval (see expert/reduced.py). For one length of window the answer is a fixed
-matrix, made once.
+least sum of squared changes and squared third differences of log √u. What the second weigh depends on how long an
+interval takes: motion is smoothed over the same time whatever the grid. Where the path rests, four coefficients are
+equal, so that h stays constant over the first or last interval (see expert/reduced.py).
 """
 
-from enum import Enum
-from functools import lru_cache
-from typing import NamedTuple
+from enum import IntEnum
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from cfplan.expert.yaw_track import YawTrack
-from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 
-STIFFNESS = 1.0
-# of the squared third differences, against the squared changes of log √u
+DURATION = 0.07
+# s, over which answers are smoothed
+YAW_WIDTH = 3.0
+# nodes, over which yaw is smoothed
+STIFFEST = 1e6
+# of third differences against changes, at most
+_BAND = 3
+# of the normal equations
 
 
-class Begin(Enum):
+class Begin(IntEnum):
     """What holds at the first node of a window."""
 
-    REST = "rest"
-    KNOWN = "known"
-    # u₋₁, u₀, u₁ are settled
-    FREE = "free"
+    REST = 0
+    KNOWN = 1  # u₋₁, u₀, u₁ are settled
+    FREE = 2
 
 
-class Smoother(NamedTuple):
-    """log √u at nodes -1 … W+1 from the answers at nodes 0 … W and what is settled."""
+@njit(cache=True, error_model="numpy")
+def smoothed(rates: NDArray, settled: NDArray, begin: int, rest_end: bool, duration: float = DURATION) -> NDArray:
+    """(W+3,) log √u/Δs at nodes -1 … W+1 from answers, (W+1,), and what is settled, (3,)."""
+    count = len(rates) + 2
+    first = 3 if begin == 0 else 0
+    last = count - 4 if rest_end else count - 1
+    held = 3 if begin == 1 else 0
+    size = last - first + 1
+    # Column k of the lower band holds the element k below the diagonal; variables are those from `first` to `last`.
+    band, right = np.zeros((size, _BAND + 1)), np.zeros(size)
+    for n in range(count):
+        row = min(max(n, first), last) - first
+        if 1 <= n < count - 1:
+            band[row, 0] += 1.0
+            right[row] += rates[n - 1]
+    weights = (-1.0, 3.0, -3.0, 1.0)
+    for n in range(count - 3):
+        stiffness = min((duration * np.exp(rates[min(n, len(rates) - 1)])) ** 6, STIFFEST)
+        for i in range(4):
+            row = min(max(n + i, first), last) - first
+            for j in range(4):
+                column = min(max(n + j, first), last) - first
+                if column <= row:
+                    band[column, row - column] += stiffness * weights[i] * weights[j]
+    for n in range(held):  # what is settled goes to the other side
+        for k in range(1, _BAND + 1):
+            if n + k >= held and n + k < size:
+                right[n + k] -= band[n, k] * settled[n]
+        band[n, 0], band[n, 1:] = 1.0, 0.0
+        right[n] = settled[n]
+    _solve(band, right)
+    out = np.empty(count)
+    for n in range(count):
+        out[n] = right[min(max(n, first), last) - first]
+    return out
 
-    answers: NDArray
-    # (W+3, W+1)
-    settled: NDArray
-    # (W+3, 3)
 
-    def __call__(self, answers: NDArray, settled: NDArray) -> NDArray:
-        """(W+3,) from (W+1,) and (3,)."""
-        return self.answers @ answers + self.settled @ settled
+@njit(cache=True, error_model="numpy")
+def _solve(band: NDArray, right: NDArray) -> None:
+    """Cholesky in place of a banded matrix, then both substitutions."""
+    size = len(right)
+    for n in range(size):
+        pivot = np.sqrt(band[n, 0])
+        band[n] /= pivot
+        for i in range(1, _BAND + 1):
+            if n + i < size:
+                for j in range(i, _BAND + 1):
+                    band[n + i, j - i] -= band[n, i] * band[n, j]
+    for n in range(size):
+        right[n] /= band[n, 0]
+        for k in range(1, min(_BAND + 1, size - n)):
+            right[n + k] -= band[n, k] * right[n]
+    for n in range(size - 1, -1, -1):
+        for k in range(1, min(_BAND + 1, size - n)):
+            right[n] -= band[n, k] * right[n + k]
+        right[n] /= band[n, 0]
 
 
-@lru_cache
-def smoother(window: int, begin: Begin, rest_end: bool, stiffness: float = STIFFNESS) -> Smoother:
-    """The matrices for a kind of window."""
-    count = window + 3
-    seen = np.eye(count)[1:-1]
-    third = np.diff(np.eye(count), 3, axis=0)
-    normal = seen.T @ seen + stiffness * third.T @ third
-    column = np.arange(count)
-    if begin is Begin.REST:
-        column = np.maximum(column, 3) - 3
-    if rest_end:
-        column = np.minimum(column, column[-4])
-    free = np.eye(column[-1] + 1)[column]
-    held = np.zeros((count, 3))
-    if begin is Begin.KNOWN:
-        held[:3] = np.eye(3)
-        free = free[:, 3:]
-    solve = free @ np.linalg.solve(free.T @ normal @ free, free.T)
-    return Smoother(np.ascontiguousarray(solve @ seen.T), held - solve @ normal @ held)
+def track_through(yaw: NDArray, step: float, start: BoundaryState | None, end: BoundaryState | None) -> YawTrack:
+    """A smooth track by yaw at the nodes, (N+1,): a quadratic spline, with the yaw and its rate of states given."""
+    smooth = gaussian_filter1d(yaw, YAW_WIDTH, mode="nearest")
+    inner = (smooth[1:] + smooth[:-1]) / 2
+    spline = np.concatenate([inner[:1], inner, inner[-1:]])
+    for state, places, sign in ((start, [0, 1], -1.0), (end, [-1, -2], 1.0)):
+        if state is not None:
+            half = sign * state.dyaw * step / 2
+            spline[places] = state.yaw + half, state.yaw - half
+    return YawTrack((spline[:-1] + spline[1:]) / 2, np.diff(spline) / step, np.diff(spline, 2) / step**2)
 
 
 def profile_by(coefficients: NDArray, end: float, track: YawTrack) -> SpeedProfile:

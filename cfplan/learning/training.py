@@ -266,7 +266,8 @@ class _Run:
         unseen, window = self.unseen, self.options.window
         nodes = max(window, unseen.spec.nodes)
         found = [
-            travel_time(predict(path, network, unseen.bound, nodes, window), path.end / nodes) for path in unseen.paths
+            travel_time(predict(path, network, unseen.bound, nodes, window, yaw_angle=yaw)[0], path.end / nodes)
+            for path, yaw in zip(unseen.paths, unseen.labels.yaw[:, 0, 0], strict=True)
         ]
         return np.array(found) / unseen.travel_time - 1.0
 

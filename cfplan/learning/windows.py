@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 WINDOW = 64
 # intervals of a window
-KEEP = 48
-# intervals of a window that are kept where the path goes on: what is behind lies further ahead than braking takes
+KEPT_SHARE = 0.75
+# of a window, where the path goes on: what lies behind is further ahead than braking takes
 
 
 class Window(NamedTuple):
@@ -20,7 +20,12 @@ class Window(NamedTuple):
     # ends where the path ends
 
 
-def chain(nodes: int, window: int = WINDOW, keep: int = KEEP) -> Iterator[Window]:
+def kept(window: int) -> int:
+    """Intervals of a window that are kept where the path goes on."""
+    return max(1, round(KEPT_SHARE * window))
+
+
+def chain(nodes: int, window: int, keep: int) -> Iterator[Window]:
     """The windows over `nodes` intervals, at least `window`: each begins where the kept part of the one before ends.
 
     The last one ends where the path ends, so the one before it keeps less.

@@ -1,0 +1,70 @@
+"""From answers to a profile: the least squares that are promised, and the ends as the expert has them."""
+
+import numpy as np
+import pytest
+
+from cfplan.expert.yaw_track import YawTrack
+from cfplan.learning.smooth import Begin, profile_by, smoothed
+
+SETTLED = np.array([2.0, 2.05, 2.12])
+
+
+def rough(count: int = 21) -> np.ndarray:
+    return 2.0 + np.random.default_rng(0).normal(scale=0.2, size=count)
+
+
+@pytest.mark.parametrize("begin", Begin)
+@pytest.mark.parametrize("rest_end", [False, True])
+def test_it_is_the_least_sum_of_squares(begin, rest_end):
+    """Any small change within what is free to change makes the sum larger."""
+    rates, duration = rough(), 0.15
+    found = smoothed(rates, SETTLED, int(begin), rest_end, duration)
+    stiffness = (duration * np.exp(rates[np.minimum(np.arange(20), 20)])) ** 6
+
+    def cost(z):
+        return np.sum((z[1:-1] - rates) ** 2) + np.sum(stiffness * np.diff(z, 3) ** 2)
+
+    for seed in range(40):
+        change = np.random.default_rng(seed).normal(size=23)
+        if begin is Begin.REST:
+            change[:4] = change[0]
+        if begin is Begin.KNOWN:
+            change[:3] = 0.0
+        if rest_end:
+            change[-4:] = change[-1]
+        slope = (cost(found + 1e-4 * change) - cost(found - 1e-4 * change)) / 2e-4
+        assert abs(slope) < 1e-6 * cost(found + change)
+        assert cost(found + 1e-3 * change) > cost(found)
+
+
+def test_what_is_settled_stays():
+    np.testing.assert_array_equal(smoothed(rough(), SETTLED, int(Begin.KNOWN), False)[:3], SETTLED)
+
+
+def test_h_is_constant_next_to_a_rest():
+    u = np.exp(2 * smoothed(rough(), SETTLED, int(Begin.REST), True))
+    zeros = np.zeros(21)
+    profile = profile_by(u, 3.0, YawTrack(zeros, zeros, zeros[1:]))
+    for values, at in ((profile.dh, [0, 1]), (profile.ddh, [0, 1]), (profile.dddh, [0])):
+        assert np.all(values[at] == 0.0)
+        assert np.all(values[[-1 - k for k in at]] == 0.0)
+
+
+def test_smoothing_takes_the_same_time_whatever_the_grid():
+    """A ripple of two seconds in flight is damped alike on a grid twice as fine."""
+    left = []
+    for rate in (10.0, 20.0):
+        n = np.arange(400)
+        ripple = np.sin(2 * np.pi * n / (2.0 * rate))
+        out = smoothed(np.log(rate) + 1e-3 * ripple, SETTLED, int(Begin.FREE), False, 0.3)[1:-1] - np.log(rate)
+        left.append(np.ptp(out[100:300]) / 2e-3)
+    assert left[0] == pytest.approx(left[1], rel=0.05)
+    assert 0.1 < left[0] < 0.9
+
+
+def test_a_profile_is_the_spline_of_its_coefficients(make_profile):
+    u = np.random.default_rng(1).uniform(0.5, 2.0, 23)
+    zeros = np.zeros(21)
+    found, expected = profile_by(u, 3.0, YawTrack(zeros, zeros, zeros[1:])), make_profile(3.0, u)
+    for name in ("s", "h", "dh", "ddh", "dddh"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-8)
