@@ -77,7 +77,7 @@ def dense_rows(
         return dense_rows(airframe, derivatives[:, :, more], profile, places[more], interval[more])[:, :count]
     out = np.empty((ROWS, count))
     curves = np.ascontiguousarray(derivatives, dtype=float).reshape(12, count)
-    _at_points(out, compiled_body(airframe), curves, profile.starts(), places, interval)
+    _at_points(out, compiled_body(airframe), curves, profile.table(), places, interval)
     return out
 
 
@@ -92,8 +92,8 @@ def sampled_rows(airframe: Airframe, path: Path, profile: SpeedProfile, stretche
         coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
         coefficients.setflags(write=False)
     _along(
-        out, compiled_body(airframe), coefficients, path.origins[stretches.piece], profile.starts(),
-        profile.s[stretches.interval], *stretches,
+        out, compiled_body(airframe), coefficients, path.origins[stretches.piece], profile.table(),
+        *stretches,
     )  # fmt: skip
     return out
 
@@ -115,7 +115,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
             for n in range(lanes):
                 panel[_X * WIDTH + n] = places[begin + n]
                 for row in range(7):
-                    panel[(_NODE + row) * WIDTH + n] = nodes[interval[begin + n], row]
+                    panel[(_NODE + row) * WIDTH + n] = nodes[interval[begin + n], 1 + row]
             _flatten(panel, body, lanes)
             for row in range(ROWS):
                 for n in range(lanes):
@@ -124,7 +124,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
 
     @njit(cache=True, error_model="numpy")
     def along(
-        out: NDArray, body: Body, coefficients: NDArray, origins: NDArray, nodes: NDArray, grid: NDArray,
+        out: NDArray, body: Body, coefficients: NDArray, origins: NDArray, nodes: NDArray,
         left: NDArray, right: NDArray, interval: NDArray, piece: NDArray, counts: NDArray,
     ) -> int:  # fmt: skip
         panel, s = np.empty(_SIZE), np.empty(WIDTH)
@@ -134,7 +134,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
             last, first_s, width, last_s = counts[k] - 1, left[k], right[k] - left[k], np.nextafter(right[k], -np.inf)
             for row in range(7):
                 for n in range(WIDTH):
-                    panel[(_NODE + row) * WIDTH + n] = nodes[interval[k], row]
+                    panel[(_NODE + row) * WIDTH + n] = nodes[interval[k], 1 + row]
             for done in range(0, counts[k], WIDTH):
                 lanes = min(WIDTH, _whole(counts[k] - done))
                 for n in range(lanes):
@@ -142,7 +142,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
                     panel[_X * WIDTH + n] = s[n] - origins[k]
                 _trace(panel, coefficients[piece[k]], lanes)
                 for n in range(lanes):
-                    panel[_X * WIDTH + n] = s[n] - grid[k]
+                    panel[_X * WIDTH + n] = s[n] - nodes[interval[k], 0]
                 _flatten(panel, body, lanes)
                 _finish(panel, lanes)
                 at, count = begin + done, min(WIDTH, counts[k] - done)

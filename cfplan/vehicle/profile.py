@@ -74,13 +74,12 @@ class SpeedProfile:
             ddyaw=turn,
         )
 
-    def starts(self) -> NDArray:
-        """(N, 7), for compiled code: h with three derivatives and yaw with two where each interval begins."""
-        count = len(self.dddh)
-        table = np.empty((count, 7))
-        for k, values in enumerate((self.h, self.dh, self.ddh, self.dddh, self.yaw, self.dyaw, self.ddyaw)):
-            table[:, k] = values[:count]
-        return table
+    def table(self) -> NDArray:
+        """(N+1, 8), for compiled code: s, h with three derivatives, yaw with two; what has N values ends in 0."""
+        rows = np.zeros((len(self.s), 8))
+        for k, values in enumerate((self.s, self.h, self.dh, self.ddh, self.dddh, self.yaw, self.dyaw, self.ddyaw)):
+            rows[: len(values), k] = values
+        return rows
 
     def boundary(self, node: int) -> BoundaryState:
         """The state at a grid point."""

@@ -7,6 +7,7 @@ and until a polynomial of degree 7 in time, which matches s and three time deriv
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import NotCertifiedError
@@ -17,7 +18,8 @@ LONGEST = 3600.0  # s, beyond which a profile is a mistake
 _SPLITS = 40  # halvings of an interval before its speed counts as zero
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = (_NODES + 1.0) / 2.0, _WEIGHTS / 2.0
-_PROBES = np.array([0.2, 0.5, 0.8])  # where in a piece the inverse is tried
+_PROBES = (0.2, 0.5, 0.8)  # where in a piece the inverse is tried
+_CONTINUOUS = [1, 2, 3, 5, 6]  # columns of a profile's table that must not jump: h, h', h'', yaw, yaw'
 # Coefficients 4 to 7 of a polynomial on [0, 1] from what is left of it and three derivatives at 1.
 _FAR_END = np.linalg.inv(np.array([[1, 1, 1, 1], [4, 5, 6, 7], [12, 20, 30, 42], [24, 60, 120, 210]], dtype=float))
 
@@ -34,155 +36,225 @@ class Timing:
     interval: NDArray
     # (K,) of the profile
     polynomial: NDArray
-    # (8, K) s less that of the piece's start, by the share of the piece's duration
+    # (K, 8) s less that of the piece's start, by the share of the piece's duration
+    nodes: NDArray
+    # the profile as its table() has it
 
     def time_at(self, s: ArrayLike) -> NDArray:
         """s of time at which the vehicle is at s."""
-        places = np.clip(np.asarray(s, dtype=float), self.s[0], self.s[-1])
-        piece = _piece(self.s, places)
-        return self.time[piece] + _quadrature(self.profile, self.interval[piece], self.s[piece], places)
+        places = np.array(s, dtype=float)
+        return _times(self.s, self.time, self.interval, self.nodes, places.ravel()).reshape(places.shape)
 
     def s_at(self, time: ArrayLike) -> NDArray:
         """Where on the path the vehicle is at each time."""
-        times = np.clip(np.asarray(time, dtype=float), 0.0, self.time[-1])
-        piece = _piece(self.time, times)
-        share = (times - self.time[piece]) / (self.time[piece + 1] - self.time[piece])
-        offset = _horner(self.polynomial[:, piece], share)
-        return np.clip(self.s[piece] + offset, self.s[piece], self.s[piece + 1])
+        times = np.array(time, dtype=float)
+        return _places(self.s, self.time, self.polynomial, times.ravel()).reshape(times.shape)
 
 
 def measure(profile: SpeedProfile) -> Timing:
     """The timing of a profile. Raises NotCertifiedError where h is not positive or not smooth."""
-    check(profile)
-    left, right, interval = profile.s[:-1], profile.s[1:], np.arange(len(profile.s) - 1)
-    pieces: list[tuple[NDArray, NDArray, NDArray, NDArray, NDArray]] = []
-    for _ in range(_SPLITS):
-        middle = (left + right) / 2.0
-        duration = _quadrature(profile, interval, left, right)
-        halves = _quadrature(profile, interval, left, middle) + _quadrature(profile, interval, middle, right)
-        polynomial = _inverse(profile, interval, left, right, duration)
-        good = (np.abs(duration - halves) < TOLERANCE + 1e-14 * duration) & (
-            _inverse_error(profile, interval, left, duration, polynomial) < 1e-10
-        )
-        pieces.append((left[good], right[good], interval[good], duration[good], polynomial[:, good]))
-        left, middle, right, interval = (values[~good] for values in (left, middle, right, interval))
-        if not len(left):
-            break
-        left, right, interval = np.r_[left, middle], np.r_[middle, right], np.r_[interval, interval]
-    else:
-        raise NotCertifiedError("the speed falls to almost zero", where=f"s = {left[0]:.6g}")
-    left, right, interval, duration = (np.concatenate([piece[k] for piece in pieces]) for k in range(4))
-    order = np.argsort(left)
+    nodes = check(profile)
+    left, duration, interval, polynomial, stuck = _split(nodes)
+    if not np.isnan(stuck):
+        raise NotCertifiedError("the speed falls to almost zero", where=f"s = {stuck:.6g}")
     total = float(duration.sum())
     if not total <= LONGEST:
         raise NotCertifiedError(f"the speed profile takes {total:.0f} s, longer than any flight")
     return Timing(
         profile=profile,
-        s=np.r_[left[order], right[order[-1]]],
-        time=np.r_[0.0, np.cumsum(duration[order])],
-        interval=interval[order],
-        polynomial=np.concatenate([piece[4] for piece in pieces], axis=1)[:, order],
+        s=np.append(left, profile.s[-1]),
+        time=np.append(0.0, np.cumsum(duration)),
+        interval=interval,
+        polynomial=polynomial,
+        nodes=nodes,
     )
 
 
-def check(profile: SpeedProfile) -> None:
-    """Raises NotCertifiedError unless the profile is finite, smooth as it promises, and h positive everywhere."""
+def check(profile: SpeedProfile) -> NDArray:
+    """The profile's table. Raises NotCertifiedError unless it is finite, smooth as promised, and h positive."""
     intervals = len(profile.s) - 1
     for name in SpeedProfile.__slots__:
         values = getattr(profile, name)
         if values.shape != (intervals + (name not in ("dddh", "ddyaw")),) or intervals < 1:
             raise NotCertifiedError(f"the speed profile has {values.shape} values of {name} for {intervals} intervals")
-        if not np.all(np.isfinite(values)):
-            raise NotCertifiedError(
-                f"the speed profile's {name} is not finite", where=_node(profile, ~np.isfinite(values))
-            )
-    if not np.all(np.diff(profile.s) > 0):
+    nodes = profile.table()
+    wrong = ~np.isfinite(nodes)
+    if wrong.any():
+        column = int(np.argmax(wrong.any(axis=0)))
+        raise NotCertifiedError(
+            f"the speed profile's {SpeedProfile.__slots__[column]} is not finite", where=_node(nodes, wrong[:, column])
+        )
+    if not np.all(np.diff(nodes[:, 0]) > 0):
         raise NotCertifiedError("the speed profile's grid does not ascend")
-    least = _least(profile)
+    least, jumps = _inspect(nodes)
     if not np.all(least > 0):
-        raise NotCertifiedError("the speed profile falls to zero or below", where=_node(profile, ~(least > 0)))
-    before = profile.at(profile.s[1:], np.arange(intervals))
-    for name in ("h", "dh", "ddh", "yaw", "dyaw"):
-        values = getattr(profile, name)
-        jump = np.abs(getattr(before, name) - values[1:])
-        if not np.all(jump <= 1e-6 * (1.0 + np.max(np.abs(values)))):
+        raise NotCertifiedError("the speed profile falls to zero or below", where=_node(nodes, ~(least > 0)))
+    allowed = 1e-6 * (1.0 + np.abs(nodes[:, _CONTINUOUS]).max(axis=0))
+    for column, jump, limit in zip(_CONTINUOUS, jumps.T, allowed, strict=True):
+        if not np.all(jump <= limit):
             raise NotCertifiedError(
-                f"the speed profile's {name} jumps", where=_node(profile, np.r_[0.0, jump] == jump.max())
+                f"the speed profile's {SpeedProfile.__slots__[column]} jumps",
+                where=_node(nodes, np.append(0.0, jump) == jump.max()),
             )
+    return nodes
 
 
-def _node(profile: SpeedProfile, bad: NDArray) -> str:
+def _node(nodes: NDArray, bad: NDArray) -> str:
     index = int(np.flatnonzero(bad)[0])
-    return f"node {index}, s = {profile.s[index]:.6g}"
+    return f"node {index}, s = {nodes[index, 0]:.6g}"
 
 
-def _least(profile: SpeedProfile) -> NDArray:
-    """(N,) the least h in each interval: at its ends or where h' = 0."""
-    width = np.diff(profile.s)
-    slope, bend, jerk = profile.dh[:-1], profile.ddh[:-1], profile.dddh
-    root = np.sqrt(np.maximum(bend * bend - 2.0 * jerk * slope, 0.0))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # Both roots of h', each in the form that does not cancel.
-        far = -(bend + np.copysign(root, bend))
-        roots = np.stack([far / jerk, 2.0 * slope / far])
-    inner = np.where(np.isfinite(roots), np.clip(roots, 0.0, width), 0.0)
-    places = np.concatenate([inner, np.zeros((1, len(width))), width[None]])
-    h = profile.h[:-1] + places * (slope + places * (bend / 2 + places * jerk / 6))
-    return h.min(axis=0)
+@njit(cache=True, error_model="numpy")
+def _inspect(nodes: NDArray) -> tuple[NDArray, NDArray]:
+    """The least h in each interval, (N,), and by how much h, h', h'', yaw and yaw' jump at its end, (N, 5)."""
+    count = len(nodes) - 1
+    least, jumps = np.empty(count), np.empty((count, 5))
+    for k in range(count):
+        node, after = nodes[k], nodes[k + 1]
+        slope, bend, jerk, x = node[2], node[3], node[4], after[0] - node[0]
+        # h is least at an end or where h' = 0: both roots, each in the form that does not cancel.
+        far = -(bend + np.copysign(np.sqrt(max(bend * bend - 2.0 * jerk * slope, 0.0)), bend))
+        least[k] = min(node[1], _h(node, after[0]))
+        for root in (far / jerk, 2.0 * slope / far):
+            if np.isfinite(root):
+                least[k] = min(least[k], _h(node, node[0] + min(max(root, 0.0), x)))
+        jumps[k, 0] = abs(_h(node, after[0]) - after[1])
+        jumps[k, 1] = abs(slope + x * (bend + x * jerk / 2) - after[2])
+        jumps[k, 2] = abs(bend + x * jerk - after[3])
+        jumps[k, 3] = abs(node[5] + x * (node[6] + x * node[7] / 2) - after[5])
+        jumps[k, 4] = abs(node[6] + x * node[7] - after[6])
+    return least, jumps
 
 
-def _piece(edges: NDArray, values: NDArray) -> NDArray:
-    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+@njit(cache=True, error_model="numpy")
+def _split(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
+    """Start, duration, interval and inverse of each piece; and where pieces never get short enough, else NaN."""
+    room = 2 * len(nodes) + 100
+    starts, durations, polynomials = np.empty(room), np.empty(room), np.empty((room, 8))
+    intervals = np.empty(room, dtype=np.int64)
+    ends, depths = np.empty(_SPLITS + 1), np.empty(_SPLITS + 1, dtype=np.int64)  # right ends of what is still to do
+    count = 0
+    for k in range(len(nodes) - 1):
+        node, left, waiting = nodes[k], nodes[k, 0], 1
+        ends[0], depths[0] = nodes[k + 1, 0], 0
+        while waiting:
+            right, depth = ends[waiting - 1], depths[waiting - 1]
+            if count == len(starts):
+                starts, durations = np.append(starts, starts), np.append(durations, durations)
+                intervals = np.append(intervals, intervals)
+                polynomials = np.concatenate((polynomials, polynomials))
+            middle = (left + right) / 2.0
+            duration = _quadrature(node, left, right)
+            halves = _quadrature(node, left, middle) + _quadrature(node, middle, right)
+            _invert(polynomials[count], node, left, right, duration)
+            good = abs(duration - halves) < TOLERANCE + 1e-14 * duration
+            if good and _inverse_error(polynomials[count], node, left, duration) < 1e-10:
+                starts[count], durations[count], intervals[count] = left, duration, k
+                count += 1
+                left = right
+                waiting -= 1
+            elif depth + 1 == _SPLITS:
+                return starts[:0], durations[:0], intervals[:0], polynomials[:0], left
+            else:
+                depths[waiting - 1] = depth + 1
+                ends[waiting], depths[waiting] = middle, depth + 1
+                waiting += 1
+    return starts[:count], durations[:count], intervals[:count], polynomials[:count], np.nan
 
 
-def _quadrature(profile: SpeedProfile, interval: NDArray, left: NDArray, right: NDArray) -> NDArray:
-    """s of time from `left` to `right`, both in `interval`."""
-    width = np.asarray(right - left)
-    x = (left - profile.s[interval])[..., None] + width[..., None] * _NODES
-    h, dh, ddh, dddh = (v[interval][..., None] for v in (profile.h, profile.dh, profile.ddh, profile.dddh))
-    return width * ((h + x * (dh + x * (ddh / 2 + x * dddh / 6))) ** -0.5 @ _WEIGHTS)
+@njit(cache=True, error_model="numpy")
+def _times(edges: NDArray, time: NDArray, interval: NDArray, nodes: NDArray, places: NDArray) -> NDArray:
+    out = np.empty(len(places))
+    piece = 0
+    for n in range(len(places)):
+        place = min(max(places[n], edges[0]), edges[-1])
+        piece = _piece(edges, place, piece)
+        out[n] = time[piece] + _quadrature(nodes[interval[piece]], edges[piece], place)
+    return out
 
 
-def _inverse(profile: SpeedProfile, interval: NDArray, left: NDArray, right: NDArray, duration: NDArray) -> NDArray:
-    """(8, K) coefficients of s(t): ds/dt = √h, d²s/dt² = h'/2, d³s/dt³ = √h h''/2."""
-    near, far = (_time_derivatives(profile, interval, place, duration) for place in (left, right))
-    low = np.stack([np.zeros_like(left), near[0], near[1] / 2.0, near[2] / 6.0])
-    missing = np.stack(
-        [
-            right - left - low.sum(axis=0),
-            far[0] - (low[1] + 2.0 * low[2] + 3.0 * low[3]),
-            far[1] - (2.0 * low[2] + 6.0 * low[3]),
-            far[2] - 6.0 * low[3],
-        ]
+@njit(cache=True, error_model="numpy")
+def _places(edges: NDArray, time: NDArray, polynomial: NDArray, times: NDArray) -> NDArray:
+    out = np.empty(len(times))
+    piece = 0
+    for n in range(len(times)):
+        moment = min(max(times[n], 0.0), time[-1])
+        piece = _piece(time, moment, piece)
+        offset = _horner(polynomial[piece], (moment - time[piece]) / (time[piece + 1] - time[piece]))
+        out[n] = min(max(edges[piece] + offset, edges[piece]), edges[piece + 1])
+    return out
+
+
+@njit(error_model="numpy")
+def _piece(edges: NDArray, value: float, guess: int) -> int:
+    """The piece in which the value lies, an edge in the one on its right; found fast a little behind the guess."""
+    last = len(edges) - 2
+    if edges[guess] <= value:
+        for piece in range(guess, min(guess + 4, last)):
+            if value < edges[piece + 1]:
+                return piece
+    return min(max(int(np.searchsorted(edges, value, side="right")) - 1, 0), last)
+
+
+@njit(error_model="numpy")
+def _h(node: NDArray, s: float) -> float:
+    """h at s in the interval that begins with this row of a profile's table."""
+    x = s - node[0]
+    return node[1] + x * (node[2] + x * (node[3] / 2 + x * node[4] / 6))
+
+
+@njit(error_model="numpy")
+def _quadrature(node: NDArray, left: float, right: float) -> float:
+    """s of time from `left` to `right`, both in the interval."""
+    width = right - left
+    total = 0.0
+    for k in range(len(_NODES)):
+        total += _WEIGHTS[k] / np.sqrt(_h(node, left + width * _NODES[k]))
+    return width * total
+
+
+@njit(error_model="numpy")
+def _invert(polynomial: NDArray, node: NDArray, left: float, right: float, duration: float) -> None:
+    """Coefficients of s(t): ds/dt = √h, d²s/dt² = h'/2, d³s/dt³ = √h h''/2."""
+    near, far = _time_derivatives(node, left, duration), _time_derivatives(node, right, duration)
+    low1, low2, low3 = near[0], near[1] / 2.0, near[2] / 6.0
+    polynomial[0], polynomial[1], polynomial[2], polynomial[3] = 0.0, low1, low2, low3
+    missing = (
+        right - left - (low1 + low2 + low3),
+        far[0] - (low1 + 2.0 * low2 + 3.0 * low3),
+        far[1] - (2.0 * low2 + 6.0 * low3),
+        far[2] - 6.0 * low3,
     )
-    return np.concatenate([low, _FAR_END @ missing])
+    for row in range(4):
+        polynomial[4 + row] = 0.0
+        for column in range(4):
+            polynomial[4 + row] += _FAR_END[row, column] * missing[column]
 
 
-def _time_derivatives(profile: SpeedProfile, interval: NDArray, s: NDArray, unit: NDArray) -> tuple[NDArray, ...]:
+@njit(error_model="numpy")
+def _time_derivatives(node: NDArray, s: float, unit: float) -> tuple[float, float, float]:
     """The first three time derivatives of s, with time in units of `unit`."""
-    sample = profile.at(s, interval)
-    speed = np.sqrt(sample.h)
-    return speed * unit, sample.dh / 2.0 * unit**2, speed * sample.ddh / 2.0 * unit**3
+    x = s - node[0]
+    speed = np.sqrt(_h(node, s))
+    dh, ddh = node[2] + x * (node[3] + x * node[4] / 2), node[3] + x * node[4]
+    return speed * unit, dh / 2.0 * unit**2, speed * ddh / 2.0 * unit**3
 
 
-def _inverse_error(
-    profile: SpeedProfile, interval: NDArray, left: NDArray, duration: NDArray, polynomial: NDArray
-) -> NDArray:
+@njit(error_model="numpy")
+def _inverse_error(polynomial: NDArray, node: NDArray, left: float, duration: float) -> float:
     """The most by which the inverse misses at the probes, the larger of s and of seconds."""
-    offset = _horner(polynomial[:, :, None], _PROBES)
-    x = (left - profile.s[interval])[:, None] + offset
-    h, dh, ddh, dddh = (v[interval][:, None] for v in (profile.h, profile.dh, profile.ddh, profile.dddh))
-    with np.errstate(invalid="ignore"):
-        speed = np.sqrt(h + x * (dh + x * (ddh / 2 + x * dddh / 6)))
-        start = np.broadcast_to(left[:, None], offset.shape)
-        which = np.broadcast_to(interval[:, None], offset.shape)
-        reached = _quadrature(profile, which, start, start + offset)
-        late = np.abs(reached - duration[:, None] * _PROBES) * np.maximum(1.0, speed)
-    return np.where(np.isfinite(late), late, np.inf).max(axis=1)
+    worst = 0.0
+    for share in _PROBES:
+        place = left + _horner(polynomial, share)
+        late = abs(_quadrature(node, left, place) - duration * share) * max(1.0, np.sqrt(_h(node, place)))
+        if not late <= worst:
+            worst = late if np.isfinite(late) else np.inf
+    return worst
 
 
-def _horner(coefficients: NDArray, x: NDArray) -> NDArray:
-    value = coefficients[-1]
-    for coefficient in coefficients[-2::-1]:
-        value = value * x + coefficient
+@njit(error_model="numpy")
+def _horner(coefficients: NDArray, x: float) -> float:
+    value = 0.0
+    for k in range(len(coefficients) - 1, -1, -1):
+        value = value * x + coefficients[k]
     return value
