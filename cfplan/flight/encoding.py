@@ -7,11 +7,12 @@ is the quaternion with the planned thrust axis and that Euler yaw; at 30° of ti
 planned attitude, and the controller, reading it, is not.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, encode
@@ -76,13 +77,17 @@ def encode_trajectory(
 
 def setpoints_at(trajectory: Trajectory, times: NDArray, rate_lead: float = RATE_LEAD) -> FullStateSetpoints:
     """What the controller is to be told at each time, (N,) s: the acceleration includes what makes up for drag."""
-    states = trajectory.at(times)
+    return _setpoints(trajectory.at(times), trajectory.at(times + rate_lead))
+
+
+def _setpoints(states: FullState, ahead: FullState) -> FullStateSetpoints:
+    """Of the states that are due, with the body rates of those ahead."""
     return FullStateSetpoints(
         position=states.position,
         velocity=states.velocity,
         acceleration=thrust_vector(states) - np.array([0.0, 0.0, GRAVITY]),
         quaternion=command_quaternion(states.quaternion),
-        body_rate=trajectory.at(times + rate_lead).body_rate,
+        body_rate=ahead.body_rate,
     )
 
 
@@ -93,22 +98,12 @@ def thrust_vector(states: FullState) -> NDArray:
 
 def command_quaternion(quaternion: NDArray) -> NDArray:
     """(N, 4) x y z w to send so that the controller arrives at the attitudes `quaternion`, (N, 4)."""
-    _, y, z = np.moveaxis(_rotations(quaternion), 2, 0)
-    yaw = np.arctan2(-y[:, 0], y[:, 1])
-    heading = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-    x = np.column_stack([heading, -np.sum(heading * z[:, :2], axis=1) / z[:, 2]])
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=2)).as_quat()
+    return _commands(np.array(quaternion, dtype=float))
 
 
 def controller_attitude(thrust: NDArray, quaternion: NDArray) -> NDArray:
     """(N, 3, 3) the attitudes that the controller makes of thrust vectors (N, 3) and received quaternions (N, 4)."""
-    x, y, z, w = np.moveaxis(quaternion, -1, 0)
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    axis = thrust / np.linalg.norm(thrust, axis=1, keepdims=True)
-    left = np.cross(axis, np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))]))
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
-    return np.stack([np.cross(left, axis), left, axis], axis=2)
+    return _attitudes(np.array(thrust, dtype=float), np.array(quaternion, dtype=float))
 
 
 def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimits) -> None:
@@ -125,7 +120,7 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimi
     told = decode(payloads)
     times = encoded.times + encoded.lead
     states = trajectory.at(times)
-    meant = setpoints_at(trajectory, times, encoded.rate_lead)
+    meant = _setpoints(states, trajectory.at(times + encoded.rate_lead))
     for name in ("position", "velocity", "acceleration", "body_rate"):
         error = np.abs(getattr(told, name) - getattr(meant, name)).max(axis=1)
         _require(
@@ -137,10 +132,10 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimi
     quantum = np.sqrt(3) * HALF_QUANTUM + _ROUNDING
     _require(thrust >= limits.specific_thrust_min - quantum, "too little specific thrust in the packet, m/s²", thrust)
     tilt = np.arccos(np.clip(force[:, 2] / thrust, -1.0, 1.0))
-    off = _angles(_rotations(told.quaternion), _rotations(meant.quaternion))
+    off = _angles(_frames(told.quaternion), _frames(meant.quaternion))
     _require(off <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", off)
     # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(tilt) as far.
-    off = _angles(controller_attitude(force, told.quaternion), _rotations(states.quaternion))
+    off = _angles(controller_attitude(force, told.quaternion), _frames(states.quaternion.copy()))
     _require(
         off * np.cos(tilt) <= ATTITUDE_QUANTUM, "the controller would not make the planned attitude, off by rad", off
     )
@@ -174,10 +169,89 @@ def _require(good: NDArray, what: str, values: NDArray) -> None:
         raise NotCertifiedError(f"{what} {values[row]:.4g}", where=f"setpoint {row}")
 
 
+@njit(cache=True, error_model="numpy")
 def _angles(first: NDArray, second: NDArray) -> NDArray:
     """(N,) rad between attitudes (N, 3, 3)."""
-    return 2 * np.arcsin(np.clip(np.linalg.norm(first - second, axis=(1, 2)) / np.sqrt(8), 0.0, 1.0))
+    out = np.empty(len(first))
+    for n in range(len(first)):
+        total = 0.0
+        for i in range(3):
+            for j in range(3):
+                total += (first[n, i, j] - second[n, i, j]) ** 2
+        half = math.sqrt(total / 8.0)
+        out[n] = 2.0 * math.asin(half if half <= 1.0 else 1.0) if half == half else half  # what is no number stays so
+    return out
 
 
-def _rotations(quaternion: NDArray) -> NDArray:
-    return Rotation.from_quat(quaternion).as_matrix()
+@njit(cache=True, error_model="numpy")
+def _frames(quaternions: NDArray) -> NDArray:
+    """(N, 3, 3) whose columns are the body axes of attitudes (N, 4), not zero."""
+    out = np.empty((len(quaternions), 3, 3))
+    for n in range(len(quaternions)):
+        x, y, z, w = quaternions[n, 0], quaternions[n, 1], quaternions[n, 2], quaternions[n, 3]
+        scale = 2.0 / (x * x + y * y + z * z + w * w)
+        out[n, 0, 0], out[n, 1, 1] = 1.0 - scale * (y * y + z * z), 1.0 - scale * (x * x + z * z)
+        out[n, 2, 2] = 1.0 - scale * (x * x + y * y)
+        out[n, 0, 1], out[n, 1, 0] = scale * (x * y - z * w), scale * (x * y + z * w)
+        out[n, 0, 2], out[n, 2, 0] = scale * (x * z + y * w), scale * (x * z - y * w)
+        out[n, 1, 2], out[n, 2, 1] = scale * (y * z - x * w), scale * (y * z + x * w)
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _attitudes(thrusts: NDArray, quaternions: NDArray) -> NDArray:
+    """What controller_attitude gives: z along the thrust, y along z × [cos yaw, sin yaw, 0]."""
+    out = np.empty((len(thrusts), 3, 3))
+    for n in range(len(thrusts)):
+        x, y, z, w = quaternions[n, 0], quaternions[n, 1], quaternions[n, 2], quaternions[n, 3]
+        yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        a, b, c = thrusts[n, 0], thrusts[n, 1], thrusts[n, 2]
+        norm = math.sqrt(a * a + b * b + c * c)
+        a, b, c = a / norm, b / norm, c / norm
+        left = (-c * sin, c * cos, a * sin - b * cos)
+        norm = math.sqrt(left[0] ** 2 + left[1] ** 2 + left[2] ** 2)
+        p, q, r = left[0] / norm, left[1] / norm, left[2] / norm
+        out[n, 0, 0], out[n, 1, 0], out[n, 2, 0] = q * c - r * b, r * a - p * c, p * b - q * a
+        out[n, 0, 1], out[n, 1, 1], out[n, 2, 1] = p, q, r
+        out[n, 0, 2], out[n, 1, 2], out[n, 2, 2] = a, b, c
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _commands(quaternions: NDArray) -> NDArray:
+    """What command_quaternion gives: z as planned, x above [cos yaw, sin yaw]."""
+    out = np.empty((len(quaternions), 4))
+    planned = _frames(quaternions)
+    for n in range(len(quaternions)):
+        frame = planned[n]
+        a, b, c = frame[0, 2], frame[1, 2], frame[2, 2]
+        yaw = math.atan2(-frame[0, 1], frame[1, 1])
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        rise = -(cos * a + sin * b) / c
+        norm = math.sqrt(1.0 + rise * rise)
+        p, q, r = cos / norm, sin / norm, rise / norm
+        frame[0, 0], frame[1, 0], frame[2, 0] = p, q, r
+        frame[0, 1], frame[1, 1], frame[2, 1] = b * r - c * q, c * p - a * r, a * q - b * p
+        _write_quaternion(out[n], frame)
+    return out
+
+
+@njit(error_model="numpy")
+def _write_quaternion(out: NDArray, frame: NDArray) -> None:
+    """x y z w of a rotation matrix, by way of the largest component (Shepperd 1978)."""
+    trace = frame[0, 0] + frame[1, 1] + frame[2, 2]
+    i = 0 if frame[0, 0] >= frame[1, 1] and frame[0, 0] >= frame[2, 2] else 1 if frame[1, 1] >= frame[2, 2] else 2
+    j, k = (i + 1) % 3, (i + 2) % 3
+    if trace >= frame[i, i]:
+        twice = math.sqrt(1.0 + trace)
+        for axis in range(3):
+            before, behind = (axis + 1) % 3, (axis + 2) % 3
+            out[axis] = (frame[behind, before] - frame[before, behind]) / (2.0 * twice)
+        out[3] = twice / 2.0
+    else:
+        twice = math.sqrt(1.0 + frame[i, i] - frame[j, j] - frame[k, k])
+        out[i] = twice / 2.0
+        out[j] = (frame[j, i] + frame[i, j]) / (2.0 * twice)
+        out[k] = (frame[k, i] + frame[i, k]) / (2.0 * twice)
+        out[3] = (frame[k, j] - frame[j, k]) / (2.0 * twice)
