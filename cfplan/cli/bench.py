@@ -109,6 +109,47 @@ def flights(path_files: tuple[Path, ...], output: Path | None, as_json: bool) ->
     _publish(result, output, as_json)
 
 
+@study.command(epilog="Example: cfplan study faults flights/line.yaml -o docs/studies/faults.json")
+@click.argument("path_file", metavar="PATH", type=click.Path(path_type=Path))
+@click.option("--only", multiple=True, help="Rows whose name has this in it; may be given several times.")
+@_output
+@options.as_json
+def faults(path_file: Path, only: tuple[str, ...], output: Path | None, as_json: bool) -> None:
+    """Let something go wrong at full speed along PATH, one fault a flight, and see what the pilot makes of it."""
+    from cfplan.studies.fault_scenarios import SCENARIOS
+    from cfplan.studies.faults import fault_table
+    from cfplan.studies.missions import plan_mission
+
+    _require_free(output)
+    wanted = [row for row in SCENARIOS if not only or any(text in row.name for text in only)]
+    with _progress("flying", as_json) as progress:
+        mission = plan_mission(path_file, options.find_safety_file(None, path_file))
+        result = fault_table(mission, path_file.stem, scenarios=wanted, command=_command(), progress=progress)
+    _publish(result, output, as_json)
+
+
+@study.command(epilog="Example: cfplan study random-faults flights/*.yaml -o docs/studies/random-faults.json")
+@click.argument("path_files", metavar="PATH...", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.option("--flights", "count", type=click.IntRange(1), default=200, show_default=True)
+@click.option("--seed", "first_seed", type=int, default=0, show_default=True, help="Of the first flight.")
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@_output
+@options.as_json
+def random_faults(
+    path_files: tuple[Path, ...], count: int, first_seed: int, jobs: int, output: Path | None, as_json: bool
+) -> None:
+    """Faults by chance along each PATH in turn: kind, moment, length and size drawn by seeds."""
+    from cfplan.studies.missions import plan_mission
+    from cfplan.studies.random_faults import random_flights
+
+    _require_free(output)
+    with _progress("flying", as_json) as progress:
+        missions = {file.stem: plan_mission(file, options.find_safety_file(None, file)) for file in path_files}
+        seeds = range(first_seed, first_seed + count)
+        result = random_flights(missions, seeds=seeds, jobs=jobs, command=_command(), progress=progress)
+    _publish(result, output, as_json)
+
+
 def _given(what: dict[str, Any]) -> dict[str, Any]:
     """What was not given is left to the study's own default."""
     return {name: value for name, value in what.items() if value != ()}

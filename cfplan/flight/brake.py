@@ -20,15 +20,19 @@ DURATION = 0.8  # s, from full speed to rest: 3.75 m/s² from 2 m/s on top of th
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
 
 
-def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION) -> NDArray:
-    """(N, M, 29) uint8: stop i begins with setpoint i's place and ends in hover; M setpoints at `rate`."""
+def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION, rows: NDArray | None = None) -> NDArray:
+    """(N, M, 29) uint8: stop i begins with setpoint i's place and ends in hover; M setpoints at `rate`.
+
+    Where `rows` are given, those of these setpoints alone.
+    """
     reference = decode(payloads)
+    begin = np.arange(len(payloads)) if rows is None else rows
     steps = round(duration * rate)
     share = np.arange(steps + 1) / steps
     clock_rate = 1.0 - share**2 * (3.0 - 2.0 * share)
     slowing = -6.0 * share * (1.0 - share) / duration
     elapsed = duration * rate * (share - share**3 + share**4 / 2.0)  # in setpoints; the integral of clock_rate
-    place = np.minimum(np.arange(len(payloads))[:, None] + elapsed, len(payloads) - 1.0)
+    place = np.minimum(begin[:, None] + elapsed, len(payloads) - 1.0)
     row = np.minimum(place.astype(int), max(len(payloads) - 2, 0))
     between = (place - row)[..., None]
 
@@ -43,7 +47,7 @@ def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION) -> 
     headed = np.stack([zero, zero, np.sin(turn / 2), np.cos(turn / 2)], axis=1)
     made = controller_attitude(acceleration.reshape(-1, 3) + _GRAVITY, headed)
     attitude = Rotation.from_matrix(made).as_quat()
-    shape = (len(payloads), steps + 1)
+    shape = (len(begin), steps + 1)
     body_rate = _ahead(_turn_rates(attitude.reshape(*shape, 4), rate), RATE_LEAD * rate)
     body_rate[:, -1] = 0.0  # the vehicle may be left with the last setpoint
     return encode(

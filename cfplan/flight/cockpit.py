@@ -63,7 +63,7 @@ class Cockpit:
         self._orders, self._sleep = orders, sleep
         self._watch = Watch(mission.limits)
         self._freshness, self._forecast = Freshness(mission.limits.pose.jump), Forecast()
-        self.plan = Stream(mission.payloads, mission.rate)
+        self.plan = Stream(mission.payloads, mission.rate, stop_from=mission.stops.__getitem__)
         self.stream: Stream | None = None
         # what each tick sends; None while the on-board commander flies
         self.muted = False
@@ -97,7 +97,8 @@ class Cockpit:
         if stream is not None and not self.muted:
             index = stream.index(now)
             self.link.send(stream.packets[index])
-            self.report(stream.sent(index, now, due))
+            if self.plan.start:
+                self.report(stream.sent(index, now, due))
             if stream is self.plan and now < stream.end:
                 self.late.append(now - due)
         self.waking.append(now - due)

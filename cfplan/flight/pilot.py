@@ -8,9 +8,11 @@ import math
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from cfplan.errors import CfplanError, ExitCode, PreflightError
+from cfplan.flight.brake import encode_stops
 from cfplan.flight.cockpit import REPLY, TRIES, Cockpit, LinkLost, OrdersFrom, Tripped
-from cfplan.flight.descent import encode_descent
 from cfplan.flight.ground import prepare
 from cfplan.flight.link import GO_TO, LAND, TAKE_OFF, Link
 from cfplan.flight.mission import Mission, manoeuvre_time, yaw_of
@@ -20,6 +22,7 @@ from cfplan.flight.poses import PoseSource
 from cfplan.flight.stream import Stream
 from cfplan.flight.supervisor import ARMED, FLYING, HIGH_LEVEL_ACTIVE
 from cfplan.flight.telemetry import Level, Phase, Telemetry
+from cfplan.flight.transfer import encode_transfer
 from cfplan.flight.watch import Trip
 
 SETTLED_WITHIN = 0.03  # m, from where the motion ended
@@ -74,8 +77,7 @@ class Pilot:
         cockpit = self._cockpit
         try:
             prepare(cockpit, self._connect, self._quieten)
-            self._take_off()
-            self._go_to_start()
+            self._go_to_start(self._take_off())
             self._fly_plan()
             self._hand_back()
             self._land()
@@ -93,10 +95,12 @@ class Pilot:
             return self._leave_plan(_safety(Rung.LAND, f"fault in the pilot: {error!r}"))
         return ExitCode.OK, "landed"
 
-    def _take_off(self) -> None:
+    def _take_off(self) -> Stream:
+        """Up, in the hands of the on-board commander; the way from there to the start."""
         cockpit = self._cockpit
         cockpit.enter(Phase.TAKE_OFF)
         height = self._mission.take_off_height
+        way = self._way_to_start(height)
         climb = height - cockpit.floor
         duration = manoeuvre_time(climb, self._limits.ground.take_off_speed)
         code = cockpit.ask(lambda: cockpit.link.take_off(height, duration), TAKE_OFF)
@@ -109,16 +113,23 @@ class Pilot:
         cockpit.until(lambda: abs(cockpit.pose().position[2] - height) < _AT_START_WITHIN, 2.0)
         if cockpit.pose().position[2] - cockpit.floor < climb / 2:
             raise Tripped(_safety(Rung.LAND, "the vehicle does not rise"))
+        return way
 
-    def _go_to_start(self) -> None:
+    def _way_to_start(self, height: float) -> Stream:
+        """From above where it stands."""
+        here, rate = self._cockpit.pose(), self._mission.rate
+        (x, y, _), (start, yaw) = here.position, self._mission.start
+        duration = manoeuvre_time(math.dist((x, y, height), start), self._limits.ground.go_to_speed)
+        payloads = encode_transfer((x, y, height), yaw_of(here.quaternion), start, yaw, duration, rate)
+        return Stream(payloads, rate, stop_from=lambda row: encode_stops(payloads, rate, rows=np.array([row]))[0])
+
+    def _go_to_start(self, way: Stream) -> None:
         cockpit = self._cockpit
         cockpit.enter(Phase.GO_TO_START)
-        start, yaw = self._mission.start
-        duration = manoeuvre_time(math.dist(cockpit.pose().position, start), self._limits.ground.go_to_speed)
-        code = cockpit.ask(lambda: cockpit.link.go_to(start, yaw, duration), GO_TO)
-        if code != 0:
-            raise Tripped(_safety(Rung.LAND, f"the vehicle does not go to the start (code {code})"))
-        cockpit.pause(duration)
+        start, _ = self._mission.start
+        way.start = cockpit.pace.upcoming
+        cockpit.stream = way
+        cockpit.until(lambda: cockpit.now() > way.end, math.inf)
         near_since = math.inf
 
         def settled() -> bool:
@@ -216,7 +227,8 @@ class Pilot:
         begin, hover, pose = cockpit.pace.upcoming, cockpit.stream, cockpit.pose()
         place, quaternion = (pose.position, pose.quaternion) if hover is None else hover.states[hover.last][0::3][:2]
         floor = cockpit.floor - _BELOW_FLOOR
-        down = encode_descent(place, yaw_of(quaternion), floor, duration, self._mission.rate)
+        yaw = yaw_of(quaternion)
+        down = encode_transfer(place, yaw, (*place[:2], floor), yaw, duration, self._mission.rate)
         cockpit.stream = Stream(down, self._mission.rate, begin)
         cockpit.pause(duration + _TOUCH)
         cockpit.stream = None
@@ -266,27 +278,29 @@ class Pilot:
     def _stop(self) -> None:
         """Along the path to a hover, or to the end of a stop that has begun; without a stream it is slow already."""
         cockpit = self._cockpit
-        if cockpit.stream is cockpit.plan:
-            index = self._present_index()
-            self._stopped_at = cockpit.pace.upcoming
-            cockpit.stream = Stream(self._mission.stops[index], self._mission.rate, self._stopped_at)
+        left = cockpit.stream
+        if left is not None and left.stop_from is not None:
+            stop = left.stop_from(self._present_index(left))
+            cockpit.stream = Stream(stop, self._mission.rate, cockpit.pace.upcoming)
+            if left is cockpit.plan:
+                self._stopped_at = cockpit.stream.start
         if cockpit.stream is not None:
             end = cockpit.stream.end
             cockpit.until(lambda: cockpit.now() > end, math.inf)
 
-    def _present_index(self) -> int:
+    def _present_index(self, stream: Stream) -> int:
         """The setpoint from which to stop: that of the moment, or the nearest before it if the vehicle fell behind."""
         cockpit = self._cockpit
-        due = cockpit.plan.index(cockpit.now())
+        due = stream.index(cockpit.now())
         pose = cockpit.pose()
         if cockpit.now() - pose.time > self._limits.pose.age_warning:
             return due
         lead = self._mission.lead
-        if math.dist(pose.position, cockpit.plan.position(pose.time - lead)) < _BEHIND:
+        if math.dist(pose.position, stream.position(pose.time - lead)) < _BEHIND:
             return due
         nearest, least = due, math.inf
         for index in range(due, -1, -1):
-            distance = math.dist(pose.position, cockpit.plan.states[index][0])
+            distance = math.dist(pose.position, stream.states[index][0])
             if distance < least:
                 nearest, least = index, distance
             elif distance > least + _BEHIND:  # what comes nearer again is another turn of the path

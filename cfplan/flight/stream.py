@@ -1,5 +1,6 @@
 """A run of encoded setpoints, sampled by the clock."""
 
+from collections.abc import Callable
 from typing import Any
 
 from numpy.typing import NDArray
@@ -15,9 +16,16 @@ class Stream:
     Everything slow is done here at once, so that sending is a look-up.
     """
 
-    def __init__(self, payloads: NDArray, rate: float, start: float = 0.0):
-        # payloads (N, 29) uint8, the last of them at rest; start in s on the clock of time.monotonic()
-        self.start, self.rate = start, rate
+    def __init__(
+        self,
+        payloads: NDArray,
+        rate: float,
+        start: float = 0.0,
+        stop_from: Callable[[int], NDArray] | None = None,
+    ):
+        # payloads (N, 29) uint8, the last of them at rest; start in s on the clock of time.monotonic();
+        # stop_from gives (M, 29) uint8, a way to stop from one of them; None where it is a stop itself
+        self.start, self.rate, self.stop_from = start, rate, stop_from
         self.packets: list[Any] = [packet(GENERIC_PORT, 0, row.tobytes()) for row in payloads]
         state = decode(payloads)
         fields = (state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate)

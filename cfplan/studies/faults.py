@@ -33,6 +33,8 @@ from cfplan.studies.fault_scenarios import SCENARIOS, Scenario
 from cfplan.studies.machine import Machine, this_machine
 
 COLUMNS = ("fault", "must come to", "rung", "reacts after", "off the plan", "to the wall", "end", "record")
+_DOWN = 0.05  # m
+_SETTLING = 0.1  # s in which the supervisor notices that it was disarmed
 _AFTERWARDS = 6.0  # s in which what the pilot left behind comes to rest
 _ARMED = (State.ARMING, State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
 _RUNGS = {f"{rung.name.lower()}:": rung for rung in Rung}
@@ -201,8 +203,11 @@ def fly_stepped(
         flown.reason = "the pilot was killed"
     except CfplanError as error:
         flown.reason = str(error)
-    lab.sleep(_AFTERWARDS)
+    lab.sleep(_SETTLING)
     flown.truth = lab.truth()
+    if flown.truth.position[-1, 2] > _DOWN or flown.truth.motor[-1].any():
+        lab.sleep(_AFTERWARDS)
+        flown.truth = lab.truth()
     return flown
 
 
@@ -224,7 +229,7 @@ def judge(scenario: Scenario, flown: Flown, mission: Mission, readable: bool) ->
         off_plan=_off_plan(flown, mission),
         to_wall=float(-_beyond_walls(truth, mission).max()),
         motors_off=int(truth.off_in_air[-1]),
-        landed=bool(truth.position[-1, 2] < 0.05 and not truth.motor[-1].any()),
+        landed=bool(truth.position[-1, 2] < _DOWN and not truth.motor[-1].any()),
         disarmed=truth.supervisor[-1] not in _ARMED,
         readable=readable,
         reason=flown.reason,

@@ -34,7 +34,7 @@ def test_each_setpoint_is_sent_when_it_is_due(world, mission, fly):
 def test_the_command_comes_before_the_priority_is_given_back(world, fly):
     fly()
     after_take_off = world.calls[world.calls.index("take off") :]
-    assert after_take_off[:5] == ["take off", "go to", "go to", "release", "land"]
+    assert after_take_off[:4] == ["take off", "go to", "release", "land"]
 
 
 def test_good_poses_are_forwarded_while_the_stream_runs(world, fly):

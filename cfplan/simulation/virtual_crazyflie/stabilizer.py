@@ -11,10 +11,18 @@ from numpy.typing import NDArray
 
 from cfplan.simulation.body import ALL_WELL, FLOOR, STILL_AIR, TIME_STEP, at_rest, pack_body, rotation, step_body
 from cfplan.simulation.estimator import Filter, estimate, new_filter, reset, step_filter
-from cfplan.simulation.mellinger import FULL_COMMAND, MEMORY_SIZE, distribute_power, level_out, step_mellinger
+from cfplan.simulation.mellinger import (
+    DISABLE,
+    FULL_COMMAND,
+    MEMORY_SIZE,
+    MODE_Z,
+    distribute_power,
+    level_out,
+    step_mellinger,
+)
 from cfplan.simulation.virtual_crazyflie.pid import MEMORY_SIZE as PID_MEMORY_SIZE
 from cfplan.simulation.virtual_crazyflie.pid import OUTPUT_LIMIT, OVERHEAD, default_gains, default_limits, step_pid
-from cfplan.simulation.virtual_crazyflie.setpoints import Setpoint
+from cfplan.simulation.virtual_crazyflie.setpoints import THRUST, Setpoint
 from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
@@ -105,6 +113,7 @@ class Stabilizer:
         _run(
             self.loop, self.body, self.gains if self.mellinger else NO_MELLINGER, self.pid_gains, self.pid_limits,
             self.prior, values, mode, setpoint.velocity_in_body, poses, tick, ticks, allowed, flying, self._per_command,
+            allowed and bool(mode[MODE_Z] != DISABLE or values[THRUST] > 0),
         )  # fmt: skip
 
 
@@ -135,6 +144,7 @@ def _run(
     allowed: bool,
     flying: bool,
     per_command: float,
+    asked: bool,
 ) -> None:
     gyro, measured = np.empty(3), np.empty(3)
     none = poses[:0]
@@ -157,12 +167,15 @@ def _run(
                     loop.belief, now,
                 )  # fmt: skip
             distribute_power(loop.control, loop.motors)
-        _drive(loop, body, allowed, per_command)
+        _drive(loop, body, allowed, per_command, asked)
 
 
 @njit(cache=True)
-def _drive(loop: Loop, body: NDArray, allowed: bool, per_command: float) -> None:
-    """Turn the motors, move the body, and note what an accelerometer there feels."""
+def _drive(loop: Loop, body: NDArray, allowed: bool, per_command: float, asked: bool) -> None:
+    """Turn the motors, move the body, and note what an accelerometer there feels.
+
+    Motors count as off where nothing asks them to turn, not where the controller wants no thrust for a moment.
+    """
     off = True
     command = np.empty(4)
     for motor in range(4):
@@ -170,7 +183,7 @@ def _drive(loop: Loop, body: NDArray, allowed: bool, per_command: float) -> None
             loop.motors[motor] = 0.0
         off = off and loop.motors[motor] == 0.0
         command[motor] = loop.motors[motor] * per_command
-    if off:
+    if off and not asked:
         loop.counts[OFF_TICKS] += 1
         if loop.truth[2] > body[FLOOR] + IN_AIR:
             loop.counts[OFF_IN_AIR_TICKS] += 1

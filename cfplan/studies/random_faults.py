@@ -1,0 +1,147 @@
+"""Faults by chance: kind, moment, length and size drawn by a seed, each flown in the stepped lab. None may leave."""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from cfplan.flight.mission import Mission
+from cfplan.flight.outcome import Rung
+from cfplan.flight.telemetry import Phase
+from cfplan.simulation.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.stepped_lab import Fault
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_vicon_faults import FaultKind, ViconFault
+from cfplan.studies.fault_scenarios import Scenario
+from cfplan.studies.faults import FaultFlight, fly_stepped, judge
+from cfplan.studies.machine import Machine, this_machine
+
+_LENGTH, _SPREAD = 0.5, 1.2  # s and its logarithm's deviation: a twentieth of a second to some seconds
+_WHILE_FLYING = (Phase.TAKE_OFF, Phase.GO_TO_START, Phase.STREAM, Phase.STREAM, Phase.STREAM, Phase.HOLD, Phase.LAND)
+_STALL, _MAIN, _PILOT = "stall", "main process killed", "pilot killed"
+
+# Kind, and the least and most size where it has one.
+_KINDS: tuple[tuple[Any, float, float], ...] = (
+    (FaultKind.OCCLUDE, 0, 0),
+    (FaultKind.STALL, 0, 0),
+    (FaultKind.FREEZE, 0, 0),
+    (FaultKind.REPEAT, 0, 0),
+    (FaultKind.JUMP, -2.0, 2.0),
+    (FaultKind.FLIP, -math.pi, math.pi),
+    (FaultKind.BREAK, 0, 0),
+    (FaultKind.DELAY, 0.02, 0.5),
+    (FaultKind.CLOSE, 0, 0),
+    (RadioFaultKind.LOSS, 0.05, 0.8),
+    (RadioFaultKind.DELAY, 0.005, 0.05),
+    (RadioFaultKind.DEAD, 0, 0),
+    (VehicleFaultKind.MOTOR, 0.7, 1.0),
+    (VehicleFaultKind.MASS, 0.8, 1.2),
+    (VehicleFaultKind.GUST, -1.5, 1.5),
+    (VehicleFaultKind.BATTERY, 3.0, 3.4),
+    (VehicleFaultKind.TUMBLE, 0, 0),
+    (VehicleFaultKind.LOCK, 0, 0),
+    (_STALL, 0, 0),
+    (_MAIN, 0, 0),
+    (_PILOT, 0, 0),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RandomFlights:
+    """A whole run."""
+
+    command: str
+    machine: Machine
+    first_seed: int
+    flights: tuple[tuple[str, FaultFlight], ...]
+    # with the path of each
+
+    @property
+    def outside(self) -> list[str]:
+        """The names of those that left the walls."""
+        return [flight.name for _, flight in self.flights if flight.to_wall < 0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
+        """Rungs and distances by kind of fault."""
+        rows = []
+        for kind in dict.fromkeys(flight.name.split(" ", 1)[0] for _, flight in self.flights):
+            of_kind = [flight for _, flight in self.flights if flight.name.split(" ", 1)[0] == kind]
+            rungs = Counter(flight.rung for flight in of_kind)
+            rows.append(
+                [
+                    kind,
+                    str(len(of_kind)),
+                    ", ".join(f"{count} {rung}" for rung, count in rungs.items()),
+                    f"{100 * max(flight.off_plan for flight in of_kind):.0f} cm",
+                    f"{min(flight.to_wall for flight in of_kind):.2f} m",
+                    str(sum(not (flight.landed and flight.disarmed) for flight in of_kind)),
+                ]
+            )
+        title = f"{len(self.flights)} random faults, {len(self.outside)} outside the walls"
+        return [(title, ["fault", "flights", "rungs", "off the plan", "to the wall", "not landed"], rows)]
+
+
+def random_scenario(seed: int, duration: float) -> Scenario:
+    """What goes wrong in flight number `seed`, along a path of `duration` s."""
+    chance = np.random.default_rng(seed)
+    kind, least, most = _KINDS[chance.integers(len(_KINDS))]
+    phase = _WHILE_FLYING[chance.integers(len(_WHILE_FLYING))]
+    moment = float(chance.uniform(0.0, duration if phase is Phase.STREAM else 1.5))
+    length = float(_LENGTH * np.exp(_SPREAD * chance.normal()))
+    size = float(chance.uniform(least, most)) if most > least else None
+    faults: tuple[Fault, ...] = ()
+    if isinstance(kind, FaultKind):
+        faults = (ViconFault(kind, 0.0, length, size),)
+    elif isinstance(kind, RadioFaultKind):
+        faults = (RadioFault(kind, 0.0, length, size),)
+    elif isinstance(kind, VehicleFaultKind):
+        faults = (VehicleFault(kind, 0.0, length, size),)
+    what = str(kind).replace(" ", "-")
+    of_size = f" {size:.2f}" if size is not None else ""
+    group = {FaultKind: "pose", RadioFaultKind: "radio", VehicleFaultKind: "vehicle"}.get(type(kind), "computer")
+    return Scenario(
+        name=f"{group}:{what}{of_size} for {length:.2f} s, {moment:.2f} s into {phase}, seed {seed}",
+        rung=Rung.NONE,
+        faults=faults,
+        phase=phase,
+        moment=moment,
+        stall=length if kind == _STALL else 0.0,
+        main_killed=kind == _MAIN,
+        pilot_killed=kind == _PILOT,
+        vehicle=VehicleSettings(auto_arming=False, seed=seed),
+    )
+
+
+def fly_random(seed: int, missions: Mapping[str, Mission]) -> tuple[str, FaultFlight]:
+    """Flight number `seed`, along one of the paths; which, and what came of it."""
+    names = sorted(missions)
+    name = names[seed % len(names)]
+    scenario = random_scenario(seed, missions[name].duration)
+    return name, judge(scenario, fly_stepped(scenario, missions[name], seed=seed), missions[name], readable=False)
+
+
+def random_flights(
+    missions: Mapping[str, Mission],
+    *,
+    seeds: Sequence[int],
+    command: str = "",
+    jobs: int = 1,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> RandomFlights:
+    """Fly a fault for each seed, on `jobs` processes."""
+    from joblib import Parallel, delayed
+
+    flown = []
+    work = Parallel(n_jobs=jobs, return_as="generator")(delayed(fly_random)(seed, missions) for seed in seeds)
+    for done, flight in enumerate(work):
+        progress(done + 1, len(seeds))
+        flown.append(flight)
+    return RandomFlights(command, this_machine(), seeds[0] if seeds else 0, tuple(flown))

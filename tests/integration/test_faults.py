@@ -1,0 +1,71 @@
+"""The fault table: each row at full speed in the stepped lab, judged by the simulated truth."""
+
+from pathlib import Path
+
+import pytest
+
+from cfplan.studies.fault_scenarios import SCENARIOS
+from cfplan.studies.faults import fly_scenario
+from cfplan.studies.missions import plan_mission
+from cfplan.studies.random_faults import fly_random
+
+REPOSITORY = Path(__file__).parents[2]
+pytestmark = pytest.mark.integration
+
+# One of each kind; the others are as many as take some minutes.
+QUICK = (
+    "poses stop for 5 s",
+    "poses 200 ms late for good",
+    "radio loses 50 %",
+    "radio dead for 1 s",
+    "stream stalled for 0.6 s",
+    "take-off refused",
+    "disk full",
+)
+SEEDS, PATHS = range(200), ("helix", "line", "loop3d", "random", "slalom")
+
+
+@pytest.fixture(scope="module")
+def line():
+    return plan_mission(REPOSITORY / "flights" / "line.yaml", REPOSITORY / "safety.yaml")
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [pytest.param(row, id=row.name, marks=[] if row.name in QUICK else pytest.mark.slow) for row in SCENARIOS],
+)
+def test_a_fault_comes_to_its_rung_and_the_vehicle_to_the_ground(scenario, line):
+    flown = fly_scenario(scenario, line)
+    assert flown.rung == flown.expected, flown.reason
+    assert flown.to_wall > 0.0
+    assert flown.landed
+    assert flown.disarmed
+    assert flown.readable
+    if not scenario.falls and flown.rung != "cut":
+        assert flown.motors_off == 0
+        assert flown.off_plan < 0.4
+
+
+def test_the_quick_rows_are_rows_of_the_table():
+    assert set(QUICK) <= {row.name for row in SCENARIOS}
+
+
+def test_a_flight_in_the_stepped_lab_repeats_to_the_last_bit(line):
+    assert fly_random(11, {"line": line}) == fly_random(11, {"line": line})
+
+
+@pytest.mark.parametrize("seed", [8, 23])
+def test_a_random_fault_stays_inside_the_walls(seed, line):
+    _, flown = fly_random(seed, {"line": line})
+    assert flown.to_wall > 0.0
+    assert flown.landed
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_no_random_fault_of_two_hundred_leaves_the_walls():
+    missions = {
+        name: plan_mission(REPOSITORY / "flights" / f"{name}.yaml", REPOSITORY / "safety.yaml") for name in PATHS
+    }
+    outside = [flown.name for _, flown in (fly_random(seed, missions) for seed in SEEDS) if flown.to_wall <= 0.0]
+    assert not outside
