@@ -28,7 +28,7 @@ from cfplan.errors import InputError
 @click.option("--hidden", type=int, default=64, show_default=True, help="Size of each LSTM, in each direction.")
 @click.option("--layers", type=int, default=2, show_default=True)
 @click.option("--window", type=int, default=64, show_default=True, help="Intervals that the network sees at once.")
-@click.option("--epochs", type=int, default=60, show_default=True)
+@click.option("--epochs", type=int, default=40, show_default=True)
 @click.option("--windows", type=int, default=2, show_default=True, help="Windows of each path, an epoch.")
 @click.option("--batch", type=int, default=64, show_default=True, help="Windows a step.")
 @click.option("--rate", type=float, default=2e-3, show_default=True, help="Learning rate at its highest.")

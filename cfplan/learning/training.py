@@ -6,6 +6,7 @@ goes on as if it had not been. Under torchrun each process takes its share of th
 
 import csv
 import io
+import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -55,7 +57,7 @@ class Options:
     hidden: int = 64
     layers: int = 2
     window: int = WINDOW
-    epochs: int = 60
+    epochs: int = 40
     windows: int = 2
     # of each path, an epoch
     batch: int = 64
@@ -139,6 +141,8 @@ class _Run:
             "features": features.VERSION,
         }
         self.seen, self.unseen = _split(material, options.seed)
+        self.noise: tuple[int, Labels] | None = None
+        self.log: list[Epoch] = []
         torch.manual_seed(options.seed)
         self.network = build(options.architecture, options.hidden, options.layers)
         self._normalise()
@@ -148,8 +152,6 @@ class _Run:
         per_process = len(self.seen.rows) * options.windows // world
         self.batch = max(1, min(options.batch // world, per_process))
         self.batches = per_process // self.batch
-        self.log: list[Epoch] = []
-        self.noise: tuple[int, Labels] | None = None
         self.unseen_windows = self._windows(self.unseen, np.tile(np.arange(len(self.unseen.rows)), 2), _SPLIT, 0)
         self._resume()
 
@@ -308,7 +310,7 @@ class _Run:
             content = torch.load(file, map_location=self.place, weights_only=True)
             identity = content["identity"]
             different = [
-                f"{part} {name} {identity[part].get(name)} there, {value} here"
+                f"{name} {identity[part].get(name)} there, {value} here"
                 for part in ("options", "data")
                 for name, value in self.identity[part].items()
                 if identity[part].get(name) != value
@@ -322,7 +324,16 @@ class _Run:
             self.network.load_state_dict(content["network"])
             self.optimiser.load_state_dict(content["optimiser"])
             self.log = [Epoch(**row) for row in content["log"]]
-        except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, EOFError) as error:
+        except (
+            OSError,
+            RuntimeError,
+            ValueError,
+            LookupError,
+            TypeError,
+            AttributeError,
+            EOFError,
+            UnpicklingError,
+        ) as error:
             reason = " ".join(str(error).split())[:120]
             raise InputError(f"cannot be read: {reason}", where=str(file), hint="delete it to begin again") from None
 
@@ -349,10 +360,9 @@ def _split(material: Material, seed: int) -> tuple[Material, Material]:
 
 
 def _plain(content: Any) -> dict[str, Any]:
-    return {
-        name: str(value) if isinstance(value, str) else list(value) if isinstance(value, tuple) else value
-        for name, value in asdict(content).items()
-    }
+    """As a card has it: JSON knows no tuples."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(content)))
+    return plain
 
 
 @contextmanager
