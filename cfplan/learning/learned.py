@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from cfplan.errors import InputError
 from cfplan.expert.preconditions import broken_by, check_arguments, unsolvable
@@ -41,6 +42,8 @@ from cfplan.vehicle.profile import BoundaryState
 LEAST_NODES = 10
 LEAD = 3.0
 # intervals over which the profile comes to a state given for the end
+LOWERED_WIDTH = 2.0
+# nodes, over which lowering for tighter limits is smoothed
 
 
 def plan_learned(
@@ -57,7 +60,8 @@ def plan_learned(
 ) -> Solution:
     """Plan over `nodes` intervals uniform in s, or over one window's where those are more; see Planner.
 
-    Speed is the model's, at its own limits where they are looser than `limits`: repair does the rest.
+    Limits looser than the model's are used as far as the model knows; for tighter ones the profile is lowered to about
+    what they allow, and repair does the rest.
 
     Raises:
         InputError: fewer than ten nodes, arguments that are not numbers, or no model for this vehicle and these limits.
@@ -83,9 +87,10 @@ def plan_learned(
     track = None
     if yaw is not YawMode.FREE:
         track = (tangent_yaw if yaw is YawMode.TANGENT else fixed_yaw)(path, nodes, yaw_angle, start, end)
+    known, allowed = model.card.limits, model.limits_within(limits)
     coefficients, turned = predict(
-        path, model.network, bounds(airframe, model.card.limits), nodes, model.window,
-        start=start, end=end, track=track, yaw_angle=yaw_angle,
+        path, model.network, bounds(airframe, known), nodes, model.window, start=start, end=end,
+        track=track, yaw_angle=yaw_angle, allowed=bounds(airframe, allowed) if allowed != known else None,
     )  # fmt: skip
     if not (np.isfinite(coefficients).all() and np.isfinite(turned).all() and (coefficients[1:-1] > 0).all()):
         return Solution(Status.NOT_CONVERGED, None, f"the network {model.name} answered what is not a number")
@@ -110,10 +115,12 @@ def predict(
     end: BoundaryState | None = None,
     track: YawTrack | None = None,
     yaw_angle: float = 0.0,
+    allowed: Bounds | None = None,
 ) -> tuple[NDArray, NDArray]:
     """(N+3,) coefficients of the spline of h, and (N+1,) yaw at the nodes, rad: that of the track, else the network's.
 
-    Not finite where the network fails. `nodes` is at least `window`.
+    `bound` is what the network was trained for, `allowed` what is asked for where that is less. Not finite where the
+    network fails. `nodes` is at least `window`.
     """
     step = path.end / nodes
     table = node_table(path, 0.0, step, nodes + 1, bound)
@@ -140,6 +147,9 @@ def predict(
             turned = np.unwrap(np.arctan2(answer[:, 2], answer[:, 1]))[: part.keep + 1]
             yaw[first : stop + 1] = angle + turned - turned[0]
             angle, turning = yaw[stop], yaw[stop] - yaw[stop - 1]
+    if allowed is not None:
+        asked = node_table(path, 0.0, step, nodes + 1, allowed)[:, REFERENCE]
+        _lower(logs, table[:, REFERENCE], asked, rest_start, rest_end)
     with np.errstate(over="ignore"):  # then they are not finite
         coefficients = np.exp(2.0 * (logs + np.log(step)))
     if start is not None:
@@ -147,6 +157,17 @@ def predict(
     if end is not None:
         _lead_to(coefficients, end, step)
     return coefficients, yaw
+
+
+def _lower(logs: NDArray, known: NDArray, asked: NDArray, rest_start: bool, rest_end: bool) -> None:
+    """Lower by as much as the reference is lower, less what the profile lies under its own reference already."""
+    gap = np.maximum(known - asked - np.maximum(known - logs[1:-1], 0.0), 0.0)
+    gap = gaussian_filter1d(np.pad(gap, 1, mode="edge"), LOWERED_WIDTH, mode="nearest")
+    if rest_start:
+        gap[:4] = gap[:4].max()
+    if rest_end:
+        gap[-4:] = gap[-4:].max()
+    logs -= gap
 
 
 def _lead_to(coefficients: NDArray, end: BoundaryState, step: float) -> None:

@@ -107,11 +107,12 @@ def test_each_window_begins_where_the_one_before_was_left(model):
 
 def test_a_start_state_is_met_exactly(model):
     state = BoundaryState(h=0.8, dh=0.3, ddh=-0.2, yaw=0.2, dyaw=0.0)
-    inside = PATH
-    solution = plan(model, inside, nodes=120, start=replace(state, dh=0.0, ddh=0.0), end=None)
+    solution = plan(model, nodes=120, start=state)
     assert solution.status is Status.SOLVED, solution.reason
-    assert solution.profile.boundary(0).h == pytest.approx(0.8)
-    assert solution.profile.boundary(0).yaw == pytest.approx(0.2)
+    found = solution.profile.boundary(0)
+    for name in ("h", "dh", "ddh", "yaw", "dyaw"):
+        assert getattr(found, name) == pytest.approx(getattr(state, name), abs=1e-9)
+    Trajectory(PATH, solution.profile, CHOSEN.airframe)
 
 
 def test_an_end_state_is_met_exactly(model):
@@ -138,6 +139,27 @@ def test_yaw_is_held_or_follows_the_path(model):
     middle = 100
     x, y, _ = PATH(profile.s[middle], 1)
     assert math.remainder(profile.yaw[middle] - math.atan2(y, x), 2 * math.pi) == pytest.approx(0.0, abs=0.2)
+
+
+def test_free_yaw_is_the_networks_and_continuous(model):
+    profile = plan(model, long_path(8), nodes=200, yaw=YawMode.FREE, yaw_angle=0.3).profile
+    assert np.ptp(profile.yaw) > 0.01
+    assert profile.dyaw[0] == profile.dyaw[-1] == 0.0
+    before = profile.at(profile.s[1:], np.arange(200))
+    np.testing.assert_allclose(before.yaw, profile.yaw[1:], atol=1e-9)
+    np.testing.assert_allclose(before.dyaw, profile.dyaw[1:], atol=1e-9)
+
+
+def test_tighter_limits_lower_the_profile_and_looser_ones_leave_it(model):
+    own = plan(model).profile
+    for change, compare in (({"speed": 3.0, "tilt": 1.0}, np.equal), ({"speed": 1.2}, np.less_equal)):
+        limits = replace(CHOSEN.limits, **change)
+        found = plan_learned(PATH, CHOSEN.airframe, limits, model=model).profile
+        assert compare(found.h, own.h).all()
+    speed = np.linalg.norm(PATH(found.s, 1), axis=1) * np.sqrt(found.h)
+    before = np.linalg.norm(PATH(own.s, 1), axis=1) * np.sqrt(own.h)
+    assert speed.max() < 0.75 * before.max()
+    Trajectory(PATH, found, CHOSEN.airframe)
 
 
 def test_work_grows_with_the_path_and_no_faster(model):
