@@ -69,7 +69,7 @@ class DensePath:
         share = (np.arange(counts.sum()) - self.first[self.interval]) / (counts[self.interval] - 1)
         self.places = (1.0 - np.cos(np.pi * share)) / 2.0 * step
         s = self.interval * step + self.places
-        self.derivatives = np.stack([path(s, order).T for order in (1, 2, 3, 4)])
+        self.derivatives = path.derivatives(s)[1:]
 
     def excess(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Excess:
         """Of a profile with as many intervals; h must be positive."""

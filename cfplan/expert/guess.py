@@ -21,7 +21,7 @@ def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int,
     vertical |ω| = h^1.5 |γ'''|/g and |α| = h²|γ''''|/g.
     """
     s = np.clip(np.arange(-1, nodes + 2) * (path.end / nodes), 0.0, path.end)
-    first, second, third, fourth = (np.maximum(np.linalg.norm(path(s, k), axis=1), 1e-9) for k in (1, 2, 3, 4))
+    first, second, third, fourth = np.maximum(np.linalg.norm(path.derivatives(s)[1:], axis=1), 1e-9)
     up = limits.motor_thrust_max - airframe.hover_thrust
     down = airframe.hover_thrust - limits.motor_thrust_min
     acceleration = min(limits.acceleration, GRAVITY * np.tan(min(limits.tilt, 1.0)), 4 * up / airframe.mass)

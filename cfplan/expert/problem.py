@@ -182,8 +182,7 @@ def _parameters(
 ) -> NDArray:
     data = np.zeros((len(layout.interval), stage.POINT_DATA))
     s = (layout.interval + layout.place) * step
-    for order in (1, 2, 3, 4):
-        data[:, 3 * order - 3 : 3 * order] = path(s, order) * step**order
+    data[:, :12] = (path.derivatives(s)[1:] * step ** np.arange(1, 5)[:, None, None]).reshape(12, -1).T
     data[:, 12], data[:, 13] = layout.place, layout.weight
     psi, psi_ds, psi_dds = track.at(layout.interval, layout.place, step)
     data[:, 14], data[:, 15], data[:, 16] = psi, psi_ds * step, psi_dds * step**2

@@ -4,9 +4,11 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
+from cfplan.geometry.polynomials import shifted
 
 MAX_ORDER = 5
 STANDSTILL = 0.01
@@ -36,7 +38,7 @@ class Path:
 
     def __post_init__(self) -> None:
         breaks = np.array(self.breaks, dtype=float)
-        table = np.array(self.coefficients, dtype=float)
+        table = np.array(self.coefficients, dtype=float, order="C")
         if breaks.ndim != 1 or table.ndim != 3 or table.shape[::2] != (len(breaks) - 1, 3) or not table.shape[1]:
             raise InputError(f"breaks {breaks.shape} and coefficients {table.shape} do not make a path")
         if not (np.isfinite(breaks).all() and np.isfinite(table).all()):
@@ -77,14 +79,26 @@ class Path:
         """The derivative of that order, 0 to 5, with respect to s: shape s.shape + (3,)."""
         if not 0 <= order <= MAX_ORDER:
             raise ValueError(f"a path has derivatives of order 0 to {MAX_ORDER}, not {order}")
-        s = np.clip(np.asarray(s, dtype=float), 0.0, self.breaks[-1])
-        piece = np.minimum(np.searchsorted(self.breaks, s, side="right") - 1, len(self.origins) - 1)
-        x = (s - self.origins[piece])[..., None]
-        terms = self._tables[order][piece]
-        value = terms[..., -1, :]
-        for power in range(terms.shape[-2] - 2, -1, -1):
-            value = terms[..., power, :] + x * value
-        return value
+        s = np.array(s, dtype=float)
+        return _values(self.breaks, self.origins, self._tables[order], s.ravel()).reshape(*s.shape, 3)
+
+    def derivatives(self, s: NDArray) -> NDArray:
+        """(5, 3, N) γ and its first four derivatives at s, (N,): in one pass, for where many are wanted."""
+        out = np.empty((5, 3, len(s)))
+        _trace(self.breaks, self.origins, self.coefficients, np.asarray(s, dtype=float), out)
+        return out
+
+    def part(self, low: float, high: float) -> "Path":
+        """The path from s = low to s = high, with s counted from there; two pieces at least, so that rests stay exact."""
+        first = int(np.searchsorted(self.breaks, low, side="right")) - 1
+        last = int(np.searchsorted(self.breaks, high, side="left"))
+        piece = np.arange(first, last)
+        inner = self.breaks[first + 1 : last]
+        if not len(inner):
+            piece, inner = np.repeat(piece, 2), np.array([(low + high) / 2])
+        breaks = np.concatenate([[low], inner, [high]])
+        origins = np.append(breaks[:-2], high)
+        return Path(breaks - low, shifted(self.coefficients[piece], origins - self.origins[piece]))
 
     def placed(self, offset: ArrayLike, yaw: float = 0.0) -> "Path":
         """This path turned by `yaw` about the world's z axis, then moved by `offset`, (3,) m."""
@@ -129,6 +143,47 @@ class Path:
             where=where,
             hint="move a waypoint aside there so that the path turns in a curve, or split the flight in two",
         )
+
+
+@njit(cache=True)
+def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray, out: NDArray) -> None:
+    piece, count = 0, coefficients.shape[1]
+    for n in range(len(s)):
+        place = min(max(s[n], 0.0), breaks[-1])
+        if place < breaks[piece]:
+            piece = 0
+        while piece < len(origins) - 1 and place >= breaks[piece + 1]:
+            piece += 1
+        x = place - origins[piece]
+        for axis in range(3):
+            a = b = c = d = e = 0.0  # derivatives over factorials, by Horner
+            for power in range(count - 1, -1, -1):
+                e = e * x + d
+                d = d * x + c
+                c = c * x + b
+                b = b * x + a
+                a = a * x + coefficients[piece, power, axis]
+            out[0, axis, n], out[1, axis, n], out[2, axis, n] = a, b, 2.0 * c
+            out[3, axis, n], out[4, axis, n] = 6.0 * d, 24.0 * e
+
+
+@njit(cache=True)
+def _values(breaks: NDArray, origins: NDArray, table: NDArray, places: NDArray) -> NDArray:
+    """(N, 3) of piecewise polynomials at each s, (N,)."""
+    out = np.empty((len(places), 3))
+    last = len(origins) - 1
+    piece = 0
+    for n in range(len(places)):
+        s = places[n]
+        s = 0.0 if s < 0.0 else breaks[-1] if s > breaks[-1] else s
+        if not (breaks[piece] <= s and (s < breaks[piece + 1] or piece == last)):
+            piece = min(max(int(np.searchsorted(breaks, s, side="right")) - 1, 0), last)
+        terms, x = table[piece], s - origins[piece]
+        a, b, c = terms[-1, 0], terms[-1, 1], terms[-1, 2]
+        for power in range(len(terms) - 2, -1, -1):
+            a, b, c = terms[power, 0] + x * a, terms[power, 1] + x * b, terms[power, 2] + x * c
+        out[n, 0], out[n, 1], out[n, 2] = a, b, c
+    return out
 
 
 def rotation_about_z(yaw: float) -> NDArray:
