@@ -11,6 +11,7 @@ import click
 
 from cfplan import __version__
 from cfplan.cli import options
+from cfplan.cli.confirm import confirmed
 from cfplan.cli.flight_progress import FlightProgress
 from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.cli.rehearsal import PlannedFlight, PlanOptions, certify_bytes, obtain_plan, rehearse
@@ -58,6 +59,7 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
     "--mavlink",
     help="Tell a ground station of the flight and obey its orders to stop, as udp:127.0.0.1:14550, where it listens.",
 )
+@click.option("--yes", is_flag=True, help="Do not ask before hardware flies.")
 @options.as_json
 def fly(
     path_or_plan: Path,
@@ -70,6 +72,7 @@ def fly(
     records: Path,
     live: bool,
     mavlink: str | None,
+    yes: bool,
     as_json: bool,
 ) -> int:
     """Fly along PATH: plan, certify, rehearse, then take off, stream the flight, land, and keep a record."""
@@ -82,6 +85,7 @@ def fly(
 
     from cfplan.flight.mission import mission_of
     from cfplan.flight.process import fly as fly_mission
+    from cfplan.flight.stop_certificate import certify_stops
     from cfplan.planning.files import save_plan
     from cfplan.recording.reader import read_record
     from cfplan.recording.summary import summarise
@@ -89,7 +93,14 @@ def fly(
 
     with steps.step("stops") as said:
         mission = mission_of(encoded, flight.limits)
-        said.append(f"a way to stop from each of {len(mission.payloads)} setpoints")
+        stops = certify_stops(mission.stops, flight.limits, mission.rate)
+        stops.require(flight.limits)
+        said.append(
+            f"a certified way to stop from each of {stops.count} setpoints, {stops.as_planned} within the plan's limits"
+        )
+    if not confirmed(flight.name, mission, uri, records, yes=yes, speed_share=speed_share):
+        click.echo("not flown", err=True)
+        return int(ExitCode.ENDED_BY_PILOT)
     with vehicle(uri, mocap_uri, flight.limits) as (drivers, pose_source):
         folder = new_record_folder(records, flight.name)
         progress = FlightProgress(duration=mission.duration, steps=steps)
@@ -119,7 +130,7 @@ def fly(
         steps.failed("record", writer.failure)
     for failure in watching.failures():
         steps.failed("watching", failure)
-    summary = {"outcome": _outcome_to_dict(outcome), **summarise(read_record(folder)).to_json()}
+    summary = {"uri": uri, "outcome": _outcome_to_dict(outcome), **summarise(read_record(folder)).to_json()}
     write_summary(folder, summary)
 
     if as_json:

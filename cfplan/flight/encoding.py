@@ -8,6 +8,7 @@ planned attitude, and the controller, reading it, is not.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,7 @@ RATE_LEAD = 0.015
 HALF_QUANTUM = 0.5e-3  # of position m, velocity m/s, acceleration m/s², body rate rad/s
 ATTITUDE_QUANTUM = np.radians(0.25)  # the most by which the compressed quaternion turns
 _ROUNDING = 1e-9
+_BATCH = 4096  # setpoints at a time, so that memory does not grow with the states of a long flight
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,18 @@ def encode_trajectory(
 
 def setpoints_at(trajectory: Trajectory, times: NDArray, rate_lead: float = RATE_LEAD) -> FullStateSetpoints:
     """What the controller is to be told at each time, (N,) s: the acceleration includes what makes up for drag."""
-    return _setpoints(trajectory.at(times), trajectory.at(times + rate_lead))
+    parts = [
+        _setpoints(trajectory.at(times[rows]), trajectory.at(times[rows] + rate_lead)) for rows in _batches(len(times))
+    ]
+    if len(parts) == 1:
+        return parts[0]
+    return FullStateSetpoints(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in FullStateSetpoints.__slots__)
+    )
+
+
+def _batches(count: int) -> Iterator[slice]:
+    return (slice(first, min(first + _BATCH, count)) for first in range(0, max(count, 1), _BATCH))
 
 
 def _setpoints(states: FullState, ahead: FullState) -> FullStateSetpoints:
@@ -117,26 +130,36 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimi
     if payloads.ndim != 2 or payloads.shape != (len(encoded.times), PAYLOAD_SIZE) or len(payloads) == 0:
         raise NotCertifiedError(f"payloads of shape {payloads.shape} for {len(encoded.times)} times")
     _require(payloads[:, 0] == FULL_STATE_TYPE, "the payload is no full state", payloads[:, 0])
-    told = decode(payloads)
-    times = encoded.times + encoded.lead
+    for rows in _batches(len(payloads)):
+        _check_rows(decode(payloads[rows]), encoded, trajectory, limits, rows)
+    _require_hover(decode(payloads[-1:]), len(payloads), trajectory.at(np.array([trajectory.duration])).position[0])
+
+
+def _check_rows(
+    told: FullStateSetpoints, encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimits, rows: slice
+) -> None:
+    """What check_bytes asks of each setpoint, for those of `rows`, which the vehicle reads as `told`."""
+
+    def require(good: NDArray, what: str, values: NDArray) -> None:
+        _require(good, what, values, rows.start)
+
+    times = encoded.times[rows] + encoded.lead
     states = trajectory.at(times)
     meant = _setpoints(states, trajectory.at(times + encoded.rate_lead))
     for name in ("position", "velocity", "acceleration", "body_rate"):
         error = np.abs(getattr(told, name) - getattr(meant, name)).max(axis=1)
-        _require(
-            error <= HALF_QUANTUM + _ROUNDING, f"{name} in the packet is not that of the trajectory, off by", error
-        )
+        require(error <= HALF_QUANTUM + _ROUNDING, f"{name} in the packet is not that of the trajectory, off by", error)
 
     force = told.acceleration + np.array([0.0, 0.0, GRAVITY])
     thrust = np.linalg.norm(force, axis=1)
     quantum = np.sqrt(3) * HALF_QUANTUM + _ROUNDING
-    _require(thrust >= limits.specific_thrust_min - quantum, "too little specific thrust in the packet, m/s²", thrust)
+    require(thrust >= limits.specific_thrust_min - quantum, "too little specific thrust in the packet, m/s²", thrust)
     tilt = np.arccos(np.clip(force[:, 2] / thrust, -1.0, 1.0))
     off = _angles(_frames(told.quaternion), _frames(meant.quaternion))
-    _require(off <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", off)
+    require(off <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", off)
     # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(tilt) as far.
     off = _angles(controller_attitude(force, told.quaternion), _frames(states.quaternion.copy()))
-    _require(
+    require(
         off * np.cos(tilt) <= ATTITUDE_QUANTUM, "the controller would not make the planned attitude, off by rad", off
     )
     for name, values, limit in (
@@ -145,28 +168,28 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimi
         ("angular velocity", told.body_rate, limits.angular_velocity),
     ):
         size = np.linalg.norm(values, axis=1)
-        _require(size <= limit + quantum, f"{name} in the packet exceeds its limit, {limit:g}, with", size)
-    _require(
+        require(size <= limit + quantum, f"{name} in the packet exceeds its limit, {limit:g}, with", size)
+    require(
         tilt <= limits.tilt + quantum / thrust, f"tilt in the packet exceeds its limit, {limits.tilt:.4g}, with", tilt
     )
-    _require_hover(told, trajectory.at(np.array([trajectory.duration])).position[0])
 
 
-def _require_hover(told: FullStateSetpoints, end: NDArray) -> None:
+def _require_hover(told: FullStateSetpoints, count: int, end: NDArray) -> None:
     """The last setpoint is what the vehicle is left with if nothing more comes."""
     moves = [told.velocity[-1], told.acceleration[-1], told.body_rate[-1]]
     if np.any(moves) or np.any(np.abs(told.position[-1] - end) > HALF_QUANTUM + _ROUNDING):
         raise NotCertifiedError(
             "the last setpoint is not a hover at the end of the path",
-            where=f"setpoint {len(told.position) - 1}",
+            where=f"setpoint {count - 1}",
             hint="encode the trajectory with a longer hold",
         )
 
 
-def _require(good: NDArray, what: str, values: NDArray) -> None:
+def _require(good: NDArray, what: str, values: NDArray, first: int = 0) -> None:
+    """`first` is the number of the setpoint that the first row is of."""
     if not np.all(good):
         row = int(np.flatnonzero(~good)[0])
-        raise NotCertifiedError(f"{what} {values[row]:.4g}", where=f"setpoint {row}")
+        raise NotCertifiedError(f"{what} {values[row]:.4g}", where=f"setpoint {first + row}")
 
 
 @njit(cache=True, error_model="numpy")

@@ -114,6 +114,17 @@ def test_its_own_bytes_pass(encoded, trajectory):
     check_bytes(encoded, trajectory, LIMITS)
 
 
+def test_a_long_flight_is_encoded_and_checked_by_parts_alike(encoded, trajectory, monkeypatch):
+    monkeypatch.setattr("cfplan.flight.encoding._BATCH", 100)
+    np.testing.assert_array_equal(encode_trajectory(trajectory).payloads, encoded.payloads)
+    check_bytes(encoded, trajectory, LIMITS)
+    payloads = encoded.payloads.copy()
+    payloads[250, 3] ^= 0x40
+    with pytest.raises(NotCertifiedError) as caught:
+        check_bytes(replace(encoded, payloads=payloads), trajectory, LIMITS)
+    assert caught.value.where == "setpoint 250"
+
+
 @pytest.mark.parametrize("lead", [0.0, 0.01])
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0])
 def test_bytes_pass_at_other_rates_and_leads(trajectory, lead, rate):

@@ -1,0 +1,68 @@
+"""The question before hardware flies."""
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from cfplan.cli.vehicle import SIMULATED
+from cfplan.errors import ExitCode, InputError
+from cfplan.recording.record import SUMMARY_FILE
+
+if TYPE_CHECKING:
+    from cfplan.flight.mission import Mission
+
+FIRST_SPEED = 0.3  # share at which a path should be flown first
+
+
+def confirmed(name: str, mission: "Mission", uri: str, records: Path, *, yes: bool, speed_share: float | None) -> bool:
+    """Whether to fly: always with a virtual vehicle or --yes, else what a person answers.
+
+    Raises InputError where there is nobody to ask.
+    """
+    if yes or uri.startswith(SIMULATED):
+        return True
+    click.echo(what_it_does(name, mission, uri), err=True)
+    if not flown_before(name, records) and (speed_share is None or speed_share > FIRST_SPEED):
+        click.echo(
+            f"No flight of {name!r} on hardware is in {records}: fly it with --speed {FIRST_SPEED} first.", err=True
+        )
+    if not sys.stdin.isatty():
+        raise InputError("nobody is there to say yes", where=uri, hint="fly from a terminal, or give --yes")
+    return click.confirm("Fly?", err=True)
+
+
+def what_it_does(name: str, mission: "Mission", uri: str) -> str:
+    """Time, speed, fence, and how to end it."""
+    import numpy as np
+
+    from cfplan.flight.packets import decode
+
+    speed = float(np.linalg.norm(decode(mission.payloads).velocity, axis=1).max())
+    space = mission.limits.space
+    walls = ", ".join(
+        f"{axis} {low:.2f} to {high:.2f} m" for axis, low, high in zip("xyz", space.low, space.high, strict=True)
+    )
+    return (
+        f"{uri} will take off to {mission.take_off_height:g} m, go to the start of {name!r}, fly it in "
+        f"{mission.motion_ends:.1f} s at up to {speed:.1f} m/s, and land where it ends.\n"
+        f"Nobody may be inside {walls}. Space lands it, Esc cuts the motors."
+    )
+
+
+def flown_before(name: str, records: Path) -> bool:
+    """Whether a record says that a path of this name was flown to its end on hardware."""
+    for file in records.glob(f"*/{SUMMARY_FILE}"):
+        if not re.search(rf"-{re.escape(name)}(-\d+)?$", file.parent.name):
+            continue
+        try:
+            summary = json.loads(file.read_text(encoding="utf-8"))
+            flown = summary["outcome"]["exit_code"] == ExitCode.OK and not summary["uri"].startswith(SIMULATED)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            continue
+        if flown:
+            return True
+    return False
