@@ -73,24 +73,20 @@ def encode_trajectory(
         raise NotCertifiedError(f"cannot sample {trajectory.duration} s at {rate} Hz with a hold of {hold} s")
     moving = int(np.ceil(trajectory.duration * rate)) + 1
     times = np.arange(moving + int(np.ceil(hold * rate))) / rate
-    payloads = encode(setpoints_at(trajectory, times + lead, rate_lead))
+    parts = _batches(len(times))
+    payloads = np.concatenate(
+        [encode(setpoints_at(trajectory, times[rows] + lead, rate_lead), rows.start) for rows in parts]
+    )
     return EncodedFlight(times, payloads, decode(payloads), lead, rate_lead)
+
+
+def _batches(count: int) -> Iterator[slice]:
+    return (slice(first, min(first + _BATCH, count)) for first in range(0, count, _BATCH))
 
 
 def setpoints_at(trajectory: Trajectory, times: NDArray, rate_lead: float = RATE_LEAD) -> FullStateSetpoints:
     """What the controller is to be told at each time, (N,) s: the acceleration includes what makes up for drag."""
-    parts = [
-        _setpoints(trajectory.at(times[rows]), trajectory.at(times[rows] + rate_lead)) for rows in _batches(len(times))
-    ]
-    if len(parts) == 1:
-        return parts[0]
-    return FullStateSetpoints(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in FullStateSetpoints.__slots__)
-    )
-
-
-def _batches(count: int) -> Iterator[slice]:
-    return (slice(first, min(first + _BATCH, count)) for first in range(0, max(count, 1), _BATCH))
+    return _setpoints(trajectory.at(times), trajectory.at(times + rate_lead))
 
 
 def _setpoints(states: FullState, ahead: FullState) -> FullStateSetpoints:

@@ -5,9 +5,11 @@ quaternion compressed to its three smallest components, body rates in millirad/s
 cflib's own call truncates towards zero; here values are rounded, which halves the error and removes the bias.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
@@ -46,13 +48,16 @@ class FullStateSetpoints:
     # (N, 3) rad/s, body axes
 
 
-def encode(setpoints: FullStateSetpoints) -> NDArray:
-    """The payloads, (N, 29) uint8. Raises NotCertifiedError where a value is not finite or does not fit."""
+def encode(setpoints: FullStateSetpoints, first: int = 0) -> NDArray:
+    """The payloads, (N, 29) uint8. Raises NotCertifiedError where a value is not finite or does not fit.
+
+    `first` is the number of the first setpoint, for those who read of one that does not.
+    """
     rows = np.zeros(len(setpoints.position), dtype=_WIRE)
     rows["type"] = FULL_STATE_TYPE
     for name in ("position", "velocity", "acceleration", "body_rate"):
-        rows[name] = _milli(name, getattr(setpoints, name))
-    rows["quaternion"] = compress_quaternion(setpoints.quaternion)
+        rows[name] = _milli(name, getattr(setpoints, name), first)
+    rows["quaternion"] = compress_quaternion(setpoints.quaternion, first)
     return rows.view(np.uint8).reshape(-1, PAYLOAD_SIZE)
 
 
@@ -72,48 +77,67 @@ def decode(payloads: NDArray) -> FullStateSetpoints:
     )
 
 
-def _milli(name: str, values: NDArray) -> NDArray:
+def _milli(name: str, values: NDArray, first: int) -> NDArray:
     bad = ~(np.abs(values) <= LARGEST)
     if np.any(bad):
         row = int(np.flatnonzero(bad.any(axis=1))[0])
         raise NotCertifiedError(
-            f"{name} {np.asarray(values)[row]} does not fit a packet (at most {LARGEST})", where=f"setpoint {row}"
+            f"{name} {np.asarray(values)[row]} does not fit a packet (at most {LARGEST})",
+            where=f"setpoint {first + row}",
         )
     return np.round(np.asarray(values) * 1000.0).astype("<i2")
 
 
-def compress_quaternion(quaternion: NDArray) -> NDArray:
+def compress_quaternion(quaternion: NDArray, first: int = 0) -> NDArray:
     """(N, 4) x y z w, not zero, to (N,) u32: 2 bits name the largest component, 3 × (sign, 9 bits) give the others."""
-    q = np.asarray(quaternion, dtype=float)
-    norm = np.linalg.norm(q, axis=1, keepdims=True)
-    bad = ~(np.isfinite(norm) & (norm > 0))
-    if np.any(bad):
-        raise NotCertifiedError("the quaternion is zero or not finite", where=f"setpoint {int(np.argmax(bad))}")
-    q = q / norm
-    rows = np.arange(len(q))
-    largest = np.argmax(np.abs(q), axis=1)
-    q = q * np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]
-    others = _other_components(largest)
-    small = q[rows[:, None], others]
-    magnitude = np.minimum(np.floor(np.abs(small) * np.sqrt(2.0) * _MAGNITUDES + 0.5), _MAGNITUDES).astype(np.uint32)
-    fields = magnitude | ((small < 0).astype(np.uint32) << 9)
-    return (largest.astype(np.uint32) << 30) | (fields[:, 0] << 20) | (fields[:, 1] << 10) | fields[:, 2]
+    compressed, bad = _compressed(np.array(quaternion, dtype=float))
+    if bad >= 0:
+        raise NotCertifiedError("the quaternion is zero or not finite", where=f"setpoint {first + bad}")
+    return compressed
 
 
 def decompress_quaternion(compressed: NDArray) -> NDArray:
     """(N,) u32 to (N, 4) unit quaternions x y z w, the largest component positive."""
-    bits = np.asarray(compressed, dtype=np.uint32)
-    rows = np.arange(len(bits))
-    largest = (bits >> 30).astype(int)
-    fields = np.stack([(bits >> shift) & 0x3FF for shift in (20, 10, 0)], axis=1)
-    small = (fields & 0x1FF) / (_MAGNITUDES * np.sqrt(2.0)) * np.where(fields >> 9, -1.0, 1.0)
-    q = np.zeros((len(bits), 4))
-    q[rows[:, None], _other_components(largest)] = small
-    q[rows, largest] = np.sqrt(np.maximum(0.0, 1.0 - np.sum(small**2, axis=1)))
-    return q
+    return _decompressed(np.array(compressed, dtype=np.int64))
 
 
-def _other_components(largest: NDArray) -> NDArray:
-    """(N, 3) indices of the components that are not the largest, ascending."""
-    every = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-    return every[largest]
+@njit(cache=True, error_model="numpy")
+def _compressed(quaternions: NDArray) -> tuple[NDArray, int]:
+    """And the first row that is zero or not finite, else -1."""
+    out = np.empty(len(quaternions), dtype=np.uint32)
+    for n in range(len(quaternions)):
+        q = quaternions[n]
+        norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+        if not (math.isfinite(norm) and norm > 0.0):
+            return out, n
+        largest = 0
+        for k in range(1, 4):
+            if abs(q[k]) > abs(q[largest]):
+                largest = k
+        bits = largest
+        for k in range(4):
+            if k != largest:
+                # The sign of the largest is not sent, so all change theirs where it is negative.
+                small = -q[k] / norm if q[largest] < 0.0 else q[k] / norm
+                magnitude = min(math.floor(abs(small) * math.sqrt(2.0) * _MAGNITUDES + 0.5), _MAGNITUDES)
+                bits = bits << 10 | (512 if small < 0.0 else 0) | magnitude
+        out[n] = bits
+    return out, -1
+
+
+@njit(cache=True, error_model="numpy")
+def _decompressed(compressed: NDArray) -> NDArray:
+    out = np.empty((len(compressed), 4))
+    for n in range(len(compressed)):
+        bits = compressed[n]
+        largest, rest = bits >> 30, 1.0
+        shift = 20
+        for k in range(4):
+            if k != largest:
+                field = (bits >> shift) & 0x3FF
+                small = (field & 0x1FF) / (_MAGNITUDES * math.sqrt(2.0))
+                out[n, k] = -small if field >> 9 else small
+                rest -= small * small
+                shift -= 10
+        out[n, largest] = math.sqrt(max(0.0, rest))
+    return out

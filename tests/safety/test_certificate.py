@@ -18,6 +18,7 @@ from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.dense import PLACE, sampled_rows
+from cfplan.vehicle.flatness import flat_state
 from cfplan.vehicle.trajectory import Trajectory, state_at
 
 AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
@@ -160,6 +161,74 @@ def test_batches_change_nothing(trajectory, monkeypatch):
     whole = certify(trajectory, LIMITS, SPACE)
     monkeypatch.setattr("cfplan.safety.certificate.BATCH", 500)
     assert certify(trajectory, LIMITS, SPACE) == whole
+
+
+def plainly(trajectory, limits):
+    """The certificate's rule, sample by sample, on the flatness map in plain numpy: the worst of each quantity."""
+    path, profile = trajectory.path, trajectory.profile
+    worst = {}
+    for left, right, interval, _, count in zip(*_stretches(trajectory), strict=True):
+        s = np.append((left + np.arange(count) / (count - 1) * (right - left))[:-1], np.nextafter(right, 0))
+        at = profile.at(s, np.full(count, interval))
+        derivatives = tuple(tuple(path(s, order).T) for order in (1, 2, 3, 4))
+        flat = flat_state(trajectory.airframe, derivatives, at[:4], at[4:], np.cos, np.sin)
+        x, y, z = flat.thrust_axis
+        middle = (np.array(SPACE.low) + SPACE.high) / 2
+        for name, rows in {
+            "speed": [np.linalg.norm(flat.velocity, axis=0)],
+            "acceleration": [np.linalg.norm(flat.acceleration, axis=0)],
+            "angular velocity": [np.linalg.norm(flat.body_rate, axis=0)],
+            "angular acceleration": [np.linalg.norm(flat.angular_acceleration, axis=0)],
+            "tilt": [np.arctan2(np.hypot(x, y), z)],
+            "motor thrust, most": flat.motor_thrust,
+            "motor thrust, least": [-thrust for thrust in flat.motor_thrust],
+            "specific thrust, least": [-flat.specific_thrust],
+            "distance to the walls": list((np.abs(path(s) - middle) - (np.array(SPACE.high) - middle)).T),
+        }.items():
+            for row in rows:
+                largest = np.maximum(np.maximum(row[:-2], row[1:-1]), row[2:])
+                bound = (largest + np.maximum(2 * row[1:-1] - row[:-2] - row[2:], 0.0) / 4).max()
+                worst[name] = max(worst.get(name, -np.inf), bound)
+    return worst
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    st.lists(points, min_size=2, max_size=4),
+    st.one_of(st.lists(gentle, min_size=6, max_size=15), st.lists(rough, min_size=6, max_size=15)),
+    st.lists(st.floats(-1, 1), min_size=1, max_size=15),
+    st.floats(0.5, 3.0),
+)
+def test_the_compiled_certificate_is_that_of_plain_numpy(make_profile, waypoints, rates, turns, scale):
+    trajectory = make(make_profile, waypoints, rates, turns, scale)
+    limits = replace(LIMITS, angular_acceleration=35.0)
+    certificate, expected = certify(trajectory, limits, SPACE), plainly(trajectory, limits)
+    assert len(certificate.margins) == len(expected)
+    for margin in certificate.margins:
+        assert as_upper(margin) == pytest.approx(expected[margin.name], rel=1e-9, abs=1e-9), margin.name
+
+
+def test_margins_are_what_they_were_before_they_were_compiled(make_profile):
+    """Worst value, share and time of each as first written, in numpy over whole arrays."""
+    before = {
+        "speed": (2.581249420105033, 1.2906247100525166, 3.959924550693536),
+        "acceleration": (3.9538921517901797, 0.790778430358036, 2.661764298369392),
+        "angular velocity": (1.8812567521357015, 0.2351570940169627, 2.4830677188036367),
+        "angular acceleration": (12.612831729054745, 0.3603666208301356, 2.6734970470091093),
+        "tilt": (0.40933296013715115, 0.7817683677151843, 2.656878824875043),
+        "motor thrust, most": (0.0948633432171529, 0.8703059010747972, 1.1991307149339256),
+        "motor thrust, least": (0.06767034129397484, 0.1911326962840027, 2.41455839412602),
+        "specific thrust, least": (9.253827585212946, 0.11338887151621907, 2.4363737362107485),
+        "distance to the walls": (0.4682227869012948, 0.6647215163733814, 5.2162251673040085),
+    }
+    path = min_snap([[0, 0, 1], [1, 1.5, 1.3], [-1, 2, 0.7], [-1.5, -1.0, 1.2]])
+    h, yaw = 1.0 + 0.5 * np.sin(1.3 * np.arange(30)), 0.3 * np.cos(0.9 * np.arange(29)).cumsum()
+    trajectory = Trajectory(path, make_profile(path.end, h, yaw), AIRFRAME)
+    certificate = certify(trajectory, replace(LIMITS, angular_acceleration=35.0), SPACE)
+    assert certificate.duration == pytest.approx(7.2628029465075254, rel=1e-13)
+    assert certificate.samples == 7610
+    for margin in certificate.margins:
+        assert (margin.worst, margin.share, margin.time) == pytest.approx(before[margin.name], rel=1e-12)
 
 
 def test_the_worst_value_is_where_and_when_the_certificate_says(trajectory):
