@@ -41,7 +41,10 @@ _GOODBYE = 3.0  # s
 
 
 def open_live(header: RecordHeader, folder: Path) -> "LiveView":
-    """A live view in a viewer's window, of a flight whose plan lies in the record's folder. Raises InputError where there is no screen."""
+    """A live view in a viewer's window, of a flight whose plan lies in the record's folder.
+
+    Raises InputError where there is no screen.
+    """
     require_screen("leave out --live; `cfplan replay` shows the record afterwards")
     port = free_port()
     subprocess.Popen(

@@ -8,7 +8,9 @@ from enum import StrEnum
 from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
+from pyarrow import json as pa_json
 
 from cfplan.flight import telemetry
 from cfplan.recording import record
@@ -17,6 +19,7 @@ PROFILE = "cfplan"
 # the profile that our MCAP files name; a file with another is not a record
 METADATA = "cfplan"
 # the metadata entry that holds format and header
+_BLOCK = 1 << 26  # bytes of JSON read at a time
 FORMAT = "1"
 # raised when older versions can no longer read a record
 
@@ -90,11 +93,43 @@ def _finite(value: Any) -> Any:
 
 def columns_from_json(topic: Topic, payloads: list[bytes]) -> Any:
     """The messages of one topic as arrays. Raises ValueError, KeyError or TypeError where they are not its messages."""
-    messages = json.loads(b"[" + b",".join(payloads) + b"]")
     hints = get_type_hints(topic.message)
-    return topic.columns(
-        **{f.name: _column([m[f.name] for m in messages], hints[f.name]) for f in fields(topic.columns)}
+    names = [f.name for f in fields(topic.columns)]
+    if not payloads:
+        return topic.columns(**{name: _column([], hints[name]) for name in names})
+    for name in names:
+        json.loads(payloads[0])[name]  # Arrow takes what is missing for null
+    schema = pa.schema([(name, _arrow_type(hints[name])) for name in names])
+    table = pa_json.read_json(
+        pa.BufferReader(b"\n".join(payload.replace(b"\n", b" ") for payload in payloads)),
+        pa_json.ReadOptions(block_size=_BLOCK),
+        pa_json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
     )
+    if len(table) != len(payloads):
+        raise ValueError(f"{len(table)} messages in {len(payloads)} entries")
+    return topic.columns(**{name: _array(table.column(name).combine_chunks(), hints[name]) for name in names})
+
+
+def _arrow_type(kind: Any) -> pa.DataType:
+    items = get_args(kind)
+    if items:
+        return pa.list_(_arrow_type(items[0]))
+    return pa.string() if issubclass(kind, str) else pa.int64() if kind is int else pa.float64()
+
+
+def _array(values: Any, kind: Any) -> NDArray:
+    """An Arrow column as NumPy has it: null becomes NaN, and is an error where that cannot be."""
+    items = get_args(kind)
+    if items:
+        lengths = values.value_lengths()
+        if values.null_count or set(lengths.unique().to_pylist()) != {len(items)}:
+            raise ValueError(f"not {len(items)} numbers each")
+        return _array(values.flatten(), items[0]).reshape(-1, len(items))
+    if values.null_count and kind is not float:
+        raise ValueError("a value is missing")
+    if issubclass(kind, str):
+        return np.array(values.to_pylist(), dtype=np.str_)
+    return values.to_numpy(zero_copy_only=False)
 
 
 def columns_of(topic: Topic, messages: Sequence[telemetry.Telemetry]) -> Any:

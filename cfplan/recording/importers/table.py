@@ -39,6 +39,12 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
     """
     file = Path(file)
     importer = find_importer(file)
+    if importer is None and _is_rerun(file):
+        raise InputError(
+            "a recording of rerun's, drawn already",
+            where=str(file),
+            hint="open it with `rerun FILE`; `rerun rrd merge FILE -o NEW` mends one that is cut off",
+        )
     if importer is None:
         known = ", ".join(importer.name for importer in IMPORTERS)
         raise InputError("of no format that is known", where=str(file), hint=f"known are: a cfplan record, {known}")
@@ -49,6 +55,13 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
     if not any(subject.seen.any() for subject in log.subjects):
         raise InputError("there is no pose in it", where=str(file), hint="; ".join(log.notes))
     return log
+
+
+def _is_rerun(file: Path) -> bool:
+    if file.is_dir():
+        return False
+    with file.open("rb") as stream:
+        return stream.read(3) == b"RRF"
 
 
 def find_importer(file: Path) -> Importer | None:
