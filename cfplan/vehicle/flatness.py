@@ -210,11 +210,9 @@ def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArra
     `interval` tells whose polynomials of the profile hold; a break of the path belongs to the piece on its right.
     """
     out = np.empty((len(s), WIDTH))
-    piece = np.clip(np.searchsorted(path.breaks, s, side="right") - 1, 0, len(path.breaks) - 2)
-    offset = s - np.where(piece == len(path.breaks) - 2, path.breaks[-1], path.breaks[piece])
     _fill(
-        out, compiled_body(airframe), path.coefficients, piece, offset, s - profile.s[interval], interval,
-        profile.h, profile.dh, profile.ddh, profile.dddh, profile.yaw, profile.dyaw, profile.ddyaw,
+        out, compiled_body(airframe), path.breaks, path.origins, path.coefficients, profile.table(),
+        np.array(s, dtype=float), interval,
     )  # fmt: skip
     return out
 
@@ -222,20 +220,21 @@ def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArra
 # Here and not in a file of its own, because numba's cache only notices changes of the file that a function stands in.
 @njit(cache=True, error_model="numpy")
 def _fill(
-    out: NDArray, body: Body, coefficients: NDArray, pieces: NDArray, offsets: NDArray, places: NDArray,
-    intervals: NDArray, h: NDArray, dh: NDArray, ddh: NDArray, dddh: NDArray, yaw: NDArray, dyaw: NDArray,
-    ddyaw: NDArray,
+    out: NDArray, body: Body, breaks: NDArray, origins: NDArray, coefficients: NDArray, nodes: NDArray, s: NDArray,
+    intervals: NDArray,
 ) -> None:  # fmt: skip
-    power = coefficients.shape[1]
+    power, last, piece = coefficients.shape[1], len(origins) - 1, 0
     for n in range(len(out)):
-        table, x = coefficients[pieces[n]], offsets[n]
+        if not (breaks[piece] <= s[n] and (s[n] < breaks[piece + 1] or piece == last)):
+            piece = min(max(int(np.searchsorted(breaks, s[n], side="right")) - 1, 0), last)
+        table, x = coefficients[piece], s[n] - origins[piece]
         # Horner's scheme for the value and four derivatives over their factorials
         p0 = p1 = p2 = p3 = p4 = (0.0, 0.0, 0.0)
         for k in range(power - 1, -1, -1):
             p4, p3, p2, p1 = _sum2(x, p4, 1.0, p3), _sum2(x, p3, 1.0, p2), _sum2(x, p2, 1.0, p1), _sum2(x, p1, 1.0, p0)
             p0 = _sum2(x, p0, 1.0, (table[k, 0], table[k, 1], table[k, 2]))
-        i, x = intervals[n], places[n]
-        speed, turn = profile_within(x, h[i], dh[i], ddh[i], dddh[i], yaw[i], dyaw[i], ddyaw[i])
+        node = nodes[intervals[n]]
+        speed, turn = profile_within(s[n] - node[0], node[1], node[2], node[3], node[4], node[5], node[6], node[7])
         psi = turn[0]
         derivatives = (p1, _scaled(2.0, p2), _scaled(6.0, p3), _scaled(24.0, p4))
         flat = flat_state(body, derivatives, speed, turn, math.cos, math.sin)

@@ -90,8 +90,8 @@ class Trajectory:
         flat = times.reshape(-1)
         s = self.s_at(flat)
         state = state_at(self.path, self.profile, self.airframe, s, time=flat)
-        resting = ~((flat >= 0.0) & (flat <= self.duration))
-        if np.any(resting):
+        resting = np.flatnonzero(~((flat >= 0.0) & (flat <= self.duration)))
+        if len(resting):
             _hover(state, resting, self.airframe)
         return state if times.ndim else FullState(*(getattr(state, name)[0] for name in FullState.__slots__))
 
