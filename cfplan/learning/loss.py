@@ -2,9 +2,9 @@
 
 from torch import Tensor
 
-SLOPES = 1.0
+SLOPES = 2.0
 # weight of squared errors of the first difference between nodes, against those of the values
-BENDS = 1.0
+BENDS = 5.0
 # likewise of the second difference
 DURATION = 1.0
 # weight of the squared relative error of a window's time

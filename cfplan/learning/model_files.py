@@ -193,8 +193,10 @@ def other_vehicle(card: Card, airframe: Airframe) -> str:
 
 def models_folder() -> Path:
     """Where the models are that come with cfplan: in a checkout beside the package, else where pip put them."""
-    beside = Path(__file__).parents[2] / "models"
-    return beside if beside.is_dir() else Path(sysconfig.get_path("data")) / "share" / "cfplan" / "models"
+    checkout = Path(__file__).parents[2]
+    if (checkout / "pyproject.toml").is_file():
+        return checkout / "models"
+    return Path(sysconfig.get_path("data")) / "share" / "cfplan" / "models"
 
 
 def find_model(airframe: Airframe, limits: PlanLimits, folder: Path | None = None) -> Model | None:

@@ -123,9 +123,16 @@ def train(
     material = read_material(dataset)
     with _processes(device) as (rank, world, place):
         run = _Run(material, folder, options, rank, world, place)
-        for epoch in run.epochs():
-            on_epoch(epoch)
-        return run.finish(command) if rank == 0 else None
+        try:
+            for epoch in run.epochs():
+                on_epoch(epoch)
+            return run.finish(command) if rank == 0 else None
+        except OSError as error:
+            raise InputError(
+                f"cannot be written: {error.strerror or error}",
+                where=str(folder),
+                hint="make room, or name another folder, and give the same command again",
+            ) from None
 
 
 class _Run:
