@@ -20,11 +20,12 @@ from cfplan.flight.outcome import Check, Rung
 from cfplan.flight.pace import Pace
 from cfplan.flight.poses import Pose, PoseSource
 from cfplan.flight.stream import Stream
-from cfplan.flight.telemetry import Event, Level, Phase, PhaseEntered, PoseReceived, Telemetry
+from cfplan.flight.telemetry import Event, Level, Phase, PhaseEntered, PoseReceived, Quaternion, Telemetry, Triple
 from cfplan.flight.watch import LINK_GONE, Seen, Trip, Watch
 
 REPLY = 0.2  # s that the on-board commander has to answer; setpoints may stay out for 0.5 s
 TRIES = 3
+_SIGN_OF_LIFE = 0.1  # s between those for the vehicle's watchdog, which waits for 1 s
 
 
 class OrdersFrom(Protocol):
@@ -80,6 +81,8 @@ class Cockpit:
         self.pose_fault = ""
         # why the last pose was not good
         self._source_fault = ""
+        self._sign_of_life = -math.inf
+        # s, when the vehicle's watchdog last had one
         self.recent: deque[Pose] = deque()
         # the good poses of the last second
         self.waking: deque[float] = deque(maxlen=200)
@@ -101,6 +104,9 @@ class Cockpit:
                 self.report(stream.sent(index, now, due))
             if stream is self.plan and now < stream.end:
                 self.late.append(now - due)
+        if self.airborne and self.limits.firmware.watchdog and now - self._sign_of_life > _SIGN_OF_LIFE:
+            self._sign_of_life = now
+            self.link.keep_alive()
         self.waking.append(now - due)
         if self.feeding:
             self._forward_poses()
@@ -189,6 +195,13 @@ class Cockpit:
         pose = self._freshness.last
         assert pose is not None  # nothing asks before the feed has begun
         return pose
+
+    def resting(self) -> tuple[Triple, Quaternion]:
+        """Where the vehicle is asked to hover: at the stream's end, or without one where it is."""
+        if self.stream is None:
+            return self.pose().position, self.pose().quaternion
+        position, _, _, quaternion, _ = self.stream.states[self.stream.last]
+        return position, quaternion
 
     def bits(self, mask: int) -> int:
         status = self.link.status

@@ -127,6 +127,13 @@ class Link:
         else:
             self._send(LOCALIZATION_PORT, 1, b"\x03")
 
+    def keep_alive(self) -> None:
+        """A sign of life for the vehicle's emergency-stop watchdog, which the first one starts for good."""
+        if self.protocol >= 12:
+            self._send(SUPERVISOR_PORT, 1, b"\x04")
+        else:
+            self._send(LOCALIZATION_PORT, 1, b"\x04")
+
     # What waits for an answer: for the ground only.
 
     def has_parameter(self, name: str) -> bool:

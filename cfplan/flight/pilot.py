@@ -21,7 +21,7 @@ from cfplan.flight.pace import Lateness
 from cfplan.flight.poses import PoseSource
 from cfplan.flight.stream import Stream
 from cfplan.flight.supervisor import ARMED, FLYING, HIGH_LEVEL_ACTIVE
-from cfplan.flight.telemetry import Level, Phase, Telemetry
+from cfplan.flight.telemetry import Level, Phase, Telemetry, Triple
 from cfplan.flight.transfer import encode_transfer
 from cfplan.flight.watch import Trip
 
@@ -77,7 +77,8 @@ class Pilot:
         cockpit = self._cockpit
         try:
             prepare(cockpit, self._connect, self._quieten)
-            self._go_to_start(self._take_off())
+            self._take_off()
+            self._go_to_start()
             self._fly_plan()
             self._hand_back()
             self._land()
@@ -95,41 +96,50 @@ class Pilot:
             return self._leave_plan(_safety(Rung.LAND, f"fault in the pilot: {error!r}"))
         return ExitCode.OK, "landed"
 
-    def _take_off(self) -> Stream:
-        """Up, in the hands of the on-board commander; the way from there to the start."""
+    def _take_off(self) -> None:
+        """Up by setpoints, once the on-board commander has said that it would: it knows whether the vehicle may fly.
+
+        In its hands the vehicle would hover on without this program or its poses, wherever that leads; while setpoints
+        come, its own time-outs hold.
+        """
         cockpit = self._cockpit
         cockpit.enter(Phase.TAKE_OFF)
-        height = self._mission.take_off_height
-        way = self._way_to_start(height)
-        climb = height - cockpit.floor
+        height, (x, y, _) = self._mission.take_off_height, cockpit.pose().position
+        yaw, climb = yaw_of(cockpit.pose().quaternion), height - cockpit.floor
         duration = manoeuvre_time(climb, self._limits.ground.take_off_speed)
+        way = self._way((x, y, cockpit.floor), yaw, (x, y, height), yaw, duration)
+        if way.stop_from is not None:
+            way.stop_from(0)  # whatever is slow the first time is slow here, on the ground
         code = cockpit.ask(lambda: cockpit.link.take_off(height, duration), TAKE_OFF)
         if code:
             raise PreflightError(
                 f"the vehicle refuses to take off (code {code})", hint="restart the vehicle, and look at its battery"
             )
         cockpit.airborne = True
-        cockpit.pause(duration)
+        self._follow(way)
         cockpit.until(lambda: abs(cockpit.pose().position[2] - height) < _AT_START_WITHIN, 2.0)
         if cockpit.pose().position[2] - cockpit.floor < climb / 2:
             raise Tripped(_safety(Rung.LAND, "the vehicle does not rise"))
-        return way
 
-    def _way_to_start(self, height: float) -> Stream:
-        """From above where it stands."""
-        here, rate = self._cockpit.pose(), self._mission.rate
-        (x, y, _), (start, yaw) = here.position, self._mission.start
-        duration = manoeuvre_time(math.dist((x, y, height), start), self._limits.ground.go_to_speed)
-        payloads = encode_transfer((x, y, height), yaw_of(here.quaternion), start, yaw, duration, rate)
+    def _way(self, begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float) -> Stream:
+        """From hover to hover, with a way to stop from each setpoint."""
+        rate = self._mission.rate
+        payloads = encode_transfer(begin, yaw, end, end_yaw, duration, rate)
         return Stream(payloads, rate, stop_from=lambda row: encode_stops(payloads, rate, rows=np.array([row]))[0])
 
-    def _go_to_start(self, way: Stream) -> None:
+    def _follow(self, way: Stream) -> None:
         cockpit = self._cockpit
-        cockpit.enter(Phase.GO_TO_START)
-        start, _ = self._mission.start
         way.start = cockpit.pace.upcoming
         cockpit.stream = way
         cockpit.until(lambda: cockpit.now() > way.end, math.inf)
+
+    def _go_to_start(self) -> None:
+        cockpit = self._cockpit
+        cockpit.enter(Phase.GO_TO_START)
+        start, yaw = self._mission.start
+        (above, quaternion), here = cockpit.resting(), cockpit.pose().position
+        duration = manoeuvre_time(math.dist(here, start), self._limits.ground.go_to_speed)
+        self._follow(self._way(above, yaw_of(quaternion), start, yaw, duration))
         near_since = math.inf
 
         def settled() -> bool:
@@ -224,13 +234,10 @@ class Pilot:
     def _descend(self, duration: float) -> None:
         """Down by setpoints from where it hovers, and motors off at the end."""
         cockpit = self._cockpit
-        begin, hover, pose = cockpit.pace.upcoming, cockpit.stream, cockpit.pose()
-        place, quaternion = (pose.position, pose.quaternion) if hover is None else hover.states[hover.last][0::3][:2]
-        floor = cockpit.floor - _BELOW_FLOOR
+        place, quaternion = cockpit.resting()
         yaw = yaw_of(quaternion)
-        down = encode_transfer(place, yaw, (*place[:2], floor), yaw, duration, self._mission.rate)
-        cockpit.stream = Stream(down, self._mission.rate, begin)
-        cockpit.pause(duration + _TOUCH)
+        self._follow(self._way(place, yaw, (*place[:2], cockpit.floor - _BELOW_FLOOR), yaw, duration))
+        cockpit.pause(_TOUCH)
         cockpit.stream = None
         for _ in range(TRIES):
             cockpit.link.stop_setpoint()

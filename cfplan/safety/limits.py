@@ -105,6 +105,8 @@ class FirmwareSettings:
     # stabilizer.estimator
     oldest: tuple[int, ...]
     # the oldest firmware that may fly
+    watchdog: bool = False
+    # motors stop 1 s after the pilot's last sign of life, in the air and after landing: then it must be restarted
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
 
 from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.yaml_source import Places, read_yaml_with_places
@@ -90,6 +90,7 @@ class _Firmware(_Section):
     controller: Annotated[int, Field(ge=1, le=6)]
     estimator: Annotated[int, Field(ge=1, le=3)]
     oldest: Annotated[str, StringConstraints(pattern=r"^\d{4}\.\d{1,2}(\.\d{1,3})?$")]
+    watchdog: StrictBool
 
 
 class _Ground(_Section):

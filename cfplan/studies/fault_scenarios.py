@@ -97,8 +97,8 @@ SCENARIOS: tuple[Scenario, ...] = (
         phase=Phase.GO_TO_START, moment=0.5, falls=True,
     ),
     Scenario(
-        "radio dead for 3 s while taking off", Rung.LAND, (RadioFault(RadioFaultKind.DEAD, 0.0, 3.0),),
-        phase=Phase.TAKE_OFF, moment=0.5,
+        "radio dead for 3 s while taking off", Rung.CUT, (RadioFault(RadioFaultKind.DEAD, 0.0, 3.0),),
+        phase=Phase.TAKE_OFF, moment=0.5, falls=True,
     ),
     Scenario("stream stalled for 0.2 s", Rung.NONE, stall=0.2),
     Scenario("stream stalled for 0.6 s", Rung.BRAKE, stall=0.6),

@@ -113,9 +113,9 @@ def random_scenario(seed: int, duration: float) -> Scenario:
         faults=faults,
         phase=phase,
         moment=moment,
-        stall=length if kind == _STALL else 0.0,
-        main_killed=kind == _MAIN,
-        pilot_killed=kind == _PILOT,
+        stall=length if kind is _STALL else 0.0,
+        main_killed=kind is _MAIN,
+        pilot_killed=kind is _PILOT,
         vehicle=VehicleSettings(auto_arming=False, seed=seed),
     )
 

@@ -111,6 +111,7 @@ class World:
     messages: list[Telemetry] = field(default_factory=list)
     forwarded: list[tuple[float, ...]] = field(default_factory=list)
     calls: list[str] = field(default_factory=list)
+    signs_of_life: list[float] = field(default_factory=list)
     events: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
     orders: FakeOrders = field(default_factory=FakeOrders)
     motors_off_in_the_air: float = 0.0
@@ -259,6 +260,9 @@ class World:
     def stop_motors(self) -> None:
         self.calls.append("stop")
         self._curve = None
+
+    def keep_alive(self) -> None:
+        self.signs_of_life.append(self.now)
 
     def stop_setpoint(self) -> None:
         self.calls.append("stop setpoint")

@@ -1,6 +1,7 @@
 """The pilot's decisions, on a clock of their own: what it does when, and what it never does."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -294,3 +295,17 @@ def test_leaving_the_room_beyond_the_last_line_cuts(world, fly):
     outcome = fly()
     assert outcome.rung is Rung.CUT
     assert "fence" in outcome.reason
+
+
+def test_the_watchdog_of_the_vehicle_sleeps_unless_it_is_asked_for(world, fly):
+    fly()
+    assert not world.signs_of_life
+
+
+def test_the_watchdog_gets_ten_signs_of_life_a_second_from_take_off_to_landing(world, mission, fly):
+    watched = replace(mission.limits.firmware, watchdog=True)
+    outcome = fly(firmware=watched)
+    phases = dict(outcome.phases)
+    assert min(world.signs_of_life) < phases[Phase.TAKE_OFF] + 0.5
+    assert max(b - a for a, b in pairwise(world.signs_of_life)) < 0.15
+    assert max(world.signs_of_life) < phases[Phase.DISARM]

@@ -82,7 +82,11 @@ def test_no_key_may_be_missing(tmp_path, place):
         load_limits(file)
 
 
-NUMBERS = [".".join(p) for p in keys() if p[-1] not in ("vehicle", "low", "high", "latency", "controller", "estimator")]
+NUMBERS = [
+    ".".join(p)
+    for p in keys()
+    if p[-1] not in ("vehicle", "low", "high", "latency", "controller", "estimator", "watchdog")
+]
 
 
 @pytest.mark.parametrize("place", [place for place in NUMBERS if place != "firmware.oldest"])
