@@ -1,7 +1,7 @@
 """The networks without torch: one thread, no autograd, compiled loops over weights laid out for them.
 
 What does not depend on the step before, the input projections of a layer, is one matrix product; what does is a loop
-over the steps in which sixteen rows of the recurrent weights are added up at a time.
+over the steps in which eight rows of the recurrent weights are added up at a time.
 """
 
 from collections.abc import Mapping
