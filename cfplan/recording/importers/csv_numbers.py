@@ -38,7 +38,7 @@ def numbers(data: mmap.mmap, lines: Lines, file: Path) -> tuple[NDArray, bool]:
 
     Raises InputError with the file's line where one has another number of cells, or a wanted one is no number.
     """
-    blocks, cut = [np.empty((0, len(lines.wanted)))], False
+    blocks, cut = [], False
     for begin, end in _blocks(data, lines):
         try:
             blocks.append(_block(data[begin:end], lines))
@@ -50,7 +50,9 @@ def numbers(data: mmap.mmap, lines: Lines, file: Path) -> tuple[NDArray, bool]:
                 raise mistake or InputError("the numbers cannot be read", where=place(data, begin, file)) from error
             if last > begin:
                 blocks.append(_block(data[begin:last], lines))
-    return np.concatenate(blocks), cut
+    if not blocks:
+        return np.empty((0, len(lines.wanted))), cut
+    return np.concatenate(blocks, axis=1).T, cut
 
 
 def place(data: mmap.mmap, offset: int, file: Path) -> str:
@@ -74,6 +76,7 @@ def _blocks(data: mmap.mmap, lines: Lines) -> Iterator[tuple[int, int]]:
 
 
 def _block(text: bytes, lines: Lines) -> NDArray:
+    """(wanted, rows): a column of the file is a row here, side by side in memory as Arrow has it."""
     names = [str(index) for index in range(lines.width)]
     kept = [names[index] for index in lines.wanted]
     table = csv.read_csv(
@@ -87,7 +90,7 @@ def _block(text: bytes, lines: Lines) -> NDArray:
             decimal_point=lines.point,
         ),
     )
-    return np.stack([column.to_numpy() for column in table.columns], axis=1)
+    return np.stack([column.to_numpy() for column in table.columns])
 
 
 def _mistake(data: mmap.mmap, begin: int, end: int, lines: Lines, file: Path) -> InputError | None:

@@ -131,7 +131,7 @@ def _log(parts: list[_Rows], reading: _Reading, file: Path) -> MocapLog:
         notes += [f"left out, as it holds no pose: {name}" for name in section.left_out]
         if not part.blocks:
             continue
-        values = np.concatenate(part.blocks)
+        values = np.concatenate(part.blocks) if len(part.blocks) > 1 else part.blocks[0]
         frame = values[:, 0]
         if origin is None:
             origin = float(frame[np.isfinite(frame)][0]) if np.isfinite(frame).any() else 0.0
@@ -143,10 +143,11 @@ def _log(parts: list[_Rows], reading: _Reading, file: Path) -> MocapLog:
         column = 1 + (section.sub_frame_column is not None)
         for group in section.groups:
             after = column + len(group.rotation_columns) + len(group.position_columns)
+            rows = values[:, column:after] if keep.all() else values[keep, column:after]
             if group.name in subjects:
                 notes.append(f"{group.name} stands in the file twice; the first is used")
             else:
-                subjects[group.name] = _subject(group, time[keep], values[keep, column:after], file)
+                subjects[group.name] = _subject(group, time[keep], rows, file)
             column = after
     assumed = [group.name for part in parts for group in part.section.groups if group.assumed]
     if assumed:
