@@ -39,8 +39,9 @@ from cfplan.errors import InputError
 def train(dataset: Path, folder: Path, device: str, as_json: bool, **what: Any) -> None:
     """Train a model on DATASET. Given again after a stop, it goes on where the last whole epoch ended."""
     try:
+        from cfplan.learning.checkpoints import Epoch
         from cfplan.learning.networks import Architecture
-        from cfplan.learning.training import Epoch, Options, train
+        from cfplan.learning.training import Options, train
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors", "matplotlib"):
             raise

@@ -48,6 +48,10 @@ START_NOISE = (0.01, 0.01, 0.005)
 TAIL = 16
 # nodes at the end of a window inside a path, whose speed is decided by what the window does not show
 TAIL_WEIGHT = 0.1
+UNSEEN_SHARE, UNSEEN_MOST = 0.1, 500
+# of the paths, kept apart to be judged on
+SPLIT_STREAM = 0
+# of a seed's random numbers
 
 
 class Labels(NamedTuple):
@@ -152,6 +156,18 @@ def _joined(paths: tuple[Path, ...]) -> tuple[NDArray, NDArray, NDArray]:
     for path, first in zip(paths, pieces, strict=False):
         coefficients[first : first + len(path.coefficients), : path.coefficients.shape[1]] = path.coefficients
     return pieces, np.concatenate([path.breaks for path in paths]), coefficients
+
+
+def split(material: Material, seed: int) -> tuple[Material, Material]:
+    """What is learned from, and what is judged on: a path's perturbed copies go where it goes."""
+    paths = material.rows // (1 + material.spec.copies)
+    known = np.unique(paths)
+    order = np.random.default_rng([seed, SPLIT_STREAM]).permutation(known)
+    count = min(UNSEEN_MOST, max(1, round(UNSEEN_SHARE * len(known))))
+    if count >= len(known):
+        raise InputError("only one path to learn from and to be judged on", where="dataset", hint="make more paths")
+    apart = np.isin(paths, order[:count])
+    return material.part(np.flatnonzero(~apart)), material.part(np.flatnonzero(apart))
 
 
 def draw(labels: Labels, bound: Bounds, rows: NDArray, window: int, random: np.random.Generator) -> Batch:

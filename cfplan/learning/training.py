@@ -4,17 +4,12 @@ Every epoch draws its windows by a seed of its own and is followed by a checkpoi
 goes on as if it had not been. Under torchrun each process takes its share of the windows, and the first one writes.
 """
 
-import csv
-import io
 import json
-import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -27,16 +22,17 @@ from cfplan import __version__
 from cfplan.errors import InputError
 from cfplan.expert.limit_sets import LIMIT_SETS
 from cfplan.learning import features, inference
+from cfplan.learning.checkpoints import Epoch, resume, save_checkpoint
 from cfplan.learning.learned import predict
 from cfplan.learning.loss import loss
 from cfplan.learning.model_files import Card, save_model
 from cfplan.learning.networks import Architecture, build
-from cfplan.learning.sampling import Labels, Material, draw, read_material
+from cfplan.learning.processes import processes
+from cfplan.learning.sampling import Labels, Material, draw, read_material, split
+from cfplan.learning.smooth import travel_time
 from cfplan.learning.windows import WINDOW
 
-CHECKPOINT, LOG, CURVES = "checkpoint.pt", "log.csv", "curves.png"
-UNSEEN_SHARE, UNSEEN_MOST = 0.1, 500
-# of the paths, kept apart to be judged on
+CURVES = "curves.png"
 CHUNK = 4096
 # windows drawn at a time
 WARM_UP = 0.05
@@ -45,7 +41,7 @@ CLIP = 1.0
 # norm of the gradient, at most
 NOISE_EPOCHS = 5
 # after which paths are perturbed anew
-_DATA, _NOISE, _SPLIT = 1, 2, 3
+_DATA, _NOISE, _JUDGED = 1, 2, 3
 # streams of random numbers of one seed
 
 
@@ -88,23 +84,6 @@ class Options:
                 )
 
 
-@dataclass(frozen=True, slots=True)
-class Epoch:
-    """What an epoch came to; a row of log.csv."""
-
-    epoch: int
-    loss: float
-    unseen_loss: float
-    time_error: float
-    # mean of the relative errors of travel time, whole unseen paths, as a chain flies them
-    time_error_mean: float
-    # of their absolute values
-    time_error_p95: float
-    rate: float
-    seconds: float
-    # that the epoch took
-
-
 def train(
     dataset: Path,
     folder: Path,
@@ -121,7 +100,7 @@ def train(
             a loss that is not a number.
     """
     material = read_material(dataset)
-    with _processes(device) as (rank, world, place):
+    with processes(device) as (rank, world, place):
         run = _Run(material, folder, options, rank, world, place)
         try:
             for epoch in run.epochs():
@@ -147,9 +126,8 @@ class _Run:
             "data": _plain(material.spec),
             "features": features.VERSION,
         }
-        self.seen, self.unseen = _split(material, options.seed)
+        self.seen, self.unseen = split(material, options.seed)
         self.noise: tuple[int, Labels] | None = None
-        self.log: list[Epoch] = []
         torch.manual_seed(options.seed)
         self.network = build(options.architecture, options.hidden, options.layers)
         self._normalise()
@@ -159,8 +137,8 @@ class _Run:
         per_process = len(self.seen.rows) * options.windows // world
         self.batch = max(1, min(options.batch // world, per_process))
         self.batches = per_process // self.batch
-        self.unseen_windows = self._windows(self.unseen, np.tile(np.arange(len(self.unseen.rows)), 2), _SPLIT, 0)
-        self._resume()
+        self.unseen_windows = self._windows(self.unseen, np.tile(np.arange(len(self.unseen.rows)), 2), _JUDGED, 0)
+        self.log = resume(folder, self.identity, self.network, self.optimiser, place)
 
     def epochs(self) -> Iterator[Epoch]:
         """Train, an epoch at a time."""
@@ -175,7 +153,7 @@ class _Run:
                     self.optimiser.param_groups[0]["lr"], time.perf_counter() - began,
                 )  # fmt: skip
                 self.log.append(epoch)
-                self._checkpoint()
+                save_checkpoint(self.folder, self.identity, self.network, self.optimiser, self.log)
                 yield epoch
             if self.world > 1:
                 distributed.barrier()
@@ -281,7 +259,7 @@ class _Run:
         return np.array(found) / unseen.travel_time - 1.0
 
     def _normalise(self) -> None:
-        inputs = self._windows(self.seen, np.arange(len(self.seen.rows))[:CHUNK], _SPLIT, 1)[0]
+        inputs = self._windows(self.seen, np.arange(len(self.seen.rows))[:CHUNK], _JUDGED, 1)[0]
         spread = inputs.std(dim=(0, 1))
         self.network.mean.copy_(inputs.mean(dim=(0, 1)))
         self.network.scale.copy_(torch.where(spread > 1e-6, 1.0 / spread, torch.ones_like(spread)))
@@ -289,106 +267,8 @@ class _Run:
     def _weights(self) -> dict[str, NDArray]:
         return {name: values.detach().cpu().numpy() for name, values in self.network.state_dict().items()}
 
-    def _checkpoint(self) -> None:
-        """Everything that going on needs; whole or not at all."""
-        content = {
-            "identity": self.identity,
-            "network": self.network.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "log": [asdict(epoch) for epoch in self.log],
-        }
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        table = io.StringIO()
-        writer = csv.DictWriter(table, Epoch.__slots__, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(asdict(epoch) for epoch in self.log)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        for name, data in ((CHECKPOINT, buffer.getvalue()), (LOG, table.getvalue().encode())):
-            temporary = self.folder / f".{name}.new"
-            temporary.write_bytes(data)
-            temporary.replace(self.folder / name)
-
-    def _resume(self) -> None:
-        file = self.folder / CHECKPOINT
-        if not file.exists():
-            return
-        try:
-            content = torch.load(file, map_location=self.place, weights_only=True)
-            identity = content["identity"]
-            different = [
-                f"{name} {identity[part].get(name)} there, {value} here"
-                for part in ("options", "data")
-                for name, value in self.identity[part].items()
-                if identity[part].get(name) != value
-            ]
-            if different or identity["features"] != features.VERSION:
-                raise InputError(
-                    f"holds another training: {'; '.join(different) or 'of other features'}",
-                    where=str(self.folder),
-                    hint=f"give another folder, or delete its {CHECKPOINT}",
-                )
-            self.network.load_state_dict(content["network"])
-            self.optimiser.load_state_dict(content["optimiser"])
-            self.log = [Epoch(**row) for row in content["log"]]
-        except (
-            OSError,
-            RuntimeError,
-            ValueError,
-            LookupError,
-            TypeError,
-            AttributeError,
-            EOFError,
-            UnpicklingError,
-        ) as error:
-            reason = " ".join(str(error).split())[:120]
-            raise InputError(f"cannot be read: {reason}", where=str(file), hint="delete it to begin again") from None
-
-
-def travel_time(coefficients: NDArray, step: float) -> float:
-    """s, of a spline of h, by four-point Gauss quadrature on every interval."""
-    places, shares = np.polynomial.legendre.leggauss(4)
-    x = (places[:, None] + 1.0) / 2.0
-    u0, u1, u2, u3 = (coefficients[k : len(coefficients) - 3 + k] for k in range(4))
-    h = ((1 - x) ** 3 * u0 + (3 * x**3 - 6 * x**2 + 4) * u1 + (-3 * x**3 + 3 * x**2 + 3 * x + 1) * u2 + x**3 * u3) / 6
-    return float(step / 2.0 * (shares @ (1.0 / np.sqrt(h))).sum())
-
-
-def _split(material: Material, seed: int) -> tuple[Material, Material]:
-    """What is learned from, and what is judged on: a path's perturbed copies go where it goes."""
-    paths = material.rows // (1 + material.spec.copies)
-    known = np.unique(paths)
-    order = np.random.default_rng([seed, _SPLIT]).permutation(known)
-    count = min(UNSEEN_MOST, max(1, round(UNSEEN_SHARE * len(known))))
-    if count >= len(known):
-        raise InputError("only one path to learn from and to be judged on", where="dataset", hint="make more paths")
-    apart = np.isin(paths, order[:count])
-    return material.part(np.flatnonzero(~apart)), material.part(np.flatnonzero(apart))
-
 
 def _plain(content: Any) -> dict[str, Any]:
     """As a card has it: JSON knows no tuples."""
     plain: dict[str, Any] = json.loads(json.dumps(asdict(content)))
     return plain
-
-
-@contextmanager
-def _processes(device: str) -> Iterator[tuple[int, int, torch.device]]:
-    """Rank and number of the processes of this training, and where this one computes."""
-    world = int(os.environ.get("WORLD_SIZE", "1"))
-    local = int(os.environ.get("LOCAL_RANK", "0"))
-    try:
-        place = torch.device(f"{device}:{local}" if device == "cuda" else device)
-        torch.zeros(1, device=place)
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(
-            f"no device {device!r}: {' '.join(str(error).split())[:120]}", where="--device", hint="cpu always works"
-        ) from None
-    if world == 1:
-        yield 0, 1, place
-        return
-    distributed.init_process_group("nccl" if place.type == "cuda" else "gloo")
-    try:
-        yield distributed.get_rank(), distributed.get_world_size(), place
-    finally:
-        distributed.destroy_process_group()

@@ -14,12 +14,14 @@ import torch
 
 from cfplan.errors import InputError
 from cfplan.learning import training
+from cfplan.learning.checkpoints import CHECKPOINT, LOG
 from cfplan.learning.dataset_spec import load_spec
 from cfplan.learning.loss import loss
 from cfplan.learning.model_files import load_model
 from cfplan.learning.networks import Architecture
-from cfplan.learning.sampling import read_material
-from cfplan.learning.training import CHECKPOINT, CURVES, LOG, Options, train, travel_time
+from cfplan.learning.sampling import read_material, split
+from cfplan.learning.smooth import travel_time
+from cfplan.learning.training import CURVES, Options, train
 from cfplan.vehicle.timing import measure
 
 SMALL = Options(hidden=6, layers=1, window=16, epochs=3, windows=16, batch=8)
@@ -134,7 +136,7 @@ def test_a_device_that_is_not_there_is_named(tiny, tmp_path, device):
 def test_copies_of_a_path_are_all_learned_from_or_all_kept_apart(tiny):
     material = read_material(tiny)
     copied = replace(material, spec=replace(material.spec, epsilon=0.01, copies=3))  # sixteen rows of four paths
-    seen, unseen = training._split(copied, 0)
+    seen, unseen = split(copied, 0)
     assert set(seen.rows // 4).isdisjoint(unseen.rows // 4)
     assert len(seen.rows) + len(unseen.rows) == 16
     assert len(unseen.rows) % 4 == 0
