@@ -9,6 +9,7 @@ the larger of them by at most an eighth of its second difference there; that is 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from cfplan.vehicle.dense import Stretches, sampled_rows
 from cfplan.vehicle.trajectory import FullState, Trajectory
 
 TIME_STEP = 1e-3  # s, the most between two samples
-BATCH = 4_000  # samples at a time, about: as many as stay near the processor
+BATCH = 2_000  # samples at a time, about: as many as stay near the processor
 LEAST_POINTS = 11  # of a piece, its ends included
 WALLS = "distance to the walls"
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
@@ -105,8 +106,10 @@ class _Quantity:
     name: str
     unit: str
     sign: int
-    values: NDArray
-    # (k, N), of which all must keep the same limit
+    row: int
+    # of dense.sampled_rows
+    count: int
+    # of rows, all of which must keep the same limit
     limit: float
     at_rest: float
     # what it is in hover, which counts as share 0
@@ -123,23 +126,22 @@ class _Peak(NamedTuple):
 
 def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Certificate:
     """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
-    stretches = _stretches(trajectory)
+    stretches, quantities = _stretches(trajectory), list(_quantities(trajectory, limits, space))
+    table = np.array([(quantity.row, quantity.count, quantity.sign) for quantity in quantities])
     ends = np.cumsum(stretches.counts)
-    worst: dict[str, _Peak] = {}
-    first = 0
-    for last in [*(1 + np.flatnonzero(np.diff(ends // BATCH))).tolist(), len(ends)]:
-        batch = Stretches(*(values[first:last] for values in stretches))
-        rows = sampled_rows(trajectory.airframe, trajectory.path, trajectory.profile, batch)
-        for quantity in _quantities(rows, trajectory.airframe.hover_thrust, limits, space):
-            index, value = _peak(quantity.values, quantity.sign, batch.counts)
-            known = worst.get(quantity.name)
-            if known is None or not (np.isnan(known.value) or value <= known.value):  # NaN is the worst and stays
-                worst[quantity.name] = _Peak(quantity, value, float(rows[dense.PLACE, index]))
-        first = last
-    places = np.array([peak.s for peak in worst.values()])
+    bounds = [0, *(1 + np.flatnonzero(np.diff(ends // BATCH))).tolist(), len(ends)]
+    rows = np.empty((dense.SAMPLED_ROWS, int(np.diff(np.append(0, ends)[bounds]).max())))
+    values, places = np.full(len(table), -np.inf), np.zeros(len(table))
+    for first, last in pairwise(bounds):
+        batch = Stretches(*(each[first:last] for each in stretches))
+        sampled_rows(trajectory.airframe, trajectory.path, trajectory.profile, batch, rows)
+        if space is not None:
+            _put_distances(rows[dense.POSITION : dense.POSITION + 3, : batch.counts.sum()], space)
+        _raise_peaks(values, places, table, rows, rows[dense.PLACE], batch.counts)
+    peaks = [_Peak(*each) for each in zip(quantities, values.tolist(), places.tolist(), strict=True)]
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     return Certificate(
-        margins=tuple(_margin(*each) for each in zip(worst.values(), when, where, strict=True)),
+        margins=tuple(_margin(*each) for each in zip(peaks, when, where, strict=True)),
         duration=trajectory.duration,
         samples=int(ends[-1]),
     )
@@ -149,8 +151,11 @@ def shares(trajectory: Trajectory, limits: PlanLimits, time: NDArray) -> dict[st
     """How much of each limit is used at each time, (N,) each; counted as in the certificate, the walls left out."""
     rows = _rows(trajectory.at(time))
     return {
-        quantity.name: ((quantity.values - quantity.at_rest) / (quantity.limit - quantity.at_rest)).max(axis=0)
-        for quantity in _quantities(rows, trajectory.airframe.hover_thrust, limits, None)
+        quantity.name: (
+            (rows[quantity.row : quantity.row + quantity.count] - quantity.at_rest)
+            / (quantity.limit - quantity.at_rest)
+        ).max(axis=0)
+        for quantity in _quantities(trajectory, limits, None)
     }
 
 
@@ -170,28 +175,30 @@ def _rows(state: FullState) -> NDArray:
     return rows
 
 
-def _quantities(rows: NDArray, hover: float, limits: PlanLimits, space: Space | None) -> Iterator[_Quantity]:
-    def part(first: int, count: int = 1) -> NDArray:
-        return rows[first : first + count]
-
-    motors = part(dense.MOTOR_THRUST, 4)
-    yield _Quantity("speed", "m/s", 1, part(dense.SPEED), limits.speed, 0.0)
-    yield _Quantity("acceleration", "m/s²", 1, part(dense.ACCELERATION), limits.acceleration, 0.0)
-    yield _Quantity("angular velocity", "rad/s", 1, part(dense.BODY_RATE), limits.angular_velocity, 0.0)
+def _quantities(trajectory: Trajectory, limits: PlanLimits, space: Space | None) -> Iterator[_Quantity]:
+    hover = trajectory.airframe.hover_thrust
+    yield _Quantity("speed", "m/s", 1, dense.SPEED, 1, limits.speed, 0.0)
+    yield _Quantity("acceleration", "m/s²", 1, dense.ACCELERATION, 1, limits.acceleration, 0.0)
+    yield _Quantity("angular velocity", "rad/s", 1, dense.BODY_RATE, 1, limits.angular_velocity, 0.0)
     if limits.angular_acceleration != math.inf:
-        turning = part(dense.ANGULAR_ACCELERATION)
-        yield _Quantity("angular acceleration", "rad/s²", 1, turning, limits.angular_acceleration, 0.0)
-    yield _Quantity("tilt", "rad", 1, part(dense.TILT), limits.tilt, 0.0)
-    yield _Quantity("motor thrust, most", "N", 1, motors, limits.motor_thrust_max, 0.0)
-    yield _Quantity("motor thrust, least", "N", -1, motors, limits.motor_thrust_min, hover)
-    specific = part(dense.SPECIFIC_THRUST)
-    yield _Quantity("specific thrust, least", "m/s²", -1, specific, limits.specific_thrust_min, GRAVITY)
+        most = limits.angular_acceleration
+        yield _Quantity("angular acceleration", "rad/s²", 1, dense.ANGULAR_ACCELERATION, 1, most, 0.0)
+    yield _Quantity("tilt", "rad", 1, dense.TILT, 1, limits.tilt, 0.0)
+    yield _Quantity("motor thrust, most", "N", 1, dense.MOTOR_THRUST, 4, limits.motor_thrust_max, 0.0)
+    yield _Quantity("motor thrust, least", "N", -1, dense.MOTOR_THRUST, 4, limits.motor_thrust_min, hover)
+    least = limits.specific_thrust_min
+    yield _Quantity("specific thrust, least", "m/s²", -1, dense.SPECIFIC_THRUST, 1, least, GRAVITY)
     if space is not None:
-        low, high = np.array(space.low), np.array(space.high)
-        middle, half = (low + high) / 2, (high - low) / 2
-        # The walls of one axis after the other; the least of the distances is kept.
-        distance = half[:, None] - np.abs(part(dense.POSITION, 3) - middle[:, None])
-        yield _Quantity(WALLS, "m", -1, distance, space.margin, float(half.min()))
+        half = float((np.array(space.high) - np.array(space.low)).min()) / 2
+        yield _Quantity(WALLS, "m", -1, dense.POSITION, 3, space.margin, half)
+
+
+def _put_distances(position: NDArray, space: Space) -> None:
+    """In place of positions, (3, N), how far from the walls of each axis they are; the least of them counts."""
+    low, high = np.array(space.low)[:, None], np.array(space.high)[:, None]
+    position -= (low + high) / 2
+    np.abs(position, out=position)
+    np.subtract((high - low) / 2, position, out=position)
 
 
 def _plain(value: Any) -> Any:
@@ -231,6 +238,16 @@ def _stretches(trajectory: Trajectory) -> Stretches:
     needed = width / (TIME_STEP * np.sqrt(h.min(axis=0)))
     counts = np.maximum(np.ceil(needed).astype(int) + 1, LEAST_POINTS)
     return Stretches(edges[:-1], edges[1:], interval, piece, counts)
+
+
+@njit(cache=True)
+def _raise_peaks(values: NDArray, places: NDArray, table: NDArray, rows: NDArray, s: NDArray, counts: NDArray) -> None:
+    """Take over the peaks of these samples where they are higher. `table`, (Q, 3): first row, how many, and sign."""
+    for k in range(len(table)):
+        if not np.isnan(values[k]):  # NaN is the worst and stays
+            index, value = _peak(rows[table[k, 0] : table[k, 0] + table[k, 1]], table[k, 2], counts)
+            if not value <= values[k]:
+                values[k], places[k] = value, s[index]
 
 
 @njit(cache=True)

@@ -81,12 +81,16 @@ def dense_rows(
     return out
 
 
-def sampled_rows(airframe: Airframe, path: Path, profile: SpeedProfile, stretches: Stretches) -> NDArray:
+def sampled_rows(
+    airframe: Airframe, path: Path, profile: SpeedProfile, stretches: Stretches, out: NDArray | None = None
+) -> NDArray:
     """(SAMPLED_ROWS, N) at the samples of all stretches, one stretch behind the other.
 
+    `out` is where they are written, if given; it may have more columns than are needed.
     The last sample of a stretch is the last number below its right end, so that it falls on its own side of a break.
     """
-    out = np.empty((SAMPLED_ROWS, int(stretches.counts.sum())))
+    if out is None:
+        out = np.empty((SAMPLED_ROWS, int(stretches.counts.sum())))
     coefficients = path.coefficients
     if missing := -coefficients.shape[1] % _BLOCK:
         coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
