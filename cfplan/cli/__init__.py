@@ -17,6 +17,7 @@ from cfplan.cli.replay import replay
 from cfplan.cli.report import report
 from cfplan.cli.sim import sim
 from cfplan.cli.train import train
+from cfplan.cli.virtual import virtual
 from cfplan.errors import CfplanError
 
 EPILOG = """\b
@@ -36,7 +37,7 @@ def cfplan() -> None:
     """Plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
 
 
-for command in (plan, check, sim, fly, replay, report, mocap, dataset, train, bench, study, doctor):
+for command in (plan, check, sim, fly, virtual, replay, report, mocap, dataset, train, bench, study, doctor):
     cfplan.add_command(command)
 
 

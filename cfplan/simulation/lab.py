@@ -17,13 +17,16 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.errors import LinkError
+from cfplan.errors import CfplanError, LinkError
+from cfplan.simulation.radio import RadioFault
 from cfplan.simulation.room import RoomSettings, lab_variable
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon_faults import ViconFault
 from cfplan.vehicle.airframe import Airframe
 
-TRUTH, CLOSE = "truth", "close"
+TRUTH, LATEST, CLOSE = "truth", "latest", "close"
+Fault = VehicleFault | RadioFault | ViconFault
 _START_TIMEOUT = 180.0  # s; the first start on a machine compiles
 _ANSWER_TIMEOUT = 10.0  # s
 _CLOSE_TIMEOUT = 3.0  # s
@@ -105,8 +108,15 @@ class Lab:
 
     def truth(self) -> Truth:
         """What really happened so far; for tests and reports. Raises LinkError where the lab has died."""
+        return self._ask(TRUTH)
+
+    def latest(self) -> Truth:
+        """The last row of it."""
+        return self._ask(LATEST)
+
+    def _ask(self, request: str) -> Truth:
         try:
-            self._connection.send(TRUTH)
+            self._connection.send(request)
             if not self._connection.poll(_ANSWER_TIMEOUT):
                 raise LinkError("the lab does not answer", where=self.uri, hint="is the machine overloaded? Try again")
             rows, locked = self._connection.recv()
@@ -116,8 +126,8 @@ class Lab:
             ) from why
         return Truth.of(np.frombuffer(rows).reshape(-1, ROW_SIZE), locked)
 
-    def disturb(self, fault: ViconFault) -> None:
-        """Let something go wrong with the virtual Vicon; the fault's start counts from now."""
+    def disturb(self, fault: Fault) -> None:
+        """Let something go wrong with the vehicle, its radio or the virtual Vicon; its start counts from now."""
         with suppress(OSError):  # the lab has died, which others will notice
             self._connection.send(fault)
 
@@ -147,9 +157,16 @@ class Lab:
 
 
 def start_lab(
-    airframe: Airframe, *, vehicle: VehicleSettings | None = None, room: RoomSettings | None = None, number: int = 0
+    airframe: Airframe,
+    *,
+    vehicle: VehicleSettings | None = None,
+    room: RoomSettings | None = None,
+    number: int = 0,
+    port: int = 0,
 ) -> Lab:
-    """Start a lab with a vehicle of this airframe as `sim://number`. Raises LinkError where it does not come up.
+    """Start a lab with a vehicle of this airframe as `sim://number`, and as `udp://127.0.0.1:port`; 0 takes a free one.
+
+    Raises LinkError where it does not come up, InputError where the port or the one above it is taken.
 
     A lab that had that number is hidden until this one is closed. A plain child process rather than one of
     multiprocessing's, so that it can be started from a daemonic process and from a script without a main guard.
@@ -163,10 +180,13 @@ def start_lab(
         )
     connection = Connection(ours.detach())
     try:
-        connection.send((airframe, vehicle or VehicleSettings(), room or RoomSettings()))
+        connection.send((airframe, vehicle or VehicleSettings(), room or RoomSettings(), port))
         if not connection.poll(_START_TIMEOUT):
             raise EOFError
-        port, vicon_port = connection.recv()
+        answer = connection.recv()
+        if isinstance(answer, CfplanError):
+            raise answer
+        port, vicon_port = answer
         subject = room.vicon.subject if room is not None and room.vicon is not None else ""
         mocap_uri = f"vicon://127.0.0.1:{vicon_port}/{subject}" if subject else ""
         return Lab(process, connection, number, port, mocap_uri)

@@ -6,6 +6,7 @@ import os
 import select
 import signal
 import socket
+import struct
 import sys
 import time
 from contextlib import suppress
@@ -13,8 +14,11 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
-from cfplan.simulation.lab import CLOSE, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME, TRUTH
+from cfplan.errors import CfplanError, InputError
+from cfplan.simulation.lab import CLOSE, LATEST, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME, TRUTH
+from cfplan.simulation.radio import Radio, RadioFault
 from cfplan.simulation.room import SUBSCRIBE, SUBSCRIPTION_LASTS, MotionCapture, RoomSettings
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.vehicle import COMMANDER_PERIOD, VirtualCrazyflie
@@ -29,6 +33,7 @@ _RECORD_PERIOD = 10  # ms
 _MOST_BEHIND = 0.25  # s that a stall may be caught up with; beyond, simulated time is lost
 _SILENCE = 2.0  # s after which a client has gone
 _LARGEST_DATAGRAM = 64
+EXTERNAL_POSE = b"\x08"
 
 _Address = tuple[str, int]
 
@@ -49,26 +54,31 @@ class Recorder:
         row[OFF_IN_AIR], row[SUPERVISOR] = loop.counts[OFF_IN_AIR_TICKS], vehicle.supervisor.state
         self._count += 1
 
-    def rows(self) -> bytes:
-        """All of it."""
-        return self._rows[: self._count].tobytes()
+    def rows(self, first: int = 0) -> bytes:
+        """All of it, or from a row on; negative ones count from the end."""
+        return self._rows[: self._count][first:].tobytes()
 
 
 class LabLoop:
     """Vehicle, room and sockets on one clock."""
 
-    def __init__(self, airframe: Airframe, vehicle: VehicleSettings, room: RoomSettings):
+    def __init__(self, airframe: Airframe, vehicle: VehicleSettings, room: RoomSettings, port: int = 0):
         self.vehicle = VirtualCrazyflie(airframe, vehicle)
+        self._on_board = room.on_board
+        if room.on_board:
+            self.vehicle.use_kalman()
         self._warm_up()
         self.capture = MotionCapture(room, begin=self.vehicle.tick)
         self.vicon: VirtualVicon | None = None
         self.record = Recorder()
-        self.link, self.poses = _adjacent_sockets()
+        self.link, self.poses = _sockets_at(port) if port else _adjacent_sockets()
         self.port: int = self.link.getsockname()[1]
         self._client: _Address | None = None
         self._heard = 0.0
         self._subscribers: dict[_Address, float] = {}
         self._origin = 0.0
+        self._radio: Radio | None = None
+        # None while the link is perfect
 
     def _warm_up(self) -> None:
         """Compile, and let the supervisor pass its checks, before anyone looks."""
@@ -94,6 +104,8 @@ class LabLoop:
     def _due(self) -> float:
         """When something happens next that is seen outside; whatever comes in wakes it besides."""
         tick = self.vehicle.tick
+        if self._radio is not None and self._radio.busy:
+            return self._origin + (tick + 1) / 1000
         if self.vicon is not None:
             return min(self._origin + (tick + _VICON_STEP) / 1000, self.capture.next_due)
         boundary = -(-tick // COMMANDER_PERIOD) * COMMANDER_PERIOD
@@ -130,10 +142,19 @@ class LabLoop:
             self.vicon.step(now)
         if self._client is not None and now - self._heard > _SILENCE:
             self._client = None
+        if self._radio is not None:
+            for packet in packets:
+                self._radio.answer(packet)
+            up, packets = self._radio.step(now)
+            for packet in up:
+                self.vehicle.receive(packet)
         if self._client is not None:
             for packet in packets:
                 self.link.sendto(packet, self._client)
         for packet in self.capture.ready(now):
+            if self._on_board:
+                pose = EXTERNAL_POSE + struct.pack("<7f", *self.capture.measured(packet))
+                self.vehicle.receive(pack(Port.LOCALIZATION, 1, pose))
             for address, renewed in list(self._subscribers.items()):
                 if now - renewed > SUBSCRIPTION_LASTS:
                     del self._subscribers[address]
@@ -146,7 +167,10 @@ class LabLoop:
                 self.link.sendto(pack(Port.LINK, 3, b""), sender)
                 continue
             self._client, self._heard = sender, time.monotonic()
-            self.vehicle.receive(packet)
+            if self._radio is not None:
+                self._radio.send(packet)
+            else:
+                self.vehicle.receive(packet)
         self._send_out(time.monotonic())
 
     def _read_subscriptions(self) -> None:
@@ -161,10 +185,16 @@ class LabLoop:
             request = control.recv()
         except (EOFError, OSError):  # whoever started this has gone
             return False
-        if request == TRUTH:
-            control.send((self.record.rows(), self.vehicle.supervisor.ever_locked))
+        if request in (TRUTH, LATEST):
+            rows = self.record.rows(-1 if request == LATEST else 0)
+            control.send((rows, self.vehicle.supervisor.ever_locked))
         elif isinstance(request, ViconFault) and self.vicon is not None:
             self.vicon.inject(request, time.monotonic())
+        elif isinstance(request, VehicleFault):
+            self.vehicle.inject(request)
+        elif isinstance(request, RadioFault):
+            self._radio = self._radio or Radio(time.monotonic())
+            self._radio.inject(request, time.monotonic())
         return request != CLOSE
 
 
@@ -194,10 +224,30 @@ def _adjacent_sockets() -> tuple[socket.socket, socket.socket]:
         return first, second
 
 
+def _sockets_at(port: int) -> tuple[socket.socket, socket.socket]:
+    """The same at a port. Raises InputError where it cannot be had."""
+    found = []
+    for number in (port, port + 1):
+        made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            made.bind(("127.0.0.1", number))
+        except (OSError, OverflowError) as why:
+            raise InputError(
+                f"port {number} cannot be had: {why}", where="virtual vehicle", hint="name another with --port"
+            ) from why
+        made.setblocking(False)
+        found.append(made)
+    return found[0], found[1]
+
+
 def serve(control: Connection) -> None:
     """Make the lab that the other side asks for, say on which port it listens, and run it."""
-    airframe, vehicle, room = control.recv()
-    loop = LabLoop(airframe, vehicle, room)
+    airframe, vehicle, room, port = control.recv()
+    try:
+        loop = LabLoop(airframe, vehicle, room, port)
+    except CfplanError as error:
+        control.send(error)
+        return
     if room.vicon is not None:
         loop.vicon = VirtualVicon(room.vicon, time.monotonic())
     gc.collect()

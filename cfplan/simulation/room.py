@@ -38,6 +38,8 @@ class RoomSettings:
     latency: float = 0.010
     # s from the moment of a pose to its leaving the room
     seed: int = 7
+    on_board: bool = False
+    # the vehicle has the poses too, as from a positioning deck
     vicon: ViconSettings | None = None
     # a virtual Vicon that sees the vehicle too, with its own rate, noise and faults
 
@@ -70,6 +72,11 @@ class MotionCapture:
         packet = _POSE.pack(time, self._number, *position, *quaternion)
         self._waiting.append((time + self._settings.latency, packet))
         self._number += 1
+
+    @staticmethod
+    def measured(packet: bytes) -> tuple[float, ...]:
+        """Position and quaternion of a packet."""
+        return _POSE.unpack(packet)[2:]
 
     def ready(self, time: float) -> list[bytes]:
         """The packets that leave the room by now."""

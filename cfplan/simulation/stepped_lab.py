@@ -8,22 +8,19 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cfplan.simulation.lab import MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME, Truth
+from cfplan.simulation.lab import MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME, Fault, Truth
 from cfplan.simulation.radio import Radio, RadioFault
 from cfplan.simulation.virtual_cameras import Cameras, ViconSettings
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.vehicle import COMMANDER_PERIOD, VirtualCrazyflie
-from cfplan.simulation.virtual_vicon_faults import ViconFault
 from cfplan.simulation.virtual_vicon_server import Picture
 from cfplan.vehicle.airframe import Airframe
 
 BEGIN = 1000.0  # s, where the clock starts
 _WARM_UP = 200  # ms
 _RECONNECTS_AFTER = 0.3  # s from when the cameras' connection is possible again
-
-Fault = VehicleFault | RadioFault | ViconFault
 
 
 class SteppedLab:

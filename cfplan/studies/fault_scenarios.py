@@ -7,8 +7,8 @@ from typing import Any
 from cfplan.flight.keys import Order
 from cfplan.flight.outcome import Rung
 from cfplan.flight.telemetry import Phase
+from cfplan.simulation.lab import Fault
 from cfplan.simulation.radio import RadioFault, RadioFaultKind
-from cfplan.simulation.stepped_lab import Fault
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon_faults import FaultKind, ViconFault

@@ -88,6 +88,10 @@ class VirtualCrazyflie:
         # with the ticks of their begin and end
         self._watch_parameters()
 
+    def use_kalman(self) -> None:
+        """As a positioning deck asks for at start."""
+        self.parameters["stabilizer.estimator"] = KALMAN
+
     def inject(self, fault: VehicleFault) -> None:
         """Let something go wrong; its start counts from now."""
         begin = self.tick + round(1000 * fault.start)
