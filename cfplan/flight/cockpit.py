@@ -114,7 +114,9 @@ class Cockpit:
         return now
 
     def _forward_poses(self) -> None:
-        newest = None
+        newest, estimate = None, self.link.estimate
+        if self.airborne and estimate is not None and self.now() - estimate.time <= self.limits.pose.age_warning:
+            self.source.tell_attitude(estimate.quaternion)
         for pose in self.source.poses():
             self.report(PoseReceived(pose.time, pose.received, pose.position, pose.quaternion))
             fault = self._freshness.fault(pose)

@@ -30,5 +30,8 @@ class PoseSource(Protocol):
     def poses(self) -> list[Pose]:
         """All that came since the last call, oldest first; empty when there is none. Never blocks."""
 
+    def tell_attitude(self, attitude: tuple[float, float, float, float]) -> None:
+        """What the vehicle believes its attitude to be, now; helps to judge the next pose."""
+
     def close(self) -> None:
         """End; may be called twice."""

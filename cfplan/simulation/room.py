@@ -159,6 +159,9 @@ class RoomPoseSource:
         except (BlockingIOError, ConnectionRefusedError):  # nothing more; or the lab has gone, and nothing comes
             return found
 
+    def tell_attitude(self, attitude: tuple[float, float, float, float]) -> None:
+        """These poses are never turned over."""
+
     def close(self) -> None:
         if self._socket is not None:
             with suppress(OSError):  # the lab has gone before us

@@ -109,3 +109,18 @@ def test_what_is_no_pose_is_broken_and_forgotten(body):
     assert sorter.sort(i * PERIOD, body, i) is Verdict.BROKEN
     assert sorter.sort((i + 1) * PERIOD, flown((i + 1) * PERIOD), i + 1) is Verdict.GOOD
     assert sorter.counts[Verdict.BROKEN] == 1
+
+
+@pytest.mark.parametrize("gap", [0.8, 1.2])
+def test_a_vehicle_that_turned_while_it_was_not_seen_is_told_from_a_pattern_turned_over(gap):
+    for turned, expected in ((0.0, Verdict.GOOD), (math.pi, Verdict.FLIPPED)):
+        sorter, i = sorter_after()
+        k = i + round(gap / PERIOD)
+        sorter.attitude = flown(k * PERIOD).quaternion
+        assert sorter.sort(k * PERIOD, flown(k * PERIOD, turned=turned), k) is expected
+
+
+def test_without_the_vehicles_word_a_large_turn_is_not_believed():
+    sorter, i = sorter_after()
+    k = i + 120
+    assert sorter.sort(k * PERIOD, flown(k * PERIOD), k) is Verdict.FLIPPED

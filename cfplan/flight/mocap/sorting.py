@@ -10,7 +10,7 @@ from collections import Counter, deque
 from enum import StrEnum
 
 from cfplan.flight.mocap.frames import Body
-from cfplan.flight.telemetry import Triple
+from cfplan.flight.telemetry import Quaternion, Triple
 
 _ACCELERATION = 20.0  # m/s² by which the motion may have changed since; twice what a flight may do
 _TURN = 0.5  # rad that the attitude may turn from one pose to the next
@@ -47,6 +47,9 @@ class Sorter:
         self._other_since = 0.0
         self._other_verdict = Verdict.JUMPED
         self.counts: Counter[Verdict] = Counter()
+        self.attitude: Quaternion | None = None
+        # as the vehicle itself believes it: its gyroscopes tell a vehicle that turned, while it was not seen, from a
+        # pattern that was turned over
 
     def sort(self, time: float, body: Body | None, number: int | None = None) -> Verdict:
         """What this pose is. Only a good one may be used."""
@@ -82,7 +85,9 @@ class Sorter:
         last_time, last = self._good[-1]
         elapsed = time - last_time
         off = math.dist(body.position, self._expected(time))
-        turned = _angle(body, last)
+        turned = _angle(body.quaternion, last.quaternion)
+        if turned > _TURN and self.attitude is not None and _angle(body.quaternion, self.attitude) <= _TURN:
+            turned = 0.0
         if off <= self._jump and turned <= _TURN:
             self._other = None
             return Verdict.GOOD
@@ -117,7 +122,7 @@ class Sorter:
         other_time, other = self._other
         elapsed = time - other_time
         near = math.dist(body.position, other.position) <= self._jump + _SPEED * elapsed
-        return near and _angle(body, other) <= min(_TURN + _TURN_RATE * elapsed, _MOST_TURN)
+        return near and _angle(body.quaternion, other.quaternion) <= min(_TURN + _TURN_RATE * elapsed, _MOST_TURN)
 
     def _believe_other(self) -> None:
         self._other = None
@@ -128,7 +133,7 @@ def _same(a: Body, b: Body) -> bool:
     return a.position == b.position and a.quaternion == b.quaternion
 
 
-def _angle(a: Body, b: Body) -> float:
+def _angle(a: Quaternion, b: Quaternion) -> float:
     """rad between two attitudes."""
-    aligned = abs(math.fsum(p * q for p, q in zip(a.quaternion, b.quaternion, strict=True)))
+    aligned = abs(math.fsum(p * q for p, q in zip(a, b, strict=True)))
     return 2.0 * math.acos(min(1.0, aligned))

@@ -11,6 +11,7 @@ from cfplan.flight.mocap.frames import Frame, Scene
 from cfplan.flight.mocap.sorting import Sorter, Verdict
 from cfplan.flight.mocap.uri import MocapUri, no_such_body, parse_uri
 from cfplan.flight.poses import Pose
+from cfplan.flight.telemetry import Quaternion
 from cfplan.safety.limits import PoseLimits
 
 OPEN_WITHIN = 4.5  # s
@@ -45,6 +46,10 @@ class MocapSource:
         self._next = -math.inf
         self.fault = ""
         # why there is silence; "" while good poses come
+
+    def tell_attitude(self, attitude: Quaternion) -> None:
+        """What the vehicle believes."""
+        self._sorter.attitude = attitude
 
     @property
     def counts(self) -> "Counter[Verdict]":
