@@ -10,6 +10,7 @@ from cfplan.expert import stage
 from cfplan.expert.between import SPEED, Excess, spread
 from cfplan.expert.guess import guess_spline
 from cfplan.expert.program import Layout
+from cfplan.expert.spline_profile import spline_profile
 from cfplan.expert.yaw_track import YawTrack
 from cfplan.geometry.path import Path
 from cfplan.safety.limits import PlanLimits
@@ -38,6 +39,8 @@ class Ends:
 
     start: BoundaryState | None
     end: BoundaryState | None
+    continues: bool = False
+    # whether the start is where another problem's solution was cut: then it keeps its limits with room to spare
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,15 +79,20 @@ def pose(
     yaw_angle: float,
     ends: Ends,
     penalties: stage.Penalties,
+    table: NDArray | None = None,
 ) -> Problem:
-    """The problem of a path. Where yaw is free its first value lies from `yaw_angle` to a quarter turn more."""
+    """The problem of a path. Where yaw is free its first value lies from `yaw_angle` to a quarter turn more.
+
+    `table`, (N+3, 1 or 2), is from where to search, else a guess; it must agree with the boundary states.
+    """
     nodes = layout.shape.nodes
     step, unit = path.end / nodes, limits.speed**2
     p = _parameters(layout, path, airframe, limits, track, penalties, unit, step)
     margin = MARGIN * (1.0 - held_by(ends, nodes))
     lbx, ubx = _variable_bounds(layout, path, limits, unit, step, margin)
     lbg, ubg = _constraint_bounds(layout, path, limits, unit, step, margin, ends)
-    table = _guess(layout, path, airframe, limits, yaw_angle, ends, unit, step)
+    if table is None:
+        table = _guess(layout, path, airframe, limits, yaw_angle, ends, unit, step)
     x0 = variables_of(table, layout)
     if layout.shape.free_yaw:
         lbx[3], ubx[3] = yaw_angle, yaw_angle + math.pi / 2
@@ -122,6 +130,32 @@ def tightened(problem: Problem, excess: Excess, at_points: NDArray) -> Problem:
     return replace(problem, lbg=lbg, ubg=ubg, ubx=ubx)
 
 
+def continued(problem: Problem, before: Problem, first: int) -> Problem:
+    """The problem with the limits lowered as they were in `before`, whose interval `first` is its first one."""
+    overlap = before.layout.shape.nodes - first
+    lower, upper = (np.full((overlap, stage.ROWS), value) for value in (-np.inf, np.inf))
+    point, row = np.divmod(before.layout.selected, stage.ROWS)
+    interval = before.layout.interval[point] - first
+    shared = interval >= 0
+    at = interval[shared], row[shared]
+    np.maximum.at(lower, at, before.lbg[before.layout.point_rows[shared]])
+    np.minimum.at(upper, at, before.ubg[before.layout.point_rows[shared]])
+
+    layout = problem.layout
+    lbg, ubg, ubx = problem.lbg.copy(), problem.ubg.copy(), problem.ubx.copy()
+    point, row = np.divmod(layout.selected, stage.ROWS)
+    interval = layout.interval[point]
+    decided = np.isin(row, stage.JUMPING, invert=True) & (interval == 0) & (layout.place[point] == 0.0)
+    shared = (interval < overlap) & ~decided
+    at, rows = (interval[shared], row[shared]), layout.point_rows[shared]
+    lbg[rows], ubg[rows] = np.maximum(lbg[rows], lower[at]), np.minimum(ubg[rows], upper[at])
+    theirs = before.layout.speed_rows[first:]
+    ubg[layout.speed_rows[:overlap]] = np.minimum(ubg[layout.speed_rows[:overlap]], before.ubg[theirs])
+    nodes = np.arange(1, overlap) * layout.block
+    ubx[nodes] = np.minimum(ubx[nodes], before.ubx[nodes + first * layout.block])
+    return replace(problem, lbg=lbg, ubg=ubg, ubx=ubx)
+
+
 def table_of(x: NDArray, layout: Layout) -> NDArray:
     """(N+3, 1 or 2) the spline coefficients that a solver's variables imply."""
     rows = np.append(x, np.zeros(layout.controls)).reshape(layout.shape.nodes + 1, layout.block)
@@ -150,24 +184,13 @@ def variables_of(table: NDArray, layout: Layout) -> NDArray:
 
 
 def profile_of(table: NDArray, problem: Problem, track: YawTrack, end: float) -> SpeedProfile:
-    """The profile of these splines."""
-    step, unit, cubic = problem.step, problem.unit, table[:, 0]
-    grid = {
-        "s": np.linspace(0.0, end, problem.layout.shape.nodes + 1),
-        "h": (cubic[:-2] + 4 * cubic[1:-1] + cubic[2:]) / 6 * unit,
-        "dh": (cubic[2:] - cubic[:-2]) / 2 * unit / step,
-        "ddh": np.diff(cubic, 2) * unit / step**2,
-        "dddh": np.diff(cubic, 3) * unit / step**3,
-    }
-    if not problem.layout.shape.free_yaw:
-        return SpeedProfile(**grid, yaw=track.yaw, dyaw=track.dyaw, ddyaw=track.ddyaw)
-    quadratic = table[:-1, 1]
-    return SpeedProfile(
-        **grid,
-        yaw=(quadratic[:-1] + quadratic[1:]) / 2,
-        dyaw=np.diff(quadratic) / step,
-        ddyaw=np.diff(quadratic, 2) / step**2,
-    )
+    """The profile of these splines, and of the track where yaw is not among them."""
+    if problem.layout.shape.free_yaw:
+        quadratic, step = table[:-1, 1], problem.step
+        track = YawTrack(
+            (quadratic[:-1] + quadratic[1:]) / 2, np.diff(quadratic) / step, np.diff(quadratic, 2) / step**2
+        )
+    return spline_profile(table[:, 0] * problem.unit, end, track)
 
 
 def _parameters(
@@ -197,7 +220,7 @@ def held_by(ends: Ends, nodes: int) -> NDArray:
     """
     free = np.ones(nodes)
     distance = np.arange(nodes) + 0.5
-    if ends.start:
+    if ends.start and not ends.continues:
         free = np.minimum(free, (distance - 1.5) / FADE)
     if ends.end:
         free = np.minimum(free, (nodes - distance - 1.5) / FADE)

@@ -34,8 +34,8 @@ class Shape:
     free_yaw: bool
     turning_limited: bool = False
     # whether angular acceleration has a limit of its own
-    end_intervals: int = 3
-    # intervals at each end with points inside
+    end_intervals: tuple[int, int] = (3, 3)
+    # intervals at each end with more points inside
     end_places: tuple[float, ...] = (0.2, 0.5, 0.8)
     middle_places: tuple[float, ...] = (0.5,)
     # points inside every other interval
@@ -75,7 +75,7 @@ class Layout:
         every = [r for r in range(stage.ROWS) if shape.turning_limited or r != stage.ANGULAR_ACCELERATION]
         jumping = [r for r in every if r in stage.JUMPING]
         for k in range(shape.nodes):
-            at_end = k < shape.end_intervals or k >= shape.nodes - shape.end_intervals
+            at_end = k < shape.end_intervals[0] or k >= shape.nodes - shape.end_intervals[1]
             inside = shape.end_places if at_end else shape.middle_places
             last = k == shape.nodes - 1
             points = [(0.0, every), *((p, every) for p in inside), (1.0, every if last else jumping)]

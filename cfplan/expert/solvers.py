@@ -34,12 +34,13 @@ class Attempt(NamedTuple):
     # the solver's own, for people
 
 
-def interior_point(problem: Problem, backend: Backend | None, table: NDArray | None = None) -> Attempt:
-    """Search from the problem's own guess, or from `table`, the answer to a problem almost the same."""
+def interior_point(
+    problem: Problem, backend: Backend | None, table: NDArray | None = None, search: Search | None = None
+) -> Attempt:
+    """Search from the problem's own table, or from `table`, the answer to a problem almost the same."""
     posed = SplineProblem(problem, backend)
-    ended = minimise(
-        posed, posed.rows, posed.v_of(problem.table if table is None else table), FROM_AFAR if table is None else NEARBY
-    )
+    search = search or (FROM_AFAR if table is None else NEARBY)
+    ended = minimise(posed, posed.rows, posed.v_of(problem.table if table is None else table), search)
     return Attempt(
         "interior point", posed.table_of(ended.v), posed.at_points(ended.g), ended.solved, ended.iterations, ended.words
     )

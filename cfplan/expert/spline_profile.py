@@ -1,4 +1,4 @@
-"""A SpeedProfile through samples of h and yaw: penalised B-splines with their knots at the profile's grid points."""
+"""SpeedProfiles and splines on their grid: from coefficients and back, and penalised splines through samples."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,6 +6,7 @@ from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
+from cfplan.expert.yaw_track import YawTrack
 from cfplan.vehicle.profile import SpeedProfile
 
 
@@ -25,6 +26,37 @@ def profile_through(
         s=grid, h=speed(grid), dh=speed(grid, 1), ddh=speed(grid, 2), dddh=speed(middle, 3),
         yaw=turn(grid), dyaw=turn(grid, 1), ddyaw=turn(middle, 2),
     )  # fmt: skip
+
+
+def spline_profile(cubic: NDArray, end: float, yaw: YawTrack) -> SpeedProfile:
+    """The profile whose h is the cubic B-spline with these coefficients, (N+3,), on the grid from 0 to `end`."""
+    step = end / (len(cubic) - 3)
+    difference = np.diff(cubic)
+    second = np.diff(difference)
+    return SpeedProfile(
+        s=np.linspace(0.0, end, len(cubic) - 2),
+        h=cubic[1:-1] + second / 6,
+        dh=(difference[1:] + difference[:-1]) / (2 * step),
+        ddh=second / step**2,
+        dddh=np.diff(second) / step**3,
+        yaw=yaw.yaw,
+        dyaw=yaw.dyaw,
+        ddyaw=yaw.ddyaw,
+    )
+
+
+def h_coefficients(profile: SpeedProfile) -> NDArray:
+    """(N+3,) the coefficients of h as a cubic B-spline on its grid."""
+    step = profile.s[1] - profile.s[0]
+    inner = profile.h - profile.ddh * step**2 / 6
+    before = inner[1] - 2 * step * profile.dh[0]
+    return np.concatenate([[before], inner, [inner[-2] + 2 * step * profile.dh[-1]]])
+
+
+def yaw_of(profile: SpeedProfile, first: int = 0, last: int | None = None) -> YawTrack:
+    """Yaw along the intervals from `first` to before `last`."""
+    nodes = slice(first, None if last is None else last + 1)
+    return YawTrack(profile.yaw[nodes], profile.dyaw[nodes], profile.ddyaw[first:last])
 
 
 def _fit(grid: NDArray, s: NDArray, values: NDArray, weights: NDArray, degree: int, stiffness: float) -> BSpline:
