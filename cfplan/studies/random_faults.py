@@ -1,4 +1,7 @@
-"""Faults by chance: kind, moment, length and size drawn by a seed, each flown in the stepped lab. None may leave."""
+"""Faults by chance: kind, moment, length and size drawn by a seed, each flown in the stepped lab. None may leave.
+
+A pilot that is dead is not among them: what the vehicle then does, it does by its own time-outs.
+"""
 
 import math
 from collections import Counter
@@ -22,7 +25,7 @@ from cfplan.studies.machine import Machine, this_machine
 
 _LENGTH, _SPREAD = 0.5, 1.2  # s and its logarithm's deviation: a twentieth of a second to some seconds
 _WHILE_FLYING = (Phase.TAKE_OFF, Phase.GO_TO_START, Phase.STREAM, Phase.STREAM, Phase.STREAM, Phase.HOLD, Phase.LAND)
-_STALL, _MAIN, _PILOT = "stall", "main process killed", "pilot killed"
+_STALL, _MAIN = "stall", "main process killed"
 
 # Kind, and the least and most size where it has one.
 _KINDS: tuple[tuple[Any, float, float], ...] = (
@@ -46,8 +49,8 @@ _KINDS: tuple[tuple[Any, float, float], ...] = (
     (VehicleFaultKind.LOCK, 0, 0),
     (_STALL, 0, 0),
     (_MAIN, 0, 0),
-    (_PILOT, 0, 0),
 )
+_LONGEST_STALL = 1.9  # s; what stands still for longer is as good as dead: the vehicle stops its motors after 2 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,9 +116,8 @@ def random_scenario(seed: int, duration: float) -> Scenario:
         faults=faults,
         phase=phase,
         moment=moment,
-        stall=length if kind is _STALL else 0.0,
+        stall=min(length, _LONGEST_STALL) if kind is _STALL else 0.0,
         main_killed=kind is _MAIN,
-        pilot_killed=kind is _PILOT,
         vehicle=VehicleSettings(auto_arming=False, seed=seed),
     )
 

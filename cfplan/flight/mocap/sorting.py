@@ -16,6 +16,7 @@ _ACCELERATION = 20.0  # m/s² by which the motion may have changed since; twice 
 _TURN = 0.5  # rad that the attitude may turn from one pose to the next
 _TURN_RATE = 12.0  # rad/s by which it may have turned on since
 _MOST_TURN = 1.3  # rad, however long ago; a pattern seen the wrong way round turns by 90° or 180°
+_SEEN_LATELY = 0.2  # s; after longer the vehicle knows better how it turned than its last pose does
 _SPEED = 4.0  # m/s at which another track may go on
 _HISTORY = 0.1  # s of good poses from which the velocity is taken
 _EXTRAPOLATE = 0.3  # s for which that velocity is taken to last
@@ -86,8 +87,9 @@ class Sorter:
         elapsed = time - last_time
         off = math.dist(body.position, self._expected(time))
         turned = _angle(body.quaternion, last.quaternion)
-        if turned > _TURN and self.attitude is not None and _angle(body.quaternion, self.attitude) <= _TURN:
-            turned = 0.0
+        if self.attitude is not None and (turned > _TURN or elapsed > _SEEN_LATELY):
+            turned = _angle(body.quaternion, self.attitude)
+            turned = turned if turned > _TURN else 0.0
         if off <= self._jump and turned <= _TURN:
             self._other = None
             return Verdict.GOOD
@@ -99,7 +101,7 @@ class Sorter:
             return Verdict.GOOD
         if off > self._jump + _ACCELERATION / 2 * elapsed**2:
             verdict = Verdict.JUMPED
-        elif turned > min(_TURN + _TURN_RATE * elapsed, _MOST_TURN):
+        elif turned > (_TURN if self.attitude is not None else min(_TURN + _TURN_RATE * elapsed, _MOST_TURN)):
             verdict = Verdict.FLIPPED
         else:
             self._other = None
