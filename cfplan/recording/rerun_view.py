@@ -29,6 +29,7 @@ from cfplan.recording.viewer import open_viewer, save
 from cfplan.vehicle.airframe import GRAVITY
 
 AXIS_LENGTH = 0.25  # m, of the body axes as drawn
+STRIPS_AT_ONCE = 250  # `rerun rrd verify` takes a time that grows with the square of the strips in one chunk
 BODY_SCALE = 4.0  # the vehicle is drawn larger than it is, or it could not be seen in its room
 TRACK_RADIUS, TAIL_RADIUS, WANTED_RADIUS, PATH_RADIUS = 0.004, 0.02, 0.01, 0.006  # m, of the lines
 HOVER_ARROW = 0.35  # m, of the thrust in hover
@@ -192,9 +193,10 @@ def log_tail(
 ) -> None:
     """Each step as a short line at its own time; the layout shows those of the last seconds."""
     stream.log(entity, rr.LineStrips3D.from_fields(colors=[colour], radii=[radius]), static=True)
-    if len(times) > 1:
-        columns = rr.LineStrips3D.columns(strips=_steps(positions))
-        stream.send_columns(entity, [rr.TimeColumn(layout.TIMELINE, duration=times[1:])], columns, strict=True)
+    for begin in range(0, len(times) - 1, STRIPS_AT_ONCE):
+        some = slice(begin, begin + STRIPS_AT_ONCE + 1)
+        columns = rr.LineStrips3D.columns(strips=_steps(positions[some]))
+        stream.send_columns(entity, [rr.TimeColumn(layout.TIMELINE, duration=times[some][1:])], columns, strict=True)
 
 
 def _steps(positions: NDArray) -> pa.ListArray:
