@@ -7,6 +7,7 @@ from cflib.crtp.crtpdriver import CRTPDriver
 from cflib.crtp.exceptions import WrongUriType
 
 from cfplan.errors import LinkError
+from cfplan.flight.claim import claim
 from cfplan.flight.connection import connect
 
 
@@ -36,6 +37,49 @@ class BrokenDriver(SilentDriver):
         if not uri.startswith("broken://"):
             raise WrongUriType("not mine")
         raise OSError("the wire is cut")
+
+
+@pytest.mark.parametrize(
+    ("reason", "hint"),
+    [
+        ("[Errno 13] Access denied (insufficient permissions)", "udev"),
+        ("[Errno 16] Resource busy", "another program"),
+    ],
+)
+def test_a_radio_that_cannot_be_opened_says_what_to_do(reason, hint):
+    class Refused(SilentDriver):
+        def connect(self, uri, statistics, error):
+            if not uri.startswith("refused://"):
+                raise WrongUriType("not mine")
+            raise OSError(reason)
+
+    with pytest.raises(LinkError) as caught:
+        connect("refused://0", lambda message: None, [Refused])
+    assert hint in caught.value.hint
+    assert "\n" not in str(caught.value)
+
+
+def test_a_second_pilot_on_the_same_radio_is_refused_and_the_first_keeps_it(monkeypatch, tmp_path):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    first = claim("radio://0/80/2M/E7E7E7E7E7")
+    assert first is not None
+    for again in ("radio://0/80/2M/E7E7E7E7E7", "radio://0/90/1M/E7E7E7E701"):
+        began = time.monotonic()
+        with pytest.raises(LinkError, match="another cfplan") as caught:
+            connect(again, lambda message: None)
+        assert time.monotonic() - began < 5.0
+        assert caught.value.hint
+    other = claim("radio://1/80/2M/E7E7E7E7E7")
+    assert other is not None
+    other.close()
+    first.close()
+    freed = claim("radio://0/80/2M/E7E7E7E7E7")
+    assert freed is not None
+    freed.close()
+
+
+def test_what_nothing_else_can_reach_needs_no_claim():
+    assert claim("sim://0") is None
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ _RESISTANCE = 0.2  # Ω: 4.2 V at rest and 3.30 V at 4.44 A, Bitcraze's table of
 _CURRENT, _AT_THRUST = 4.44, 0.568  # A at N, the same table
 _IDLE_CURRENT = 0.15  # A
 _EMPTY, _FULL = 3.5, 4.18  # V at rest
-_WHOLE_ABOVE, _LOSS = 3.06, 0.106 / 0.12  # V, from where a motor gives all it is asked for; share a V below that
+_WHOLE_ABOVE, _LOSS = 3.066, 0.106 / 0.12  # V, from where a motor gives all it is asked for; share a V below that
 
 
 class Battery:
