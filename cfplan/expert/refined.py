@@ -12,11 +12,10 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.expert.interior_point import Search
 from cfplan.expert.problem import FLOOR, Ends, Problem, continued, pose
 from cfplan.expert.program import Shape, layout_of
 from cfplan.expert.solution import Solution, Status
-from cfplan.expert.solvers import interior_point
+from cfplan.expert.solvers import FROM_AFAR, FROM_NEAR, interior_point
 from cfplan.expert.spline_profile import h_coefficients, spline_profile, yaw_of
 from cfplan.expert.stage import Penalties
 from cfplan.expert.tightening import Task, flaw, kept_between
@@ -28,7 +27,6 @@ from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 
 WINDOW, AHEAD = 96, 32
 # intervals that a window keeps, and how much further it looks
-FROM_NEAR = Search(barrier=0.05, push=1e-3, iterations=40)
 
 
 def refine(
@@ -59,7 +57,7 @@ def refine(
         problem = pose(task.layout, part, airframe, limits, track, 0.0, ends, Penalties(), near)
         if before:
             problem = continued(problem, before, WINDOW)
-        attempt = interior_point(problem, None, search=FROM_NEAR)
+        attempt = interior_point(problem, None, searches=(FROM_NEAR, FROM_AFAR))
         if reason := flaw(attempt, problem, task):
             where = f"s = {first * step:.3g} to {last * step:.3g}"
             return Solution(Status.NOT_CONVERGED, None, f"refining {where}: {reason}")

@@ -1,5 +1,6 @@
 """The solvers of a problem: our own interior point method first, IPOPT as a second try."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -16,8 +17,10 @@ from cfplan.expert.spline_problem import SplineProblem
 TOLERANCE = 1e-2
 # of the scaled problem: 1e-5 s in the cost's gradient
 FROM_AFAR = Search()
-NEARBY = Search(barrier=3e-3, push=1e-4, iterations=40)
-# from an answer to a problem almost the same: near the bounds from the start
+FROM_NEAR = Search(barrier=0.05, push=1e-3, iterations=40)
+# from what is nearly right
+AGAIN = Search(barrier=3e-3, push=1e-4, iterations=20)
+# from the answer to a problem almost the same: near the bounds from the start
 
 
 class Attempt(NamedTuple):
@@ -35,14 +38,19 @@ class Attempt(NamedTuple):
 
 
 def interior_point(
-    problem: Problem, backend: Backend | None, table: NDArray | None = None, search: Search | None = None
+    problem: Problem, backend: Backend | None, table: NDArray | None = None, searches: Sequence[Search] = (FROM_AFAR,)
 ) -> Attempt:
-    """Search from the problem's own table, or from `table`, the answer to a problem almost the same."""
+    """Search from the problem's own table, or from `table`: as the first of `searches` that succeeds."""
     posed = SplineProblem(problem, backend)
-    search = search or (FROM_AFAR if table is None else NEARBY)
-    ended = minimise(posed, posed.rows, posed.v_of(problem.table if table is None else table), search)
+    v = posed.v_of(problem.table if table is None else table)
+    iterations = 0
+    for search in searches:
+        ended = minimise(posed, posed.rows, v, search)
+        iterations += ended.iterations
+        if ended.solved:
+            break
     return Attempt(
-        "interior point", posed.table_of(ended.v), posed.at_points(ended.g), ended.solved, ended.iterations, ended.words
+        "interior point", posed.table_of(ended.v), posed.at_points(ended.g), ended.solved, iterations, ended.words
     )
 
 

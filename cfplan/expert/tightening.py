@@ -10,7 +10,7 @@ from cfplan.expert.between import ALLOWANCE, DensePath
 from cfplan.expert.compiled import Backend
 from cfplan.expert.problem import Ends, Problem, held_by, profile_of, tightened
 from cfplan.expert.program import Layout
-from cfplan.expert.solvers import Attempt, interior_point
+from cfplan.expert.solvers import AGAIN, FROM_AFAR, FROM_NEAR, Attempt, interior_point
 from cfplan.expert.yaw_track import YawTrack
 from cfplan.geometry.path import Path
 from cfplan.safety.limits import PlanLimits
@@ -58,7 +58,7 @@ def kept_between(attempt: Attempt, problem: Problem, task: Task) -> Kept:
         if excess.worst <= ENOUGH:
             return Kept(attempt.table, problem, done, iterations)
         problem = tightened(problem, excess, attempt.at_points)
-        again = interior_point(problem, task.backend, attempt.table)
+        again = interior_point(problem, task.backend, attempt.table, (AGAIN, FROM_NEAR, FROM_AFAR))
         iterations += again.iterations
         if flaw(again, problem, task):
             return Kept(attempt.table, problem, done, iterations)
