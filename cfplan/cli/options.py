@@ -24,7 +24,12 @@ def planning(command: Callable) -> Callable:
                 type=click.Path(path_type=Path),
                 help=f"Limits to keep; else the nearest {SAFETY_FILE}, from here or from the path file upwards.",
             ),
-            click.option("--planner", default="expert", show_default=True, help="How to find the speed profile."),
+            click.option(
+                "--planner",
+                default="auto",
+                show_default=True,
+                help="auto, learned, expert, toppquad, convex or minsnap.",
+            ),
             click.option("--nodes", type=click.IntRange(4), help="Grid intervals; else chosen from the path's length."),
             click.option(
                 "--speed",

@@ -25,7 +25,7 @@ from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import FullState, Trajectory
 
-FORMAT = 1
+FORMAT = 2
 RATE = 100  # Hz, of the samples
 _KEY = b"cfplan"
 _AXES = ("x", "y", "z", "w")
@@ -50,6 +50,7 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
         "speed_share": plan.speed_share,
         "seconds": plan.seconds,
         "notes": list(plan.notes),
+        "lower_bound": plan.lower_bound,
         "provenance": dict(provenance or {}),
         "certificate": plan.certificate.to_dict(),
         "airframe": asdict(plan.airframe),
@@ -125,6 +126,7 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
         speed_share=float(metadata["speed_share"]),
         seconds=float(metadata["seconds"]),
         notes=tuple(map(str, metadata["notes"])),
+        lower_bound=None if metadata["lower_bound"] is None else float(metadata["lower_bound"]),
     )
 
 

@@ -1,32 +1,40 @@
 """The one entry to planning: from a path and limits to a certified trajectory, and how it came about."""
 
 import time
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
+from cfplan.expert.convex import lower_bound
 from cfplan.expert.solution import Solution
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
-from cfplan.planning.planners import find_planner
-from cfplan.planning.repair import repair
+from cfplan.learning.model_files import find_model
+from cfplan.planning.planners import AUTO, find_planner
+from cfplan.planning.repair import Repaired, repair, slow
 from cfplan.safety.certificate import Certificate
 from cfplan.safety.limits import Limits
-from cfplan.safety.slowing import Slowed
 from cfplan.safety.space import check_space
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 
-NODES_PER_METRE = 10
+NODES_PER_METRE = {"learned": 5}
+# the network was taught on wide grids, and refining costs by the node
+OTHER_NODES_PER_METRE = 10
 FEWEST_NODES, MOST_NODES = 60, 3000
+MOST_LEARNED_NODES = 30_000
 NODES_PER_PIECE = 4
 GOOD_SHARE = 0.97  # a plan that had to be slowed further is worth a second try with twice the nodes
 LEAST_SPEED_SHARE = 0.01
-FALLBACKS = ("convex", "min-snap")
+LAST_RESORTS = ("convex", "minsnap")
+# which hardly ever fail
+EXPERT_GAP = 0.1
+# over the proven bound: from there on the expert is asked too
+REFINED = ("learned", "expert", "convex")
+# whose profiles are refined where they do not pass; the others are what they are, slowed
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +47,7 @@ class Plan:
     trajectory: Trajectory
     certificate: Certificate
     planner: str
-    # the one that succeeded
+    # the one whose profile it is
     nodes: int
     # intervals of the profile
     slowed: float
@@ -50,6 +58,8 @@ class Plan:
     # s that planning took, all tries and certificates included
     notes: tuple[str, ...]
     # what a reader should know, one sentence each
+    lower_bound: float | None = None
+    # s, no flight within speed, acceleration and collective thrust takes less; None where it was not asked for
 
     @property
     def profile(self) -> SpeedProfile:
@@ -57,9 +67,41 @@ class Plan:
         return self.trajectory.profile
 
 
-def default_nodes(path: Path) -> int:
-    """Intervals for a path: ten a metre, within bounds, and a few for each of its pieces."""
-    by_length = int(np.clip(round(NODES_PER_METRE * path.length), FEWEST_NODES, MOST_NODES))
+class _Found(NamedTuple):
+    """A planner's profile, repaired."""
+
+    repaired: Repaired
+    planner: str
+    nodes: int
+
+    @property
+    def duration(self) -> float:
+        return self.repaired.trajectory.duration
+
+
+@dataclass(frozen=True, slots=True)
+class _Question:
+    """What every planner is asked."""
+
+    path: Path
+    airframe: Airframe
+    limits: Limits
+    nodes: int | None
+    # None where the planner's own number is taken
+    yaw: YawMode
+    yaw_angle: float
+    start: BoundaryState | None
+    end: BoundaryState | None
+
+    def nodes_for(self, planner: str) -> int:
+        return self.nodes if self.nodes is not None else default_nodes(self.path, planner)
+
+
+def default_nodes(path: Path, planner: str = "expert") -> int:
+    """Intervals for a path: some a metre, within bounds, and a few for each of its pieces."""
+    a_metre = NODES_PER_METRE.get(planner, OTHER_NODES_PER_METRE)
+    most = MOST_LEARNED_NODES if planner == "learned" else MOST_NODES
+    by_length = int(np.clip(round(a_metre * path.length), FEWEST_NODES, most))
     return max(by_length, NODES_PER_PIECE * (len(path.breaks) - 1))
 
 
@@ -68,7 +110,7 @@ def plan(
     airframe: Airframe,
     limits: Limits,
     *,
-    planner: str = "expert",
+    planner: str = AUTO,
     nodes: int | None = None,
     yaw: YawMode = YawMode.FIXED,
     yaw_angle: float = 0.0,
@@ -78,32 +120,36 @@ def plan(
 ) -> Plan:
     """The fastest certified flight along the path that the planner finds.
 
+    "auto" asks the learned planner, where there is a model for the vehicle and the limits, and the convex one, and
+    takes the faster of their flights; where that is far above the proven bound, the expert too.
     `speed_share` slows the whole result: the same motion at that share of its speed, so that accelerations fall with
     its square. Where a boundary state is given, nothing may be slowed, or it would no longer hold.
 
     Raises:
         InfeasibleError: the path leaves the space, takes longer than the battery lasts, or no profile is found.
-        InputError: unknown planner, speed share or nodes out of range.
+        InputError: unknown planner, no model for it, speed share or nodes out of range.
     """
     begun = time.perf_counter()
     _check_arguments(nodes, speed_share, bound=start is not None or end is not None)
     check_space(path, limits.space)
-    count = nodes if nodes is not None else default_nodes(path)
-
+    question = _Question(path, airframe, limits, nodes, yaw, yaw_angle, start, end)
     notes: list[str] = []
-    tries = _tries(planner, count, fixed=nodes is not None)
-    options = {"yaw": yaw, "yaw_angle": yaw_angle, "start": start, "end": end}
-    slowed, name, count = _best(path, airframe, limits, planner, tries, options, notes)
-    if slowed.share < 1.0:
-        if start is not None or end is not None:
-            raise InfeasibleError(
-                f"the profile passes only at {slowed.share:.2%} of its speed, which would break the boundary state",
-                hint="start slower, or leave the boundary free",
-            )
-        notes.append(f"{name}'s profile was slowed to {slowed.share:.2%} of its speed to pass")
+    bound = None
+    if planner == AUTO:
+        found, bound = _automatic(question, notes)
+    else:
+        found = _best(question, planner, notes)
+    slowed = found.repaired
+    if slowed.share < 1.0 and (start is not None or end is not None):
+        raise InfeasibleError(
+            f"the profile passes only at {slowed.share:.2%} of its speed, which would break the boundary state",
+            hint="start slower, or leave the boundary free",
+        )
+    if changed := slowed.describe():
+        notes.append(f"{found.planner}'s profile was {changed}")
     flown = slowed
     if speed_share < 1.0:
-        flown = repair(path, slowed.trajectory.profile.slowed(speed_share), airframe, limits.plan, limits.space)
+        flown = slow(path, slowed.trajectory.profile.slowed(speed_share), airframe, limits.plan, limits.space)
     _check_endurance(flown.trajectory.duration, limits)
     return Plan(
         path=path,
@@ -111,13 +157,45 @@ def plan(
         limits=limits,
         trajectory=flown.trajectory,
         certificate=flown.certificate,
-        planner=name,
-        nodes=count,
+        planner=found.planner,
+        nodes=found.nodes,
         slowed=slowed.share,
         speed_share=speed_share,
         seconds=time.perf_counter() - begun,
         notes=tuple(notes),
+        lower_bound=bound,
     )
+
+
+def _automatic(question: _Question, notes: list[str]) -> tuple[_Found, float]:
+    """The fastest of what takes milliseconds, or of the expert; and the proven bound, s."""
+    path, airframe, limits = question.path, question.airframe, question.limits.plan
+    names = ["convex"]
+    try:
+        if model := find_model(airframe, limits):
+            names.insert(0, "learned")
+            notes.extend(model.differences(limits))
+        else:
+            notes.append("no model is for this vehicle and these limits: `cfplan train` makes one")
+    except InputError as error:
+        notes.append(f"no learned plan: {error}")
+    found = [one for name in names if (one := _ask(question, name, question.nodes_for(name), notes))]
+    bound = lower_bound(path, airframe, limits, start=question.start, end=question.end)
+    best = min(found, key=lambda one: one.duration, default=None)
+    if best is None or best.repaired.share < 1.0 or best.duration > (1.0 + EXPERT_GAP) * bound:
+        try:
+            expert = _best(question, "expert", notes)
+        except InfeasibleError:
+            if best is None:
+                raise
+        else:
+            found.append(expert)
+            why = f"{best.duration / bound - 1:.1%} above the bound" if best else "nothing else came of it"
+            notes.append(f"the expert was asked too: {why}")
+            best = min(found, key=lambda one: one.duration)
+    times = ", ".join(f"{one.planner} {one.duration:.3f} s" for one in found)
+    notes.append(f"{times}; the proven bound is {bound:.3f} s, the plan {best.duration / bound - 1:.1%} above it")
+    return best, bound
 
 
 def _check_arguments(nodes: int | None, speed_share: float, bound: bool) -> None:
@@ -141,46 +219,48 @@ def _check_arguments(nodes: int | None, speed_share: float, bound: bool) -> None
         )
 
 
-def _tries(planner: str, nodes: int, fixed: bool) -> Iterator[tuple[str, int]]:
-    """What to try, in order: more nodes unless they are fixed, then planners that hardly fail."""
-    yield planner, nodes
-    if not fixed:
-        yield planner, 2 * nodes
-    for fallback in FALLBACKS:
-        if fallback != planner:
-            yield fallback, nodes
-
-
-def _best(
-    path: Path,
-    airframe: Airframe,
-    limits: Limits,
-    planner: str,
-    tries: Iterator[tuple[str, int]],
-    options: Mapping[str, Any],
-    notes: list[str],
-) -> tuple[Slowed, str, int]:
-    """The fastest of the planner's tries, or the first of a fallback; stops at the first good one."""
-    best: tuple[Slowed, str, int] | None = None
-    for name, nodes in tries:
-        if best is not None and (best[0].share >= GOOD_SHARE or name != planner):
-            break
-        solution = find_planner(name)(path, airframe, limits.plan, nodes=nodes, **options)
-        if solution.profile is None:
-            notes.append(_failure(name, nodes, solution))
-            continue
-        try:
-            found = repair(path, solution.profile, airframe, limits.plan, limits.space)
-        except (InfeasibleError, NotCertifiedError) as error:
-            notes.append(f"{name} with {nodes} nodes: {error}")
-            continue
-        if best is None or found.trajectory.duration < best[0].trajectory.duration:
-            best = found, name, nodes
+def _best(question: _Question, planner: str, notes: list[str]) -> _Found:
+    """The fastest of the planner's tries, else what the first of the others finds; stops at the first good one."""
+    nodes = question.nodes_for(planner)
+    best: _Found | None = None
+    for count in (nodes,) if question.nodes is not None or planner == "learned" else (nodes, 2 * nodes):
+        found = _ask(question, planner, count, notes)
+        if found and (best is None or found.duration < best.duration):
+            best = found
+        if best and best.repaired.share >= GOOD_SHARE:
+            return best
+    others = (*(("expert",) if planner == "learned" else ()), *LAST_RESORTS)
+    for name in others:
+        if best is None and name != planner:
+            best = _ask(question, name, question.nodes_for(name), notes)
     if best is None:
         raise InfeasibleError(
             f"no plan. {'; '.join(notes)}", hint="loosen the plan's limits, or make the path gentler or longer"
         )
     return best
+
+
+def _ask(question: _Question, name: str, nodes: int, notes: list[str]) -> _Found | None:
+    """A planner's profile, repaired; None, and a note why, where nothing came of it."""
+    path, airframe, limits = question.path, question.airframe, question.limits
+    solution = find_planner(name)(
+        path, airframe, limits.plan, nodes=nodes, yaw=question.yaw, yaw_angle=question.yaw_angle,
+        start=question.start, end=question.end,
+    )  # fmt: skip
+    if solution.profile is None:
+        notes.append(_failure(name, nodes, solution))
+        return None
+    nodes = len(solution.profile.s) - 1
+    try:
+        if name in REFINED:
+            ends = {"start": question.start, "end": question.end}
+            repaired = repair(path, solution.profile, airframe, limits.plan, limits.space, **ends)
+        else:
+            repaired = slow(path, solution.profile, airframe, limits.plan, limits.space)
+    except (InfeasibleError, NotCertifiedError) as error:
+        notes.append(f"{name} with {nodes} nodes: {error}")
+        return None
+    return _Found(repaired, name, nodes)
 
 
 def _failure(name: str, nodes: int, solution: Solution) -> str:

@@ -7,12 +7,15 @@ from types import MappingProxyType
 from cfplan.errors import InputError
 from cfplan.expert.solution import Planner
 
+AUTO = "auto"
+# no planner: the fastest of some, see plan()
 PLANNERS = MappingProxyType(
     {
+        "learned": "cfplan.learning.learned:plan_learned",
         "expert": "cfplan.expert.reduced:plan_reduced",
         "toppquad": "cfplan.expert.toppquad:plan_toppquad",
         "convex": "cfplan.expert.convex:plan_convex",
-        "min-snap": "cfplan.expert.min_snap_baseline:plan_min_snap",
+        "minsnap": "cfplan.expert.min_snap_baseline:plan_min_snap",
     }
 )
 
@@ -20,9 +23,9 @@ PLANNERS = MappingProxyType(
 def find_planner(name: str) -> Planner:
     """The planner of that name. Raises InputError."""
     if name not in PLANNERS:
-        near = difflib.get_close_matches(name, PLANNERS, n=1)
+        near = difflib.get_close_matches(name, [AUTO, *PLANNERS], n=1)
         guess = f"did you mean {near[0]}? " if near else ""
-        raise InputError(f"unknown planner {name!r}", hint=f"{guess}known: {', '.join(PLANNERS)}")
+        raise InputError(f"unknown planner {name!r}", hint=f"{guess}known: {', '.join([AUTO, *PLANNERS])}")
     module, function = PLANNERS[name].split(":")
     planner: Planner = getattr(import_module(module), function)
     return planner

@@ -1,21 +1,101 @@
-"""From any profile to a certified trajectory."""
+"""From any profile to a certified trajectory, by the least change that does it.
 
+A profile that passes stays as it is. One that does not is refined: the expert's problem, searched from there, which
+lowers the speed where a limit is exceeded and raises it beside, with yaw and grid left alone. What cannot be refined
+is slowed as a whole, which always ends certified.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfplan.expert.refined import refine
 from cfplan.geometry.path import Path
+from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import PlanLimits
-from cfplan.safety.slowing import Slowed, slow_until_certified
+from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
+
+NOTICEABLE = 0.01
+# share of the speed by which a place must have changed to be told
+
+
+@dataclass(frozen=True, slots=True)
+class Repaired:
+    """A certified trajectory and what became of the profile on the way to it."""
+
+    trajectory: Trajectory
+    certificate: Certificate
+    share: float
+    # of its speed to which the whole was slowed, 1 where it was not
+    before: float
+    # s of flight before repair
+    slower: tuple[float, float] | None = None
+    # s from where to where refining made it slower by more than NOTICEABLE, None where it did not
+    most: float = 0.0
+    # by how much at most there, of the speed
+    failed: str = ""
+    # why it could not be refined, where that was tried
+
+    def describe(self) -> str:
+        """One sentence, empty where nothing was changed."""
+        duration = self.trajectory.duration
+        cost = f"{self.before:.3f} s became {duration:.3f} s ({duration / self.before - 1:+.2%})"
+        if self.share < 1.0:
+            why = f" ({self.failed})" if self.failed else ""
+            return f"slowed to {self.share:.2%} of its speed to pass{why}; {cost}"
+        if self.slower:
+            first, last = self.slower
+            return f"refined; slower from s = {first:.2f} to {last:.2f}, by up to {self.most:.1%}; {cost}"
+        return f"refined; {cost}" if duration != self.before else ""
 
 
 def repair(
-    path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits, space: Space | None = None
-) -> Slowed:
-    """The certified trajectory that is nearest to the profile: itself where it passes, else slowed as a whole.
+    path: Path,
+    profile: SpeedProfile,
+    airframe: Airframe,
+    limits: PlanLimits,
+    space: Space | None = None,
+    *,
+    start: BoundaryState | None = None,
+    end: BoundaryState | None = None,
+) -> Repaired:
+    """The certified trajectory nearest to the profile. Boundary states are kept by refining, not by slowing.
 
     Raises:
         InfeasibleError: hovering, or the path itself, breaks a limit; says which.
         NotCertifiedError: the profile is not finite, not smooth, or h is not positive.
     """
-    return slow_until_certified(Trajectory(path, profile, airframe), limits, space)
+    trajectory = Trajectory(path, profile, airframe)
+    certificate = certify(trajectory, limits, space)
+    if certificate.passed:
+        return Repaired(trajectory, certificate, 1.0, trajectory.duration)
+    solution = refine(path, profile, airframe, limits, start=start, end=end)
+    if solution.profile is None:
+        return slow(path, profile, airframe, limits, space, failed=solution.reason)
+    slowed = slow_until_certified(Trajectory(path, solution.profile, airframe), limits, space)
+    return Repaired(
+        slowed.trajectory, slowed.certificate, slowed.share, trajectory.duration,
+        *_where_slower(profile, solution.profile),
+    )  # fmt: skip
+
+
+def slow(
+    path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits, space: Space | None = None,
+    *, failed: str = "",
+) -> Repaired:  # fmt: skip
+    """The profile slowed as a whole until it passes: itself where it does. Raises as repair()."""
+    trajectory = Trajectory(path, profile, airframe)
+    slowed = slow_until_certified(trajectory, limits, space)
+    return Repaired(slowed.trajectory, slowed.certificate, slowed.share, trajectory.duration, failed=failed)
+
+
+def _where_slower(before: SpeedProfile, after: SpeedProfile) -> tuple[tuple[float, float] | None, float]:
+    change = 1.0 - np.sqrt(after.h / before.h)
+    places = np.flatnonzero(change > NOTICEABLE)
+    if not len(places):
+        return None, 0.0
+    return (float(before.s[places[0]]), float(before.s[places[-1]])), float(change.max())

@@ -27,7 +27,7 @@ from cfplan.studies.trials import (
     random_path,
 )
 
-PLANNERS = ("expert", "toppquad", "convex", "min-snap")
+PLANNERS = ("expert", "toppquad", "convex", "minsnap")
 REFERENCE = "toppquad"
 # whose planning time the others' is compared with
 COLUMNS = (

@@ -20,7 +20,7 @@ from cfplan.planning.plan import plan
 
 @pytest.fixture(scope="module")
 def made(path, limits):
-    return plan(path, limits.airframe, limits, planner="min-snap", speed_share=0.9)
+    return plan(path, limits.airframe, limits, planner="minsnap", speed_share=0.9)
 
 
 @pytest.fixture(scope="module")

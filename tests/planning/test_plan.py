@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from cfplan.errors import CfplanError, InfeasibleError, InputError
 from cfplan.expert.solution import Solution, Status
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
-from cfplan.planning.plan import FALLBACKS, FEWEST_NODES, MOST_NODES, default_nodes, plan
+from cfplan.planning.plan import FEWEST_NODES, LAST_RESORTS, MOST_NODES, default_nodes, plan
 from cfplan.planning.planners import PLANNERS, find_planner
 from cfplan.safety.certificate import certify
 
@@ -27,23 +28,23 @@ def stub(monkeypatch, **answers):
         return planner
 
     monkeypatch.setattr("cfplan.planning.plan.find_planner", find)
-    monkeypatch.setattr("cfplan.planning.plan.FALLBACKS", [name for name in FALLBACKS if name in answers])
+    monkeypatch.setattr("cfplan.planning.plan.LAST_RESORTS", [name for name in LAST_RESORTS if name in answers])
     return calls
 
 
 def test_a_plan_is_certified_for_its_limits_and_space(path, limits):
-    made = plan(path, limits.airframe, limits, planner="min-snap")
+    made = plan(path, limits.airframe, limits, planner="minsnap")
     assert made.certificate.passed
     assert made.certificate == certify(made.trajectory, limits.plan, limits.space)
-    assert (made.planner, made.nodes, made.speed_share) == ("min-snap", default_nodes(path), 1.0)
+    assert (made.planner, made.nodes, made.speed_share) == ("minsnap", default_nodes(path), 1.0)
     assert made.profile is made.trajectory.profile
     assert made.seconds > 0
 
 
 def test_too_fast_a_profile_is_slowed_and_the_plan_says_by_how_much(path, limits, make_profile, monkeypatch):
     fast = make_profile(path.end, np.full(40, 9.0))
-    calls = stub(monkeypatch, expert=lambda path, nodes: Solution(Status.SOLVED, fast))
-    made = plan(path, limits.airframe, limits)
+    calls = stub(monkeypatch, toppquad=lambda path, nodes: Solution(Status.SOLVED, fast))
+    made = plan(path, limits.airframe, limits, planner="toppquad")
     assert made.certificate.passed
     assert 0.1 < made.slowed < 0.9
     assert f"{made.slowed:.2%}" in made.notes[-1]
@@ -53,30 +54,30 @@ def test_too_fast_a_profile_is_slowed_and_the_plan_says_by_how_much(path, limits
 
 def test_the_faster_of_two_tries_is_taken(path, limits, make_profile, monkeypatch):
     def answer(path, nodes):
-        rates = np.full(40, 9.0)
+        rates = np.full(nodes + 3, 9.0)
         if nodes == default_nodes(path):
             rates[20] = 0.5  # rough, so that it must be slowed more
         return Solution(Status.SOLVED, make_profile(path.end, rates))
 
-    stub(monkeypatch, expert=answer)
-    assert plan(path, limits.airframe, limits).nodes == 2 * default_nodes(path)
+    stub(monkeypatch, toppquad=answer)
+    assert plan(path, limits.airframe, limits, planner="toppquad").nodes == 2 * default_nodes(path)
 
 
 def test_nodes_that_are_given_are_kept(path, limits, make_profile, monkeypatch):
     fast = make_profile(path.end, np.full(40, 9.0))
-    calls = stub(monkeypatch, expert=lambda path, nodes: Solution(Status.SOLVED, fast))
-    plan(path, limits.airframe, limits, nodes=77)
+    calls = stub(monkeypatch, toppquad=lambda path, nodes: Solution(Status.SOLVED, fast))
+    plan(path, limits.airframe, limits, planner="toppquad", nodes=77)
     assert [nodes for _, nodes, _ in calls] == [77]
 
 
 def test_where_the_planner_fails_another_one_steps_in_and_the_plan_says_so(path, limits, make_profile, monkeypatch):
     stub(
         monkeypatch,
-        expert=lambda path, nodes: Solution(Status.NOT_CONVERGED, None, "restoration failed"),
-        **{"min-snap": lambda path, nodes: Solution(Status.SOLVED, make_profile(path.end, np.full(40, 0.5)))},
+        toppquad=lambda path, nodes: Solution(Status.NOT_CONVERGED, None, "restoration failed"),
+        **{"minsnap": lambda path, nodes: Solution(Status.SOLVED, make_profile(path.end, np.full(40, 0.5)))},
     )
-    made = plan(path, limits.airframe, limits)
-    assert made.planner == "min-snap"
+    made = plan(path, limits.airframe, limits, planner="toppquad")
+    assert made.planner == "minsnap"
     assert made.certificate.passed
     assert "did not converge" in made.notes[0]
     assert "restoration failed" in made.notes[0]
@@ -87,24 +88,24 @@ def test_an_unsound_profile_counts_as_a_failure(path, limits, make_profile, monk
     broken = replace(sound, h=np.full_like(sound.h, np.nan))
     stub(
         monkeypatch,
-        expert=lambda path, nodes: Solution(Status.SOLVED, broken),
+        toppquad=lambda path, nodes: Solution(Status.SOLVED, broken),
         convex=lambda path, nodes: Solution(Status.SOLVED, sound),
     )
-    made = plan(path, limits.airframe, limits)
+    made = plan(path, limits.airframe, limits, planner="toppquad")
     assert made.planner == "convex"
     assert "h is not finite" in made.notes[0]
 
 
 def test_where_every_planner_fails_the_reasons_are_given_in_one_line(path, limits, monkeypatch):
-    stub(monkeypatch, expert=lambda path, nodes: Solution(Status.INFEASIBLE, None, "no\nway"))
+    stub(monkeypatch, toppquad=lambda path, nodes: Solution(Status.INFEASIBLE, None, "no\nway"))
     with pytest.raises(InfeasibleError, match="no profile meets the limits") as error:
-        plan(path, limits.airframe, limits)
+        plan(path, limits.airframe, limits, planner="toppquad")
     assert "\n" not in str(error.value)
     assert error.value.hint
 
 
 def test_a_speed_share_slows_the_whole_flight(path, limits):
-    whole, half = (plan(path, limits.airframe, limits, planner="min-snap", speed_share=share) for share in (1.0, 0.5))
+    whole, half = (plan(path, limits.airframe, limits, planner="minsnap", speed_share=share) for share in (1.0, 0.5))
     assert half.trajectory.duration == pytest.approx(2 * whole.trajectory.duration)
     fast, slow = ({margin.name: margin.worst for margin in made.certificate.margins} for made in (whole, half))
     assert slow["speed"] == pytest.approx(fast["speed"] / 2, rel=1e-4)
@@ -115,23 +116,23 @@ def test_a_speed_share_slows_the_whole_flight(path, limits):
 @pytest.mark.parametrize("arguments", [{"speed_share": s} for s in (0.0, -1.0, 1.1, float("nan"))] + [{"nodes": 1}])
 def test_arguments_out_of_range_are_refused(path, limits, arguments):
     with pytest.raises(InputError, match=re.escape(next(iter(arguments))[:5])):
-        plan(path, limits.airframe, limits, planner="min-snap", **arguments)
+        plan(path, limits.airframe, limits, planner="minsnap", **arguments)
 
 
 def test_a_boundary_state_is_never_slowed_away(path, limits, make_profile, monkeypatch):
     fast = make_profile(path.end, np.full(40, 9.0))
-    stub(monkeypatch, expert=lambda path, nodes: Solution(Status.SOLVED, fast))
+    stub(monkeypatch, toppquad=lambda path, nodes: Solution(Status.SOLVED, fast))
     with pytest.raises(InfeasibleError, match="break the boundary state"):
-        plan(path, limits.airframe, limits, start=fast.boundary(0))
+        plan(path, limits.airframe, limits, planner="toppquad", start=fast.boundary(0))
     with pytest.raises(InputError, match="break the boundary state"):
-        plan(path, limits.airframe, limits, start=fast.boundary(0), speed_share=0.5)
+        plan(path, limits.airframe, limits, planner="toppquad", start=fast.boundary(0), speed_share=0.5)
 
 
 def test_yaw_and_boundary_states_reach_the_planner(path, limits, make_profile, monkeypatch):
     slow = make_profile(path.end, np.full(40, 0.1))
-    calls = stub(monkeypatch, expert=lambda path, nodes: Solution(Status.SOLVED, slow))
+    calls = stub(monkeypatch, toppquad=lambda path, nodes: Solution(Status.SOLVED, slow))
     end = slow.boundary(-1)
-    plan(path, limits.airframe, limits, yaw=YawMode.TANGENT, yaw_angle=0.3, end=end)
+    plan(path, limits.airframe, limits, planner="toppquad", yaw=YawMode.TANGENT, yaw_angle=0.3, end=end)
     assert calls[0][2] == {"yaw": YawMode.TANGENT, "yaw_angle": 0.3, "start": None, "end": end}
 
 
@@ -145,13 +146,88 @@ def test_a_path_outside_the_space_is_refused_before_any_planner_runs(limits, mon
 def test_a_path_longer_than_the_battery_lasts_is_refused(path, limits):
     tired = replace(limits, battery=replace(limits.battery, endurance=15.0))
     with pytest.raises(InfeasibleError, match="the battery is trusted for 15 s"):
-        plan(path, limits.airframe, tired, planner="min-snap", speed_share=0.5)
+        plan(path, limits.airframe, tired, planner="minsnap", speed_share=0.5)
+
+
+def test_too_fast_a_profile_of_the_learned_planner_is_refined_and_the_plan_says_where(
+    path, limits, make_profile, monkeypatch
+):
+    fast = make_profile(path.end, np.full(64, 4.0))
+    best = plan(path, limits.airframe, limits, planner="expert", nodes=61)
+    stub(monkeypatch, learned=lambda path, nodes: Solution(Status.SOLVED, fast))
+    made = plan(path, limits.airframe, limits, planner="learned")
+    assert made.certificate.passed
+    assert made.slowed == 1.0
+    assert made.trajectory.duration == pytest.approx(best.trajectory.duration, rel=1e-3)
+    assert re.search(r"refined; slower from s = .* by up to", made.notes[-1])
+
+
+def test_where_the_learned_planner_fails_the_expert_steps_in(path, limits, make_profile, monkeypatch):
+    stub(
+        monkeypatch,
+        learned=lambda path, nodes: Solution(Status.NOT_CONVERGED, None, "answered what is not a number"),
+        expert=lambda path, nodes: Solution(Status.SOLVED, make_profile(path.end, np.full(40, 0.5))),
+    )
+    made = plan(path, limits.airframe, limits, planner="learned")
+    assert made.planner == "expert"
+    assert "not a number" in made.notes[0]
+
+
+def automatic(monkeypatch, make_profile, model=True, **rates):
+    """plan() with planners that fly at these rates."""
+    answers = {
+        name: lambda path, nodes, rate=rate: Solution(Status.SOLVED, make_profile(path.end, np.full(40, rate)))
+        for name, rate in rates.items()
+    }
+    known = SimpleNamespace(differences=lambda limits: ("speed is tighter",))
+    monkeypatch.setattr("cfplan.planning.plan.find_model", lambda airframe, limits: known if model else None)
+    monkeypatch.setattr("cfplan.planning.plan.lower_bound", lambda path, *_, **__: path.end / 0.4**0.5)
+    return stub(monkeypatch, **answers)
+
+
+def test_auto_takes_the_faster_flight_and_prints_both_times_and_the_gap(path, limits, make_profile, monkeypatch):
+    calls = automatic(monkeypatch, make_profile, learned=0.38, convex=0.39)
+    made = plan(path, limits.airframe, limits)
+    assert made.planner == "convex"
+    assert [name for name, *_ in calls] == ["learned", "convex"]
+    assert made.lower_bound == pytest.approx(path.end / 0.4**0.5)
+    assert "speed is tighter" in made.notes
+    for said in (
+        f"learned {path.end / 0.38**0.5:.3f} s",
+        f"convex {path.end / 0.39**0.5:.3f} s",
+        "the plan 1.3% above it",
+    ):
+        assert said in made.notes[-1]
+
+
+def test_auto_asks_the_expert_where_the_flight_is_far_above_the_bound(path, limits, make_profile, monkeypatch):
+    automatic(monkeypatch, make_profile, learned=0.2, convex=0.3, expert=0.39)
+    made = plan(path, limits.airframe, limits)
+    assert made.planner == "expert"
+    assert any("the expert was asked too: 15.5% above" in note for note in made.notes)
+
+
+def test_auto_plans_without_a_model(path, limits, make_profile, monkeypatch):
+    calls = automatic(monkeypatch, make_profile, model=False, convex=0.39)
+    made = plan(path, limits.airframe, limits)
+    assert [name for name, *_ in calls] == ["convex"]
+    assert any("cfplan train" in note for note in made.notes)
+
+
+def test_auto_says_that_a_model_is_damaged_and_goes_on(path, limits, make_profile, monkeypatch):
+    automatic(monkeypatch, make_profile, convex=0.39)
+
+    def damaged(airframe, limits):
+        raise InputError("damaged", where="models/x")
+
+    monkeypatch.setattr("cfplan.planning.plan.find_model", damaged)
+    assert any("no learned plan: models/x: damaged" in n for n in plan(path, limits.airframe, limits).notes)
 
 
 def test_an_unknown_planner_is_refused_with_the_known_ones():
     with pytest.raises(InputError, match="unknown planner 'min snap'") as error:
         find_planner("min snap")
-    assert "did you mean min-snap?" in error.value.hint
+    assert "did you mean minsnap?" in error.value.hint
     assert all(name in error.value.hint for name in PLANNERS)
 
 
@@ -166,13 +242,13 @@ def test_the_number_of_nodes_grows_with_the_path_within_bounds():
     assert default_nodes(min_snap(waypoints)) >= 300
 
 
-@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("planner", ["auto", *(name for name in PLANNERS if name != "learned")])
 def test_every_planner_ends_in_a_certified_plan_or_a_typed_error(limits, planner):
     path = min_snap([[-1, 0, 1], [0.5, 0.8, 1.3], [1, 0, 1]])
     try:
         made = plan(path, limits.airframe, limits, planner=planner, nodes=60)
     except CfplanError as error:
         pytest.fail(str(error))
-    assert made.planner == planner
+    assert made.planner == planner or planner == "auto"
     assert made.certificate.passed
     assert made.slowed > 0.8

@@ -16,7 +16,7 @@ from cfplan.studies.machine import this_machine
 from cfplan.studies.trials import quantiles, random_path
 
 pytestmark = pytest.mark.unit
-SMALL = {"boxes": ["4.5x8x2"], "limit_sets": ["hardware"], "planners": ["convex", "min-snap"]}
+SMALL = {"boxes": ["4.5x8x2"], "limit_sets": ["hardware"], "planners": ["convex", "minsnap"]}
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def test_every_planner_meets_the_same_paths_and_the_same_bound(small):
         name: [(trial["seed"], trial["bound"]) for trial in small.trials if trial["planner"] == name]
         for name in SMALL["planners"]
     }
-    assert by_planner["convex"] == by_planner["min-snap"]
+    assert by_planner["convex"] == by_planner["minsnap"]
     assert len(by_planner["convex"]) == 2
 
 
@@ -67,7 +67,7 @@ def test_a_failing_planner_is_counted_with_its_reason(monkeypatch):
         return Solution(Status.NOT_CONVERGED, None, "gave up")
 
     monkeypatch.setattr(bench_module, "find_planner", lambda name: never)
-    result = bench(paths=1, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=["min-snap"])
+    result = bench(paths=1, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=["minsnap"])
     assert result.rows[0].certified == 0
     assert result.trials[0]["reason"] == "gave up"
     assert math.isnan(result.rows[0].flight)
@@ -76,7 +76,7 @@ def test_a_failing_planner_is_counted_with_its_reason(monkeypatch):
 
 def test_an_interrupt_keeps_what_is_measured(monkeypatch):
     calls = []
-    true = planners.find_planner("min-snap")
+    true = planners.find_planner("minsnap")
 
     def stopping(*arguments, **options):
         calls.append(1)
@@ -85,7 +85,7 @@ def test_an_interrupt_keeps_what_is_measured(monkeypatch):
         return true(*arguments, **options)
 
     monkeypatch.setattr(bench_module, "find_planner", lambda name: stopping)
-    result = bench(paths=5, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=["min-snap"])
+    result = bench(paths=5, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=["minsnap"])
     assert result.interrupted
     assert result.rows[0].paths == 2
 
@@ -102,7 +102,7 @@ def test_feasibility_shares_its_paths_out_and_keeps_failures():
 
 
 def test_scaling_grows_the_path_with_the_grid():
-    result = scaling.scaling(sizes=(50, 100), repeats=1, planner="min-snap")
+    result = scaling.scaling(sizes=(50, 100), repeats=1, planner="minsnap")
     assert [size.nodes for size in result.sizes] == [50, 100]
     assert result.sizes[1].length > 1.4 * result.sizes[0].length
     assert result.sizes[0].against_first == 1.0
