@@ -42,7 +42,7 @@ class SteppedLab:
         self.cameras = Cameras(cameras or ViconSettings(seed=7 + seed), BEGIN)
         self.heard: Callable[[bytes], None] = lambda _: None
         self._origin = BEGIN - self.vehicle.tick / 1000
-        self._pictures: list[Picture] = []
+        self._pictures: list[tuple[float, Picture]] = []
         self._connected_from = BEGIN
         self._events: list[tuple[float, Callable[[], None]]] = []
         self._stalled = 0.0
@@ -81,8 +81,8 @@ class SteppedLab:
         else:
             self.cameras.inject(fault, self.now)
 
-    def pictures(self) -> list[Picture]:
-        """What the cameras sent since the last call."""
+    def pictures(self) -> list[tuple[float, Picture]]:
+        """What the cameras sent since the last call, each with the time at which it came."""
         found, self._pictures = self._pictures, []
         return found
 
@@ -136,7 +136,7 @@ class SteppedLab:
         if self.cameras.cut_off(self.now):
             self._connected_from = self.now + _RECONNECTS_AFTER
         elif self.now >= self._connected_from:
-            self._pictures += due
+            self._pictures += [(self.now, picture) for picture in due]
 
     def _note(self) -> None:
         row, loop = np.empty(ROW_SIZE), self.vehicle.stabilizer.loop

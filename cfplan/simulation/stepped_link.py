@@ -146,14 +146,14 @@ class SteppedPoses(MocapSource):
 
     def poses(self) -> list[Any]:
         found = []
-        for picture in self._lab.pictures():
+        for received, picture in self._lab.pictures():
             bodies, hidden = [], []
             for shown in picture.bodies:
                 if shown.pose is None:
                     hidden.append(shown.name)
                 else:
                     bodies.append(Body(shown.name, *shown.pose))
-            frame = Frame(self._lab.now, tuple(bodies), tuple(hidden), picture.number, picture.rate, picture.latency)
+            frame = Frame(received, tuple(bodies), tuple(hidden), picture.number, picture.rate, picture.latency)
             pose = self._sort(frame)
             if pose is not None:
                 found.append(pose)
