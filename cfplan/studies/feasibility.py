@@ -11,12 +11,12 @@ from typing import Any
 from cfplan.errors import InputError
 from cfplan.expert.limit_sets import BOXES, LIMIT_SETS
 from cfplan.geometry.yaw import YawMode
-from cfplan.planning.planners import find_planner
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.trials import (
     BAD_PATH,
     Trial,
     find_box,
+    find_entrant,
     find_limit_set,
     path_trials,
     quantiles,
@@ -112,13 +112,13 @@ def dense_feasibility(
         find_box(box)
     if paths < len(pairs):
         raise InputError(f"{paths} paths do not fill {len(pairs)} groups", where="paths")
-    found = find_planner(planner)
+    found = find_entrant(planner)
     each, begun, interrupted = paths // len(pairs), time.perf_counter(), False
     measured: dict[tuple[str, str], list[Trial]] = {}
     try:
         for number, (box, chosen) in enumerate(pairs):
             warm = random_path(first_seed, box)
-            found(warm, chosen.airframe, chosen.limits, nodes=nodes, yaw=yaw)
+            found.plan(warm, chosen.airframe, chosen.limits, nodes=nodes, yaw=yaw)
             trials = measured.setdefault((box, chosen.name), [])
             for count in range(each):
                 seed = first_seed + count

@@ -1,8 +1,9 @@
 """One planner on one path: how long it took, how fast its flight is, and what the certificate says of it."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,13 +15,16 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.geometry.yaw import YawMode
-from cfplan.planning.repair import repair
+from cfplan.planning.planners import find_planner
+from cfplan.planning.repair import Repaired, repair, slow
 from cfplan.safety.certificate import certify
 from cfplan.vehicle.trajectory import Trajectory
 
 WAYPOINTS = (3, 6)
 # least and most of a random path
 BAD_PATH = "bad path"
+REFINED = ", refined"
+# behind a planner's name: its profile is refined where it does not pass, not just slowed
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +49,8 @@ class Trial:
     # s of flight, before repair
     certified_time: float
     # s of flight
+    slowed_to: float
+    # of its speed as a whole, 1 where that was not needed
     bound: float
     # s, no flight within speed, acceleration and collective thrust is faster
 
@@ -59,6 +65,11 @@ class Trial:
         return self.worst_share <= 1.0
 
     @property
+    def whole_seconds(self) -> float:
+        """From the path to the certified trajectory."""
+        return self.plan_seconds + self.repair_seconds
+
+    @property
     def gap(self) -> float:
         """Time over the lower bound, relative."""
         return self.certified_time / self.bound - 1.0
@@ -67,6 +78,18 @@ class Trial:
     def lost(self) -> float:
         """Time that repair cost, relative."""
         return self.certified_time / self.planned_time - 1.0
+
+
+class Entrant(NamedTuple):
+    """A planner and what is done to those of its profiles that do not pass."""
+
+    plan: Planner
+    mend: Callable[..., Repaired]
+
+
+def find_entrant(name: str) -> Entrant:
+    """The planner of that name, slowed; refined where the name says so. Raises InputError."""
+    return Entrant(find_planner(name.removesuffix(REFINED)), repair if name.endswith(REFINED) else slow)
 
 
 def random_path(seed: int, box: str, waypoints: tuple[int, int] = WAYPOINTS) -> Path:
@@ -90,7 +113,7 @@ def find_limit_set(name: str) -> LimitSet:
 
 
 def path_trials(
-    planners: Mapping[str, Planner], seed: int, box: str, chosen: LimitSet, *, nodes: int, yaw: YawMode
+    entrants: Mapping[str, Entrant], seed: int, box: str, chosen: LimitSet, *, nodes: int, yaw: YawMode
 ) -> list[Trial]:
     """Every planner's trial on the random path of that seed; a path with a cusp is a bad one for all."""
     try:
@@ -98,19 +121,19 @@ def path_trials(
         path.check()
         bound = lower_bound(path, chosen.airframe, chosen.limits)
     except CfplanError as error:
-        return [failed_trial(name, seed, BAD_PATH, str(error)) for name in planners]
+        return [failed_trial(name, seed, BAD_PATH, str(error)) for name in entrants]
     return [
-        run_trial(name, planner, path, seed, chosen, nodes=nodes, yaw=yaw, bound=bound)
-        for name, planner in planners.items()
+        run_trial(name, entrant, path, seed, chosen, nodes=nodes, yaw=yaw, bound=bound)
+        for name, entrant in entrants.items()
     ]
 
 
 def run_trial(
-    name: str, planner: Planner, path: Path, seed: int, chosen: LimitSet, *, nodes: int, yaw: YawMode, bound: float
+    name: str, entrant: Entrant, path: Path, seed: int, chosen: LimitSet, *, nodes: int, yaw: YawMode, bound: float
 ) -> Trial:
     """Plan, certify, repair. Whatever fails is a trial with a reason."""
     begun = time.perf_counter()
-    solution = planner(path, chosen.airframe, chosen.limits, nodes=nodes, yaw=yaw)
+    solution = entrant.plan(path, chosen.airframe, chosen.limits, nodes=nodes, yaw=yaw)
     plan_seconds = time.perf_counter() - begun
     solve_seconds = float(solution.stats.get("solve_seconds", np.nan))
     values = {"plan_seconds": plan_seconds, "solve_seconds": solve_seconds, "bound": bound}
@@ -120,14 +143,15 @@ def run_trial(
         planned = Trajectory(path, solution.profile, chosen.airframe)
         certificate = certify(planned, chosen.limits)
         begun = time.perf_counter()
-        repaired = repair(path, solution.profile, chosen.airframe, chosen.limits)
+        repaired = entrant.mend(path, solution.profile, chosen.airframe, chosen.limits)
         repair_seconds = time.perf_counter() - begun
     except CfplanError as error:
         return failed_trial(name, seed, Status.SOLVED.name, f"not certified: {error}", **values)
     return Trial(
         planner=name, seed=seed, status=solution.status.name, reason="", repair_seconds=repair_seconds,
         worst_share=certificate.worst.share, worst_limit=certificate.worst.name, planned_time=planned.duration,
-        certified_time=repaired.trajectory.duration, **values,
+        certified_time=repaired.trajectory.duration,
+        slowed_to=repaired.share, **values,
     )  # fmt: skip
 
 
@@ -143,7 +167,7 @@ def failed_trial(
 ) -> Trial:
     """A trial without a certified flight."""
     return Trial(
-        name, seed, status, reason, plan_seconds, solve_seconds, np.nan, np.nan, "", np.nan, np.nan, bound
+        name, seed, status, reason, plan_seconds, solve_seconds, np.nan, np.nan, "", np.nan, np.nan, np.nan, bound
     )  # fmt: skip
 
 

@@ -9,8 +9,7 @@ import pytest
 from cfplan.errors import InputError
 from cfplan.expert.solution import Solution, Status
 from cfplan.planning import planners
-from cfplan.studies import bench as bench_module
-from cfplan.studies import feasibility, scaling
+from cfplan.studies import feasibility, scaling, trials
 from cfplan.studies.bench import bench
 from cfplan.studies.machine import this_machine
 from cfplan.studies.trials import quantiles, random_path
@@ -66,7 +65,7 @@ def test_a_failing_planner_is_counted_with_its_reason(monkeypatch):
     def never(*_arguments, **_options):
         return Solution(Status.NOT_CONVERGED, None, "gave up")
 
-    monkeypatch.setattr(bench_module, "find_planner", lambda name: never)
+    monkeypatch.setattr(trials, "find_planner", lambda name: never)
     result = bench(paths=1, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=["minsnap"])
     assert result.rows[0].certified == 0
     assert result.trials[0]["reason"] == "gave up"
@@ -84,7 +83,7 @@ def test_an_interrupt_keeps_what_is_measured(monkeypatch):
             raise KeyboardInterrupt
         return true(*arguments, **options)
 
-    monkeypatch.setattr(bench_module, "find_planner", lambda name: stopping)
+    monkeypatch.setattr(trials, "find_planner", lambda name: stopping)
     result = bench(paths=5, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=["minsnap"])
     assert result.interrupted
     assert result.rows[0].paths == 2
@@ -139,3 +138,13 @@ def test_random_paths_come_from_their_seed():
 
 def test_the_machine_knows_its_packages():
     assert {"numpy", "casadi"} <= set(this_machine().packages)
+
+
+def test_a_refined_planner_is_another_entrant_than_the_same_one_slowed():
+    names = ["convex", "convex, refined", "expert, refined"]
+    result = bench(paths=2, nodes=60, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=names)
+    slowed, refined, expert = result.rows
+    assert refined.mended >= slowed.mended
+    assert refined.flight <= slowed.flight
+    assert expert.against_expert == (0.0, 0.0)
+    assert slowed.against_expert[0] > 0
