@@ -75,6 +75,26 @@ def feasibility(yaw: str, output: Path | None, as_json: bool, **what: Any) -> No
     _publish(result, output, as_json)
 
 
+@study.command(epilog="Example: cfplan study learned --paths 1000 -o docs/studies/learned.json")
+@click.option("--paths", type=int, default=1000, show_default=True, help="Random paths in each box with each set.")
+@click.option("--seed", "first_seed", type=int, default=20_000, show_default=True, help="Of the first path.")
+@_boxes
+@_sets
+@_output
+@options.as_json
+def learned(output: Path | None, as_json: bool, **what: Any) -> None:
+    """The learned planner on unseen paths, against the expert: the network alone, repaired, and in the dry run."""
+    from cfplan.studies.machine import one_thread
+
+    one_thread()
+    from cfplan.studies.learned import learned_study
+
+    _require_free(output)
+    with _progress("planning", as_json) as progress:
+        result = learned_study(**_given(what), command=_command(), progress=progress)
+    _publish(result, output, as_json)
+
+
 @study.command(epilog="Example: cfplan study scaling -o docs/studies/scaling.json")
 @click.option("--planner", default="expert", show_default=True)
 @click.option("--repeats", type=int, default=5, show_default=True, help="Paths of each size.")

@@ -10,7 +10,6 @@ import click
 
 from cfplan.cli.vehicle import SIMULATED
 from cfplan.errors import ExitCode, InputError
-from cfplan.recording.record import SUMMARY_FILE
 
 if TYPE_CHECKING:
     from cfplan.flight.mission import Mission
@@ -55,6 +54,8 @@ def what_it_does(name: str, mission: "Mission", uri: str) -> str:
 
 def flown_before(name: str, records: Path) -> bool:
     """Whether a record says that a path of this name was flown to its end on hardware."""
+    from cfplan.recording.record import SUMMARY_FILE
+
     for file in records.glob(f"*/{SUMMARY_FILE}"):
         if not re.search(rf"-{re.escape(name)}(-\d+)?$", file.parent.name):
             continue

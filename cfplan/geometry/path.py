@@ -89,7 +89,7 @@ class Path:
         return out
 
     def part(self, low: float, high: float) -> "Path":
-        """The path from s = low to s = high, with s counted from there; two pieces at least, so that rests stay exact."""
+        """The path from s = low to s = high, s counted from there; two pieces at least, so that rests stay exact."""
         first = int(np.searchsorted(self.breaks, low, side="right")) - 1
         last = int(np.searchsorted(self.breaks, high, side="left"))
         piece = np.arange(first, last)

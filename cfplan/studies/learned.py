@@ -1,0 +1,202 @@
+"""The learned planner on unseen paths: the network alone, repaired, flown in the dry run, and how long that takes.
+
+Every path is also planned by the expert, whose certified flight is what travel times are compared with.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from cfplan.errors import CfplanError, InputError
+from cfplan.expert.limit_sets import BOXES, LIMIT_SETS, LimitSet
+from cfplan.expert.reduced import plan_reduced
+from cfplan.flight.encoding import check_bytes, encode_trajectory
+from cfplan.geometry.path import Path
+from cfplan.learning.learned import plan_learned
+from cfplan.planning.repair import repair
+from cfplan.safety.certificate import certify
+from cfplan.safety.limits import FlightLimits, Ladder
+from cfplan.simulation.dry_run import dry_run
+from cfplan.studies.machine import Machine, this_machine
+from cfplan.studies.trials import find_box, find_limit_set, random_path
+from cfplan.vehicle.trajectory import Trajectory
+
+NODES = 100
+LOST = 1.0
+# m off its place: a dry run that gets there has failed
+FEW_METRES = (18.0, 22.0)
+# paths whose planning time is told apart
+COLUMNS = (
+    "box", "limits", "paths", "network against expert: mean", "p95 of |·|", "as it is", "refined", "slowed",
+    "certified against expert: mean", "p95", "max", "expert repaired: mean", "max ", "dry run: failed",
+    "deviation median", "max  ", "path to bytes median", "p99", "of 20 m: median", "p99 ",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """One path. Times of flight in s; NaN where there was nothing to measure."""
+
+    box: str
+    limits: str
+    seed: int
+    length: float
+    # m
+    reason: str
+    # why there is no certified flight, empty where there is
+    expert_planned: float
+    # before repair
+    expert: float
+    network: float
+    # before repair
+    worst_share: float
+    # of a limit, before repair
+    learned: float
+    share: float
+    # of its speed to which the whole was slowed
+    seconds: tuple[float, float, float]
+    # to plan, to repair and certify, to encode and certify the bytes
+    deviation: float
+    # m, in the dry run
+    dry_run: str
+    # why it failed, empty where it passed; "not encodable" where a place is too far out for a packet
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedStudy:
+    """A whole run."""
+
+    command: str
+    machine: Machine
+    first_seed: int
+    interrupted: bool
+    seconds: float
+    flights: tuple[Flight, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the table, and each flight that is out of the ordinary."""
+        rest = {name: value for name, value in asdict(self).items() if name != "flights"}
+        odd = [asdict(f) for f in self.flights if f.reason or f.dry_run or f.share < 1.0]
+        return rest | {"table": [dict(zip(COLUMNS, row, strict=True)) for row in self._rows()], "flights": odd}
+
+    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
+        """Title, columns and rows of the one table."""
+        return [(f"the learned planner on unseen paths, N = {NODES}, yaw fixed", list(COLUMNS), self._rows())]
+
+    def _rows(self) -> list[list[str]]:
+        groups = dict.fromkeys((f.box, f.limits) for f in self.flights)
+        return [_texts(*group, [f for f in self.flights if (f.box, f.limits) == group]) for group in groups]
+
+
+def _texts(box: str, limits: str, flights: list[Flight]) -> list[str]:
+    done = [f for f in flights if not f.reason]
+    network = _numbers(f.network / f.expert_planned - 1 for f in done)
+    against = _numbers(f.learned / f.expert - 1 for f in done)
+    mended = _numbers(f.expert / f.expert_planned - 1 for f in done)
+    flown = [f for f in done if f.dry_run != "not encodable"]
+    deviation = _numbers(f.deviation for f in flown)
+    whole = 1e3 * _numbers(sum(f.seconds) for f in flown)
+    few = 1e3 * _numbers(sum(f.seconds) for f in flown if FEW_METRES[0] <= f.length <= FEW_METRES[1])
+    passed = sum(f.worst_share <= 1.0 for f in done)
+    slowed = sum(f.share < 1.0 for f in done)
+    return [
+        box, limits, f"{len(flights)}", _percent(np.mean(network)), _percent(np.quantile(np.abs(network), 0.95)),
+        f"{passed}", f"{len(done) - passed - slowed}", f"{slowed}",
+        _percent(np.mean(against)), _percent(np.quantile(against, 0.95)), _percent(np.max(against)),
+        _percent(np.mean(mended)), _percent(np.max(mended)),
+        f"{sum(bool(f.dry_run) for f in flown)} of {len(flown)}", f"{100 * np.median(deviation):.1f} cm",
+        f"{100 * np.max(deviation):.1f} cm",
+        *(f"{np.quantile(ms, q):.1f} ms" for ms in (whole, few) for q in (0.5, 0.99)),
+    ]  # fmt: skip
+
+
+def _numbers(values: Iterable[float]) -> np.ndarray:
+    """As an array that is never empty."""
+    array = np.array(list(values), dtype=float)
+    return array if len(array) else np.array([np.nan])
+
+
+def _percent(value: Any) -> str:
+    return f"{100 * float(value):+.2f} %"
+
+
+def learned_study(
+    *,
+    paths: int = 1000,
+    boxes: Sequence[str] = tuple(BOXES),
+    limit_sets: Sequence[str] = tuple(LIMIT_SETS),
+    first_seed: int = 20_000,
+    command: str = "",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> LearnedStudy:
+    """`paths` random paths from each box with each limit set. An interrupt ends it early with what is measured.
+
+    Raises:
+        InputError: an unknown box or limit set, no path at all, or no model for a limit set.
+    """
+    if paths < 1:
+        raise InputError(f"{paths} paths are none", where="paths")
+    for box in boxes:
+        find_box(box)
+    pairs = [(box, find_limit_set(name)) for name in limit_sets for box in boxes]
+    begun, interrupted, flights = time.perf_counter(), False, []
+    try:
+        for number, (box, chosen) in enumerate(pairs):
+            for seed in range(first_seed - 1, first_seed + paths):
+                flight = _fly(random_path(seed, box), box, seed, chosen)
+                if seed >= first_seed:  # the first one compiles and loads
+                    flights.append(flight)
+                    progress(number * paths + seed - first_seed + 1, len(pairs) * paths)
+    except KeyboardInterrupt:
+        interrupted = True
+    seconds = time.perf_counter() - begun
+    return LearnedStudy(command, this_machine(), first_seed, interrupted, seconds, tuple(flights))
+
+
+def _fly(path: Path, box: str, seed: int, chosen: LimitSet) -> Flight:
+    airframe, limits = chosen.airframe, chosen.limits
+    values: dict[str, Any] = dict.fromkeys(("expert_planned", "expert", "network", "worst_share", "learned"), np.nan)
+    values |= {"share": np.nan, "deviation": np.nan, "dry_run": "", "reason": "", "seconds": (np.nan,) * 3}
+    values |= {"box": box, "limits": chosen.name, "seed": seed, "length": path.length}
+    try:
+        path.check()
+        expert = plan_reduced(path, airframe, limits, nodes=NODES)
+        if expert.profile is None:
+            return Flight(**values | {"reason": f"expert: {expert.reason or expert.status}"})
+        mended = repair(path, expert.profile, airframe, limits)
+        values |= {"expert_planned": mended.before, "expert": mended.trajectory.duration}
+
+        begun = time.perf_counter()
+        solution = plan_learned(path, airframe, limits, nodes=NODES)
+        planned = time.perf_counter()
+        if solution.profile is None:
+            return Flight(**values | {"reason": f"learned: {solution.reason or solution.status}"})
+        found = repair(path, solution.profile, airframe, limits)
+        repaired = time.perf_counter()
+        values |= {"network": found.before, "learned": found.trajectory.duration, "share": found.share}
+        raw = certify(Trajectory(path, solution.profile, airframe), limits)
+        values["worst_share"] = raw.worst.share
+
+        encoding = time.perf_counter()
+        try:
+            encoded = encode_trajectory(found.trajectory)
+            check_bytes(encoded, found.trajectory, limits)
+        except CfplanError:
+            return Flight(**values | {"dry_run": "not encodable"})
+        encoded_at = time.perf_counter()
+        values["seconds"] = planned - begun, repaired - planned, encoded_at - encoding
+        run = dry_run(encoded, found.trajectory, airframe, _lost_alone())
+        return Flight(**values | {"deviation": run.deviation, "dry_run": run.reason})
+    except CfplanError as error:
+        return Flight(**values | {"reason": str(error)})
+
+
+def _lost_alone() -> FlightLimits:
+    never = Ladder(np.inf, np.inf, np.inf)
+    return FlightLimits(
+        deviation=Ladder(LOST, LOST, LOST), fence=never, speed=never, acceleration=never, angular_velocity=never,
+        patience=1.0,
+    )  # fmt: skip
