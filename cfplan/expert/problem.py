@@ -21,6 +21,9 @@ MARGIN = 1e-3
 # share by which limits are tightened, for what happens between points
 FADE = 5
 # intervals over which that margin grows from nothing, next to a boundary state that may lie at a limit
+JOINT_MARGIN, AROUND_JOINT = 0.01, 6
+# by how much limits are tightened around a joint, and over how many intervals on each side, so that the search which
+# goes on from there is not cornered
 LEAD = 3.0
 # intervals over which the guess comes away from a boundary state
 HASTE = 1.5
@@ -40,7 +43,9 @@ class Ends:
     start: BoundaryState | None
     end: BoundaryState | None
     continues: bool = False
-    # whether the start is where another problem's solution was cut: then it keeps its limits with room to spare
+    # whether the start is a joint, crossed by another problem's solution with room to spare
+    joint: int | None = None
+    # the interval before which this problem's solution will be cut, for another to go on from there
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +94,8 @@ def pose(
     step, unit = path.end / nodes, limits.speed**2
     p = _parameters(layout, path, airframe, limits, track, penalties, unit, step)
     margin = MARGIN * (1.0 - held_by(ends, nodes))
+    if ends.joint is not None:
+        margin[ends.joint - AROUND_JOINT : ends.joint + AROUND_JOINT] = JOINT_MARGIN
     lbx, ubx = _variable_bounds(layout, path, limits, unit, step, margin)
     lbg, ubg = _constraint_bounds(layout, path, limits, unit, step, margin, ends)
     if table is None:
@@ -127,32 +134,6 @@ def tightened(problem: Problem, excess: Excess, at_points: NDArray) -> Problem:
     free = problem.lbx[first] < ubx[first]
     around = np.minimum(np.append(slower, 1.0), np.append(1.0, slower))
     ubx[first] *= np.where(free, around, 1.0)
-    return replace(problem, lbg=lbg, ubg=ubg, ubx=ubx)
-
-
-def continued(problem: Problem, before: Problem, first: int) -> Problem:
-    """The problem with the limits lowered as they were in `before`, whose interval `first` is its first one."""
-    overlap = before.layout.shape.nodes - first
-    lower, upper = (np.full((overlap, stage.ROWS), value) for value in (-np.inf, np.inf))
-    point, row = np.divmod(before.layout.selected, stage.ROWS)
-    interval = before.layout.interval[point] - first
-    shared = interval >= 0
-    at = interval[shared], row[shared]
-    np.maximum.at(lower, at, before.lbg[before.layout.point_rows[shared]])
-    np.minimum.at(upper, at, before.ubg[before.layout.point_rows[shared]])
-
-    layout = problem.layout
-    lbg, ubg, ubx = problem.lbg.copy(), problem.ubg.copy(), problem.ubx.copy()
-    point, row = np.divmod(layout.selected, stage.ROWS)
-    interval = layout.interval[point]
-    decided = np.isin(row, stage.JUMPING, invert=True) & (interval == 0) & (layout.place[point] == 0.0)
-    shared = (interval < overlap) & ~decided
-    at, rows = (interval[shared], row[shared]), layout.point_rows[shared]
-    lbg[rows], ubg[rows] = np.maximum(lbg[rows], lower[at]), np.minimum(ubg[rows], upper[at])
-    theirs = before.layout.speed_rows[first:]
-    ubg[layout.speed_rows[:overlap]] = np.minimum(ubg[layout.speed_rows[:overlap]], before.ubg[theirs])
-    nodes = np.arange(1, overlap) * layout.block
-    ubx[nodes] = np.minimum(ubx[nodes], before.ubx[nodes + first * layout.block])
     return replace(problem, lbg=lbg, ubg=ubg, ubx=ubx)
 
 

@@ -2,8 +2,7 @@
 
 Searched from near, the expert's problem takes a fraction of its steps. A long path is taken window by window, so that
 time grows with its length and memory does not: each window begins in the state where the kept part of the one before
-ends, with the limits there as that one had lowered them, and looks further than it keeps, by more than it takes to
-brake.
+ends, and looks further than it keeps, by more than it takes to brake. Joints are crossed a little below the limits.
 """
 
 import math
@@ -12,7 +11,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.expert.problem import FLOOR, Ends, Problem, continued, pose
+from cfplan.expert.problem import FLOOR, Ends, pose
 from cfplan.expert.program import Shape, layout_of
 from cfplan.expert.solution import Solution, Status
 from cfplan.expert.solvers import FROM_AFAR, FROM_NEAR, interior_point
@@ -44,26 +43,23 @@ def refine(
     step, unit = path.end / nodes, limits.speed**2
     table = np.maximum(h_coefficients(profile) / unit, FLOOR)[:, None]
     turning = limits.angular_acceleration < math.inf
-    before: Problem | None = None
     iterations = rounds = windows = 0
     for first, last in windows_of(nodes):
         part = path if last - first == nodes else path.part(first * step, last * step)
         track = yaw_of(profile, first, last)
         state = start if first == 0 else _state(table[first : first + 3, 0] * unit, track, step)
-        ends = Ends(state, end if last == nodes else None, continues=first > 0)
+        joint = WINDOW if last < nodes else None
+        ends = Ends(state, end if last == nodes else None, continues=first > 0, joint=joint)
         shape = Shape(last - first, False, turning, (3 * (first == 0), 3 * (last == nodes)))
         task = Task(part, airframe, limits, ends, track, layout_of(shape))
         near = table[first : last + 3] if not (first == 0 and start) and not (last == nodes and end) else None
         problem = pose(task.layout, part, airframe, limits, track, 0.0, ends, Penalties(), near)
-        if before:
-            problem = continued(problem, before, WINDOW)
         attempt = interior_point(problem, None, searches=(FROM_NEAR, FROM_AFAR))
         if reason := flaw(attempt, problem, task):
             where = f"s = {first * step:.3g} to {last * step:.3g}"
             return Solution(Status.NOT_CONVERGED, None, f"refining {where}: {reason}")
         kept = kept_between(attempt, problem, task)
         table[first : last + 3] = kept.table
-        before = kept.problem
         iterations, rounds, windows = (
             iterations + kept.iterations - attempt.iterations,
             rounds + kept.rounds,

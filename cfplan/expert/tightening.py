@@ -40,8 +40,6 @@ class Kept(NamedTuple):
 
     table: NDArray
     # (N+3, 1 or 2) spline coefficients
-    problem: Problem
-    # with the limits as lowered
     rounds: int
     iterations: int
     # of the attempt and of all rounds
@@ -56,14 +54,14 @@ def kept_between(attempt: Attempt, problem: Problem, task: Task) -> Kept:
         profile = profile_of(attempt.table, problem, task.track, task.path.end)
         excess = dense.excess(profile, task.airframe, task.limits)
         if excess.worst <= ENOUGH:
-            return Kept(attempt.table, problem, done, iterations)
+            return Kept(attempt.table, done, iterations)
         problem = tightened(problem, excess, attempt.at_points)
         again = interior_point(problem, task.backend, attempt.table, (AGAIN, FROM_NEAR, FROM_AFAR))
         iterations += again.iterations
         if flaw(again, problem, task):
-            return Kept(attempt.table, problem, done, iterations)
+            return Kept(attempt.table, done, iterations)
         attempt = again
-    return Kept(attempt.table, problem, ROUNDS, iterations)
+    return Kept(attempt.table, ROUNDS, iterations)
 
 
 def flaw(attempt: Attempt, problem: Problem, task: Task) -> str:

@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from cfplan.errors import InputError
 from cfplan.expert.preconditions import broken_by, check_arguments, unsolvable
 from cfplan.expert.solution import Solution, Status
+from cfplan.expert.spline_profile import spline_profile
 from cfplan.expert.yaw_track import YawTrack, fixed_yaw, tangent_yaw
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
@@ -33,7 +34,7 @@ from cfplan.learning.features import (
 )
 from cfplan.learning.inference import Network
 from cfplan.learning.model_files import Model, find_model
-from cfplan.learning.smooth import Begin, profile_by, smoothed, track_through
+from cfplan.learning.smooth import Begin, smoothed, track_through
 from cfplan.learning.windows import chain, kept
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
@@ -101,7 +102,7 @@ def plan_learned(
         "model": model.name,
     }
     track = track or track_through(turned, path.end / nodes, start, end)
-    return Solution(Status.SOLVED, profile_by(coefficients, path.end, track), "", stats)
+    return Solution(Status.SOLVED, spline_profile(coefficients, path.end, track), "", stats)
 
 
 def predict(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from cfplan.expert.yaw_track import YawTrack
-from cfplan.vehicle.profile import BoundaryState, SpeedProfile
+from cfplan.vehicle.profile import BoundaryState
 
 DURATION = 0.07
 # s, over which answers are smoothed
@@ -102,24 +102,6 @@ def track_through(yaw: NDArray, step: float, start: BoundaryState | None, end: B
             half = sign * state.dyaw * step / 2
             spline[places] = state.yaw + half, state.yaw - half
     return YawTrack((spline[:-1] + spline[1:]) / 2, np.diff(spline) / step, np.diff(spline, 2) / step**2)
-
-
-def profile_by(coefficients: NDArray, end: float, track: YawTrack) -> SpeedProfile:
-    """The profile whose h has these coefficients, (N+3,), on N intervals."""
-    nodes = len(coefficients) - 3
-    step = end / nodes
-    difference = np.diff(coefficients)
-    second = np.diff(difference)
-    return SpeedProfile(
-        s=np.linspace(0.0, end, nodes + 1),
-        h=coefficients[1:-1] + second / 6,
-        dh=(difference[1:] + difference[:-1]) / (2 * step),
-        ddh=second / step**2,
-        dddh=np.diff(second) / step**3,
-        yaw=track.yaw,
-        dyaw=track.dyaw,
-        ddyaw=track.ddyaw,
-    )
 
 
 def travel_time(coefficients: NDArray, step: float) -> float:

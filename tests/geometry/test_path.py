@@ -133,3 +133,25 @@ def test_a_piece_without_length_is_named(path):
     rows[2, :, 0] = [2, 1]
     with pytest.raises(InputError, match=r"here\.yaml:3: a piece has no length at s = 1\.000"):
         Path(breaks, rows).check("here.yaml:3")
+
+
+def test_all_derivatives_in_one_pass_are_those_one_by_one():
+    path = min_snap([[0, 0, 1], [1, 2, 1.5], [3, 1, 0.7], [2, -1, 1]])
+    s = np.random.default_rng(0).uniform(-0.5, path.end + 0.5, 300)  # beyond the ends too, and in no order
+    found = path.derivatives(s)
+    for order in range(5):
+        np.testing.assert_allclose(found[order], path(s, order).T, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 0.3), (0.2, 0.9), (0.5, 1.0), (0.0, 1.0)])
+def test_a_part_of_a_path_is_that_part(low, high):
+    path = min_snap([[0, 0, 1], [1, 2, 1.5], [3, 1, 0.7], [2, -1, 1]])
+    low, high = low * path.end, high * path.end
+    part = path.part(low, high)
+    s = np.linspace(0.0, high - low, 101)
+    assert part.end == pytest.approx(high - low)
+    for order in range(5):
+        np.testing.assert_allclose(part(s, order), path(low + s, order), rtol=1e-7, atol=1e-8)
+    assert np.linalg.norm(part(0.0, 1)) == pytest.approx(np.linalg.norm(path(low, 1)), abs=1e-12)
+    if high == path.end:
+        assert not part(part.end, 1).any()  # a rest stays exact

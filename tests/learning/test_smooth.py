@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from cfplan.expert.spline_profile import spline_profile
 from cfplan.expert.yaw_track import YawTrack
-from cfplan.learning.smooth import Begin, profile_by, smoothed
+from cfplan.learning.smooth import Begin, smoothed
 
 SETTLED = np.array([2.0, 2.05, 2.12])
 
@@ -44,7 +45,7 @@ def test_what_is_settled_stays():
 def test_h_is_constant_next_to_a_rest():
     u = np.exp(2 * smoothed(rough(), SETTLED, int(Begin.REST), True))
     zeros = np.zeros(21)
-    profile = profile_by(u, 3.0, YawTrack(zeros, zeros, zeros[1:]))
+    profile = spline_profile(u, 3.0, YawTrack(zeros, zeros, zeros[1:]))
     for values, at in ((profile.dh, [0, 1]), (profile.ddh, [0, 1]), (profile.dddh, [0])):
         assert np.all(values[at] == 0.0)
         assert np.all(values[[-1 - k for k in at]] == 0.0)
@@ -65,6 +66,6 @@ def test_smoothing_takes_the_same_time_whatever_the_grid():
 def test_a_profile_is_the_spline_of_its_coefficients(make_profile):
     u = np.random.default_rng(1).uniform(0.5, 2.0, 23)
     zeros = np.zeros(21)
-    found, expected = profile_by(u, 3.0, YawTrack(zeros, zeros, zeros[1:])), make_profile(3.0, u)
+    found, expected = spline_profile(u, 3.0, YawTrack(zeros, zeros, zeros[1:])), make_profile(3.0, u)
     for name in ("s", "h", "dh", "ddh", "dddh"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-8)
