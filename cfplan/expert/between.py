@@ -91,6 +91,14 @@ class DensePath:
         return Excess(upper - self.held * np.maximum(upper, 0.0), lower - self.held * np.maximum(lower, 0.0))
 
 
+def surely_exceeds(path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> bool:
+    """Whether a limit is exceeded at one of many places; where not, the certificate has the word."""
+    nodes = len(profile.s) - 1
+    dense = DensePath(path, nodes, np.zeros(nodes))
+    excess = dense.excess(profile, airframe, limits)
+    return bool(max((excess.upper - dense.allowance).max(), (excess.lower - dense.allowance).max()) > 0)
+
+
 def turns(path: Path, nodes: int) -> NDArray:
     """(N,) rad, by how much the direction of the path differs from one end of each interval to the other."""
     s = np.linspace(0.0, path.end, nodes + 1)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cfplan.expert.problem import FLOOR, Ends, pose
 from cfplan.expert.program import Shape, layout_of
 from cfplan.expert.solution import Solution, Status
-from cfplan.expert.solvers import FROM_AFAR, FROM_NEAR, interior_point
+from cfplan.expert.solvers import QUICKLY, QUICKLY_AGAIN, interior_point
 from cfplan.expert.spline_profile import h_coefficients, spline_profile, yaw_of
 from cfplan.expert.stage import Penalties
 from cfplan.expert.tightening import Task, flaw, kept_between
@@ -37,7 +37,10 @@ def refine(
     start: BoundaryState | None = None,
     end: BoundaryState | None = None,
 ) -> Solution:
-    """The fastest profile near the given one, on its grid, with its yaw; `start` and `end` are kept where given."""
+    """A profile within a few thousandths of the fastest, on the grid and with the yaw of the given one.
+
+    `start` and `end` are kept where given.
+    """
     began = time.perf_counter()
     nodes = len(profile.s) - 1
     step, unit = path.end / nodes, limits.speed**2
@@ -54,17 +57,15 @@ def refine(
         task = Task(part, airframe, limits, ends, track, layout_of(shape))
         near = table[first : last + 3] if not (first == 0 and start) and not (last == nodes and end) else None
         problem = pose(task.layout, part, airframe, limits, track, 0.0, ends, Penalties(), near)
-        attempt = interior_point(problem, None, searches=(FROM_NEAR, FROM_AFAR))
+        attempt = interior_point(problem, None, QUICKLY)
         if reason := flaw(attempt, problem, task):
             where = f"s = {first * step:.3g} to {last * step:.3g}"
             return Solution(Status.NOT_CONVERGED, None, f"refining {where}: {reason}")
-        kept = kept_between(attempt, problem, task)
+        kept = kept_between(attempt, problem, task, QUICKLY_AGAIN)
         table[first : last + 3] = kept.table
-        iterations, rounds, windows = (
-            iterations + kept.iterations - attempt.iterations,
-            rounds + kept.rounds,
-            windows + 1,
-        )
+        iterations += kept.iterations
+        rounds += kept.rounds
+        windows += 1
     stats: dict[str, float | int | str] = {
         "solve_seconds": time.perf_counter() - began,
         "iterations": iterations,

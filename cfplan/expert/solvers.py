@@ -16,11 +16,17 @@ from cfplan.expert.spline_problem import SplineProblem
 
 TOLERANCE = 1e-2
 # of the scaled problem: 1e-5 s in the cost's gradient
-FROM_AFAR = Search()
-FROM_NEAR = Search(barrier=0.05, push=1e-3, iterations=40)
-# from what is nearly right
-AGAIN = Search(barrier=3e-3, push=1e-4, iterations=20)
-# from the answer to a problem almost the same: near the bounds from the start
+FROM_AFAR = (Search(),)
+# from a guess
+AGAIN = (
+    Search(barrier=3e-3, push=1e-4, iterations=20), Search(barrier=0.05, push=1e-3, iterations=40), *FROM_AFAR
+)  # fmt: skip
+# from the answer to a problem almost the same: near the bounds from the start, and further off where that fails
+QUICKLY = (
+    Search(barrier=0.02, last_barrier=0.02, push=1e-2, iterations=40), *FROM_AFAR
+)  # fmt: skip
+# from what is nearly right, to what takes a few thousandths longer than the best at most
+QUICKLY_AGAIN = (Search(barrier=0.02, last_barrier=0.02, push=1e-3, iterations=20), *AGAIN)
 
 
 class Attempt(NamedTuple):
@@ -35,22 +41,31 @@ class Attempt(NamedTuple):
     iterations: int
     words: str
     # the solver's own, for people
+    splines: SplineProblem | None = None
+    # what it was solved as, to solve again with other limits
 
 
-def interior_point(
-    problem: Problem, backend: Backend | None, table: NDArray | None = None, searches: Sequence[Search] = (FROM_AFAR,)
-) -> Attempt:
-    """Search from the problem's own table, or from `table`: as the first of `searches` that succeeds."""
-    posed = SplineProblem(problem, backend)
-    v = posed.v_of(problem.table if table is None else table)
-    iterations = 0
+def interior_point(problem: Problem, backend: Backend | None, searches: Sequence[Search] = FROM_AFAR) -> Attempt:
+    """Search from the problem's own table, as the first of `searches` that succeeds."""
+    return _searched(SplineProblem(problem, backend), problem.table, searches)
+
+
+def again(attempt: Attempt, problem: Problem, backend: Backend | None, searches: Sequence[Search] = AGAIN) -> Attempt:
+    """Search from an attempt's answer, with the limits of `problem`, which differs in nothing else."""
+    splines = attempt.splines.bounded_as(problem) if attempt.splines else SplineProblem(problem, backend)
+    return _searched(splines, attempt.table, searches)
+
+
+def _searched(splines: SplineProblem, table: NDArray, searches: Sequence[Search]) -> Attempt:
+    v, iterations = splines.v_of(table), 0
     for search in searches:
-        ended = minimise(posed, posed.rows, v, search)
+        ended = minimise(splines, splines.rows, v, search)
         iterations += ended.iterations
         if ended.solved:
             break
+    at_points = splines.at_points(ended.g)
     return Attempt(
-        "interior point", posed.table_of(ended.v), posed.at_points(ended.g), ended.solved, iterations, ended.words
+        "interior point", splines.table_of(ended.v), at_points, ended.solved, iterations, ended.words, splines
     )
 
 

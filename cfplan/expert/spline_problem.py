@@ -7,6 +7,7 @@ of h have one value, so that h is constant in that interval, and the first two o
 """
 
 import math
+from copy import copy
 
 import numpy as np
 from numba import njit
@@ -51,13 +52,16 @@ class SplineProblem:
         self._points = Points(layout.shape.free_yaw, data, common, OBJECTIVE_SCALE * problem.p[-3:], backend)
         self._scale = OBJECTIVE_SCALE / math.sqrt(common[14])
         self._point, self._row = np.divmod(layout.selected, stage.ROWS)
-        self._linear, linear_interval, lower, upper = _linear_rows(problem, own)
-        self.rows = Rows(
-            self._of[local],
-            np.concatenate([layout.interval[self._point], linear_interval]),
-            np.concatenate([problem.lbg[layout.point_rows], lower]),
-            np.concatenate([problem.ubg[layout.point_rows], upper]),
-        )
+        self._positive = np.flatnonzero(own[:, 0])
+        self._linear, linear_interval = _linear_rows(problem, self._positive)
+        interval = np.concatenate([layout.interval[self._point], linear_interval])
+        self.rows = Rows(self._of[local], interval, *_bounds(problem, len(self._positive)))
+
+    def bounded_as(self, problem: Problem) -> "SplineProblem":
+        """The same but for the limits, which are those of `problem`. Both share their arrays: use one at a time."""
+        other = copy(self)
+        other.rows = Rows(self.rows.slots, self.rows.interval, *_bounds(problem, len(self._positive)))
+        return other
 
     def v_of(self, table: NDArray) -> NDArray:
         """The variables of a table of coefficients; the smallest counts where several have one value."""
@@ -118,36 +122,42 @@ def _slots(problem: Problem) -> tuple[NDArray, NDArray]:
     return of, of == own
 
 
-def _linear_rows(problem: Problem, own: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """(weights (E, k), interval, lower, upper): speeds at nodes and between, positive h, and where yaw starts."""
+def _linear_rows(problem: Problem, positive: NDArray) -> tuple[NDArray, NDArray]:
+    """(weights (E, k), interval): speeds at nodes and between, the coefficients of h, and where yaw starts."""
     layout, nodes = problem.layout, problem.layout.shape.nodes
-    k = 7 if layout.shape.free_yaw else 4
-    first = np.arange(nodes + 1) * layout.block
-    at_node = np.minimum(np.arange(nodes + 1), nodes - 1)
-    place = (np.arange(nodes + 1) == nodes) * 1.0
+    k = coefficients(layout.shape.free_yaw)
+    node = np.arange(nodes + 1)
     between = np.array(layout.shape.speed_places)
-    positive = np.flatnonzero(own[:, 0])
-    interval = np.clip(positive - 1, 0, nodes - 1)
+    of_positive = np.clip(positive - 1, 0, nodes - 1)
     weights = [
-        h_weights(place),
+        h_weights((node == nodes) * 1.0),
         np.tile(h_weights(between), (nodes, 1)),
-        np.eye(4)[positive - interval],
+        np.eye(4)[positive - of_positive],
     ]
-    count = len(between)
-    upper = [problem.ubx[first], problem.ubg[layout.speed_rows].ravel(), np.full(len(positive), np.inf)]
-    lower = [np.full(nodes + 1, -np.inf), np.full(nodes * count, -np.inf), np.full(len(positive), FLOOR)]
-    intervals = [at_node, np.repeat(np.arange(nodes), count), interval]
-    free = problem.lbx[first] < problem.ubx[first]
-    upper[0] = np.where(free, upper[0], np.inf)
     rows = np.pad(np.concatenate(weights), ((0, 0), (0, k - 4)))
-    if layout.shape.free_yaw and not problem.ends.start:
-        start = np.zeros((1, k))
-        start[0, 4:] = YAW_SPLINE[0]
-        rows = np.concatenate([rows, start])
-        intervals.append(np.zeros(1, dtype=int))
-        lower.append(problem.lbx[3:4])
-        upper.append(problem.ubx[3:4])
-    return rows, np.concatenate(intervals), np.concatenate(lower), np.concatenate(upper)
+    interval = np.concatenate([np.minimum(node, nodes - 1), np.repeat(node[:-1], len(between)), of_positive])
+    if layout.shape.free_yaw:
+        start = np.pad(YAW_SPLINE[:1], ((0, 0), (4, 0)))
+        rows, interval = np.concatenate([rows, start]), np.append(interval, 0)
+    return rows, interval
+
+
+def _bounds(problem: Problem, positive: int) -> tuple[NDArray, NDArray]:
+    """(lower, upper) of all constraints, in their order."""
+    layout = problem.layout
+    nodes = np.arange(layout.shape.nodes + 1) * layout.block
+    speeds = problem.ubg[layout.speed_rows].ravel()
+    free = problem.lbx[nodes] < problem.ubx[nodes]
+    never = np.full(len(nodes) + len(speeds), -np.inf)
+    lower = [problem.lbg[layout.point_rows], never, np.full(positive, FLOOR)]
+    upper = [
+        problem.ubg[layout.point_rows], np.where(free, problem.ubx[nodes], np.inf), speeds, np.full(positive, np.inf)
+    ]  # fmt: skip
+    if layout.shape.free_yaw:
+        held = problem.ends.start is not None
+        lower.append(np.array([-np.inf]) if held else problem.lbx[3:4])
+        upper.append(np.array([np.inf]) if held else problem.ubx[3:4])
+    return np.concatenate(lower), np.concatenate(upper)
 
 
 @njit(cache=True)

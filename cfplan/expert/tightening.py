@@ -1,6 +1,7 @@
 """From limits kept at points to limits kept between them too: lower them where they are exceeded, and search again."""
 
-from dataclasses import astuple, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -8,9 +9,10 @@ from numpy.typing import NDArray
 
 from cfplan.expert.between import ALLOWANCE, DensePath
 from cfplan.expert.compiled import Backend
+from cfplan.expert.interior_point import Search
 from cfplan.expert.problem import Ends, Problem, held_by, profile_of, tightened
 from cfplan.expert.program import Layout
-from cfplan.expert.solvers import AGAIN, FROM_AFAR, FROM_NEAR, Attempt, interior_point
+from cfplan.expert.solvers import AGAIN, Attempt, again
 from cfplan.expert.yaw_track import YawTrack
 from cfplan.geometry.path import Path
 from cfplan.safety.limits import PlanLimits
@@ -45,7 +47,7 @@ class Kept(NamedTuple):
     # of the attempt and of all rounds
 
 
-def kept_between(attempt: Attempt, problem: Problem, task: Task) -> Kept:
+def kept_between(attempt: Attempt, problem: Problem, task: Task, searches: Sequence[Search] = AGAIN) -> Kept:
     """Round by round until nothing is exceeded; a round that fails leaves what there was: slowing will do the rest."""
     nodes = task.layout.shape.nodes
     dense = DensePath(task.path, nodes, held_by(task.ends, nodes))
@@ -56,11 +58,11 @@ def kept_between(attempt: Attempt, problem: Problem, task: Task) -> Kept:
         if excess.worst <= ENOUGH:
             return Kept(attempt.table, done, iterations)
         problem = tightened(problem, excess, attempt.at_points)
-        again = interior_point(problem, task.backend, attempt.table, (AGAIN, FROM_NEAR, FROM_AFAR))
-        iterations += again.iterations
-        if flaw(again, problem, task):
+        next_one = again(attempt, problem, task.backend, searches)
+        iterations += next_one.iterations
+        if flaw(next_one, problem, task):
             return Kept(attempt.table, done, iterations)
-        attempt = again
+        attempt = next_one
     return Kept(attempt.table, ROUNDS, iterations)
 
 
@@ -68,9 +70,11 @@ def flaw(attempt: Attempt, problem: Problem, task: Task) -> str:
     """What is wrong with an answer, also with one that the solver calls solved; empty where nothing is."""
     if not attempt.solved:
         return attempt.words
-    profile = profile_of(attempt.table, problem, task.track, task.path.end)
-    if not all(np.isfinite(values).all() for values in astuple(profile)):
+    if not np.isfinite(attempt.table).all():
         return "the solution is not finite"
+    if (attempt.table[:, 0] > 0).all():  # then so is h, which lies between its coefficients
+        return ""
+    profile = profile_of(attempt.table, problem, task.track, task.path.end)
     places = np.linspace(0.0, 1.0, 9)
     nodes = np.arange(task.layout.shape.nodes)
     s = profile.s[:-1, None] + np.diff(profile.s)[:, None] * places

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cfplan.expert.between import surely_exceeds
 from cfplan.expert.refined import refine
 from cfplan.geometry.path import Path
 from cfplan.safety.certificate import Certificate, certify
@@ -70,9 +71,10 @@ def repair(
         NotCertifiedError: the profile is not finite, not smooth, or h is not positive.
     """
     trajectory = Trajectory(path, profile, airframe)
-    certificate = certify(trajectory, limits, space)
-    if certificate.passed:
-        return Repaired(trajectory, certificate, 1.0, trajectory.duration)
+    if not surely_exceeds(path, profile, airframe, limits):
+        certificate = certify(trajectory, limits, space)
+        if certificate.passed:
+            return Repaired(trajectory, certificate, 1.0, trajectory.duration)
     solution = refine(path, profile, airframe, limits, start=start, end=end)
     if solution.profile is None:
         return slow(path, profile, airframe, limits, space, failed=solution.reason)

@@ -186,7 +186,7 @@ def test_the_library_is_made_once_and_left_alone(monkeypatch, tmp_path):
 
 
 def test_ipopt_takes_over_where_the_first_solver_fails(monkeypatch):
-    def gives_up(problem, backend, table=None, searches=()):
+    def gives_up(problem, backend, searches=()):
         return Attempt("interior point", problem.table, problem.lbg, False, 3, "gave up")
 
     monkeypatch.setattr(reduced, "interior_point", gives_up)
@@ -207,7 +207,7 @@ def test_both_solvers_find_the_same_flight():
 
 
 def test_an_answer_that_is_not_a_flight_is_not_believed(monkeypatch):
-    def claims(problem, backend, table=None, searches=()):
+    def claims(problem, backend, searches=()):
         return Attempt("liar", np.full_like(problem.table, np.nan), problem.lbg, True, 1, "solved")
 
     monkeypatch.setattr(reduced, "interior_point", claims)

@@ -158,7 +158,7 @@ def test_too_fast_a_profile_of_the_learned_planner_is_refined_and_the_plan_says_
     made = plan(path, limits.airframe, limits, planner="learned")
     assert made.certificate.passed
     assert made.slowed == 1.0
-    assert made.trajectory.duration == pytest.approx(best.trajectory.duration, rel=1e-3)
+    assert made.trajectory.duration == pytest.approx(best.trajectory.duration, rel=5e-3)
     assert re.search(r"refined; slower from s = .* by up to", made.notes[-1])
 
 
