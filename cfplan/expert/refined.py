@@ -56,8 +56,12 @@ def refine(
         shape = Shape(last - first, False, turning, (3 * (first == 0), 3 * (last == nodes)))
         task = Task(part, airframe, limits, ends, track, layout_of(shape))
         near = table[first : last + 3] if not (first == 0 and start) and not (last == nodes and end) else None
-        problem = pose(task.layout, part, airframe, limits, track, 0.0, ends, Penalties(), near)
+        given = airframe, limits, track, 0.0, ends, Penalties()
+        problem = pose(task.layout, part, *given, near)
         attempt = interior_point(problem, None, QUICKLY)
+        if flaw(attempt, problem, task):  # not near enough
+            problem = pose(task.layout, part, *given)
+            attempt = interior_point(problem, None)
         if reason := flaw(attempt, problem, task):
             where = f"s = {first * step:.3g} to {last * step:.3g}"
             return Solution(Status.NOT_CONVERGED, None, f"refining {where}: {reason}")
