@@ -115,7 +115,7 @@ def minimise(functions: Functions, rows: Rows, v: NDArray, search: Search) -> En
     barrier = search.barrier
     cost, g = functions.values(v)
     slacks = _first_slacks(g, rows, barrier, search.push)
-    regularised = 0.0
+    regularised, band = 0.0, _band(rows.slots)
     filtered: list[tuple[float, float]] = []
     most_infeasible = 1e4 * max(1.0, float(np.abs(g - slacks.s).sum()))
     for iteration in range(search.iterations):
@@ -141,7 +141,7 @@ def minimise(functions: Functions, rows: Rows, v: NDArray, search: Search) -> En
             filtered.clear()
 
         dv, step, slope, regularised = _newton(
-            rows.slots, rows.interval, rows.lower, rows.upper, at, stiffness, slacks, barrier, regularised, len(v)
+            band, rows.slots, rows.interval, rows.lower, rows.upper, at, stiffness, slacks, barrier, regularised, len(v)
         )
         if not math.isfinite(slope):
             return Ended(v, at.g, False, iteration, "no direction to go")
@@ -166,6 +166,12 @@ def minimise(functions: Functions, rows: Rows, v: NDArray, search: Search) -> En
     return Ended(v, at.g, False, search.iterations, f"not solved in {search.iterations} iterations")
 
 
+def _band(slots: NDArray) -> int:
+    """How far apart two coefficients that meet can be."""
+    free = np.where(slots >= 0, slots, slots.max(axis=1, keepdims=True))
+    return int((slots.max(axis=1) - free.min(axis=1)).max())
+
+
 def _judge(
     infeasible: float, merit: float, infeasible_there: float, merit_there: float, slope: float,
     most_infeasible: float, filtered: list[tuple[float, float]],
@@ -186,7 +192,7 @@ def _first_slacks(g: NDArray, rows: Rows, barrier: float, push: float) -> _Slack
     return _Slacks(*_first(g, rows.lower, rows.upper, barrier, push))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _first(g, lower, upper, barrier, push):
     s, low, high = g.copy(), np.zeros(len(g)), np.zeros(len(g))
     for j in range(len(g)):
@@ -202,7 +208,7 @@ def _first(g, lower, upper, barrier, push):
     return s, low, high
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _errors(slots, interval, lower, upper, g, jacobian, gradient, slacks, barrier, size):
     """The largest |g - s|, entry of the Lagrangian's gradient, and difference of a slack's product from the barrier."""
     of_v = np.zeros(size)
@@ -221,7 +227,7 @@ def _errors(slots, interval, lower, upper, g, jacobian, gradient, slacks, barrie
     return infeasible, np.abs(of_v).max(), _complementarity(lower, upper, slacks, barrier)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _complementarity(lower, upper, slacks, barrier):
     worst = 0.0
     for j in range(len(lower)):
@@ -232,7 +238,7 @@ def _complementarity(lower, upper, slacks, barrier):
     return worst
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _stiffness(lower, upper, slacks):
     stiffness = np.zeros(len(lower))
     for j in range(len(lower)):
@@ -243,8 +249,8 @@ def _stiffness(lower, upper, slacks):
     return stiffness
 
 
-@njit(cache=True)
-def _newton(slots, interval, lower, upper, at, stiffness, slacks, barrier, regularised, size):
+@njit(cache=True, error_model="numpy")
+def _newton(band, slots, interval, lower, upper, at, stiffness, slacks, barrier, regularised, size):
     """(dv, steps of slacks and multipliers, slope of the merit along them, what was added to the diagonal)."""
     count, k = slots.shape
     rows = len(interval)
@@ -257,12 +263,6 @@ def _newton(slots, interval, lower, upper, at, stiffness, slacks, barrier, regul
         pull = force[j] + stiffness[j] * (at.g[j] - slacks.s[j])
         for a in range(k):
             gradient[interval[j], a] += pull * at.jacobian[j, a]
-    band = 0
-    for i in range(count):
-        for a in range(k):
-            for b in range(k):
-                if slots[i, a] >= 0 and slots[i, b] >= 0:
-                    band = max(band, slots[i, a] - slots[i, b])
     matrix, right = np.zeros((size, band + 1)), np.zeros(size)  # matrix[r, d] is the entry (r, r - d)
     for i in range(count):
         for a in range(k):
@@ -307,7 +307,7 @@ def _newton(slots, interval, lower, upper, at, stiffness, slacks, barrier, regul
     return dv, _Slacks(ds, dlow, dhigh), slope, added if added > 0.0 else regularised / 3.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _factorise(matrix, added):
     """The banded Cholesky factor, in place, of the matrix plus `added` on its diagonal; False where there is none.
 
@@ -315,40 +315,39 @@ def _factorise(matrix, added):
     """
     size, width = matrix.shape
     for r in range(size):
-        for d in range(min(width - 1, r), -1, -1):
-            value = matrix[r, d]
-            c = r - d
-            for e in range(d + 1, min(width - 1, r) + 1):  # the columns to the left that both rows reach
-                if e - d < width:
-                    value -= matrix[r, e] * matrix[c, e - d]
+        reach = min(width - 1, r)
+        for d in range(reach, -1, -1):
+            value, row, column = matrix[r, d], matrix[r], matrix[r - d]
+            for e in range(d + 1, reach + 1):  # the columns to the left that both rows reach
+                value -= row[e] * column[e - d]
             if d > 0:
-                matrix[r, d] = value / matrix[c, 0]
+                matrix[r, d] = value * matrix[r - d, 0]
             else:
-                if matrix[r, 0] == 0.0 and value == 0.0:
+                if row[0] == 0.0 and value == 0.0:
                     value = 1.0
                 value += added
                 if not value > 1e-12:
                     return False
-                matrix[r, 0] = math.sqrt(value)
+                matrix[r, 0] = 1.0 / math.sqrt(value)  # the diagonal is kept inverted: dividing takes long
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _solve(factor, right):
     size, width = factor.shape
     x = right.copy()
     for r in range(size):
         for d in range(1, min(width - 1, r) + 1):
             x[r] -= factor[r, d] * x[r - d]
-        x[r] /= factor[r, 0]
+        x[r] *= factor[r, 0]
     for r in range(size - 1, -1, -1):
-        x[r] /= factor[r, 0]
+        x[r] *= factor[r, 0]
         for d in range(1, min(width - 1, r) + 1):
             x[r - d] -= factor[r, d] * x[r]
     return x
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _to_boundary(lower, upper, slacks, step, most):
     """The longest shares of the steps, of slacks and of multipliers, that leave (1 - most) of the room."""
     ds, dlow, dhigh = step.s, step.low, step.high
@@ -369,7 +368,7 @@ def _to_boundary(lower, upper, slacks, step, most):
     return share, dual
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _barrier(lower, upper, s, barrier):
     total, product = 0.0, 1.0
     for j in range(len(lower)):
@@ -389,7 +388,7 @@ def _stepped(
     return _Slacks(*_after(lower, upper, slacks, step, share, dual, barrier))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _after(lower, upper, slacks, step, share, dual, barrier):
     s = slacks.s + share * step.s
     low, high = slacks.low + dual * step.low, slacks.high + dual * step.high

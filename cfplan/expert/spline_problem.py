@@ -160,7 +160,7 @@ def _bounds(problem: Problem, positive: int) -> tuple[NDArray, NDArray]:
     return np.concatenate(lower), np.concatenate(upper)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _place(v, slots, fixed, interval, at_points):
     """(N, k) each interval's coefficients, written out at its points too."""
     local = fixed.copy()
@@ -174,14 +174,14 @@ def _place(v, slots, fixed, interval, at_points):
     return local
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _spread(y, stiffness, row, point, y_at_points, stiffness_at_points):
     for j in range(len(row)):
         y_at_points[row[j], point[j]] = y[j]
         stiffness_at_points[row[j], point[j]] = stiffness[j]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _constraints(rows, row, point, linear, interval, local):
     count = len(row)
     g = np.zeros(count + len(linear))
@@ -193,7 +193,7 @@ def _constraints(rows, row, point, linear, interval, local):
     return g
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _chosen(at_points, row, point, linear):
     """(m, k) the Jacobian of the kernel's rows that are constraints, and of the linear ones."""
     k = linear.shape[1]
@@ -205,7 +205,7 @@ def _chosen(at_points, row, point, linear):
     return jacobian
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _by_interval(gradient, hessian, interval, count):
     k = gradient.shape[0]
     of_gradient, of_hessian = np.zeros((count, k)), np.zeros((count, k, k))
@@ -220,7 +220,7 @@ def _by_interval(gradient, hessian, interval, count):
     return of_gradient, of_hessian
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _add_linear(weights, interval, stiffness, hessian):
     before = len(interval) - len(weights)
     for j in range(len(weights)):
@@ -229,7 +229,7 @@ def _add_linear(weights, interval, stiffness, hessian):
                 hessian[interval[before + j], a, b] += stiffness[before + j] * weights[j, a] * weights[j, b]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _time(local, places, weights):
     """Σ ∫ds/√x over all intervals, in node units."""
     total = 0.0
@@ -242,7 +242,7 @@ def _time(local, places, weights):
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _add_time(local, places, weights, scale, gradient, hessian):
     for i in range(local.shape[0]):
         for q in range(len(weights)):
