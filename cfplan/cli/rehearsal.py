@@ -96,7 +96,7 @@ def obtain_plan(path_or_plan: Path, options: PlanOptions, steps: Steps) -> Plann
         said.append(f"{plan.trajectory.duration:.2f} s of flight by {plan.planner}")
         said.extend(plan.notes)
     with steps.step("bound") as said:
-        bound = lower_bound(plan.path, plan.airframe, limits.plan)
+        bound = plan.lower_bound or lower_bound(plan.path, plan.airframe, limits.plan)
         said.append(
             f"no flight takes less than {bound:.2f} s; this one {plan.trajectory.duration / bound - 1:.1%} more"
         )

@@ -34,10 +34,12 @@ class Repaired:
     # of its speed to which the whole was slowed, 1 where it was not
     before: float
     # s of flight before repair
-    slower: tuple[float, float] | None = None
-    # s from where to where refining made it slower by more than NOTICEABLE, None where it did not
+    slower: float = 0.0
+    # share of the path along which refining made it slower by more than NOTICEABLE
     most: float = 0.0
-    # by how much at most there, of the speed
+    # by how much at most, of the speed
+    where: float = 0.0
+    # s, there
     failed: str = ""
     # why it could not be refined, where that was tried
 
@@ -49,8 +51,8 @@ class Repaired:
             why = f" ({self.failed})" if self.failed else ""
             return f"slowed to {self.share:.2%} of its speed to pass{why}; {cost}"
         if self.slower:
-            first, last = self.slower
-            return f"refined; slower from s = {first:.2f} to {last:.2f}, by up to {self.most:.1%}; {cost}"
+            most = f"most at s = {self.where:.2f}, by {self.most:.1%}"
+            return f"refined; slower along {self.slower:.0%} of it, {most}; {cost}"
         return f"refined; {cost}" if duration != self.before else ""
 
 
@@ -95,9 +97,9 @@ def slow(
     return Repaired(slowed.trajectory, slowed.certificate, slowed.share, trajectory.duration, failed=failed)
 
 
-def _where_slower(before: SpeedProfile, after: SpeedProfile) -> tuple[tuple[float, float] | None, float]:
+def _where_slower(before: SpeedProfile, after: SpeedProfile) -> tuple[float, float, float]:
     change = 1.0 - np.sqrt(after.h / before.h)
-    places = np.flatnonzero(change > NOTICEABLE)
-    if not len(places):
-        return None, 0.0
-    return (float(before.s[places[0]]), float(before.s[places[-1]])), float(change.max())
+    worst = int(np.argmax(change))
+    if change[worst] <= NOTICEABLE:
+        return 0.0, 0.0, 0.0
+    return float(np.mean(change > NOTICEABLE)), float(change[worst]), float(before.s[worst])

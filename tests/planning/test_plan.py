@@ -159,7 +159,7 @@ def test_too_fast_a_profile_of_the_learned_planner_is_refined_and_the_plan_says_
     assert made.certificate.passed
     assert made.slowed == 1.0
     assert made.trajectory.duration == pytest.approx(best.trajectory.duration, rel=5e-3)
-    assert re.search(r"refined; slower from s = .* by up to", made.notes[-1])
+    assert re.search(r"refined; slower along .* most at s = .*, by .*%", made.notes[-1])
 
 
 def test_where_the_learned_planner_fails_the_expert_steps_in(path, limits, make_profile, monkeypatch):
