@@ -118,8 +118,8 @@ def minimise(functions: Functions, rows: Rows, v: NDArray, search: Search) -> En
     regularised, band = 0.0, _band(rows.slots)
     filtered: list[tuple[float, float]] = []
     most_infeasible = 1e4 * max(1.0, float(np.abs(g - slacks.s).sum()))
+    stiffness = _stiffness(rows.lower, rows.upper, slacks)
     for iteration in range(search.iterations):
-        stiffness = _stiffness(rows.lower, rows.upper, slacks)
         at = functions.expand(v, slacks.high - slacks.low, stiffness)
         infeasible, off_gradient, off_complementary = _errors(
             rows.slots, rows.interval, rows.lower, rows.upper, at.g, at.jacobian, at.gradient, slacks, barrier, len(v)
@@ -140,19 +140,19 @@ def minimise(functions: Functions, rows: Rows, v: NDArray, search: Search) -> En
             off_complementary = _complementarity(rows.lower, rows.upper, slacks, barrier)
             filtered.clear()
 
-        dv, step, slope, regularised = _newton(
-            band, rows.slots, rows.interval, rows.lower, rows.upper, at, stiffness, slacks, barrier, regularised, len(v)
-        )
+        direction = _direction(
+            band, rows.slots, rows.interval, rows.lower, rows.upper, at, stiffness, slacks, barrier, regularised,
+            len(v), max(BOUNDARY, 1 - barrier),
+        )  # fmt: skip
+        dv, step, slope, regularised, share, dual_share, infeasible, walls = direction
         if not math.isfinite(slope):
             return Ended(v, at.g, False, iteration, "no direction to go")
-        share, dual_share = _to_boundary(rows.lower, rows.upper, slacks, step, max(BOUNDARY, 1 - barrier))
-        infeasible = float(np.abs(at.g - slacks.s).sum())
-        merit = cost + _barrier(rows.lower, rows.upper, slacks.s, barrier)
+        merit = cost + walls
         for _ in range(HALVINGS):
             there, s = v + share * dv, slacks.s + share * step.s
             cost_there, g_there = functions.values(there)
-            merit_there = cost_there + _barrier(rows.lower, rows.upper, s, barrier)
-            infeasible_there = float(np.abs(g_there - s).sum())
+            infeasible_there, walls = _standing(rows.lower, rows.upper, g_there, s, barrier)
+            merit_there = cost_there + walls
             verdict = _judge(infeasible, merit, infeasible_there, merit_there, share * slope, most_infeasible, filtered)
             if verdict:
                 break
@@ -162,7 +162,7 @@ def minimise(functions: Functions, rows: Rows, v: NDArray, search: Search) -> En
         if verdict == "widens":
             filtered.append(((1 - FILTER) * infeasible, merit - FILTER * infeasible))
         v, cost = there, cost_there
-        slacks = _stepped(rows.lower, rows.upper, slacks, step, share, dual_share, barrier)
+        slacks, stiffness = _stepped(rows.lower, rows.upper, slacks, step, share, dual_share, barrier)
     return Ended(v, at.g, False, search.iterations, f"not solved in {search.iterations} iterations")
 
 
@@ -382,14 +382,9 @@ def _barrier(lower, upper, s, barrier):
     return -barrier * (total + math.log(product))
 
 
-def _stepped(
-    lower: NDArray, upper: NDArray, slacks: _Slacks, step: _Slacks, share: float, dual: float, barrier: float
-) -> _Slacks:
-    return _Slacks(*_after(lower, upper, slacks, step, share, dual, barrier))
-
-
 @njit(cache=True, error_model="numpy")
-def _after(lower, upper, slacks, step, share, dual, barrier):
+def _stepped(lower, upper, slacks, step, share, dual, barrier):
+    """Slacks and multipliers after the step, and their stiffness."""
     s = slacks.s + share * step.s
     low, high = slacks.low + dual * step.low, slacks.high + dual * step.high
     for j in range(len(lower)):
@@ -399,4 +394,22 @@ def _after(lower, upper, slacks, step, share, dual, barrier):
         if upper[j] < np.inf:
             middle = barrier / (upper[j] - s[j])
             high[j] = min(max(high[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
-    return s, low, high
+    after = _Slacks(s, low, high)
+    return after, _stiffness(lower, upper, after)
+
+
+@njit(cache=True, error_model="numpy")
+def _standing(lower, upper, g, s, barrier):
+    """How infeasible it is, and what the barrier adds to the cost."""
+    return np.abs(g - s).sum(), _barrier(lower, upper, s, barrier)
+
+
+@njit(cache=True, error_model="numpy")
+def _direction(band, slots, interval, lower, upper, at, stiffness, slacks, barrier, regularised, size, most):
+    """What _newton gives, how far to go along it, and how things stand before."""
+    dv, step, slope, regularised = _newton(
+        band, slots, interval, lower, upper, at, stiffness, slacks, barrier, regularised, size
+    )
+    share, dual = _to_boundary(lower, upper, slacks, step, most)
+    infeasible, walls = _standing(lower, upper, at.g, slacks.s, barrier)
+    return dv, step, slope, regularised, share, dual, infeasible, walls

@@ -83,9 +83,10 @@ class SplineProblem:
         at = self._points
         local = _place(v, self.rows.slots, self._fixed_local, self._interval, at.coefficients)
         at.evaluate()
-        time = _time(local, _GAUSS, stage.GAUSS_WEIGHTS)
-        g = _constraints(at.rows, self._row, self._point, self._linear, self.rows.interval, local)
-        return self._scale * time + float(at.penalty.sum()), g
+        return _valued(
+            at.rows, at.penalty, self._row, self._point, self._linear, self.rows.interval, local, self._scale,
+            _GAUSS, stage.GAUSS_WEIGHTS,
+        )  # fmt: skip
 
     def expand(self, v: NDArray, y: NDArray, stiffness: NDArray) -> Expansion:
         """Around v; see Functions."""
@@ -93,12 +94,10 @@ class SplineProblem:
         local = _place(v, self.rows.slots, self._fixed_local, self._interval, at.coefficients)
         _spread(y, stiffness, self._row, self._point, at.multipliers, at.stiffness)
         at.differentiate()
-        g = _constraints(at.rows, self._row, self._point, self._linear, self.rows.interval, local)
-        jacobian = _chosen(at.jacobian, self._row, self._point, self._linear)
-        gradient, hessian = _by_interval(at.gradient, at.hessian, self._interval, len(local))
-        _add_linear(self._linear, self.rows.interval, stiffness, hessian)
-        _add_time(local, _GAUSS, stage.GAUSS_WEIGHTS, self._scale, gradient, hessian)
-        return Expansion(g, jacobian, gradient, hessian)
+        return _expanded(
+            at.rows, at.jacobian, at.gradient, at.hessian, self._row, self._point, self._interval, self._linear,
+            self.rows.interval, stiffness, local, self._scale, _GAUSS, stage.GAUSS_WEIGHTS,
+        )  # fmt: skip
 
 
 def _slots(problem: Problem) -> tuple[NDArray, NDArray]:
@@ -256,3 +255,37 @@ def _add_time(local, places, weights, scale, gradient, hessian):
                 gradient[i, a] += first * places[q, a]
                 for b in range(a + 1):
                     hessian[i, a, b] += second * places[q, a] * places[q, b]
+
+
+@njit(cache=True, error_model="numpy")
+def _valued(rows, penalty, row, point, linear, interval, local, scale, places, weights):
+    """f and g from what the kernel gives."""
+    return scale * _time(local, places, weights) + penalty.sum(), _constraints(
+        rows, row, point, linear, interval, local
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _expanded(
+    rows,
+    jacobian,
+    gradient,
+    hessian,
+    row,
+    point,
+    points_interval,
+    linear,
+    interval,
+    stiffness,
+    local,
+    scale,
+    places,
+    weights,
+):
+    """The expansion from what the kernel gives."""
+    g = _constraints(rows, row, point, linear, interval, local)
+    of_rows = _chosen(jacobian, row, point, linear)
+    of_gradient, of_hessian = _by_interval(gradient, hessian, points_interval, len(local))
+    _add_linear(linear, interval, stiffness, of_hessian)
+    _add_time(local, places, weights, scale, of_gradient, of_hessian)
+    return Expansion(g, of_rows, of_gradient, of_hessian)
