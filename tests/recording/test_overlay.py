@@ -244,7 +244,7 @@ def test_replay_lays_a_record_and_a_log_side_by_side(tmp_path, vicon, flight):
 def test_replay_lays_a_log_over_a_plan_and_prints_the_offset(tmp_path):
     limits = load_limits(Path(__file__).parents[2] / "safety.yaml")
     path = min_snap([[-1, -1, 0.8], [0, 0.5, 1.2], [1, -0.5, 0.9]])
-    made = plan(path, limits.airframe, limits, planner="min-snap", nodes=60)
+    made = plan(path, limits.airframe, limits, planner="minsnap", nodes=60)
     save_plan(made, tmp_path / "plan.parquet")
     moments = np.arange(0, made.trajectory.duration + 6, 0.01)
     file = write_vicon(tmp_path / "vicon.csv", made.trajectory.at(moments - 3.21).position)

@@ -221,7 +221,7 @@ def test_a_folder_that_cannot_be_written_is_an_error(folder, tmp_path):
 def made_plan():
     limits = load_limits(Path(__file__).parents[2] / "safety.yaml")
     path = min_snap([[-1, -1, 0.8], [0, 0.5, 1.2], [1, -0.5, 0.9]])
-    return plan(path, limits.airframe, limits, planner="min-snap", nodes=60)
+    return plan(path, limits.airframe, limits, planner="minsnap", nodes=60)
 
 
 # charts

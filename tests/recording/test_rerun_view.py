@@ -37,7 +37,7 @@ VULKAN = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
 def made_plan():
     limits = load_limits(Path(__file__).parents[2] / "safety.yaml")
     path = min_snap([[-1, -1, 0.8], [0, 0.5, 1.2], [1, -0.5, 0.9]])
-    return plan(path, limits.airframe, limits, planner="min-snap", nodes=60)
+    return plan(path, limits.airframe, limits, planner="minsnap", nodes=60)
 
 
 @pytest.fixture(scope="module")
