@@ -211,19 +211,17 @@ def _first(g, lower, upper, barrier, push):
 @njit(cache=True, error_model="numpy")
 def _errors(slots, interval, lower, upper, g, jacobian, gradient, slacks, barrier, size):
     """The largest |g - s|, entry of the Lagrangian's gradient, and difference of a slack's product from the barrier."""
+    local, infeasible = gradient.copy(), 0.0
+    for j in range(len(g)):
+        infeasible = max(infeasible, abs(g[j] - slacks.s[j]))
+        y, i = slacks.high[j] - slacks.low[j], interval[j]
+        for a in range(slots.shape[1]):
+            local[i, a] += y * jacobian[j, a]
     of_v = np.zeros(size)
     for i in range(slots.shape[0]):
         for a in range(slots.shape[1]):
             if slots[i, a] >= 0:
-                of_v[slots[i, a]] += gradient[i, a]
-    infeasible = 0.0
-    for j in range(len(g)):
-        infeasible = max(infeasible, abs(g[j] - slacks.s[j]))
-        y = slacks.high[j] - slacks.low[j]
-        for a in range(slots.shape[1]):
-            slot = slots[interval[j], a]
-            if slot >= 0:
-                of_v[slot] += y * jacobian[j, a]
+                of_v[slots[i, a]] += local[i, a]
     return infeasible, np.abs(of_v).max(), _complementarity(lower, upper, slacks, barrier)
 
 
@@ -287,18 +285,16 @@ def _newton(band, slots, interval, lower, upper, at, stiffness, slacks, barrier,
             break
         factor[:] = matrix
     dv = _solve(factor, right)
-    slope = 0.0
+    slope, local = 0.0, np.zeros((count, k))  # dv, interval by interval
     for i in range(count):
         for a in range(k):
             if slots[i, a] >= 0:
-                slope += at.gradient[i, a] * dv[slots[i, a]]
-    ds, dlow, dhigh = np.empty(rows), np.zeros(rows), np.zeros(rows)
+                local[i, a] = dv[slots[i, a]]
+                slope += at.gradient[i, a] * local[i, a]
+    ds, dlow, dhigh = at.g - slacks.s, np.zeros(rows), np.zeros(rows)
     for j in range(rows):
-        ds[j] = at.g[j] - slacks.s[j]
         for a in range(k):
-            slot = slots[interval[j], a]
-            if slot >= 0:
-                ds[j] += at.jacobian[j, a] * dv[slot]
+            ds[j] += at.jacobian[j, a] * local[interval[j], a]
         slope += force[j] * ds[j]
         if lower[j] > -np.inf:
             dlow[j] = (barrier - slacks.low[j] * ds[j]) / (slacks.s[j] - lower[j]) - slacks.low[j]
