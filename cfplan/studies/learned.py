@@ -34,7 +34,7 @@ LOST = 1.0
 FEW_METRES = (18.0, 22.0)
 # paths whose planning time is told apart
 COLUMNS = (
-    "box", "limits", "paths", "network against expert: mean", "p95 of |·|", "as it is", "refined", "slowed",
+    "box", "limits", "paths", "network against expert: mean", "p95 of the absolute", "as it is", "refined", "slowed",
     "certified against expert: mean", "p95", "max", "expert repaired: mean", "max ", "bytes refused", "dry run: failed",
     "deviation median", "at motor lag of 5 ms: failed", "deviation median ",
     "path to bytes median", "p99", "of 20 m: median", "p99 ",
