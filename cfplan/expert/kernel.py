@@ -160,7 +160,7 @@ def _c_function(f: casadi.Function) -> str:
 
 
 @lru_cache(maxsize=1)
-def library() -> FilePath | None:
+def machine_code() -> FilePath | None:
     """The compiled kernels, or None where that is not possible."""
     files = [FilePath(str(file)) for file in (__file__, stage.__file__, flatness.__file__, airframe.__file__)]
     return shared_library("kernels", files, source)
@@ -168,7 +168,7 @@ def library() -> FilePath | None:
 
 def backend() -> Backend:
     """What evaluates kernels here; compiles if that was never done."""
-    return Backend.COMPILED if library() else Backend.VIRTUAL_MACHINE
+    return Backend.COMPILED if machine_code() else Backend.VIRTUAL_MACHINE
 
 
 _Bind = Callable[[list[NDArray], list[NDArray]], Callable[[], None]]
@@ -177,10 +177,10 @@ _Bind = Callable[[list[NDArray], list[NDArray]], Callable[[], None]]
 
 def _functions(free_yaw: bool, points: int, chosen: Backend | None) -> tuple[_Bind, _Bind]:
     """Values and derivatives at that many points."""
-    kernels = point_kernels(free_yaw) if chosen == Backend.VIRTUAL_MACHINE or not library() else None
+    kernels = point_kernels(free_yaw) if chosen == Backend.VIRTUAL_MACHINE or not machine_code() else None
     if kernels:
         return _interpreted(kernels[0], points), _interpreted(kernels[1], points)
-    loaded, family = ctypes.CDLL(str(library())), stage.family(free_yaw)
+    loaded, family = ctypes.CDLL(str(machine_code())), stage.family(free_yaw)
     return _compiled(loaded[f"{family}_values"], points), _compiled(loaded[f"{family}_derivatives"], points)
 
 

@@ -53,9 +53,9 @@ def broken_by(boundary: BoundaryState, path: Path, s: float, airframe: Airframe,
     """Which limit a boundary state breaks by itself, whatever follows; empty where it breaks none."""
     if boundary.h <= 0:
         return f"h must be positive, not {boundary.h:g}"
-    first, second, third, fourth = (tuple(float(v) for v in path(s, order)) for order in (1, 2, 3, 4))
+    first, second, third, fourth = (path(s, order).tolist() for order in (1, 2, 3, 4))
     flat = flat_state(
-        airframe, (first, second, third, fourth), (boundary.h, boundary.dh, boundary.ddh, 0.0),  # type: ignore[arg-type]
+        airframe, (first, second, third, fourth), (boundary.h, boundary.dh, boundary.ddh, 0.0),
         (boundary.yaw, boundary.dyaw, 0.0), math.cos, math.sin,
     )  # fmt: skip
     checks = (

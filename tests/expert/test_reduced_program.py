@@ -149,40 +149,40 @@ def test_compiled_code_and_virtual_machine_agree():
 def test_without_a_compiler_the_virtual_machine_plans(monkeypatch, tmp_path):
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "empty"))
     monkeypatch.setattr(shutil, "which", lambda *_: None)
-    kernel.library.cache_clear()
+    kernel.machine_code.cache_clear()
     try:
         assert kernel.backend() is Backend.VIRTUAL_MACHINE
         solution = plan_reduced(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=31)
         assert solution.status is Status.SOLVED
         assert solution.stats["backend"] == "virtual machine"
     finally:
-        kernel.library.cache_clear()
+        kernel.machine_code.cache_clear()
 
 
 def test_a_cache_folder_that_cannot_be_written_falls_back(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "file" / "below"))
-    kernel.library.cache_clear()
+    kernel.machine_code.cache_clear()
     try:
-        assert kernel.library() is None
+        assert kernel.machine_code() is None
     finally:
-        kernel.library.cache_clear()
+        kernel.machine_code.cache_clear()
 
 
 @pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler")
 def test_the_library_is_made_once_and_left_alone(monkeypatch, tmp_path):
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path))
-    kernel.library.cache_clear()
+    kernel.machine_code.cache_clear()
     try:
-        made = kernel.library()
+        made = kernel.machine_code()
         assert made is not None
         before = made.stat().st_mtime_ns
-        kernel.library.cache_clear()
-        assert kernel.library() == made
+        kernel.machine_code.cache_clear()
+        assert kernel.machine_code() == made
         assert made.stat().st_mtime_ns == before
         assert [entry.name for entry in tmp_path.iterdir()] == [made.name]  # nothing half-made beside it
     finally:
-        kernel.library.cache_clear()
+        kernel.machine_code.cache_clear()
 
 
 def test_ipopt_takes_over_where_the_first_solver_fails(monkeypatch):
@@ -233,8 +233,8 @@ def test_limits_are_lowered_only_around_what_exceeds_them():
 
 
 def test_many_more_nodes_need_no_other_library():
-    before = kernel.library()
+    before = kernel.machine_code()
     solution = plan_reduced(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=400)
     assert solution.status is Status.SOLVED
     assert certify(Trajectory(PATH, solution.profile, HARDWARE.airframe), HARDWARE.limits).passed
-    assert kernel.library() == before
+    assert kernel.machine_code() == before
