@@ -24,7 +24,14 @@ CRAZYRADIO_USB = {(0x1915, 0x7777): "Crazyradio", (0x35F0, 0xBAD2): "Crazyradio 
 @options.as_json
 def doctor(as_json: bool) -> int:
     """Show versions, packages, the compiler and the radio, and what is missing."""
-    checks = [_python(), *map(_package, NEEDED), *(_optional(name) for name in OPTIONAL), _expert(), _radio()]
+    checks = [
+        _python(),
+        *map(_package, NEEDED),
+        *(_optional(name) for name in OPTIONAL),
+        _expert(),
+        _priority(),
+        _radio(),
+    ]
     missing = [check for check in checks if check["verdict"] == "missing"]
     if as_json:
         print_json({"cfplan": __version__, "checks": checks, "ok": not missing})
@@ -71,6 +78,16 @@ def _expert() -> dict[str, str]:
         return _check("expert", f"compiled ({compiler()})")
     hint = "its cache folder cannot be written" if compiler() else "install a C compiler to plan several times faster"
     return _check("expert", str(used), "optional", hint)
+
+
+def _priority() -> dict[str, str]:
+    """Whether setpoints are on time although other programs run."""
+    from cfplan.flight.pace import STREAM_PRIORITY, may_go_first
+
+    if may_go_first():
+        return _check("priority", f"SCHED_FIFO, {STREAM_PRIORITY}")
+    hint = f"setpoints wait for other programs; `rtprio {STREAM_PRIORITY}` in /etc/security/limits.d permits more"
+    return _check("priority", "ordinary", "optional", hint)
 
 
 def _radio() -> dict[str, str]:

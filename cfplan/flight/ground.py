@@ -7,7 +7,7 @@ from cfplan.errors import InputError, PreflightError
 from cfplan.flight.cockpit import TRIES, Cockpit
 from cfplan.flight.link import Link
 from cfplan.flight.mission import yaw_of
-from cfplan.flight.pace import Lateness
+from cfplan.flight.pace import Lateness, goes_first
 from cfplan.flight.preflight import Ground, run_checks
 from cfplan.flight.supervisor import ARMED, CAN_BE_ARMED, CAN_FLY
 from cfplan.flight.telemetry import Level, Phase
@@ -145,4 +145,5 @@ def _look_around(cockpit: Cockpit, wanted: dict[str, float], read_back: dict[str
         estimate=link.estimate,
         variance=link.position_variance or (math.inf,),
         waking=Lateness.of(tuple(cockpit.waking), 0),
+        goes_first=goes_first(),
     )

@@ -1,11 +1,16 @@
 """Deadlines at a fixed rate that do not drift, and how well they were met."""
 
+import contextlib
 import math
+import os
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+STREAM_PRIORITY = 20  # of SCHED_FIFO, for the thread that sends setpoints
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,3 +75,32 @@ def sleep_lateness(rate: float, duration: float) -> Lateness:
         due = pace.wait()
         late.append(time.monotonic() - due)
     return Lateness.of(late, pace.skipped)
+
+
+def goes_first() -> bool:
+    """Whether the calling thread is scheduled ahead of ordinary ones."""
+    return hasattr(os, "SCHED_FIFO") and os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+
+
+def go_first(priority: int = STREAM_PRIORITY, thread: int = 0) -> bool:
+    """Have a thread of this process, the calling one, scheduled ahead of ordinary ones; whether that is permitted."""
+    try:
+        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+    except (OSError, AttributeError):  # not permitted; not on this system
+        return False
+    return True
+
+
+def go_with_all(process: int) -> None:
+    """Have a process scheduled as ordinary ones are, whatever it inherited."""
+    with contextlib.suppress(OSError, AttributeError):  # it has ended; not on this system
+        os.sched_setscheduler(process, os.SCHED_OTHER, os.sched_param(0))
+
+
+def may_go_first() -> bool:
+    """Whether that would be permitted; tried in a thread that ends at once."""
+    permitted: list[bool] = []
+    thread = threading.Thread(target=lambda: permitted.append(go_first()))
+    thread.start()
+    thread.join()
+    return permitted[0]

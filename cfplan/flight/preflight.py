@@ -46,6 +46,8 @@ class Ground:
     # m², of position along x, y, z
     waking: Lateness
     # how late this computer met its deadlines in the last second
+    goes_first: bool = False
+    # the stream has the processor ahead of ordinary programs, which the system must permit
 
 
 def run_checks(ground: Ground) -> tuple[Check, ...]:
@@ -181,9 +183,11 @@ def check_plan_inside(ground: Ground) -> Check:
 
 def check_waking(ground: Ground) -> Check:
     most = ground.mission.limits.lateness
+    how = "by SCHED_FIFO" if ground.goes_first else "without SCHED_FIFO"
     return Check(
-        "this computer's lateness", f"p99 {ground.waking.p99 * 1e3:.1f} ms", f"≤ {most * 1e3:.0f} ms",
-        ground.waking.p99 <= most, "close what else runs on this computer",
+        "this computer's lateness", f"p99 {ground.waking.p99 * 1e3:.1f} ms {how}", f"≤ {most * 1e3:.0f} ms",
+        ground.waking.p99 <= most,
+        "close what else runs on this computer" + ("" if ground.goes_first else "; see `cfplan doctor` on priority"),
     )  # fmt: skip
 
 

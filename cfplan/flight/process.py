@@ -18,13 +18,14 @@ from cfplan.flight.connection import connect
 from cfplan.flight.keys import Keyboard, Order
 from cfplan.flight.mission import Mission
 from cfplan.flight.outcome import FlightOutcome
+from cfplan.flight.pace import STREAM_PRIORITY, go_first
 from cfplan.flight.pilot import Pilot
 from cfplan.flight.poses import PoseSource
 from cfplan.flight.reporter import Reporter
 from cfplan.flight.telemetry import Telemetry
 
 _SWITCH_INTERVAL = 0.0005  # s; the stream gets the interpreter back after at most this
-_STREAM_PRIORITY, _THREAD_PRIORITY = 20, 10  # of SCHED_FIFO, where the system permits it
+_THREAD_PRIORITY = STREAM_PRIORITY // 2
 _POLL = 0.05  # s
 _LANDING = 60.0  # s that a pilot without a main process has to come down
 
@@ -193,5 +194,5 @@ def _quieten() -> None:
         # The other threads too: one that is kept from the processor while it holds the interpreter keeps the stream
         # waiting as well.
         for thread in os.listdir("/proc/self/task"):
-            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(_THREAD_PRIORITY))
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_STREAM_PRIORITY))
+            go_first(_THREAD_PRIORITY, int(thread))
+    go_first()

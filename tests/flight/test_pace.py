@@ -1,0 +1,60 @@
+"""Who goes first on the processor: the stream where that is permitted, and nothing that it starts."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from cfplan.flight import pace
+from cfplan.flight.pace import go_first, go_with_all, goes_first, may_go_first
+
+pytestmark = pytest.mark.unit
+
+
+def in_a_thread(what):
+    """Its result; nothing of it is left behind in the thread that tests."""
+    found = []
+    thread = threading.Thread(target=lambda: found.append(what()))
+    thread.start()
+    thread.join()
+    return found[0]
+
+
+def test_asking_whether_it_may_go_first_changes_nothing():
+    before = goes_first()
+    may_go_first()
+    assert goes_first() == before
+
+
+def test_a_thread_goes_first_exactly_where_it_is_permitted():
+    permitted = may_go_first()
+    assert in_a_thread(lambda: (go_first(), goes_first())) == (permitted, permitted)
+
+
+def test_where_the_system_refuses_it_goes_with_all_others(monkeypatch):
+    def refuse(*_arguments):
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    assert in_a_thread(lambda: (go_first(), goes_first())) == (False, False)
+    assert not may_go_first()
+
+
+def test_a_system_that_knows_of_no_such_thing_is_no_fault(monkeypatch):
+    for name in ("sched_setscheduler", "SCHED_FIFO"):
+        monkeypatch.delattr(pace.os, name)
+    assert not may_go_first()
+    assert not goes_first()
+
+
+def test_a_child_of_the_stream_goes_with_all_others():
+    def start():
+        go_first()
+        child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+        go_with_all(child.pid)
+        with child:
+            return os.sched_getscheduler(child.pid)
+
+    assert in_a_thread(start) == os.SCHED_OTHER
