@@ -48,18 +48,29 @@ def coefficients(free_yaw: bool) -> int:
 def point_kernels(free_yaw: bool) -> tuple[casadi.Function, casadi.Function]:
     """Values and derivatives at one point, as CasADi functions; see Points for what they take and give."""
     w = casadi.SX.sym("w", coefficients(free_yaw))
-    z = casadi.mtimes(casadi.DM(H_SPLINE), w[:4])
-    if free_yaw:
-        turn = casadi.mtimes(casadi.DM(YAW_SPLINE), w[4:])
-        z = casadi.vertcat(z[:3], turn[:2], z[3], turn[2])
     inputs, rows, penalty = stage.point_expressions(free_yaw)
+    z, place = inputs[0], inputs[1][12]
     of_z = casadi.Function("of_z", inputs, [rows, penalty])
-    inputs[0] = w
-    rows, penalty = of_z(z, *inputs[1:])
+
+    # Differentiated by what holds at the point itself, which is sparser, and led to the coefficients from there.
+    here = casadi.SX.sym("here", w.numel())
+    rows, penalty = of_z(here, _at_left_end(inputs[1]), *inputs[2:])
     multipliers, stiffness = casadi.SX.sym("multipliers", stage.ROWS), casadi.SX.sym("stiffness", stage.ROWS)
-    jacobian = casadi.densify(casadi.jacobian(rows, w))
-    hessian, _ = casadi.hessian(penalty + casadi.dot(multipliers, rows), w)
+    jacobian = casadi.jacobian(rows, here)
+    hessian = casadi.jacobian(casadi.gradient(penalty + casadi.dot(multipliers, rows), here), here)
     hessian += casadi.mtimes(jacobian.T, casadi.repmat(stiffness, 1, w.numel()) * jacobian)
+    by_here = casadi.Function(
+        "by_here", [here, *inputs[1:], multipliers, stiffness],
+        [rows, penalty, jacobian, casadi.gradient(penalty, here), hessian],
+    )  # fmt: skip
+    led = casadi.jacobian(casadi.vertcat(*_local(z, free_yaw, place)), z)
+    led = casadi.mtimes(led, casadi.DM(_spline(free_yaw)))
+    rows, penalty, jacobian, gradient, hessian = by_here(
+        casadi.mtimes(led, w), *inputs[1:], multipliers, stiffness
+    )  # fmt: skip
+    inputs[0] = w
+    jacobian, gradient = casadi.mtimes(jacobian, led), casadi.mtimes(led.T, gradient)
+    hessian = casadi.mtimes(led.T, casadi.mtimes(hessian, led))
     size = range(w.numel())
     lower = casadi.vertcat(*(hessian[i, j] for j in size for i in size if i >= j))
 
@@ -72,9 +83,30 @@ def point_kernels(free_yaw: bool) -> tuple[casadi.Function, casadi.Function]:
         function(
             "derivatives",
             [*inputs, multipliers, stiffness],
-            [rows, casadi.vec(jacobian), casadi.gradient(penalty, w), lower],
+            [rows, casadi.vec(jacobian), gradient, lower],
         ),
     )
+
+
+def _at_left_end(point: casadi.SX) -> casadi.SX:
+    """A point's data as if it lay where its interval begins: there z is what holds at the point."""
+    return casadi.vertcat(point[:12], 0, point[13:])
+
+
+def _local(z: casadi.SX, free_yaw: bool, place: casadi.SX) -> list[casadi.SX]:
+    """z of an interval that begins at the place."""
+    x, yaw = stage.local_variables(z, free_yaw, place)
+    return [*x[:3], *yaw[:2], x[3], *yaw[2:]]
+
+
+def _spline(free_yaw: bool) -> NDArray:
+    """z from the coefficients."""
+    if not free_yaw:
+        return H_SPLINE
+    both = np.zeros((7, 7))
+    both[:3, :4], both[5, :4] = H_SPLINE[:3], H_SPLINE[3]
+    both[3:5, 4:], both[6, 4:] = YAW_SPLINE[:2], YAW_SPLINE[2]
+    return both
 
 
 UNIFORM = (2, 3)
@@ -213,17 +245,21 @@ class Points:
     """
 
     def __init__(
-        self, free_yaw: bool, data: NDArray, common: NDArray, weights: NDArray, chosen: Backend | None
+        self, free_yaw: bool, data: NDArray, common: NDArray, weights: NDArray, chosen: Backend | None, spare: int = 0
     ) -> None:
-        """`data` is (POINT_DATA, P), `common` (COMMON_DATA,), `weights` (3,) those of the penalties."""
+        """`data` is (POINT_DATA, P), `common` (COMMON_DATA,), `weights` (3,) those of the penalties.
+
+        Arrays of the rows have `spare` entries after those of the points, which the kernels leave alone.
+        """
         k, points = coefficients(free_yaw), data.shape[1]
         self.coefficients = np.ones((k, points))
         # to read
-        self.multipliers = np.zeros((stage.ROWS, points))
-        # to read; differentiate() alone needs them
-        self.stiffness = np.zeros((stage.ROWS, points))
+        self.multipliers = np.zeros(stage.ROWS * points + spare)
+        # to read, row by row; differentiate() alone needs them
+        self.stiffness = np.zeros(stage.ROWS * points + spare)
         # likewise
-        self.rows = np.empty((stage.ROWS, points))
+        self.rows = np.zeros(stage.ROWS * points + spare)
+        # row by row
         self.penalty = np.empty((1, points))
         # by evaluate() alone
         self.jacobian = np.empty((stage.ROWS * k, points))
@@ -234,10 +270,14 @@ class Points:
         # of penalty + multipliers · rows, plus Σ stiffness · (row of the Jacobian)² as an outer product: the lower
         # triangle, column by column
         given = [np.ascontiguousarray(a, dtype=float) for a in (data, common, weights)]
-        self._reads = [self.coefficients, *given, self.multipliers, self.stiffness]  # kept, as C has their addresses
+        rows, multipliers, stiffness = (
+            array[: stage.ROWS * points].reshape(stage.ROWS, points)
+            for array in (self.rows, self.multipliers, self.stiffness)
+        )
+        self._reads = [self.coefficients, *given, multipliers, stiffness]  # kept, as C has their addresses
         values, derivatives = _functions(free_yaw, points, chosen)
-        self._evaluate = values(self._reads[:4], [self.rows, self.penalty])
-        self._differentiate = derivatives(self._reads, [self.rows, self.jacobian, self.gradient, self.hessian])
+        self._evaluate = values(self._reads[:4], [rows, self.penalty])
+        self._differentiate = derivatives(self._reads, [rows, self.jacobian, self.gradient, self.hessian])
 
     def evaluate(self) -> None:
         """Rows and penalty."""

@@ -59,13 +59,12 @@ def again(attempt: Attempt, problem: Problem, backend: Backend | None, searches:
 def _searched(splines: SplineProblem, table: NDArray, searches: Sequence[Search]) -> Attempt:
     v, iterations = splines.v_of(table), 0
     for search in searches:
-        ended = minimise(splines, splines.rows, v, search)
+        ended = minimise(splines, v, search)
         iterations += ended.iterations
         if ended.solved:
             break
-    at_points = splines.at_points(ended.g)
     return Attempt(
-        "interior point", splines.table_of(ended.v), at_points, ended.solved, iterations, ended.words, splines
+        "interior point", splines.table_of(ended.v), splines.at_points(), ended.solved, iterations, ended.words, splines
     )
 
 

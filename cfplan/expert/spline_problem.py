@@ -8,6 +8,8 @@ of h have one value, so that h is constant in that interval, and the first two o
 
 import math
 from copy import copy
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -15,10 +17,10 @@ from numpy.typing import NDArray
 
 from cfplan.expert import stage
 from cfplan.expert.compiled import Backend
-from cfplan.expert.interior_point import Expansion, Rows
 from cfplan.expert.kernel import H_SPLINE, LANES, YAW_SPLINE, Points, coefficients
 from cfplan.expert.problem import FLOOR, Problem
-from cfplan.expert.program import OBJECTIVE_SCALE
+from cfplan.expert.program import OBJECTIVE_SCALE, Layout
+from cfplan.expert.slacks import bounds_of
 
 
 def h_weights(place: NDArray) -> NDArray:
@@ -31,89 +33,165 @@ _NOBODY = -1
 
 
 class SplineProblem:
-    """f and g by v, see interior_point.Functions; and the way from tables to v and back."""
+    """f and g by v, see interior_point.Functions; and the way from tables to v and back.
+
+    The constraints are the kernel's rows at all points, where those that nothing asks for have no bounds, and then
+    what is linear in the coefficients.
+    """
 
     def __init__(self, problem: Problem, backend: Backend | None = None) -> None:
         """What is fixed has its value from the problem's table."""
+        self._structure = it = _structure(problem.layout, *_kinds(problem))
         layout = problem.layout
         nodes, points = layout.shape.nodes, len(layout.interval)
         self._fixed = problem.table
-        self._of, own = _slots(problem)
         k = coefficients(layout.shape.free_yaw)
         local = np.arange(nodes)[:, None] + np.array([0, 1, 2, 3, 0, 1, 2][:k]), np.array([0, 0, 0, 0, 1, 1, 1][:k])
-        self._fixed_local = np.ascontiguousarray(self._fixed[local])
+        self._local = np.ascontiguousarray(self._fixed[local])
 
-        spare = -points % LANES
-        self._interval = np.append(layout.interval, np.repeat(layout.interval[-1], spare))
+        spare = len(it.interval) - points
         data = problem.p[: points * stage.POINT_DATA].reshape(points, stage.POINT_DATA)
         data = np.pad(data, ((0, spare), (0, 0)), mode="edge").T
         data[13, points:] = 0.0  # what is there to fill the lanes costs nothing
         common = problem.p[-3 - stage.COMMON_DATA : -3]
-        self._points = Points(layout.shape.free_yaw, data, common, OBJECTIVE_SCALE * problem.p[-3:], backend)
+        weights = OBJECTIVE_SCALE * problem.p[-3:]
+        self._points = Points(layout.shape.free_yaw, data, common, weights, backend, spare=len(it.linear))
         self._scale = OBJECTIVE_SCALE / math.sqrt(common[14])
-        self._point, self._row = np.divmod(layout.selected, stage.ROWS)
-        self._positive = np.flatnonzero(own[:, 0])
-        self._linear, linear_interval = _linear_rows(problem, self._positive)
-        interval = np.concatenate([layout.interval[self._point], linear_interval])
-        self.rows = Rows(self._of[local], interval, *_bounds(problem, len(self._positive)))
+        self.rows = stage.ROWS
+        self.g, self.multipliers, self.stiffness = self._points.rows, self._points.multipliers, self._points.stiffness
+        self.bounds = self._bounds(problem)
+        self.gradient = np.empty(it.size)
+        self.matrix = np.empty((it.size, it.band + 1))
+        self._along = np.empty(len(self.g))
 
     def bounded_as(self, problem: Problem) -> "SplineProblem":
         """The same but for the limits, which are those of `problem`. Both share their arrays: use one at a time."""
         other = copy(self)
-        other.rows = Rows(self.rows.slots, self.rows.interval, *_bounds(problem, len(self._positive)))
+        other.bounds = other._bounds(problem)
         return other
+
+    def _bounds(self, problem: Problem) -> NDArray:
+        it = self._structure
+        lower, upper = np.full(len(self.g), -np.inf), np.full(len(self.g), np.inf)
+        lower[it.selected], upper[it.selected] = problem.lbg[it.point_rows], problem.ubg[it.point_rows]
+        lower[-len(it.linear) :], upper[-len(it.linear) :] = _linear_bounds(problem, len(it.positive))
+        return bounds_of(lower, upper)
 
     def v_of(self, table: NDArray) -> NDArray:
         """The variables of a table of coefficients; the smallest counts where several have one value."""
-        v = np.full(table.size, np.inf)
-        free = self._of >= 0
-        np.minimum.at(v, self._of[free], table[free])
+        it = self._structure
+        v = np.full(it.size, np.inf)
+        free = it.of >= 0
+        np.minimum.at(v, it.of[free], table[free])
         return np.where(np.isfinite(v), v, 0.0)
 
     def table_of(self, v: NDArray) -> NDArray:
         """(N+3, 1 or 2)"""
-        return np.where(self._of >= 0, v[self._of], self._fixed)
+        of = self._structure.of
+        return np.where(of >= 0, v[of], self._fixed)
 
-    def at_points(self, g: NDArray) -> NDArray:
-        """What the kernel's rows come to, in the order of layout.selected."""
-        return g[: len(self._row)]
+    def at_points(self) -> NDArray:
+        """What the kernel's rows come to at the last v, in the order of layout.selected."""
+        return self.g[self._structure.selected]
 
-    def values(self, v: NDArray) -> tuple[float, NDArray]:
-        """f, and g (m,)."""
-        at = self._points
-        local = _place(v, self.rows.slots, self._fixed_local, self._interval, at.coefficients)
+    def values(self, v: NDArray) -> float:
+        """f; and g."""
+        at, it = self._points, self._structure
+        _place(v, it.slots, it.interval, self._local, at.coefficients)
         at.evaluate()
-        return _valued(
-            at.rows, at.penalty, self._row, self._point, self._linear, self.rows.interval, local, self._scale,
-            _GAUSS, stage.GAUSS_WEIGHTS,
-        )  # fmt: skip
+        _linear_values(it.linear, it.linear_interval, self._local, self.g)
+        return float(self._scale * _time(self._local, _GAUSS, stage.GAUSS_WEIGHTS) + at.penalty.sum())
 
-    def expand(self, v: NDArray, y: NDArray, stiffness: NDArray) -> Expansion:
-        """Around v; see Functions."""
-        at = self._points
-        local = _place(v, self.rows.slots, self._fixed_local, self._interval, at.coefficients)
-        _spread(y, stiffness, self._row, self._point, at.multipliers, at.stiffness)
+    def expand(self) -> None:
+        """Gradient and matrix, around the last v."""
+        at, it = self._points, self._structure
         at.differentiate()
-        return _expanded(
-            at.rows, at.jacobian, at.gradient, at.hessian, self._row, self._point, self._interval, self._linear,
-            self.rows.interval, stiffness, local, self._scale, _GAUSS, stage.GAUSS_WEIGHTS,
+        _assemble(
+            at.gradient, at.hessian, it.begins, it.slots, it.entries, it.linear, it.linear_interval, self.stiffness,
+            self._local, self._scale, _GAUSS, stage.GAUSS_WEIGHTS, self.gradient, self.matrix,
         )  # fmt: skip
 
+    def transposed(self, w: NDArray) -> NDArray:
+        """(size,) J'w, J of the last expand()."""
+        it, result = self._structure, np.zeros(len(self.gradient))
+        _transposed(self._points.jacobian, it.begins, it.slots, it.linear, it.linear_interval, w, result)
+        return result
 
-def _slots(problem: Problem) -> tuple[NDArray, NDArray]:
+    def along(self, dv: NDArray) -> NDArray:
+        """(m,) J dv, likewise. Overwritten by the next call."""
+        it = self._structure
+        _along(self._points.jacobian, it.interval, it.slots, it.linear, it.linear_interval, dv, self._along)
+        return self._along
+
+
+class _Structure(NamedTuple):
+    """What follows from the layout and from how the ends are held."""
+
+    of: NDArray
+    # (N+3, 1 or 2) entry of v of each coefficient, -1 where it is fixed
+    slots: NDArray
+    # (N, k) entry of v of each of an interval's coefficients, likewise
+    entries: NDArray
+    # (N, k(k+1)/2, 2) entry of the flattened matrix of each pair of them, -1 where one is fixed, and how often it counts
+    interval: NDArray
+    # (P,) of each point
+    begins: NDArray
+    # (N+1,) first point of each interval
+    selected: NDArray
+    # (G,) entry of g of each of the layout's rows at points
+    point_rows: NDArray
+    # (G,) where those lie in the problem's constraints
+    positive: NDArray
+    # coefficients of h of their own
+    linear: NDArray
+    # (E, k)
+    linear_interval: NDArray
+    # (E,)
+    size: int
+    # of v
+    band: int
+    # how far apart two coefficients that meet can be
+
+
+def _kinds(problem: Problem) -> tuple[tuple[bool, bool], ...]:
+    """Whether each end is held, and whether it is at rest."""
+    return (problem.ends.start is not None, problem.ends.end is not None), problem.rests
+
+
+@lru_cache(maxsize=32)
+def _structure(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, bool]) -> _Structure:
+    nodes = layout.shape.nodes
+    of, own = _slots(layout, held, rests)
+    k = coefficients(layout.shape.free_yaw)
+    local = np.arange(nodes)[:, None] + np.array([0, 1, 2, 3, 0, 1, 2][:k]), np.array([0, 0, 0, 0, 1, 1, 1][:k])
+    slots = of[local]
+    free = np.where(slots >= 0, slots, slots.max(axis=1, keepdims=True))
+    band = int((free.max(axis=1) - free.min(axis=1)).max())
+    right, left = np.array([(a, b) for b in range(k) for a in range(b, k)]).T
+    low, high = np.minimum(slots[:, left], slots[:, right]), np.maximum(slots[:, left], slots[:, right])
+    entry = np.where(low >= 0, high * (band + 1) + high - low, _NOBODY)
+    entries = np.stack([entry, np.where((low == high) & (left != right), 2, 1)], axis=-1)
+    interval = np.append(layout.interval, np.repeat(layout.interval[-1], -len(layout.interval) % LANES))
+    point, row = np.divmod(layout.selected, stage.ROWS)
+    positive = np.flatnonzero(own[:, 0])
+    return _Structure(
+        of, slots, entries, interval, np.searchsorted(interval, np.arange(nodes + 1)),
+        row * len(interval) + point, layout.point_rows, positive, *_linear_rows(layout, positive), of.size, band,
+    )  # fmt: skip
+
+
+def _slots(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, bool]) -> tuple[NDArray, NDArray]:
     """(N+3, 1 or 2) entry of v of each coefficient, -1 where it is fixed; and which have an entry of their own."""
-    layout, ends = problem.layout, problem.ends
     nodes, columns = layout.shape.nodes, 2 if layout.shape.free_yaw else 1
     own = np.arange((nodes + 3) * columns).reshape(nodes + 3, columns)
     of = own.copy()
-    for boundary, rests, h, yaw in (
-        (ends.start, problem.rests[0], [0, 1, 2, 3], [0, 1]),
-        (ends.end, problem.rests[1], [nodes + 2, nodes + 1, nodes, nodes - 1], [nodes + 1, nodes]),
-    ):
-        if boundary:
+    for end, (h, yaw) in enumerate((
+        ([0, 1, 2, 3], [0, 1]), ([nodes + 2, nodes + 1, nodes, nodes - 1], [nodes + 1, nodes])
+    )):  # fmt: skip
+        if held[end]:
             of[h[:3], 0] = _NOBODY
             of[yaw, columns - 1] = _NOBODY if columns == 2 else of[yaw, 0]
-        elif rests:
+        elif rests[end]:
             of[h, 0] = of[h[3], 0]
             of[yaw, columns - 1] = of[yaw[1], 1] if columns == 2 else of[yaw, 0]
     if columns == 2:
@@ -121,9 +199,9 @@ def _slots(problem: Problem) -> tuple[NDArray, NDArray]:
     return of, of == own
 
 
-def _linear_rows(problem: Problem, positive: NDArray) -> tuple[NDArray, NDArray]:
+def _linear_rows(layout: Layout, positive: NDArray) -> tuple[NDArray, NDArray]:
     """(weights (E, k), interval): speeds at nodes and between, the coefficients of h, and where yaw starts."""
-    layout, nodes = problem.layout, problem.layout.shape.nodes
+    nodes = layout.shape.nodes
     k = coefficients(layout.shape.free_yaw)
     node = np.arange(nodes + 1)
     between = np.array(layout.shape.speed_places)
@@ -141,17 +219,15 @@ def _linear_rows(problem: Problem, positive: NDArray) -> tuple[NDArray, NDArray]
     return rows, interval
 
 
-def _bounds(problem: Problem, positive: int) -> tuple[NDArray, NDArray]:
-    """(lower, upper) of all constraints, in their order."""
+def _linear_bounds(problem: Problem, positive: int) -> tuple[NDArray, NDArray]:
+    """(lower, upper) of what _linear_rows has."""
     layout = problem.layout
     nodes = np.arange(layout.shape.nodes + 1) * layout.block
     speeds = problem.ubg[layout.speed_rows].ravel()
     free = problem.lbx[nodes] < problem.ubx[nodes]
     never = np.full(len(nodes) + len(speeds), -np.inf)
-    lower = [problem.lbg[layout.point_rows], never, np.full(positive, FLOOR)]
-    upper = [
-        problem.ubg[layout.point_rows], np.where(free, problem.ubx[nodes], np.inf), speeds, np.full(positive, np.inf)
-    ]  # fmt: skip
+    lower = [never, np.full(positive, FLOOR)]
+    upper = [np.where(free, problem.ubx[nodes], np.inf), speeds, np.full(positive, np.inf)]
     if layout.shape.free_yaw:
         held = problem.ends.start is not None
         lower.append(np.array([-np.inf]) if held else problem.lbx[3:4])
@@ -159,10 +235,12 @@ def _bounds(problem: Problem, positive: int) -> tuple[NDArray, NDArray]:
     return np.concatenate(lower), np.concatenate(upper)
 
 
+_FREELY = {"contract", "reassoc", "nsz"}  # what is not a number survives
+
+
 @njit(cache=True, error_model="numpy")
-def _place(v, slots, fixed, interval, at_points):
-    """(N, k) each interval's coefficients, written out at its points too."""
-    local = fixed.copy()
+def _place(v, slots, interval, local, at_points):
+    """Each interval's coefficients, (N, k), where they are free; and all of them at its points."""
     for i in range(slots.shape[0]):
         for a in range(slots.shape[1]):
             if slots[i, a] >= 0:
@@ -170,65 +248,19 @@ def _place(v, slots, fixed, interval, at_points):
     for a in range(slots.shape[1]):
         for p in range(len(interval)):
             at_points[a, p] = local[interval[p], a]
-    return local
 
 
-@njit(cache=True, error_model="numpy")
-def _spread(y, stiffness, row, point, y_at_points, stiffness_at_points):
-    for j in range(len(row)):
-        y_at_points[row[j], point[j]] = y[j]
-        stiffness_at_points[row[j], point[j]] = stiffness[j]
-
-
-@njit(cache=True, error_model="numpy")
-def _constraints(rows, row, point, linear, interval, local):
-    count = len(row)
-    g = np.zeros(count + len(linear))
-    for j in range(count):
-        g[j] = rows[row[j], point[j]]
+@njit(cache=True, error_model="numpy", fastmath=_FREELY)
+def _linear_values(linear, interval, local, g):
+    before = len(g) - len(linear)
     for j in range(len(linear)):
+        value = 0.0
         for a in range(linear.shape[1]):
-            g[count + j] += linear[j, a] * local[interval[count + j], a]
-    return g
+            value += linear[j, a] * local[interval[j], a]
+        g[before + j] = value
 
 
-@njit(cache=True, error_model="numpy")
-def _chosen(at_points, row, point, linear):
-    """(m, k) the Jacobian of the kernel's rows that are constraints, and of the linear ones."""
-    k = linear.shape[1]
-    jacobian = np.empty((len(row) + len(linear), k))
-    for a in range(k):
-        for j in range(len(row)):
-            jacobian[j, a] = at_points[a * stage.ROWS + row[j], point[j]]
-    jacobian[len(row) :] = linear
-    return jacobian
-
-
-@njit(cache=True, error_model="numpy")
-def _by_interval(gradient, hessian, interval, count):
-    k = gradient.shape[0]
-    of_gradient, of_hessian = np.zeros((count, k)), np.zeros((count, k, k))
-    entry = 0
-    for b in range(k):
-        for p in range(len(interval)):
-            of_gradient[interval[p], b] += gradient[b, p]
-        for a in range(b, k):
-            for p in range(len(interval)):
-                of_hessian[interval[p], a, b] += hessian[entry, p]
-            entry += 1
-    return of_gradient, of_hessian
-
-
-@njit(cache=True, error_model="numpy")
-def _add_linear(weights, interval, stiffness, hessian):
-    before = len(interval) - len(weights)
-    for j in range(len(weights)):
-        for a in range(weights.shape[1]):
-            for b in range(a + 1):
-                hessian[interval[before + j], a, b] += stiffness[before + j] * weights[j, a] * weights[j, b]
-
-
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FREELY)
 def _time(local, places, weights):
     """Σ ∫ds/√x over all intervals, in node units."""
     total = 0.0
@@ -241,51 +273,104 @@ def _time(local, places, weights):
     return total
 
 
-@njit(cache=True, error_model="numpy")
-def _add_time(local, places, weights, scale, gradient, hessian):
-    for i in range(local.shape[0]):
+@njit(cache=True, error_model="numpy", fastmath=_FREELY)
+def _sum_by_interval(at_points, begins, by_interval):
+    for a in range(by_interval.shape[0]):
+        row, result = at_points[a], by_interval[a]
+        for i in range(len(result)):
+            value = 0.0
+            for p in range(begins[i], begins[i + 1]):
+                value += row[p]
+            result[i] = value
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FREELY)
+def _assemble(
+    at_gradient, at_hessian, begins, slots, entries, linear, linear_interval, stiffness, local, scale, places, weights,
+    gradient, matrix,
+):  # fmt: skip
+    """Gradient and matrix from what the kernel gives at points, the linear constraints, and the time spent."""
+    count, k = slots.shape
+    of_gradient, of_hessian = np.zeros((k, count)), np.zeros((entries.shape[1], count))
+    _sum_by_interval(at_gradient, begins, of_gradient)
+    _sum_by_interval(at_hessian, begins, of_hessian)
+    before = len(stiffness) - len(linear)
+    for j in range(len(linear)):
+        of_yaw = linear[j, 0] + linear[j, 1] + linear[j, 2] + linear[j, 3] == 0.0
+        for b in range(4 if of_yaw else 0, k if of_yaw else 4):
+            pull = stiffness[before + j] * linear[j, b]
+            e = b * k - b * (b - 1) // 2
+            for a in range(b, k if of_yaw else 4):
+                of_hessian[e + a - b, linear_interval[j]] += pull * linear[j, a]
+    for i in range(count):
         for q in range(len(weights)):
             x = 0.0
             for a in range(4):
                 x += places[q, a] * local[i, a]
             x = max(x, stage.LEAST)
-            first = -0.5 * scale * weights[q] * x**-1.5
+            first = -0.5 * scale * weights[q] / (x * math.sqrt(x))
             second = -1.5 * first / x
-            for a in range(4):
-                gradient[i, a] += first * places[q, a]
-                for b in range(a + 1):
-                    hessian[i, a, b] += second * places[q, a] * places[q, b]
+            e = 0
+            for b in range(4):
+                of_gradient[b, i] += first * places[q, b]
+                for a in range(b, 4):
+                    of_hessian[e, i] += second * places[q, b] * places[q, a]
+                    e += 1
+                e += k - 4
+    gradient[:] = 0.0
+    flat = matrix.ravel()
+    flat[:] = 0.0
+    for i in range(count):
+        for a in range(k):
+            if slots[i, a] >= 0:
+                gradient[slots[i, a]] += of_gradient[a, i]
+        for e in range(entries.shape[1]):
+            if entries[i, e, 0] >= 0:
+                flat[entries[i, e, 0]] += entries[i, e, 1] * of_hessian[e, i]
 
 
-@njit(cache=True, error_model="numpy")
-def _valued(rows, penalty, row, point, linear, interval, local, scale, places, weights):
-    """f and g from what the kernel gives."""
-    return scale * _time(local, places, weights) + penalty.sum(), _constraints(
-        rows, row, point, linear, interval, local
-    )
+@njit(cache=True, error_model="numpy", fastmath=_FREELY)
+def _transposed(jacobian, begins, slots, linear, linear_interval, w, result):
+    count, k = slots.shape
+    points = jacobian.shape[1]
+    rows = jacobian.shape[0] // k
+    of_point, local = np.empty(points), np.zeros((count, k))
+    for a in range(k):
+        of_point[:] = 0.0
+        for r in range(rows):
+            for p in range(points):
+                of_point[p] += w[r * points + p] * jacobian[a * rows + r, p]
+        for i in range(count):
+            value = 0.0
+            for p in range(begins[i], begins[i + 1]):
+                value += of_point[p]
+            local[i, a] = value
+    for j in range(len(linear)):
+        for a in range(k):
+            local[linear_interval[j], a] += w[rows * points + j] * linear[j, a]
+    for i in range(count):
+        for a in range(k):
+            if slots[i, a] >= 0:
+                result[slots[i, a]] += local[i, a]
 
 
-@njit(cache=True, error_model="numpy")
-def _expanded(
-    rows,
-    jacobian,
-    gradient,
-    hessian,
-    row,
-    point,
-    points_interval,
-    linear,
-    interval,
-    stiffness,
-    local,
-    scale,
-    places,
-    weights,
-):
-    """The expansion from what the kernel gives."""
-    g = _constraints(rows, row, point, linear, interval, local)
-    of_rows = _chosen(jacobian, row, point, linear)
-    of_gradient, of_hessian = _by_interval(gradient, hessian, points_interval, len(local))
-    _add_linear(linear, interval, stiffness, of_hessian)
-    _add_time(local, places, weights, scale, of_gradient, of_hessian)
-    return Expansion(g, of_rows, of_gradient, of_hessian)
+@njit(cache=True, error_model="numpy", fastmath=_FREELY)
+def _along(jacobian, interval, slots, linear, linear_interval, dv, result):
+    count, k = slots.shape
+    points = jacobian.shape[1]
+    rows = jacobian.shape[0] // k
+    local, of_point = np.zeros((count, k)), np.empty(points)
+    for i in range(count):
+        for a in range(k):
+            if slots[i, a] >= 0:
+                local[i, a] = dv[slots[i, a]]
+    result[:] = 0.0
+    for a in range(k):
+        for p in range(points):
+            of_point[p] = local[interval[p], a]
+        for r in range(rows):
+            for p in range(points):
+                result[r * points + p] += jacobian[a * rows + r, p] * of_point[p]
+    for j in range(len(linear)):
+        for a in range(k):
+            result[rows * points + j] += linear[j, a] * local[linear_interval[j], a]

@@ -71,11 +71,11 @@ def test_both_formulations_are_the_same_problem(free_yaw):
     shape = Shape(12, free_yaw, turning_limited=True)
     problem, _ = posed(shape)
     splines, v = near_the_guess(problem, 0.02)
-    cost, g = splines.values(v)
+    cost = splines.values(v)
     f, constraints = Program(shape).nlp(variables_of(splines.table_of(v), problem.layout), problem.p)
     constraints = np.array(constraints).ravel()
     assert cost == pytest.approx(float(f), rel=1e-10)
-    np.testing.assert_allclose(splines.at_points(g), constraints[problem.layout.point_rows], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(splines.at_points(), constraints[problem.layout.point_rows], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(constraints[problem.layout.dynamics_rows], 0.0, atol=1e-12)
 
 
@@ -92,30 +92,34 @@ def test_derivatives_by_the_splines_are_those_of_differences(free_yaw):
     splines, v = near_the_guess(problem, 0.02)
     rng = np.random.default_rng(7)
     direction = rng.normal(size=len(v))
-    y, stiffness = rng.normal(size=len(splines.rows.lower)), rng.uniform(size=len(splines.rows.lower))
-    slots, interval = splines.rows.slots, splines.rows.interval
-    step = np.append(direction, 0.0)[slots]  # -1 is the zero at the end
+    splines.multipliers[:] = y = rng.normal(size=len(splines.g))
+    splines.stiffness[:] = stiffness = rng.uniform(size=len(splines.g))
 
-    def slopes(at):
-        around = splines.expand(at, y, stiffness)
-        of_g = np.einsum("mk,mk->m", around.jacobian, step[interval])
-        of_v = np.zeros(len(v) + 1)
-        np.add.at(of_v, slots, around.gradient)
-        np.add.at(of_v, slots[interval], y[:, None] * around.jacobian)
-        return np.einsum("nk,nk", around.gradient, step), of_g, of_v[:-1], around
+    def around(at):
+        cost = splines.values(at)
+        splines.expand()
+        of_lagrangian = splines.gradient + splines.transposed(y)
+        return cost, splines.g.copy(), splines.gradient @ direction, splines.along(direction).copy(), of_lagrangian
 
     size = 1e-5
-    (before, g_before), (after, g_after) = (splines.values(v + k * size * direction) for k in (-1, 1))
-    of_f, of_g, _, around = slopes(v)
+    (before, g_before, _, _, lagrangian_before), (after, g_after, _, _, lagrangian_after) = (
+        around(v + k * size * direction) for k in (-1, 1)
+    )
+    _, _, of_f, of_g, _ = around(v)
+    bounded = splines.bounds[4] == 1
     assert of_f == pytest.approx((after - before) / (2 * size), rel=1e-5)
-    np.testing.assert_allclose(of_g, (g_after - g_before) / (2 * size), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(of_g[bounded], (g_after - g_before)[bounded] / (2 * size), rtol=1e-4, atol=1e-5)
+    w = rng.normal(size=len(y))
+    assert splines.transposed(w) @ direction == pytest.approx(w @ of_g, rel=1e-10)
 
-    curvature = (slopes(v + size * direction)[2] - slopes(v - size * direction)[2]) / (2 * size)
-    whole = np.tril(around.hessian) + np.transpose(np.tril(around.hessian, -1), (0, 2, 1))
-    product = np.zeros(len(v) + 1)
-    np.add.at(product, slots, np.einsum("nab,nb->na", whole, step))
-    np.add.at(product, slots[interval], -(stiffness * of_g)[:, None] * around.jacobian)  # expand() adds J'ΣJ
-    np.testing.assert_allclose(product[:-1], curvature, rtol=1e-3, atol=1e-4 * np.abs(curvature).max())
+    curvature = (lagrangian_after - lagrangian_before) / (2 * size)
+    size, width = splines.matrix.shape
+    whole = np.zeros((size, size))
+    for d in range(width):
+        whole[np.arange(d, size), np.arange(size - d)] = splines.matrix[d:, d]
+    whole += np.tril(whole, -1).T
+    product = whole @ direction - splines.transposed(stiffness * of_g)  # expand() adds J'ΣJ
+    np.testing.assert_allclose(product, curvature, rtol=1e-3, atol=1e-4 * np.abs(curvature).max())
 
 
 def test_rows_of_the_program_are_what_the_flatness_map_gives():
