@@ -113,7 +113,7 @@ def _replay_record(place: Path, files: Files, steps: Steps) -> dict[str, Any]:
         if flight.truncated:
             said.append("truncated: what follows the last whole chunk is lost")
     files.make(steps, partial(write_rrd, flight), partial(picture, flight), partial(show, flight))
-    return {"record": str(place), **summarise(flight).to_json()}
+    return {"record": str(place), **(summarise(flight).to_json() if steps.as_json else {})}
 
 
 def _replay_trials(

@@ -6,8 +6,8 @@ import numpy as np
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
-from cfplan.recording.plots import plots
-from cfplan.recording.record import Record
+from cfplan.recording.header import RecordHeader
+from cfplan.recording.plots import TITLES
 
 TIMELINE = "flight"
 WORLD = "world"
@@ -34,9 +34,9 @@ PlayState = Literal["paused", "playing", "following"]
 _STATES = "Phases, limit that holds the plan back, supervisor"
 
 
-def blueprint(record: Record, *, play_state: PlayState = "paused") -> rrb.Blueprint:
+def blueprint(header: RecordHeader, *, play_state: PlayState = "paused") -> rrb.Blueprint:
     """3-D at the left, the plots beside it in two columns, phases, events and the summary below."""
-    grid = rrb.Grid(*(_plot(plot.name, plot.title) for plot in plots(record)), grid_columns=2)
+    grid = rrb.Grid(*(_plot(name, title) for name, title in TITLES.items()), grid_columns=2)
     below = rrb.Horizontal(
         rrb.StateTimelineView(contents=[PHASES, ACTIVE_LIMIT, SUPERVISOR], name=_STATES),
         rrb.Tabs(
@@ -46,7 +46,7 @@ def blueprint(record: Record, *, play_state: PlayState = "paused") -> rrb.Bluepr
         column_shares=[3, 2],
     )
     return rrb.Blueprint(
-        rrb.Vertical(rrb.Horizontal(_room(record), grid, column_shares=[6, 5]), below, row_shares=[5, 1]),
+        rrb.Vertical(rrb.Horizontal(_room(header), grid, column_shares=[6, 5]), below, row_shares=[5, 1]),
         rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state=play_state),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
@@ -65,9 +65,9 @@ def _plot(name: str, title: str) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=title, plot_legend=rrb.PlotLegend("RightTop"))
 
 
-def _room(record: Record) -> rrb.Spatial3DView:
+def _room(header: RecordHeader) -> rrb.Spatial3DView:
     """The room from above one of its long sides, such that the whole fence is in sight."""
-    low, high = np.array(record.header.fence)
+    low, high = np.array(header.fence)
     centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
     target = (*centre[:2], low[2] + 0.1 * (high - low)[2])
     aside = (0.66, -0.17, 0.45) if high[1] - low[1] > high[0] - low[0] else (-0.17, -0.66, 0.45)
@@ -81,7 +81,7 @@ def _room(record: Record) -> rrb.Spatial3DView:
     )
     return rrb.Spatial3DView(
         origin=WORLD,
-        name=record.header.name,
+        name=header.name,
         overrides={
             TAIL: [rrb.VisibleTimeRanges([tail])],
             WANTED_TAIL: [rrb.VisibleTimeRanges([tail])],

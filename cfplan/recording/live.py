@@ -19,7 +19,7 @@ from cfplan.flight.telemetry import PoseReceived, SetpointSent, Telemetry, Vehic
 from cfplan.recording import layout
 from cfplan.recording.header import RecordHeader
 from cfplan.recording.plan_view import log_plan
-from cfplan.recording.plots import FLOWN, WANTED
+from cfplan.recording.plots import FLOWN, WANTED, plots
 from cfplan.recording.record import Record
 from cfplan.recording.rerun_view import (
     TRACK_RADIUS,
@@ -61,7 +61,7 @@ def open_live(header: RecordHeader, folder: Path) -> "LiveView":
 
 def live_blueprint(header: RecordHeader) -> rrb.Blueprint:
     """The same as of a replay, but the time follows."""
-    return layout.blueprint(_part(header, []), play_state="following")
+    return layout.blueprint(header, play_state="following")
 
 
 class LiveView:
@@ -99,7 +99,7 @@ class LiveView:
             empty = _part(self._header, [])
             self._stream.send_recording_name(self._header.name)
             log_room(self._stream, self._header)
-            log_styles(self._stream, empty)
+            log_styles(self._stream, plots(empty))
             log_plan(self._stream, replace(empty, folder=self._folder))
             while not self._ending.wait(PERIOD):
                 self._send()
@@ -120,8 +120,9 @@ class LiveView:
             self._start = min(message.time for message in fresh)
         part = _part(self._header, [*self._carried.values(), *fresh])
         self._carried |= {type(message): message for message in fresh if isinstance(message, _CARRIED)}
-        log_columns(self._stream, part, self._start)
-        log_limits(self._stream, part, [max(message.time for message in fresh) - self._start])
+        shown = plots(part)
+        log_columns(self._stream, part, shown, self._start)
+        log_limits(self._stream, shown, [max(message.time for message in fresh) - self._start])
         poses = part.poses
         log_tail(self._stream, layout.FLOWN, poses.time - self._start, poses.position, FLOWN, TRACK_RADIUS)
         for entity, times, colour in ((layout.BODY, poses.time, FLOWN), (layout.GHOST, part.setpoints.due, WANTED)):

@@ -16,6 +16,17 @@ FLOWN: Colour = (86, 180, 233)
 WANTED: Colour = (230, 159, 0)
 LIMIT: Colour = (226, 74, 74)
 FOUR: tuple[Colour, ...] = ((86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))
+TITLES = {
+    "deviation": "Deviation, m",
+    "motor_thrust": "Motor thrust, N",
+    "speed": "Speed, m/s",
+    "body_rate": "Body rate, rad/s",
+    "acceleration": "Acceleration, m/s²",
+    "battery": "Battery, V",
+    "age": "Age of poses and of the vehicle's log, ms",
+    "lateness": "Lateness of setpoints, ms",
+}
+# of all plots, in the order in which they are shown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,14 +48,19 @@ class Plot:
     """One set of axes."""
 
     name: str
-    title: str
+    # one of TITLES
     lines: tuple[Line, ...]
     limits: tuple[float, ...]
     # drawn as level lines; those that are not finite are left out
 
+    @property
+    def title(self) -> str:
+        """What it shows, and its unit."""
+        return TITLES[self.name]
+
 
 def plots(record: Record) -> tuple[Plot, ...]:
-    """All plots of a flight, in the order in which they are shown."""
+    """All plots of a flight, in the order of TITLES."""
     setpoints, estimates, status = record.setpoints, record.estimates, record.status
     bounds, planned, motors = record.header.bounds, record.header.plan_limits, motor_thrust(record)
     off = deviation(record)
@@ -52,7 +68,6 @@ def plots(record: Record) -> tuple[Plot, ...]:
     return (
         Plot(
             "deviation",
-            "Deviation, m",
             (
                 _flown("in_time", off.time, off.in_time, "from the reference in time"),
                 Line("to_path", off.time, off.to_path, ("from the path",), ((150, 150, 150),)),
@@ -61,13 +76,11 @@ def plots(record: Record) -> tuple[Plot, ...]:
         ),
         Plot(
             "motor_thrust",
-            "Motor thrust, N",
             (Line("motors", status.time, motors, ("motor 1", "motor 2", "motor 3", "motor 4"), FOUR),),
             (planned.motor_thrust_min, planned.motor_thrust_max),
         ),
         Plot(
             "speed",
-            "Speed, m/s",
             (
                 _flown("flown", estimates.time, _norm(estimates.velocity)),
                 _wanted(setpoints.due, _norm(setpoints.velocity)),
@@ -76,13 +89,11 @@ def plots(record: Record) -> tuple[Plot, ...]:
         ),
         Plot(
             "body_rate",
-            "Body rate, rad/s",
             (_flown("flown", status.time, _norm(status.body_rate)), _wanted(setpoints.due, _norm(setpoints.body_rate))),
             (bounds.body_rate,),
         ),
         Plot(
             "acceleration",
-            "Acceleration, m/s²",
             (
                 _flown("flown", estimates.time, _norm(estimates.acceleration)),
                 _wanted(setpoints.due, _norm(setpoints.acceleration)),
@@ -91,13 +102,11 @@ def plots(record: Record) -> tuple[Plot, ...]:
         ),
         Plot(
             "battery",
-            "Battery, V",
             (_flown("voltage", status.time, status.battery_voltage, "voltage"),),
             (bounds.battery_voltage,),
         ),
         Plot(
             "age",
-            "Age of poses and of the vehicle's log, ms",
             (
                 _flown("pose", aged, age * 1e3, "pose"),
                 Line("log", status.time[1:], 1e3 * np.diff(status.time), ("log by radio",), ((150, 150, 150),)),
@@ -106,7 +115,6 @@ def plots(record: Record) -> tuple[Plot, ...]:
         ),
         Plot(
             "lateness",
-            "Lateness of setpoints, ms",
             (_flown("lateness", setpoints.due, (setpoints.time - setpoints.due) * 1e3, "lateness"),),
             (bounds.lateness * 1e3,),
         ),

@@ -3,6 +3,7 @@
 import io
 import json
 import struct
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Message, Metadata
+from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata
 from mcap.stream_reader import get_chunk_data_stream
 
 from cfplan.errors import InputError
@@ -21,7 +22,7 @@ from cfplan.recording.topics import FORMAT, METADATA, PROFILE, TOPICS, columns_f
 
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # opcode, length
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_MESSAGE_HEAD = 22  # bytes: channel, sequence, log time, publish time
 _READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
     Opcode.METADATA: Metadata.read,
@@ -51,9 +52,9 @@ def read_record(place: Path) -> Record:
     data = _read(file)
     header: RecordHeader | None = None
     topics: dict[int, str] = {}
-    payloads: dict[str, list[bytes]] = {topic.name: [] for topic in TOPICS}
+    payloads: dict[int, list[bytes]] = defaultdict(list)
     whole = False
-    for entry in _entries(data, len(MAGIC)):
+    for entry in _entries(data, len(MAGIC), payloads):
         match entry:
             case Header(profile=profile) if profile != PROFILE:
                 raise _not_ours(file, f"its profile is {profile[:40]!r}")
@@ -61,8 +62,6 @@ def read_record(place: Path) -> Record:
                 header = _header(values, file)
             case Channel(id=number, topic=name):
                 topics[number] = name
-            case Message(channel_id=number, data=payload) if topics.get(number) in payloads:
-                payloads[topics[number]].append(payload)
             case Footer():
                 whole = data.endswith(MAGIC)
     if header is None:
@@ -71,7 +70,10 @@ def read_record(place: Path) -> Record:
             where=str(file),
             hint="the flight ended as the record was opened, or copying it failed",
         )
-    streams = {topic.stream: _columns(topic, payloads[topic.name], file) for topic in TOPICS}
+    streams = {}
+    for topic in TOPICS:
+        own = [payload for number, name in topics.items() if name == topic.name for payload in payloads[number]]
+        streams[topic.stream] = _columns(topic, own, file)
     return Record(folder=file.parent, header=header, summary=_summary(file.parent), truncated=not whole, **streams)
 
 
@@ -136,31 +138,30 @@ def _header(values: Mapping[str, str], file: Path) -> RecordHeader:
     return header_from_json(values.get("header", ""), where=str(file))
 
 
-def _entries(data: bytes, place: int) -> Iterator[McapRecord]:
-    """The MCAP records that matter from `place` on, those in chunks too, up to the first cut off or damaged."""
+def _entries(data: bytes, place: int, payloads: dict[int, list[bytes]]) -> Iterator[McapRecord]:
+    """The MCAP records that matter from `place` on, those in chunks too, up to the first cut off or damaged.
+
+    Messages are so many that they are no objects of their own: what they hold is put into `payloads` by their channel.
+    """
+    message, head, size = int(Opcode.MESSAGE), _RECORD.unpack_from, _RECORD.size
     try:
         while True:
-            opcode, length = _RECORD.unpack_from(data, place)
-            place += _RECORD.size
-            if place + length > len(data):
+            opcode, length = head(data, place)
+            begin = place + size
+            place = begin + length
+            if place > len(data):
                 return
-            if opcode == Opcode.MESSAGE:
-                yield _message(data, place, length)
+            if opcode == message:
+                payloads[int.from_bytes(data[begin : begin + 2], "little")].append(data[begin + _MESSAGE_HEAD : place])
             elif opcode in _READERS:
-                entry = _READERS[opcode](ReadDataStream(io.BytesIO(data[place : place + length])))
+                entry = _READERS[opcode](ReadDataStream(io.BytesIO(data[begin:place])))
                 if isinstance(entry, Chunk):
-                    stream, size = get_chunk_data_stream(entry, validate_crc=True)
-                    yield from _entries(stream.read(size), 0)
+                    stream, unpacked = get_chunk_data_stream(entry, validate_crc=True)
+                    yield from _entries(stream.read(unpacked), 0, payloads)
                 else:
                     yield entry
-            place += length
     except _DAMAGE:
         return
-
-
-def _message(data: bytes, place: int, length: int) -> Message:
-    channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, place)
-    return Message(channel, log_time, data[place + _MESSAGE.size : place + length], publish_time, sequence)
 
 
 def _columns(topic: Any, payloads: list[bytes], file: Path) -> Any:

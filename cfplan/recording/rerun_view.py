@@ -19,7 +19,7 @@ from cfplan.recording.header import RecordHeader
 from cfplan.recording.picture import write_png
 from cfplan.recording.plan_view import log_plan
 from cfplan.recording.plots import FLOWN as FLOWN_COLOUR
-from cfplan.recording.plots import LIMIT, Colour, finite_limits, motor_thrust, plots
+from cfplan.recording.plots import LIMIT, Colour, Plot, finite_limits, motor_thrust, plots
 from cfplan.recording.plots import WANTED as WANTED_COLOUR
 from cfplan.recording.record import Record
 from cfplan.recording.states import PHASE_COLOURS, SUPERVISOR_COLOURS, supervisor_states
@@ -43,12 +43,12 @@ LEVEL_NAMES = {Level.INFO: "INFO", Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 
 def write_rrd(record: Record, file: Path, *, overwrite: bool = False) -> None:
     """Write the recording with its blueprint; whole or not at all. Raises InputError where the file cannot be."""
-    save(file, layout.blueprint(record), partial(log_record, record=record), overwrite=overwrite)
+    save(file, layout.blueprint(record.header), partial(log_record, record=record), overwrite=overwrite)
 
 
 def show(record: Record) -> None:
     """Open the viewer on the recording; it stays open by itself. Raises InputError where there is no screen."""
-    open_viewer(layout.blueprint(record), partial(log_record, record=record))
+    open_viewer(layout.blueprint(record.header), partial(log_record, record=record))
 
 
 def picture(record: Record, file: Path, *, moment: float | None = None, overwrite: bool = False) -> tuple[str, ...]:
@@ -59,15 +59,17 @@ def picture(record: Record, file: Path, *, moment: float | None = None, overwrit
     begin, end = reference_span(record)
     middle = (begin + end) / 2 - record.start if np.isfinite(begin) else record.duration / 2
     draw = partial(log_record, record=record)
-    return write_png(file, layout.blueprint(record), draw, middle if moment is None else moment, overwrite=overwrite)
+    at = middle if moment is None else moment
+    return write_png(file, layout.blueprint(record.header), draw, at, overwrite=overwrite)
 
 
 def log_record(stream: rr.RecordingStream, record: Record) -> None:
     """Send all of a record."""
     stream.send_recording_name(record.header.name)
     log_room(stream, record.header)
-    log_styles(stream, record)
-    log_columns(stream, record, record.start)
+    shown = plots(record)
+    log_styles(stream, shown)
+    log_columns(stream, record, shown, record.start)
     log_plan(stream, record)
     _log_whole_track(stream, record)
     for entity, times, colour in (
@@ -77,7 +79,7 @@ def log_record(stream: rr.RecordingStream, record: Record) -> None:
         if len(times):
             log_outline(stream, entity, record.header.vehicle.arm, times - record.start, colour)
     if record.duration > 0:
-        log_limits(stream, record, [0.0, record.duration])
+        log_limits(stream, shown, [0.0, record.duration])
     stream.log(layout.SUMMARY, rr.TextDocument(summary_text(record), media_type=rr.MediaType.MARKDOWN), static=True)
 
 
@@ -102,11 +104,11 @@ def floor_lines(low: NDArray, high: NDArray) -> list[NDArray]:
     return across + [np.array([[low[0], y, 0.0], [high[0], y, 0.0]]) for y in ys]
 
 
-def log_styles(stream: rr.RecordingStream, record: Record) -> None:
+def log_styles(stream: rr.RecordingStream, shown: Sequence[Plot]) -> None:
     """Send how everything is drawn that has a time."""
     stream.log(layout.BODY, rr.TransformAxes3D(AXIS_LENGTH), static=True)
     stream.log(layout.THRUST, rr.Arrows3D.from_fields(colors=[THRUST_COLOUR], radii=[0.008]), static=True)
-    for plot in plots(record):
+    for plot in shown:
         for line in plot.lines:
             style = rr.SeriesLines(
                 colors=line.colours, names=line.labels, widths=[1.5] * len(line.labels), aggregation_policy="MinMax"
@@ -120,8 +122,8 @@ def log_styles(stream: rr.RecordingStream, record: Record) -> None:
         stream.log(entity, states, static=True)
 
 
-def log_columns(stream: rr.RecordingStream, record: Record, start: float) -> None:
-    """Send all rows of a record, or of a part of one; `start` is the time, s, that the timeline calls 0."""
+def log_columns(stream: rr.RecordingStream, record: Record, shown: Sequence[Plot], start: float) -> None:
+    """Send all rows of a record, or of a part of one, and of its plots; the timeline calls `start` 0, s."""
     poses, setpoints = record.poses, record.setpoints
     for entity, tail, times, moving, colour, radius in (
         (layout.BODY, layout.TAIL, poses.time, poses, FLOWN_COLOUR, TAIL_RADIUS),
@@ -132,7 +134,7 @@ def log_columns(stream: rr.RecordingStream, record: Record, start: float) -> Non
             stream.send_columns(entity, [_since(start, times)], columns, strict=True)
             log_tail(stream, tail, times - start, moving.position, colour, radius)
     _log_thrust(stream, record, start)
-    for plot in plots(record):
+    for plot in shown:
         for line in plot.lines:
             if len(line.time):
                 values = rr.Scalars.columns(scalars=line.values.reshape(-1))
@@ -206,9 +208,9 @@ def _steps(positions: NDArray) -> pa.ListArray:
     return pa.ListArray.from_arrays(pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32)), points, type=_STRIP)
 
 
-def log_limits(stream: rr.RecordingStream, record: Record, times: Sequence[float]) -> None:
+def log_limits(stream: rr.RecordingStream, shown: Sequence[Plot], times: Sequence[float]) -> None:
     """The level lines of every plot, at some times, s on the timeline."""
-    for plot in plots(record):
+    for plot in shown:
         levels = finite_limits(plot)
         if levels:
             columns = rr.Scalars.columns(scalars=np.tile(levels, len(times))).partition([len(levels)] * len(times))

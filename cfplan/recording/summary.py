@@ -162,15 +162,17 @@ def distance_to_path(points: NDArray, path: NDArray) -> NDArray:
     if len(points) == 0:
         return np.empty(0)
     nearest = cKDTree(path).query(points, k=range(1, min(8, len(path)) + 1))[1]
+    segments = np.diff(path, axis=0, append=path[-1:])
+    squares = np.einsum("ij,ij->i", segments, segments)
+    squares[squares == 0] = 1.0
     best = np.full(len(points), np.inf)
-    for first in np.concatenate([nearest, nearest - 1], axis=1).T:
-        a = path[np.clip(first, 0, len(path) - 1)]
-        along = path[np.clip(first + 1, 0, len(path) - 1)] - a
-        length = np.sum(along**2, axis=1)
-        share = np.sum((points - a) * along, axis=1) / np.where(length > 0, length, 1.0)
-        foot = a + np.clip(share, 0, 1)[:, None] * along
-        best = np.minimum(best, np.linalg.norm(points - foot, axis=1))
-    return best
+    for column in np.concatenate([nearest, nearest - 1], axis=1).T:
+        first = np.maximum(column, 0)
+        along, offset = segments[first], points - path[first]
+        share = np.clip(np.einsum("ij,ij->i", offset, along) / squares[first], 0, 1)
+        offset -= share[:, None] * along
+        best = np.minimum(best, np.einsum("ij,ij->i", offset, offset))
+    return np.sqrt(best)
 
 
 def settling(record: Record) -> float:

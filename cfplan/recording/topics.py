@@ -100,8 +100,11 @@ def columns_from_json(topic: Topic, payloads: list[bytes]) -> Any:
     for name in names:
         json.loads(payloads[0])[name]  # Arrow takes what is missing for null
     schema = pa.schema([(name, _arrow_type(hints[name])) for name in names])
+    lines = b"\n".join(payloads)
+    if lines.count(b"\n") >= len(payloads):  # others than we may spread a message over lines
+        lines = b"\n".join(payload.replace(b"\n", b" ") for payload in payloads)
     table = pa_json.read_json(
-        pa.BufferReader(b"\n".join(payload.replace(b"\n", b" ") for payload in payloads)),
+        pa.BufferReader(lines),
         pa_json.ReadOptions(block_size=_BLOCK),
         pa_json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
     )
