@@ -20,7 +20,7 @@ from cfplan.flight.outcome import Deviation, FlightOutcome, Rung, settle_time
 from cfplan.flight.pace import Lateness
 from cfplan.flight.poses import PoseSource
 from cfplan.flight.stream import Stream
-from cfplan.flight.supervisor import ARMED, FLYING, HIGH_LEVEL_ACTIVE
+from cfplan.flight.supervisor import ARMED, FLYING, HIGH_LEVEL_ACTIVE, LOCKED
 from cfplan.flight.telemetry import Level, Phase, Telemetry, Triple
 from cfplan.flight.transfer import encode_transfer
 from cfplan.flight.watch import Trip
@@ -35,6 +35,8 @@ _BELOW_FLOOR = 0.03  # m that landings aim below it, so that motors stop on the 
 _BLIND_LAND_SPEED = 0.6  # m/s, mean, at least: without poses the vehicle drifts half a metre in 2 s
 _TOUCH = 0.3  # s on the floor before motors stop
 _MOTORS_STOPPED = 4.0  # s; the vehicle calls itself landed 2 s after they did
+_ASKED_TO_RISE, _RISEN = 0.08, 0.02  # m above the floor: asked for the first, its pose must have reached the second
+_LOCKED_WITHIN = 2.5  # s for a cut to arrive; without setpoints the vehicle stops its motors after 2 s by itself
 
 
 class Pilot:
@@ -116,10 +118,34 @@ class Pilot:
                 f"the vehicle refuses to take off (code {code})", hint="restart the vehicle, and look at its battery"
             )
         cockpit.airborne = True
-        self._follow(way)
+        self._begin(way)
+        if cockpit.until(lambda: cockpit.now() > way.end or self._pose_stays(way), math.inf) and self._pose_stays(way):
+            self._stay_down()
         cockpit.until(lambda: abs(cockpit.pose().position[2] - height) < _AT_START_WITHIN, 2.0)
         if cockpit.pose().position[2] - cockpit.floor < climb / 2:
             raise Tripped(_safety(Rung.LAND, "the vehicle does not rise"))
+
+    def _pose_stays(self, way: Stream) -> bool:
+        """Whether the tracked body stays on the floor while the vehicle must rise.
+
+        Nothing on the ground tells the vehicle from another body that stands still as well. By the pose of that one its
+        controller would climb with all its thrust.
+        """
+        cockpit = self._cockpit
+        pose = cockpit.pose()
+        asked = way.position(pose.time - self._mission.lead)[2]
+        return asked - cockpit.floor > _ASKED_TO_RISE and pose.position[2] - cockpit.floor < _RISEN
+
+    def _stay_down(self) -> None:
+        """Motors off, some centimetres up at most."""
+        self._stop_motors()
+        self._cockpit.airborne = False
+        self._motors_stop()
+        raise PreflightError(
+            "the tracked body stays on the floor while the vehicle takes off",
+            where="motion capture",
+            hint="is it another body than the vehicle, are two of them swapped? Else look at battery and propellers",
+        )
 
     def _way(self, begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float) -> Stream:
         """From hover to hover, with a way to stop from each setpoint."""
@@ -127,11 +153,13 @@ class Pilot:
         payloads = encode_transfer(begin, yaw, end, end_yaw, duration, rate)
         return Stream(payloads, rate, stop_from=lambda row: encode_stops(payloads, rate, rows=np.array([row]))[0])
 
+    def _begin(self, way: Stream) -> None:
+        way.start = self._cockpit.pace.upcoming
+        self._cockpit.stream = way
+
     def _follow(self, way: Stream) -> None:
-        cockpit = self._cockpit
-        way.start = cockpit.pace.upcoming
-        cockpit.stream = way
-        cockpit.until(lambda: cockpit.now() > way.end, math.inf)
+        self._begin(way)
+        self._cockpit.until(lambda: self._cockpit.now() > way.end, math.inf)
 
     def _go_to_start(self) -> None:
         cockpit = self._cockpit
@@ -238,6 +266,11 @@ class Pilot:
         yaw = yaw_of(quaternion)
         self._follow(self._way(place, yaw, (*place[:2], cockpit.floor - _BELOW_FLOOR), yaw, duration))
         cockpit.pause(_TOUCH)
+        self._stop_motors()
+
+    def _stop_motors(self) -> None:
+        """By setpoints: none but these are sent any more."""
+        cockpit = self._cockpit
         cockpit.stream = None
         for _ in range(TRIES):
             cockpit.link.stop_setpoint()
@@ -315,11 +348,16 @@ class Pilot:
         return nearest
 
     def _cut(self) -> None:
+        """Again with every tick until the vehicle says that it is locked: a radio may lose the first ones."""
         cockpit = self._cockpit
         cockpit.stream = None
-        for _ in range(TRIES):
+
+        def locked() -> bool:
             cockpit.link.emergency_stop()
-            cockpit.pause(0.02)
+            return bool(cockpit.bits(LOCKED))
+
+        if not locked() and not cockpit.until(locked, _LOCKED_WITHIN):
+            cockpit.say(Level.ERROR, "the vehicle does not say that its motors were cut")
         cockpit.airborne = False
 
     # The end.

@@ -9,6 +9,7 @@ from cfplan.flight.outcome import Rung
 from cfplan.flight.telemetry import Phase
 from cfplan.simulation.lab import Fault
 from cfplan.simulation.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.virtual_cameras import ViconSettings
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon_faults import FaultKind, ViconFault
@@ -39,8 +40,10 @@ class Scenario:
     # the faults are there before anything is connected
     vehicle: VehicleSettings = field(default_factory=lambda: VehicleSettings(auto_arming=False))
     # armed by request alone, so that one can see whether it was disarmed
+    cameras: ViconSettings | None = None
+    # None: those of the lab
     falls: bool = False
-    # the vehicle's own supervisor stops the motors, whatever the pilot does
+    # motors stop in the air: the vehicle's own supervisor stops them, or a take-off ends a hand above the floor
     grounded: bool = False
     # it must never take off
 
@@ -117,6 +120,14 @@ SCENARIOS: tuple[Scenario, ...] = (
     _odd("firmware of 2025.09", grounded=True, protocol=10, firmware="2025.09"),
     _odd("firmware of 2025.12", protocol=10, firmware="2025.12"),
     _odd("start place 0.5 m off", position=(0.35, -2.85, 0.0)),
+    Scenario(
+        "two bodies swapped", Rung.NONE, (ViconFault(FaultKind.SWAP, 0.0, _REST),), from_start=True, grounded=True,
+        falls=True, cameras=ViconSettings(others=(("cf2", (0.5, 0.5, 0.0)),)),
+    ),
+    Scenario(
+        "two bodies swapped in the stream", Rung.LAND, (ViconFault(FaultKind.SWAP, 0.0, _REST),),
+        cameras=ViconSettings(others=(("cf2", (0.5, 0.5, 0.0)),)),
+    ),
     Scenario(
         "space bar during preflight", Rung.NONE, order=Order.LAND, phase=Phase.PREFLIGHT, moment=0.2, grounded=True,
     ),

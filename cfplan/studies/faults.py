@@ -21,7 +21,7 @@ from cfplan.flight.mission import Mission
 from cfplan.flight.outcome import FlightOutcome, Rung
 from cfplan.flight.packets import decode
 from cfplan.flight.pilot import Pilot
-from cfplan.flight.telemetry import Event, Phase, PhaseEntered, Telemetry
+from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry, Triple
 from cfplan.recording.header import FlightBounds, RecordHeader
 from cfplan.recording.reader import read_record
 from cfplan.recording.writer import RecordWriter
@@ -32,7 +32,10 @@ from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.studies.fault_scenarios import SCENARIOS, Scenario
 from cfplan.studies.machine import Machine, this_machine
 
-COLUMNS = ("fault", "must come to", "rung", "reacts after", "off the plan", "to the wall", "end", "record")
+COLUMNS = (
+    "fault", "must come to", "rung", "reacts after", "off the path", "from the setpoint", "to the wall", "end",
+    "record",
+)  # fmt: skip
 _DOWN = 0.05  # m
 _SETTLING = 0.1  # s in which the supervisor notices that it was disarmed
 _AFTERWARDS = 6.0  # s in which what the pilot left behind comes to rest
@@ -55,6 +58,8 @@ class FaultFlight:
     # s from the fault to the rung; None where there was none
     off_plan: float
     # m, largest distance of the true position from the planned path, from landing on horizontally
+    off_setpoint: float
+    # m, largest distance of the true position from the setpoint of that moment, while some are sent before landing
     to_wall: float
     # m, least distance of the true position from the walls and the ceiling; negative beyond them
     motors_off: int
@@ -76,7 +81,8 @@ class FaultFlight:
             or "in the air"
         )
         return [
-            self.name, self.expected, self.rung, reaction, f"{100 * self.off_plan:.0f} cm", f"{self.to_wall:.2f} m",
+            self.name, self.expected, self.rung, reaction, f"{100 * self.off_plan:.0f} cm",
+            f"{100 * self.off_setpoint:.0f} cm", f"{self.to_wall:.2f} m",
             end + (f", {self.motors_off} ms without motors" if self.motors_off else ""),
             "readable" if self.readable else "not readable",
         ]  # fmt: skip
@@ -119,6 +125,8 @@ class Flown:
     struck: float
     # s, when it went wrong; NaN where it did before anything else, or never
     events: list[tuple[float, str]] = field(default_factory=list)
+    sent: list[tuple[float, Triple]] = field(default_factory=list)
+    # s, m, each setpoint from the plan's first on
     landing: float = math.inf
     # s, when the last phase of landing began
 
@@ -162,7 +170,7 @@ def fly_stepped(
     scenario: Scenario, mission: Mission, *, listen: Callable[[Telemetry], None] = lambda _: None, seed: int = 0
 ) -> Flown:
     """Fly one in the stepped lab, and let what is left behind come to rest."""
-    lab = SteppedLab(mission.limits.airframe, vehicle=scenario.vehicle, seed=seed)
+    lab = SteppedLab(mission.limits.airframe, vehicle=scenario.vehicle, cameras=scenario.cameras, seed=seed)
     orders, flown = Orders(), Flown(None, "", lab.truth(), math.nan)
 
     def strike() -> None:
@@ -178,6 +186,8 @@ def fly_stepped(
         listen(message)
         if isinstance(message, Event):
             flown.events.append((message.time, message.text))
+        elif isinstance(message, SetpointSent):
+            flown.sent.append((message.time, message.position))
         elif isinstance(message, PhaseEntered):
             if message.phase is Phase.LAND:
                 flown.landing = message.time
@@ -227,6 +237,7 @@ def judge(scenario: Scenario, flown: Flown, mission: Mission, readable: bool) ->
         rung=rung.name.lower() if flew or scenario.pilot_killed else "no take-off",
         reaction=reaction,
         off_plan=_off_plan(flown, mission),
+        off_setpoint=_off_setpoint(flown, mission),
         to_wall=float(-_beyond_walls(truth, mission).max()),
         motors_off=int(truth.off_in_air[-1]),
         landed=bool(truth.position[-1, 2] < _DOWN and not truth.motor[-1].any()),
@@ -252,6 +263,19 @@ def _off_plan(flown: Flown, mission: Mission) -> float:
     near = cKDTree(planned).query(truth.position[flying])[0]
     beside = cKDTree(planned[:, :2]).query(truth.position[down][:, :2])[0]
     return float(max(near.max(initial=0.0), beside.max(initial=0.0)))
+
+
+def _off_setpoint(flown: Flown, mission: Mission) -> float:
+    """In time: a vehicle that is late on its path is off its setpoint."""
+    if not flown.sent:
+        return 0.0
+    sent, truth = np.array([time for time, _ in flown.sent]), flown.truth
+    begin = sent[0] if math.isnan(flown.struck) else max(sent[0], flown.struck)
+    during = (truth.time >= begin) & (truth.time <= min(sent[-1], flown.landing))
+    places = np.array([place for _, place in flown.sent])
+    due = truth.time[during] - mission.lead
+    wanted = np.column_stack([np.interp(due, sent, places[:, axis]) for axis in range(3)])
+    return float(np.linalg.norm(truth.position[during] - wanted, axis=1).max(initial=0.0))
 
 
 def _beyond_walls(truth: Truth, mission: Mission) -> np.ndarray:

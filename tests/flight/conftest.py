@@ -100,6 +100,10 @@ class World:
     refuses: dict[int, int] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
     unknown: tuple[str, ...] = ()
+    cuts_lost: int = 0
+    # emergency stops that the radio swallows
+    other_body: bool = False
+    # motion capture tracks one that stays on the floor
     stubborn: dict[str, float] = field(default_factory=dict)
     replies: dict[int, int] = field(default_factory=dict)
     extra_bits: int = 0
@@ -192,6 +196,8 @@ class World:
         wobble = 0.0 if self.poses_frozen else 1e-5 * (self._count % 7)
         place = tuple(a + b + wobble for a, b in zip(self.position, self.pose_shift, strict=True))
         turn = (0.0, 0.0, math.sin(self.yaw / 2), math.cos(self.yaw / 2))
+        if self.other_body:
+            place = (0.0, 0.5, 0.02 + wobble)
         if self.poses_frozen and self._poses_last is not None:
             place = self._poses_last
         if not self.poses_stopped:
@@ -249,7 +255,11 @@ class World:
 
     def emergency_stop(self) -> None:
         self.calls.append("emergency stop")
+        if self.cuts_lost:
+            self.cuts_lost -= 1
+            return
         self.stopped, self.armed = True, False
+        self.extra_bits |= LOCKED
 
     def take_off(self, height: float, duration: float) -> None:
         self._command(TAKE_OFF, "take off", (*self.position[:2], height), duration)

@@ -202,6 +202,36 @@ def test_a_cut_while_landing_is_still_obeyed(world, fly):
     assert "emergency stop" in world.calls
 
 
+def test_a_cut_is_sent_until_the_vehicle_says_that_it_is_locked(world, fly):
+    world.cuts_lost = 20
+    world.when(Phase.STREAM, 1.0, lambda: cut(world))
+    outcome = fly()
+    assert outcome.rung is Rung.CUT
+    assert world.calls.count("emergency stop") > 20
+    assert world.stopped
+    assert "does not say" not in world.said
+
+
+def test_a_cut_that_never_arrives_is_said(world, fly):
+    world.cuts_lost = 10_000
+    world.when(Phase.STREAM, 1.0, lambda: cut(world))
+    assert fly().rung is Rung.CUT
+    assert "the vehicle does not say that its motors were cut" in world.said
+
+
+def test_a_tracked_body_that_is_another_one_keeps_the_vehicle_on_the_floor(world, fly):
+    world.other_body = True
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.PREFLIGHT
+    assert "stays on the floor" in outcome.reason
+    assert "swapped" in outcome.reason
+    assert world.position[2] < 0.15
+    assert "stop setpoint" in world.calls
+    assert "emergency stop" not in world.calls
+    assert not world.armed
+    assert world.closed
+
+
 @pytest.mark.parametrize("phase", [Phase.TAKE_OFF, Phase.STREAM, Phase.LAND])
 def test_a_lost_link_is_reported_and_nothing_is_closed_in_the_air(world, fly, phase):
     world.when(phase, 0.5, lambda: setattr(world, "lost", "too many packets lost"))

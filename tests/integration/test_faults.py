@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from cfplan.studies.fault_scenarios import SCENARIOS
-from cfplan.studies.faults import fly_scenario
+from cfplan.studies.faults import fly_scenario, fly_stepped
 from cfplan.studies.missions import plan_mission
 from cfplan.studies.random_faults import fly_random
 
@@ -20,6 +20,7 @@ QUICK = (
     "radio dead for 1 s",
     "stream stalled for 0.6 s",
     "take-off refused",
+    "two bodies swapped",
     "disk full",
 )
 SEEDS, PATHS = range(200), ("helix", "line", "loop3d", "random", "slalom")
@@ -44,6 +45,21 @@ def test_a_fault_comes_to_its_rung_and_the_vehicle_to_the_ground(scenario, line)
     if not scenario.falls and flown.rung != "cut":
         assert flown.motors_off == 0
         assert flown.off_plan < 0.4
+
+
+def test_a_vehicle_that_is_late_on_its_path_is_off_its_setpoint_and_that_ends_the_flight(line):
+    (stalled,) = (row for row in SCENARIOS if row.name == "stream stalled for 0.6 s")
+    flown = fly_scenario(stalled, line)
+    assert flown.off_plan < 0.1
+    assert flown.off_setpoint > line.limits.flight.deviation.brake
+    assert "from the setpoint" in flown.reason
+
+
+def test_two_swapped_bodies_never_let_the_vehicle_climb_away(line):
+    (swapped,) = (row for row in SCENARIOS if row.name == "two bodies swapped")
+    truth = fly_stepped(swapped, line).truth
+    assert truth.position[:, 2].max() < 0.25
+    assert not truth.locked
 
 
 def test_the_quick_rows_are_rows_of_the_table():
