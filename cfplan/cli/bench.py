@@ -115,17 +115,66 @@ def scaling(yaw: str, output: Path | None, as_json: bool, **what: Any) -> None:
     _publish(result, output, as_json)
 
 
-@study.command(epilog="Example: cfplan study flights flights/*.yaml -o docs/studies/flights.json")
+@study.command(
+    epilog="Example: cfplan study flights flights/*.yaml --repeats 5 --loss 0.05 -o docs/studies/flights.json"
+)
 @click.argument("path_files", metavar="PATH...", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.option("--repeats", type=click.IntRange(1), default=1, show_default=True, help="Flights of each path.")
+@click.option(
+    "--loss", type=click.FloatRange(0, 1, max_open=True), default=0.0, show_default=True,
+    help="Share of the radio's packets that are lost.",
+)  # fmt: skip
+@click.option("--pose-noise", type=click.FloatRange(0), default=0.001, show_default=True, help="Of each axis, m.")
+@click.option("--vicon", is_flag=True, help="Poses by Vicon's protocol, as with --mocap vicon://lab/cf1.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of each path's first flight.")
 @_output
 @options.as_json
-def flights(path_files: tuple[Path, ...], output: Path | None, as_json: bool) -> None:
-    """Fly every PATH on the virtual Crazyflie, one after the other, and put the figures side by side."""
-    from cfplan.studies.flights import Flights, fly_each
+def flights(
+    path_files: tuple[Path, ...],
+    repeats: int,
+    loss: float,
+    pose_noise: float,
+    vicon: bool,
+    seed: int,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Fly every PATH on the virtual Crazyflie in real time, one flight after the other, each with other noise."""
+    from cfplan.studies.flights import fly_each
+    from cfplan.studies.real_time import Conditions
 
     _require_free(output)
     with _progress("flying", as_json) as progress:
-        result: Flights = fly_each(path_files, command=_command(), progress=progress)
+        result = fly_each(
+            path_files,
+            lambda path_file: options.find_safety_file(None, path_file),
+            repeats=repeats,
+            conditions=Conditions(loss, pose_noise, vicon, seed),
+            command=_command(),
+            progress=progress,
+        )
+    _publish(result, output, as_json)
+
+
+@study.command(epilog="Example: cfplan study lateness flights/figure8.yaml -o docs/studies/lateness.json")
+@click.argument("path_file", metavar="PATH", type=click.Path(path_type=Path))
+@click.option(
+    "--seconds", type=click.FloatRange(1), default=60.0, show_default=True,
+    help="Of streaming at least; behind the end of PATH the vehicle hovers.",
+)  # fmt: skip
+@_output
+@options.as_json
+def lateness(path_file: Path, seconds: float, output: Path | None, as_json: bool) -> None:
+    """How late setpoints are sent, with record, live view and Vicon; beside it, how late this computer wakes a sleeper.
+
+    First by SCHED_FIFO, where the system permits it; then without, for which this command gives the permission up.
+    """
+    from cfplan.studies.lateness import lateness_study
+
+    _require_free(output)
+    with _progress("measuring", as_json) as progress:
+        safety_file = options.find_safety_file(None, path_file)
+        result = lateness_study(path_file, safety_file, seconds, command=_command(), progress=progress)
     _publish(result, output, as_json)
 
 

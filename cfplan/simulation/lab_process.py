@@ -64,6 +64,7 @@ class LabLoop:
 
     def __init__(self, airframe: Airframe, vehicle: VehicleSettings, room: RoomSettings, port: int = 0):
         self.vehicle = VirtualCrazyflie(airframe, vehicle)
+        self._seed = vehicle.seed
         self._on_board = room.on_board
         if room.on_board:
             self.vehicle.use_kalman()
@@ -193,7 +194,7 @@ class LabLoop:
         elif isinstance(request, VehicleFault):
             self.vehicle.inject(request)
         elif isinstance(request, RadioFault):
-            self._radio = self._radio or Radio(time.monotonic())
+            self._radio = self._radio or Radio(time.monotonic(), self._seed)
             self._radio.inject(request, time.monotonic())
         return request != CLOSE
 

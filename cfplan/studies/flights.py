@@ -1,31 +1,42 @@
-"""The files of a folder flown one after the other on the virtual Crazyflie, by the command that people type."""
+"""Path files flown on the virtual Crazyflie in real time, each several times, and how far from the plan they came."""
 
-import json
-import subprocess
-import sys
-import tempfile
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cfplan.errors import CfplanError, InputError
-from cfplan.studies.machine import Machine, this_machine
+import numpy as np
 
-COLUMNS = (
-    "path", "length", "planned", "over bound", "speed kept", "worst share", "dry run", "flown", "rms", "settled",
-    "late p99", "late max",
+from cfplan.errors import CfplanError, ExitCode
+from cfplan.expert.convex import lower_bound
+from cfplan.flight.encoding import RATE, EncodedFlight
+from cfplan.flight.packets import encode
+from cfplan.geometry.path_file import load_path_file
+from cfplan.simulation.dry_run import dry_run
+from cfplan.studies.machine import Machine, this_machine
+from cfplan.studies.missions import PlannedMission, planned_mission
+from cfplan.studies.real_time import Conditions, Flight, fly_in_real_time
+
+PLANS = (
+    "path", "length", "planner", "planned", "over bound", "speed kept", "worst share", "dry run",
+    "dry run without drag",
 )  # fmt: skip
-_PATIENCE = 600.0  # s, of one flight
+FLIGHTS = (
+    "path", "landed", "deviation, mean", "max", "rms", "true, mean", "true, max", "time off plan", "settled, max",
+    "late p99", "late max", "refused",
+)  # fmt: skip
+FAILURES = ("path", "seed", "ended")
 
 
 @dataclass(frozen=True, slots=True)
-class Flown:
-    """One flight."""
+class Planned:
+    """One path as planned and rehearsed."""
 
     path: str
     length: float
     # m
+    planner: str
     planned: float
     # s
     lower_bound: float
@@ -36,28 +47,52 @@ class Flown:
     # of a limit, by the certificate
     dry_run: float
     # m, deviation at most
-    deviation_max: float
-    # m, flown
-    deviation_rms: float
-    # m
-    settled_after: float | None
-    # s; None where it did not settle
-    lateness_p99: float
-    # s, of setpoints
-    lateness_max: float
-    # s
+    dry_run_without_drag: float
+    # m, the same where the acceleration field does not carry what makes up for drag
 
     def texts(self) -> list[str]:
-        """As COLUMNS has it."""
+        """As PLANS has it."""
         return [
-            self.path, f"{self.length:.1f} m", f"{self.planned:.2f} s",
+            self.path, f"{self.length:.1f} m", self.planner, f"{self.planned:.2f} s",
             f"{100 * (self.planned / self.lower_bound - 1):.1f} %", f"{100 * self.slowed:.2f} %",
-            f"{100 * self.worst_share:.2f} %", *(
-                f"{100 * value:.1f} cm" for value in (self.dry_run, self.deviation_max, self.deviation_rms)
-            ),
-            "–" if self.settled_after is None else f"{self.settled_after:.2f} s",
-            f"{1e3 * self.lateness_p99:.2f} ms", f"{1e3 * self.lateness_max:.2f} ms",
+            f"{100 * self.worst_share:.2f} %", _cm(self.dry_run), _cm(self.dry_run_without_drag),
         ]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """One flight, or why there was none."""
+
+    path: str
+    seed: int
+    landed: bool
+    # at the end of its plan
+    reason: str
+    # how it ended
+    refusals: int = 0
+    # tries before it that preflight refused because this computer was late
+    planned: float = 0.0
+    # s
+    streamed: float = 0.0
+    # s, from the first setpoint to that of the path's end, as sent
+    deviation_max: float = 0.0
+    # m, from the reference in time, by the poses of motion capture
+    deviation_rms: float = 0.0
+    # m
+    true_deviation_max: float = 0.0
+    # m, by the simulated truth
+    settled_after: float | None = None
+    # s; None where it did not settle
+    lateness_p99: float = 0.0
+    # s, of setpoints
+    lateness_max: float = 0.0
+    # s
+    telemetry_dropped: int = 0
+
+    @property
+    def off_plan(self) -> float:
+        """By how much the time from the first setpoint to the last was another than planned, relative."""
+        return abs(self.streamed / self.planned - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,58 +101,147 @@ class Flights:
 
     command: str
     machine: Machine
+    conditions: Conditions
+    # with the seed of the first flight of each path
+    motor_lag: float
+    # s
+    interrupted: bool
+    plans: tuple[Planned, ...]
     flights: tuple[Flown, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return asdict(self)
+        return asdict(self) | {"table": [dict(zip(FLIGHTS, row, strict=True)) for row in self._rows()]}
 
     def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
-        """Title, columns and rows of the one table."""
-        title = "Flights on the virtual Crazyflie: deviation from the reference in time"
-        return [(title, list(COLUMNS), [flight.texts() for flight in self.flights])]
+        """Title, columns and rows: the plans, the flights by path and all together, and what failed."""
+        lab = self.conditions
+        title = (
+            f"Flights: deviation from the reference in time, {lab.loss:.0%} of radio packets lost, "
+            f"{1e3 * lab.pose_noise:g} mm of pose noise{' by Vicon' if lab.vicon else ''}, "
+            f"motor lag {self.motor_lag:g} s"
+        )
+        failed = [[f.path, str(f.seed), f.reason] for f in self.flights if not f.landed]
+        return [
+            ("Plans", list(PLANS), [plan.texts() for plan in self.plans]),
+            (title, list(FLIGHTS), self._rows()),
+            *([("Not landed", list(FAILURES), failed)] if failed else []),
+        ]
+
+    def _rows(self) -> list[list[str]]:
+        names = dict.fromkeys(flight.path for flight in self.flights)
+        rows = [_texts(name, [f for f in self.flights if f.path == name]) for name in names]
+        return [*rows, _texts("all", self.flights)]
 
 
 def fly_each(
     path_files: Sequence[Path],
+    find_safety_file: Callable[[Path], Path],
     *,
+    repeats: int = 1,
+    conditions: Conditions | None = None,
     command: str = "",
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Flights:
-    """Fly them all. Raises InputError at the first that does not end landed, with what it said."""
-    flown = []
-    for done, file in enumerate(path_files):
-        progress(done, len(path_files))
-        flown.append(_fly(file))
-    progress(len(path_files), len(path_files))
-    return Flights(command, this_machine(), tuple(flown))
+    """Fly each `repeats` times, with a seed for each. What fails is a row; an interrupt keeps what was flown.
 
-
-def _fly(file: Path) -> Flown:
-    with tempfile.TemporaryDirectory() as records:
-        ended = subprocess.run(
-            [sys.executable, "-m", "cfplan.cli", "fly", str(file), "--records", records, "--json"],
-            capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=_PATIENCE, check=False,
-        )  # fmt: skip
-    if ended.returncode != 0:
-        said = ended.stderr.strip().splitlines()
-        raise InputError(f"ended with exit code {ended.returncode}: {said[-1] if said else ''}", where=str(file))
+    Raises InputError, before anything flies, where a file is no path.
+    """
+    for file in path_files:
+        load_path_file(file)
+    conditions = conditions or Conditions()
+    plans: list[Planned] = []
+    flights: list[Flown] = []
+    total, lag, interrupted = repeats * len(path_files), 0.0, False
     try:
-        flight = json.loads(ended.stdout)
-        plan, outcome = flight["plan"], flight["outcome"]
-        return Flown(
-            path=file.stem,
-            length=plan["length"],
-            planned=plan["duration"],
-            lower_bound=plan["lower_bound"],
-            slowed=plan["slowed"],
-            worst_share=max(margin["share"] for margin in plan["certificate"]["margins"]),
-            dry_run=flight["dry_run_max_deviation"],
-            deviation_max=outcome["deviation_max"],
-            deviation_rms=outcome["deviation_rms"],
-            settled_after=outcome["settled_after"],
-            lateness_p99=outcome["lateness_p99"],
-            lateness_max=outcome["lateness_max"],
-        )
-    except (KeyError, ValueError) as error:
-        raise CfplanError(f"its JSON lacks {error}", where=str(file), hint="is this cfplan's own command?") from None
+        for index, file in enumerate(path_files):
+            progress(index * repeats, total)
+            try:
+                made = planned_mission(file, find_safety_file(file))
+                plans.append(_rehearsed(file.stem, made))
+            except CfplanError as error:
+                flights.append(Flown(file.stem, conditions.seed, landed=False, reason=str(error)))
+                continue
+            lag = made.plan.airframe.motor_time_constant
+            for number in range(repeats):
+                progress(index * repeats + number, total)
+                lab = replace(conditions, seed=conditions.seed + number)
+                flight = fly_in_real_time(made.mission, lab, name=file.stem)
+                flights.append(_judged(file.stem, lab.seed, made, flight))
+                if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT:
+                    raise KeyboardInterrupt
+        progress(total, total)
+    except KeyboardInterrupt:
+        interrupted = True
+    return Flights(command, this_machine(), conditions, lag, interrupted, tuple(plans), tuple(flights))
+
+
+def _rehearsed(name: str, made: PlannedMission) -> Planned:
+    plan, encoded = made.plan, made.encoded
+    rehearsal = dry_run(encoded, plan.trajectory, plan.airframe, plan.limits.flight)
+    rehearsal.require_passed()
+    return Planned(
+        path=name,
+        length=plan.path.length,
+        planner=plan.planner,
+        planned=plan.trajectory.duration,
+        lower_bound=plan.lower_bound or lower_bound(plan.path, plan.airframe, plan.limits.plan),
+        slowed=plan.slowed,
+        worst_share=plan.certificate.worst.share,
+        dry_run=rehearsal.deviation,
+        dry_run_without_drag=dry_run(_without_drag(made), plan.trajectory, plan.airframe, plan.limits.flight).deviation,
+    )
+
+
+def _without_drag(made: PlannedMission) -> EncodedFlight:
+    """The same flight, but the acceleration is that of the motion alone."""
+    states = made.plan.trajectory.at(made.encoded.times + made.encoded.lead)
+    told = replace(made.encoded.decoded, acceleration=states.acceleration)
+    return replace(made.encoded, payloads=encode(told), decoded=told)
+
+
+def _judged(name: str, seed: int, made: PlannedMission, flight: Flight) -> Flown:
+    outcome, truth, trajectory = flight.outcome, flight.truth, made.plan.trajectory
+    if not flight.landed or outcome is None or truth is None:
+        return Flown(name, seed, landed=False, reason=flight.reason, refusals=flight.refusals)
+    elapsed = truth.time - outcome.first_setpoint
+    moving = (elapsed >= 0) & (elapsed <= trajectory.duration)
+    off = np.linalg.norm(truth.position[moving] - trajectory.at(elapsed[moving]).position, axis=1)
+    return Flown(
+        path=name,
+        seed=seed,
+        landed=True,
+        reason=flight.reason,
+        refusals=flight.refusals,
+        planned=trajectory.duration,
+        streamed=flight.time_to(math.ceil(trajectory.duration * RATE)),
+        deviation_max=outcome.deviation.max,
+        deviation_rms=outcome.deviation.rms,
+        true_deviation_max=float(off.max()),
+        settled_after=outcome.settled_after if np.isfinite(outcome.settled_after) else None,
+        lateness_p99=outcome.lateness.p99,
+        lateness_max=outcome.lateness.max,
+        telemetry_dropped=outcome.telemetry_dropped,
+    )
+
+
+def _texts(name: str, flights: Sequence[Flown]) -> list[str]:
+    """Of those of one path, or of all, as FLIGHTS has it."""
+    landed = [flight for flight in flights if flight.landed]
+    refused = str(sum(flight.refusals for flight in flights))
+    if not landed:
+        return [name, f"0 of {len(flights)}", *["–"] * (len(FLIGHTS) - 3), refused]
+    worst, true = [f.deviation_max for f in landed], [f.true_deviation_max for f in landed]
+    settled = [f.settled_after for f in landed]
+    return [
+        name, f"{len(landed)} of {len(flights)}", _cm(np.mean(worst)), _cm(max(worst)),
+        _cm(np.sqrt(np.mean([f.deviation_rms**2 for f in landed]))), _cm(np.mean(true)), _cm(max(true)),
+        f"{100 * max(f.off_plan for f in landed):.2f} %",
+        "not" if None in settled else f"{max(s for s in settled if s is not None):.2f} s",
+        f"{1e3 * max(f.lateness_p99 for f in landed):.2f} ms", f"{1e3 * max(f.lateness_max for f in landed):.2f} ms",
+        refused,
+    ]  # fmt: skip
+
+
+def _cm(metres: float | np.floating) -> str:
+    return f"{100 * metres:.1f} cm"

@@ -1,0 +1,214 @@
+"""How late setpoints are sent while everything else runs, and how late this computer wakes a process that only sleeps.
+
+Each flight is one of the real pilot in the virtual lab, with Vicon's protocol, a record and a live view, all on this
+computer. Before each, a thread that only sleeps until the same deadlines shows what the computer itself adds.
+"""
+
+import contextlib
+import ctypes
+import os
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from cfplan.flight.encoding import RATE
+from cfplan.flight.mission import Mission
+from cfplan.flight.pace import Pace, go_first, may_go_first
+from cfplan.recording.header import RecordHeader
+from cfplan.recording.live import LiveView, live_blueprint
+from cfplan.recording.viewer import APPLICATION, free_port, viewer_program
+from cfplan.studies.machine import Machine, this_machine
+from cfplan.studies.missions import planned_mission
+from cfplan.studies.real_time import Conditions, fly_in_real_time
+
+COLUMNS = ("what", "priority", "for", "p50", "p99", "p99.9", "max", "above 1 ms", "left out", "stolen")
+FIRST, ORDINARY = "SCHED_FIFO", "ordinary"
+_DROP_CAPABILITY, _NICE_CAPABILITY = 24, 23  # PR_CAPBSET_DROP, CAP_SYS_NICE
+_VIEWER_STARTS = 2.0  # s
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """How late one kind of waking was."""
+
+    what: str
+    priority: str
+    reason: str
+    # why there is no measurement, or why it is short; "" where all went well
+    seconds: float = 0.0
+    p50: float = 0.0
+    # s, as all that follow
+    p99: float = 0.0
+    p999: float = 0.0
+    max: float = 0.0
+    count: int = 0
+    above: int = 0
+    # by more than 1 ms
+    skipped: int = 0
+    # deadlines that passed altogether
+    stolen: float = 0.0
+    # s that the host took from this virtual machine meanwhile, over all its processors
+    refusals: int = 0
+    # tries before it that preflight refused for lateness
+    view_failure: str = ""
+    # why the live view ended early
+
+    @staticmethod
+    def of(what: str, priority: str, late: Sequence[float], reason: str = "", **others: Any) -> "Measured":
+        """From s by which each was late."""
+        p50, p99, p999 = np.percentile(late, [50, 99, 99.9])
+        above = int(np.sum(np.array(late) > 1e-3))
+        return Measured(
+            what, priority, reason, len(late) / RATE, float(p50), float(p99), float(p999), float(np.max(late)),
+            len(late), above, **others,
+        )  # fmt: skip
+
+    def texts(self) -> list[str]:
+        """As COLUMNS has it."""
+        if not self.count:
+            return [self.what, self.priority, self.reason, *["–"] * (len(COLUMNS) - 3)]
+        return [
+            self.what, self.priority, f"{self.seconds:.0f} s" + (f", then {self.reason}" if self.reason else ""),
+            *(f"{1e3 * value:.3f} ms" for value in (self.p50, self.p99, self.p999, self.max)),
+            f"{self.above} of {self.count}", str(self.skipped), f"{self.stolen:.2f} s",
+        ]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class LatenessStudy:
+    """A whole run."""
+
+    command: str
+    machine: Machine
+    path: str
+    window: bool
+    # the live view had a screen; else the viewer ran without a window
+    rows: tuple[Measured, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
+        """Title, columns and rows of the one table."""
+        return [(f"Lateness at {RATE:.0f} Hz", list(COLUMNS), [row.texts() for row in self.rows])]
+
+
+def lateness_study(
+    path_file: Path,
+    safety_file: Path,
+    seconds: float,
+    *,
+    command: str = "",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> LatenessStudy:
+    """Measure both ways. Afterwards this process and those that it starts cannot go first any more."""
+    mission = planned_mission(path_file, safety_file, stream_for=seconds).mission
+    rows: list[Measured] = []
+    for step, priority in enumerate((FIRST, ORDINARY)):
+        if priority == ORDINARY:
+            give_up_priority()
+        elif not may_go_first():
+            rows.append(Measured("stream", priority, "not permitted here"))
+            continue
+        progress(2 * step, 4)
+        rows.append(_asleep(priority, seconds))
+        progress(2 * step + 1, 4)
+        rows.append(_streaming(priority, mission, seconds))
+    progress(4, 4)
+    return LatenessStudy(command, this_machine(), path_file.stem, _has_screen(), tuple(rows))
+
+
+def give_up_priority() -> None:
+    """From here on the system refuses it to this process's children, and to this process what it was not given."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_DROP_CAPABILITY, _NICE_CAPABILITY, 0, 0, 0)
+
+
+def _asleep(priority: str, seconds: float) -> Measured:
+    """A thread that only sleeps."""
+    late: list[float] = []
+    pace: list[Pace] = []
+
+    def sleep() -> None:
+        if priority == FIRST:
+            go_first()
+        pace.append(Pace(RATE))
+        for _ in range(round(seconds * RATE)):
+            due = pace[0].wait()
+            late.append(time.monotonic() - due)
+
+    stolen = _stolen()
+    thread = threading.Thread(target=sleep)
+    thread.start()
+    thread.join()
+    return Measured.of("asleep", priority, late, skipped=pace[0].skipped, stolen=_stolen() - stolen)
+
+
+def _streaming(priority: str, mission: Mission, seconds: float) -> Measured:
+    """A flight; of it, the stream."""
+    stolen = _stolen()
+    flight = fly_in_real_time(mission, Conditions(vicon=True), name="lateness", view=_view)
+    if not flight.sent or flight.outcome is None:
+        return Measured("stream", priority, flight.reason, refusals=flight.refusals)
+    late = [message.time - message.due for message in flight.sent]
+    return Measured.of(
+        "stream",
+        priority,
+        late,
+        "" if flight.landed else flight.reason,
+        skipped=flight.outcome.lateness.skipped,
+        stolen=_stolen() - stolen,
+        refusals=flight.refusals,
+        view_failure=flight.view_failure,
+    )
+
+
+@contextlib.contextmanager
+def _view(header: RecordHeader) -> Iterator[LiveView]:
+    """The live view with a viewer of its own that ends with it; without a screen, one without a window."""
+    port = free_port()
+    with tempfile.TemporaryDirectory(prefix="cfplan-") as folder:
+        command = [
+            "nice", "-n", "10", str(viewer_program()), "--port", str(port), "--bind", "127.0.0.1",
+            "--hide-welcome-screen", *([] if _has_screen() else ["--headless"]),
+        ]  # fmt: skip
+        viewer = subprocess.Popen(
+            command,
+            env={"XDG_RUNTIME_DIR": folder, **os.environ, "RERUN_ANALYTICS": "false"},
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            time.sleep(_VIEWER_STARTS)
+            stream = rr.RecordingStream(APPLICATION)
+            stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=live_blueprint(header))
+            with LiveView(stream, header) as view:
+                yield view
+        finally:
+            viewer.kill()
+            viewer.wait()
+
+
+def _has_screen() -> bool:
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _stolen() -> float:
+    """s so far in which the host of this virtual machine ran something else; 0 where the system does not tell."""
+    try:
+        fields = Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()
+        return int(fields[8]) / os.sysconf("SC_CLK_TCK")
+    except (OSError, IndexError, ValueError):
+        return 0.0

@@ -1,0 +1,169 @@
+"""A mission flown in real time on the virtual Crazyflie: the pilot's process, cflib, packets, poses and a record."""
+
+import tempfile
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from cfplan import __version__
+from cfplan.errors import CfplanError, ExitCode, InputError
+from cfplan.flight.mission import Mission
+from cfplan.flight.mocap.source import pose_source
+from cfplan.flight.outcome import FlightOutcome
+from cfplan.flight.packets import decode
+from cfplan.flight.poses import PoseSource
+from cfplan.flight.process import fly
+from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent, Telemetry
+from cfplan.recording.header import FlightBounds, RecordHeader
+from cfplan.recording.live import LiveView
+from cfplan.recording.writer import RecordWriter, wall_time_at_zero
+from cfplan.simulation.lab import Lab, Truth, start_lab
+from cfplan.simulation.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.room import RoomPoseSource, RoomSettings
+from cfplan.simulation.sim_driver import SimDriver
+from cfplan.simulation.virtual_cameras import ViconSettings
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+
+LATENESS_CHECK = "this computer's lateness"
+RETRIES = 2  # after refusals for lateness alone
+_MOST_NOISE = 1.0  # m
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What the lab is like."""
+
+    loss: float = 0.0
+    # share of the radio's transmissions
+    pose_noise: float = 0.001
+    # m, standard deviation of each axis
+    vicon: bool = False
+    # poses by Vicon's protocol, through its client in a process of its own; else straight from the room
+    seed: int = 0
+    # of all noise
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.loss < 1 and 0 <= self.pose_noise < _MOST_NOISE):
+            raise InputError(
+                f"a loss of {self.loss} and pose noise of {self.pose_noise} m make no sense",
+                hint=f"loss is a share from 0 to less than 1, noise less than {_MOST_NOISE:g} m",
+            )
+
+
+@dataclass(slots=True)
+class Flight:
+    """What a flight left behind."""
+
+    outcome: FlightOutcome | None
+    # None where the vehicle or its poses could not be had
+    reason: str
+    # how it ended, one line
+    refusals: int = 0
+    # tries before it that preflight refused for this computer's lateness alone
+    sent: list[SetpointSent] = field(default_factory=list)
+    # the plan's setpoints
+    truth: Truth | None = None
+    view_failure: str = ""
+    # why the live view ended early
+
+    @property
+    def landed(self) -> bool:
+        """Whether it flew its plan to the end and landed."""
+        return self.outcome is not None and self.outcome.exit_code is ExitCode.OK
+
+    def time_to(self, index: int) -> float:
+        """s, from the first setpoint sent to the first of this number or a later one; 0 where there was none."""
+        ended = (message.time for message in self.sent if message.index >= index)
+        return next(ended, self.sent[0].time) - self.sent[0].time if self.sent else 0.0
+
+
+View = Callable[[RecordHeader], AbstractContextManager[LiveView]]
+
+
+def fly_in_real_time(mission: Mission, conditions: Conditions, *, name: str, view: View | None = None) -> Flight:
+    """Fly it; again where preflight refused for lateness alone. What goes wrong is told, not raised."""
+    refusals = 0
+    while True:
+        flight = _fly_once(mission, conditions, name, view)
+        flight.refusals = refusals
+        if refusals == RETRIES or not _refused_for_lateness(flight.outcome):
+            return flight
+        refusals += 1
+
+
+def _refused_for_lateness(outcome: FlightOutcome | None) -> bool:
+    if outcome is None or outcome.exit_code is not ExitCode.PREFLIGHT:
+        return False
+    return {check.name for check in outcome.checks if not check.passed} == {LATENESS_CHECK}
+
+
+def _fly_once(mission: Mission, conditions: Conditions, name: str, view: View | None) -> Flight:
+    flight = Flight(None, "")
+    header, phase = _header(mission, name), Phase.CLOSED
+
+    def hear(message: Telemetry) -> None:
+        nonlocal phase
+        writer.write(message)
+        if watching is not None:
+            watching.show(message)
+        if isinstance(message, PhaseEntered):
+            phase = message.phase
+        elif isinstance(message, SetpointSent) and phase is Phase.STREAM:
+            flight.sent.append(message)
+
+    try:
+        with (
+            tempfile.TemporaryDirectory(prefix="cfplan-") as folder,
+            _lab(mission, conditions) as lab,
+            RecordWriter(Path(folder), header) as writer,
+            view(header) if view is not None else nullcontext() as watching,
+        ):
+            flight.outcome = fly(
+                mission,
+                uri=lab.uri,
+                drivers=[SimDriver],
+                pose_source=_poses(lab, mission, conditions),
+                on_telemetry=hear,
+            )
+            flight.truth = lab.truth()
+        flight.reason = flight.outcome.reason
+        flight.view_failure = watching.failure if watching is not None else ""
+    except CfplanError as error:
+        flight.reason = str(error)
+    return flight
+
+
+def _lab(mission: Mission, conditions: Conditions) -> Lab:
+    noise, seed = conditions.pose_noise, conditions.seed
+    cameras = ViconSettings(position_noise=noise, seed=seed) if conditions.vicon else None
+    lab = start_lab(
+        mission.limits.airframe,
+        vehicle=VehicleSettings(seed=seed),
+        room=RoomSettings(position_noise=noise, seed=seed, vicon=cameras),
+    )
+    if conditions.loss:
+        lab.disturb(RadioFault(RadioFaultKind.LOSS, size=conditions.loss))
+    return lab
+
+
+def _poses(lab: Lab, mission: Mission, conditions: Conditions) -> PoseSource:
+    return pose_source(lab.mocap_uri, mission.limits.pose) if conditions.vicon else RoomPoseSource(lab.number)
+
+
+def _header(mission: Mission, name: str) -> RecordHeader:
+    limits = mission.limits
+    return RecordHeader(
+        name=name,
+        version=__version__,
+        uri="sim://0",
+        planner="",
+        vehicle=limits.airframe,
+        thrust_at_full_command=limits.airframe.motor_thrust_max,
+        plan_limits=limits.plan,
+        bounds=FlightBounds(),
+        travel_time=mission.motion_ends,
+        path=decode(mission.payloads).position[::5],
+        fence=(limits.space.low, limits.space.high),
+        wall_time_at_zero=wall_time_at_zero(),
+    )

@@ -1,0 +1,186 @@
+"""Flights in real time: what failed is counted and told, the rest is measured, and an interrupt keeps it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.cli import main
+from cfplan.errors import ExitCode, InputError, LinkError
+from cfplan.flight.outcome import Check, Deviation, FlightOutcome, Rung
+from cfplan.flight.pace import Lateness
+from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent
+from cfplan.simulation.lab import Truth
+from cfplan.studies import flights, real_time
+from cfplan.studies.flights import fly_each
+from cfplan.studies.real_time import LATENESS_CHECK, RETRIES, Conditions
+
+pytestmark = pytest.mark.unit
+REPOSITORY = Path(__file__).parents[2]
+LINE = REPOSITORY / "flights" / "line.yaml"
+STILL, LEVEL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+START = 100.0  # s, of the stream
+OFF = 0.03  # m, by which the vehicle is beside its plan
+
+
+def outcome(code=ExitCode.OK, failed=(), deviation=OFF):
+    checks = tuple(Check(name, "1", "2", passed=False) for name in failed)
+    return FlightOutcome(
+        code, code.name.lower(), Rung.NONE, checks, (), START, 3.0, Lateness(1e-4, 2e-4, 3e-4, 100, 0),
+        Deviation(deviation, deviation / 2, 1.0, 100), 0.1, STILL,
+    )  # fmt: skip
+
+
+class Lab:
+    """Nothing but what the study asks of one."""
+
+    uri, number = "sim://0", 0
+
+    def __init__(self, truth):
+        self._truth = truth
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+    def truth(self):
+        return self._truth
+
+
+@pytest.fixture
+def flown(monkeypatch):
+    """Flights that are not flown: each ends as the next of the list does, a setpoint late every hundred."""
+    ends, labs = [], []
+
+    def fly(mission, *, on_telemetry, **_):
+        end = ends.pop(0)
+        if isinstance(end, BaseException):
+            raise end
+        on_telemetry(PhaseEntered(START, Phase.STREAM))
+        for index in range(len(mission.payloads)):
+            due = START + index / 100
+            on_telemetry(SetpointSent(due + 1e-4, due, index, STILL, STILL, STILL, LEVEL, STILL))
+        on_telemetry(PhaseEntered(due, Phase.HOLD))
+        return end
+
+    def lab(mission, conditions):
+        labs.append(conditions)
+        told = real_time.decode(mission.payloads)
+        time = START + np.arange(len(mission.payloads)) / 100
+        beside = told.position + np.array([OFF, 0.0, 0.0])
+        zero = np.zeros(len(time))
+        return Lab(Truth(time, beside, told.velocity, told.quaternion, told.body_rate, zero, zero, zero, False))
+
+    monkeypatch.setattr(real_time, "fly", fly)
+    monkeypatch.setattr(real_time, "_lab", lab)
+    return ends, labs
+
+
+def study(files=(LINE,), **options):
+    return fly_each(files, lambda _: REPOSITORY / "safety.yaml", **options)
+
+
+def test_each_flight_of_a_path_has_noise_of_its_own_under_the_same_conditions(flown):
+    ends, labs = flown
+    ends += [outcome(), outcome()]
+    result = study(repeats=2, conditions=Conditions(loss=0.05, seed=7))
+    assert labs == [Conditions(loss=0.05, seed=7), Conditions(loss=0.05, seed=8)]
+    assert [flight.seed for flight in result.flights] == [7, 8]
+
+
+def test_deviation_is_by_poses_and_by_the_truth_and_time_is_that_of_the_setpoints(flown):
+    ends, _ = flown
+    ends.append(outcome(deviation=0.05))
+    (flight,) = study().flights
+    assert flight.deviation_max == 0.05
+    assert flight.true_deviation_max == pytest.approx(OFF, abs=1e-3)
+    assert flight.streamed == pytest.approx(flight.planned, abs=0.011)
+    assert flight.off_plan < 0.01
+
+
+def test_mean_and_worst_are_over_the_flights_that_landed_and_the_others_are_told(flown):
+    ends, _ = flown
+    ends += [outcome(deviation=0.02), outcome(deviation=0.06), outcome(ExitCode.ENDED_BY_SAFETY), LinkError("gone")]
+    result = study(repeats=4)
+    plans, table, failures = result.tables()
+    assert all(len(row) == len(columns) for _, columns, rows in (plans, table, failures) for row in rows)
+    assert table[2][-1][:4] == ["all", "2 of 4", "4.0 cm", "6.0 cm"]
+    assert failures[2] == [["line", "2", "ended_by_safety"], ["line", "3", "gone"]]
+    json.dumps(result.to_dict())
+
+
+def test_what_preflight_refuses_for_lateness_alone_is_tried_again_at_most_twice(flown):
+    ends, _ = flown
+    late = outcome(ExitCode.PREFLIGHT, failed=[LATENESS_CHECK])
+    ends += [late, late, outcome()]
+    (flight,) = study().flights
+    assert (flight.landed, flight.refusals) == (True, 2)
+    ends += [late] * (RETRIES + 1)
+    (flight,) = study().flights
+    assert (flight.landed, flight.refusals) == (False, RETRIES)
+    assert not ends
+
+
+def test_any_other_refusal_is_final(flown):
+    ends, _ = flown
+    ends.append(outcome(ExitCode.PREFLIGHT, failed=[LATENESS_CHECK, "battery at rest"]))
+    (flight,) = study().flights
+    assert (flight.landed, flight.refusals) == (False, 0)
+
+
+def test_a_path_that_cannot_be_planned_does_not_end_the_study(flown, tmp_path):
+    ends, _ = flown
+    ends.append(outcome())
+    outside = tmp_path / "outside.yaml"
+    outside.write_text("waypoints: [[0, 0, 1], [0, 50, 1]]\n")
+    result = study((outside, LINE))
+    assert [(flight.path, flight.landed) for flight in result.flights] == [("outside", False), ("line", True)]
+    assert "outside" in result.tables()[2][2][0][0]
+
+
+def test_a_file_that_is_no_path_is_an_error_before_anything_flies(flown, tmp_path):
+    ends, _ = flown
+    ends.append(outcome())
+    with pytest.raises(InputError, match=r"gone\.yaml"):
+        study((LINE, tmp_path / "gone.yaml"))
+    assert len(ends) == 1
+
+
+def test_the_operators_stop_ends_the_study_and_keeps_what_was_flown(flown):
+    ends, _ = flown
+    ends += [outcome(), outcome(ExitCode.ENDED_BY_PILOT), outcome()]
+    result = study(repeats=3)
+    assert result.interrupted
+    assert [flight.landed for flight in result.flights] == [True, False]
+
+
+def test_without_what_makes_up_for_drag_the_dry_run_is_farther_off(flown):
+    ends, _ = flown
+    ends.append(outcome())
+    (plan,) = study().plans
+    assert plan.dry_run_without_drag > 2 * plan.dry_run
+
+
+def test_no_flight_at_all_is_a_table_too(flown):
+    ends, _ = flown
+    ends.append(outcome(ExitCode.LINK_LOST))
+    assert study().tables()[1][2][-1][1] == "0 of 1"
+
+
+@pytest.mark.parametrize("wrong", [["--loss", "1"], ["--pose-noise", "-1"], ["--repeats", "0"]])
+def test_conditions_that_cannot_be_are_refused_before_anything_is_planned(wrong, monkeypatch, capsys):
+    monkeypatch.setattr(flights, "planned_mission", None)
+    monkeypatch.setattr("sys.argv", ["cfplan", "study", "flights", str(LINE), *wrong])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert wrong[0] in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrong", [{"loss": float("nan")}, {"pose_noise": float("inf")}, {"pose_noise": float("nan")}])
+def test_what_is_no_number_is_no_condition(wrong):
+    with pytest.raises(InputError):
+        Conditions(**wrong)
