@@ -100,6 +100,7 @@ def plan_learned(
         "iterations": 0,
         "solver": "learned",
         "model": model.name,
+        "window": model.window,
     }
     track = track or track_through(turned, path.end / nodes, start, end)
     return Solution(Status.SOLVED, spline_profile(coefficients, path.end, track), "", stats)

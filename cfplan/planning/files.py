@@ -18,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 import cfplan
 from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.path import Path
-from cfplan.planning.plan import Plan
+from cfplan.planning.certified import Plan
 from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.airframe import Airframe
@@ -51,6 +51,7 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
         "seconds": plan.seconds,
         "notes": list(plan.notes),
         "lower_bound": plan.lower_bound,
+        "joints": list(plan.joints),
         "provenance": dict(provenance or {}),
         "certificate": plan.certificate.to_dict(),
         "airframe": asdict(plan.airframe),
@@ -114,6 +115,9 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
     path = Path(np.array(metadata["path"]["breaks"]), np.array(metadata["path"]["coefficients"]))
     profile = SpeedProfile(**{f.name: np.array(metadata["profile"][f.name], dtype=float) for f in fields(SpeedProfile)})
     trajectory = Trajectory(path, profile, airframe)
+    joints = tuple(map(float, metadata.get("joints", ())))  # older files tell of none
+    if not all(0.0 < joint < path.end for joint in joints):
+        raise ValueError("a joint lies outside the path")
     return Plan(
         path=path,
         airframe=airframe,
@@ -127,6 +131,7 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
         seconds=float(metadata["seconds"]),
         notes=tuple(map(str, metadata["notes"])),
         lower_bound=None if metadata["lower_bound"] is None else float(metadata["lower_bound"]),
+        joints=joints,
     )
 
 

@@ -12,14 +12,14 @@ from cfplan.expert.solution import Solution
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.model_files import find_model
+from cfplan.learning.windows import chain, kept
+from cfplan.planning.certified import Plan
 from cfplan.planning.planners import AUTO, find_planner
 from cfplan.planning.repair import Repaired, repair, slow
-from cfplan.safety.certificate import Certificate
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import check_space
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.profile import BoundaryState, SpeedProfile
-from cfplan.vehicle.trajectory import Trajectory
+from cfplan.vehicle.profile import BoundaryState
 
 NODES_PER_METRE = {"learned": 5}
 # the network was taught on wide grids, and refining costs by the node
@@ -37,42 +37,13 @@ REFINED = ("learned", "expert", "convex")
 # whose profiles are refined where they do not pass; the others are what they are, slowed
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """A certified trajectory and how it came about."""
-
-    path: Path
-    airframe: Airframe
-    limits: Limits
-    trajectory: Trajectory
-    certificate: Certificate
-    planner: str
-    # the one whose profile it is
-    nodes: int
-    # intervals of the profile
-    slowed: float
-    # share of the planner's speed at which the plan passed, 1 where nothing had to change
-    speed_share: float
-    # share of that which was asked for
-    seconds: float
-    # s that planning took, all tries and certificates included
-    notes: tuple[str, ...]
-    # what a reader should know, one sentence each
-    lower_bound: float | None = None
-    # s, no flight within speed, acceleration and collective thrust takes less; None where it was not asked for
-
-    @property
-    def profile(self) -> SpeedProfile:
-        """The profile as flown, slowing included."""
-        return self.trajectory.profile
-
-
 class _Found(NamedTuple):
     """A planner's profile, repaired."""
 
     repaired: Repaired
     planner: str
     nodes: int
+    joints: tuple[float, ...]
 
     @property
     def duration(self) -> float:
@@ -164,6 +135,7 @@ def plan(
         seconds=time.perf_counter() - begun,
         notes=tuple(notes),
         lower_bound=bound,
+        joints=found.joints,
     )
 
 
@@ -260,7 +232,17 @@ def _ask(question: _Question, name: str, nodes: int, notes: list[str]) -> _Found
     except (InfeasibleError, NotCertifiedError) as error:
         notes.append(f"{name} with {nodes} nodes: {error}")
         return None
-    return _Found(repaired, name, nodes)
+    joints = repaired.joints if repaired.joints is not None else _joints(solution)
+    return _Found(repaired, name, nodes, joints)
+
+
+def _joints(solution: Solution) -> tuple[float, ...]:
+    """s, where a planner that works window by window joined them."""
+    window = solution.stats.get("window")
+    if solution.profile is None or not isinstance(window, int):
+        return ()
+    s = solution.profile.s
+    return tuple(float(s[part.first]) for part in chain(len(s) - 1, window, kept(window)) if part.first > 0)
 
 
 def _failure(name: str, nodes: int, solution: Solution) -> str:

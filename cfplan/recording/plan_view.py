@@ -1,4 +1,4 @@
-"""What is known of the plan, in the rerun view: where its pieces join, and where which limit holds it back."""
+"""What is known of the plan, in the rerun view: where it was put together, and where which limit holds it back."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -8,8 +8,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from cfplan.errors import CfplanError
+from cfplan.planning.certified import Plan
 from cfplan.planning.files import load_plan
-from cfplan.planning.plan import Plan
 from cfplan.recording import layout
 from cfplan.recording.plots import Colour
 from cfplan.recording.record import PLAN_FILE, Record
@@ -18,7 +18,9 @@ from cfplan.safety.certificate import shares
 
 ACTIVE = 0.95  # share from which a limit counts as what holds the plan back
 STEP = 0.01  # s, between the samples of the plan
-JOINT_RADIUS, LIMIT_RADIUS = 0.025, 0.01  # m, as drawn
+PIECE_RADIUS, JOINT_RADIUS, LIMIT_RADIUS = 0.02, 0.035, 0.01  # m, as drawn
+PIECE_COLOUR: Colour = (235, 235, 235)
+JOINT_COLOUR: Colour = (255, 105, 180)
 FREE, FREE_COLOUR = "none", (60, 66, 76)
 LIMIT_COLOURS: dict[str, Colour] = {
     "speed": (0, 158, 115),
@@ -68,8 +70,12 @@ def log_plan(stream: rr.RecordingStream, record: Record) -> None:
         plan = load_plan(record.folder / PLAN_FILE)
     except CfplanError:
         return
-    joints = plan.path(plan.path.breaks)
-    stream.log(layout.JOINTS, rr.Points3D(joints, radii=JOINT_RADIUS, colors=[(235, 235, 235)]), static=True)
+    for entity, places, radius, colour in (
+        (layout.PIECES, plan.path.breaks, PIECE_RADIUS, PIECE_COLOUR),
+        (layout.JOINTS, np.array(plan.joints), JOINT_RADIUS, JOINT_COLOUR),
+    ):
+        if len(places):
+            stream.log(entity, rr.Points3D(plan.path(places), radii=radius, colors=[colour]), static=True)
     active = active_limits(plan)
     for name, colour in LIMIT_COLOURS.items():
         strips = [active.position[rows] for found, rows in active.stretches() if found == name]

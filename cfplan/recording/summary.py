@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from cfplan.flight.telemetry import Phase
+from cfplan.recording.path_distance import distance_to_path
 from cfplan.recording.record import Record, Setpoints
 
 SETTLED = 0.05  # m from the end of the path: close enough to call the flight settled
@@ -151,28 +151,6 @@ def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -
     path = record.header.path[np.all(np.isfinite(record.header.path), axis=1)]
     path = path if len(path) else record.setpoints.position
     return Deviation(time, np.linalg.norm(position - reference, axis=1), distance_to_path(position, path))
-
-
-def distance_to_path(points: NDArray, path: NDArray) -> NDArray:
-    """(N,) m from each point (N, 3) to the polyline through path (M, 3).
-
-    Looked for in the segments at the few samples nearest to each point: exact where samples lie close to each other
-    compared with the distance between parts of the path that pass one another, and never too small.
-    """
-    if len(points) == 0:
-        return np.empty(0)
-    nearest = cKDTree(path).query(points, k=range(1, min(8, len(path)) + 1))[1]
-    segments = np.diff(path, axis=0, append=path[-1:])
-    squares = np.einsum("ij,ij->i", segments, segments)
-    squares[squares == 0] = 1.0
-    best = np.full(len(points), np.inf)
-    for column in np.concatenate([nearest, nearest - 1], axis=1).T:
-        first = np.maximum(column, 0)
-        along, offset = segments[first], points - path[first]
-        share = np.clip(np.einsum("ij,ij->i", offset, along) / squares[first], 0, 1)
-        offset -= share[:, None] * along
-        best = np.minimum(best, np.einsum("ij,ij->i", offset, offset))
-    return np.sqrt(best)
 
 
 def settling(record: Record) -> float:

@@ -54,6 +54,21 @@ def test_what_is_loaded_is_what_was_saved(made, saved):
         )
 
 
+def test_where_windows_meet_is_kept_and_older_files_tell_of_none(made, saved, tmp_path):
+    joints = (made.path.end / 3, made.path.end / 2)
+    save_plan(replace(made, joints=joints), tmp_path / "chained.parquet")
+    assert load_plan(tmp_path / "chained.parquet").joints == joints
+    older = rewritten(saved, tmp_path / "older.parquet", lambda metadata: metadata.pop("joints"))
+    assert load_plan(older).joints == ()
+
+
+@pytest.mark.parametrize("joint", [0.0, -1.0, 1e3, math.nan])
+def test_a_joint_outside_the_path_is_no_sound_plan(saved, tmp_path, joint):
+    file = rewritten(saved, tmp_path / "p.parquet", lambda metadata: metadata["joints"].append(joint))
+    with pytest.raises(InputError, match="joint"):
+        load_plan(file)
+
+
 def test_a_limit_that_is_left_open_stays_open(made, limits, tmp_path):
     opened = replace(made, limits=replace(limits, plan=replace(limits.plan, speed=math.inf)))
     save_plan(opened, tmp_path / "open.parquet")

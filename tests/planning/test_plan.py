@@ -162,6 +162,20 @@ def test_too_fast_a_profile_of_the_learned_planner_is_refined_and_the_plan_says_
     assert re.search(r"refined; slower along .* most at s = .*, by .*%", made.notes[-1])
 
 
+def test_a_plan_made_window_by_window_tells_where_they_meet(limits, make_profile, monkeypatch):
+    zigzag = min_snap([[(-1) ** turn, 0.4 * turn - 1.6, 1.0] for turn in range(9)])
+    refined = {n: plan(zigzag, limits.airframe, limits, planner="convex", nodes=n) for n in (100, 150)}
+    assert all("refined" in made.notes[-1] for made in refined.values())
+    assert refined[100].joints == ()
+    assert refined[150].joints == pytest.approx([96 / 150 * zigzag.end])
+
+    slow = make_profile(zigzag.end, np.full(150 + 3, 0.2))
+    stub(monkeypatch, learned=lambda path, nodes: Solution(Status.SOLVED, slow, "", {"window": 64}))
+    chained = plan(zigzag, limits.airframe, limits, planner="learned")
+    assert chained.notes == ()
+    assert chained.joints == pytest.approx([48 / 150 * zigzag.end, 86 / 150 * zigzag.end])
+
+
 def test_where_the_learned_planner_fails_the_expert_steps_in(path, limits, make_profile, monkeypatch):
     stub(
         monkeypatch,

@@ -44,7 +44,7 @@ def made_plan():
 def rrd_with_plan(flight, made_plan, tmp_path_factory):
     folder = tmp_path_factory.mktemp("planned") / "flight"
     shutil.copytree(flight.folder, folder)
-    save_plan(made_plan, folder / PLAN_FILE)
+    save_plan(dataclasses.replace(made_plan, joints=(made_plan.path.end / 3,)), folder / PLAN_FILE)
     file = folder / "flight.rrd"
     write_rrd(read_record(folder), file)
     return file
@@ -272,13 +272,18 @@ def test_stretches_of_active_limits_are_in_order_and_leave_nothing_out(made_plan
         assert set(active.name[rows.start : rows.stop - 1]) <= {name}
 
 
-def test_joints_and_active_limits_of_the_plan_are_in_the_recording(rrd_with_plan, made_plan):
-    joints = [
+@pytest.mark.parametrize("entity", [layout.PIECES, layout.JOINTS])
+def test_where_the_plan_was_put_together_is_in_the_recording(rrd_with_plan, made_plan, entity):
+    places = {layout.PIECES: made_plan.path.breaks, layout.JOINTS: [made_plan.path.end / 3]}[entity]
+    (drawn,) = [
         value
-        for chunk in RrdReader(rrd_with_plan).stream().filter(content=[f"/{layout.JOINTS}"])
+        for chunk in RrdReader(rrd_with_plan).stream().filter(content=[f"/{entity}"])
         for value in chunk.to_record_batch().column("Points3D:positions").to_pylist()
     ]
-    np.testing.assert_allclose(joints[0], made_plan.path(made_plan.path.breaks), atol=1e-6)
+    np.testing.assert_allclose(drawn, made_plan.path(np.array(places)), atol=1e-6)
+
+
+def test_active_limits_of_the_plan_are_in_the_recording(rrd_with_plan, made_plan):
     times, names = rows(rrd_with_plan, f"/{layout.ACTIVE_LIMIT}", "StateChange:state")
     assert [name for (name,) in names] == [name for name, _ in active_limits(made_plan).stretches()] + [FREE]
     assert times[-1] - times[0] == pytest.approx(made_plan.trajectory.duration)

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from cfplan.recording import record as columns
+from cfplan.recording.path_distance import BLOCK, distance_to_path
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import Record
 from cfplan.recording.states import supervisor_states
-from cfplan.recording.summary import deviation, distance_to_path, dropouts, pose_gaps, settling, summarise
+from cfplan.recording.summary import deviation, dropouts, pose_gaps, settling, summarise
 from cfplan.recording.summary_text import summary_text
 from cfplan.recording.writer import RecordWriter
 
@@ -182,6 +183,17 @@ def test_the_distance_to_a_path_is_that_of_a_numerical_search(x, y):
 
 def test_a_path_of_one_point_has_a_distance_too():
     assert distance_to_path(np.array([[3.0, 4.0, 0.0]]), np.zeros((1, 3)))[0] == pytest.approx(5.0)
+
+
+@given(seed=st.integers(0, 10_000), corners=st.integers(1, 3 * BLOCK + 1))
+def test_the_distance_to_a_tangled_path_is_that_to_its_nearest_segment(seed, corners):
+    random = np.random.default_rng(seed)
+    path, points = random.normal(size=(corners, 3)), random.normal(size=(20, 3))
+    begin, step = path[:-1], np.diff(path, axis=0)
+    share = np.clip(np.sum((points[:, None] - begin) * step, axis=2) / np.sum(step**2, axis=1), 0, 1)
+    feet = np.concatenate([begin + share[..., None] * step, np.broadcast_to(path[-1:], (20, 1, 3))], axis=1)
+    expected = np.linalg.norm(points[:, None] - feet, axis=2).min(axis=1)
+    np.testing.assert_allclose(distance_to_path(points, path), expected, atol=1e-12)
 
 
 def test_a_record_with_nothing_in_it_has_a_summary_of_unknowns(tmp_path, small_header):

@@ -1,0 +1,42 @@
+"""What planning comes to; apart from how it is found, so that a plan is read without any planner."""
+
+from dataclasses import dataclass
+
+from cfplan.geometry.path import Path
+from cfplan.safety.certificate import Certificate
+from cfplan.safety.limits import Limits
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A certified trajectory and how it came about."""
+
+    path: Path
+    airframe: Airframe
+    limits: Limits
+    trajectory: Trajectory
+    certificate: Certificate
+    planner: str
+    # the one whose profile it is
+    nodes: int
+    # intervals of the profile
+    slowed: float
+    # share of the planner's speed at which the plan passed, 1 where nothing had to change
+    speed_share: float
+    # share of that which was asked for
+    seconds: float
+    # s that planning took, all tries and certificates included
+    notes: tuple[str, ...]
+    # what a reader should know, one sentence each
+    lower_bound: float | None = None
+    # s, no flight within speed, acceleration and collective thrust takes less; None where it was not asked for
+    joints: tuple[float, ...] = ()
+    # s, where the windows of a profile meet that was made window by window
+
+    @property
+    def profile(self) -> SpeedProfile:
+        """The profile as flown, slowing included."""
+        return self.trajectory.profile
