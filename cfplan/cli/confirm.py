@@ -35,20 +35,25 @@ def confirmed(name: str, mission: "Mission", uri: str, records: Path, *, yes: bo
 
 
 def what_it_does(name: str, mission: "Mission", uri: str) -> str:
-    """Time, speed, fence, and how to end it."""
+    """Time, speed, fence, how to end it, and where it ends if nobody can."""
     import numpy as np
 
     from cfplan.flight.packets import decode
+    from cfplan.simulation.orphan import orphaned
 
     speed = float(np.linalg.norm(decode(mission.payloads).velocity, axis=1).max())
     space = mission.limits.space
     walls = ", ".join(
         f"{axis} {low:.2f} to {high:.2f} m" for axis, low, high in zip("xyz", space.low, space.high, strict=True)
     )
+    lost = orphaned(mission.payloads, mission.limits, mission.rate)
+    calmer = "a lower --speed" if mission.limits.firmware.watchdog else "a lower --speed, or firmware.watchdog,"
+    nearer = f" With {calmer} it would not come so far." if lost.beyond > 0 else ""
     return (
         f"{uri} will take off to {mission.take_off_height:g} m, go to the start of {name!r}, fly it in "
         f"{mission.motion_ends:.1f} s at up to {speed:.1f} m/s, and land where it ends.\n"
-        f"Nobody may be inside {walls}. Space lands it, Esc cuts the motors."
+        f"Nobody may be inside {walls}. Space lands it, Esc cuts the motors.\n"
+        f"If the pilot's process or the radio dies, it stops its motors by itself: {lost}.{nearer}"
     )
 
 

@@ -143,12 +143,18 @@ def certify_bytes(flight: PlannedFlight, steps: Steps) -> "EncodedFlight":
 
 
 def rehearse(flight: PlannedFlight, encoded: "EncodedFlight", steps: Steps) -> "DryRun":
-    """Fly exactly these bytes in the simulator. Raises NotCertifiedError where the dry run fails."""
+    """Fly exactly these bytes in the simulator, and see where they lead if the pilot dies.
+
+    Raises NotCertifiedError where the dry run fails.
+    """
     from cfplan.simulation.dry_run import dry_run
+    from cfplan.simulation.orphan import orphaned
 
     with steps.step("dry run") as said:
         result = dry_run(encoded, flight.plan.trajectory, flight.limits.airframe, flight.limits.flight)
         said.append(f"deviation {100 * result.deviation:.1f} cm at most, {100 * result.deviation_rms:.1f} cm rms")
         said.append(f"{result.real_time_factor:.0f} times real time")
         result.require_passed()
+    with steps.step("lost pilot") as said:
+        said.append(str(orphaned(encoded.payloads, flight.limits)))
     return result
