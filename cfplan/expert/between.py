@@ -1,5 +1,6 @@
 """How far a profile exceeds its limits between the points where the optimiser holds them."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,9 @@ FINE_ALLOWANCE = 5e-3
 SPEED = stage.ROWS
 # column of the squared speed, after the rows of the optimiser
 COLUMNS = stage.ROWS + 1
+_ABOVE, _BELOW = np.append(stage.UPPER, 1.0), np.append(stage.LOWER, -np.inf)
+# Chebyshev-Lobatto: both ends of an interval, and closer together near them
+_PLACES, _FINE = ((1.0 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2.0 for count in (COUNT, FINE_COUNT))
 CONTINUOUS = [c for c in range(COLUMNS) if c not in stage.JUMPING]
 
 
@@ -53,59 +57,84 @@ class Excess:
 class DensePath:
     """A path's derivatives at many places of every interval, evaluated once."""
 
-    def __init__(self, path: Path, nodes: int, held: NDArray) -> None:
+    def __init__(self, path: Path, nodes: int, held: NDArray | None = None) -> None:
         """`held`, (N,): how far, 0 to 1, each interval is bound by a boundary state and had better be left alone."""
-        self.held = held[:, None]
+        self.held = held
         step = path.end / nodes
         brisk = turns(path, nodes) > SHARP
         brisk[:END_INTERVALS] = brisk[-END_INTERVALS:] = True
-        counts = np.where(brisk, FINE_COUNT, COUNT)
         self.allowance = np.full((nodes, COLUMNS), ALLOWANCE)
         self.allowance[:, list(stage.JUMPING)] = THRUST_ALLOWANCE
         self.allowance[brisk] = FINE_ALLOWANCE
-        self.first = np.cumsum(counts) - counts
-        self.interval = np.repeat(np.arange(nodes), counts)
-        # Chebyshev-Lobatto: both ends of an interval, and closer together near them
-        share = (np.arange(counts.sum()) - self.first[self.interval]) / (counts[self.interval] - 1)
-        self.places = (1.0 - np.cos(np.pi * share)) / 2.0 * step
+        self.groups = tuple(
+            (which, places) for which, places in ((np.flatnonzero(~brisk), _PLACES), (np.flatnonzero(brisk), _FINE))
+            if len(which)
+        )  # fmt: skip
+        # First all first places of a group of intervals, then all second ones: so are extremes found fastest.
+        self.interval = np.concatenate([np.tile(which, len(places)) for which, places in self.groups])
+        self.places = step * np.concatenate([np.repeat(places, len(which)) for which, places in self.groups])
         s = self.interval * step + self.places
-        self.derivatives = path.derivatives(s)[1:]
+        ascending = np.argsort(s)
+        self.derivatives = np.empty((4, 3, len(s)))
+        self.derivatives[:, :, ascending] = path.derivatives(s[ascending])[1:]
 
     def excess(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Excess:
         """Of a profile with as many intervals; h must be positive."""
+        highest, lowest = self._extremes(profile, airframe, limits)
+        upper, lower = highest.T - _ABOVE + self.allowance, _BELOW - lowest.T + self.allowance
+        if self.held is not None:
+            upper -= self.held[:, None] * np.maximum(upper, 0.0)
+            lower -= self.held[:, None] * np.maximum(lower, 0.0)
+        return Excess(upper, lower)
+
+    def exceeded(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> bool:
+        """Whether such a profile leaves its limits, without any allowance, at one of the places."""
+        highest, lowest = self._extremes(profile, airframe, limits)
+        return bool((highest.T > _ABOVE).any() or (lowest.T < _BELOW).any())
+
+    def _extremes(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> tuple[NDArray, NDArray]:
+        """(COLUMNS, N) twice: the most and the least that each row comes to in each interval."""
         at = dense.dense_rows(airframe, self.derivatives, profile, self.places, self.interval)
-        middle = 0.5 * (limits.motor_thrust_max + limits.motor_thrust_min)
-        half = 0.5 * (limits.motor_thrust_max - limits.motor_thrust_min)
-        rows = np.empty((COLUMNS, at.shape[1]))
-        rows[stage.ACCELERATION] = at[dense.ACCELERATION] / limits.acceleration**2
-        rows[stage.ANGULAR_VELOCITY] = at[dense.BODY_RATE] / limits.angular_velocity**2
-        rows[stage.TILT] = (1 - at[dense.AXIS_HEIGHT]) / (1 - np.cos(limits.tilt))
-        rows[stage.SPECIFIC_THRUST] = at[dense.SPECIFIC_THRUST] / limits.specific_thrust_min
-        rows[stage.ANGULAR_ACCELERATION] = at[dense.ANGULAR_ACCELERATION] / limits.angular_acceleration**2
-        rows[stage.THRUSTS] = (at[dense.MOTOR_THRUST : dense.MOTOR_THRUST + 4] - middle) / half
-        rows[SPEED] = at[dense.SPEED] / limits.speed**2
-        highest, lowest = np.maximum.reduceat(rows, self.first, axis=1), np.minimum.reduceat(rows, self.first, axis=1)
-        above = np.append(stage.UPPER, 1.0)
-        below = np.append(stage.LOWER, -np.inf)
-        upper, lower = highest.T - above + self.allowance, below - lowest.T + self.allowance
-        return Excess(upper - self.held * np.maximum(upper, 0.0), lower - self.held * np.maximum(lower, 0.0))
+        highest, lowest = (np.empty((dense.ROWS, len(profile.dddh))) for _ in range(2))
+        end = 0
+        for which, places in self.groups:
+            begin, end = end, end + len(which) * len(places)
+            rows = at[:, begin:end].reshape(dense.ROWS, len(places), len(which))
+            highest[:, which], lowest[:, which] = rows.max(axis=1), rows.min(axis=1)
+        # tilt is most where the thrust axis is lowest
+        least_height, most_height = lowest[dense.AXIS_HEIGHT].copy(), highest[dense.AXIS_HEIGHT].copy()
+        highest[dense.AXIS_HEIGHT], lowest[dense.AXIS_HEIGHT] = least_height, most_height
+        return _as_shares(highest, limits), _as_shares(lowest, limits)
 
 
 def surely_exceeds(path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> bool:
     """Whether a limit is exceeded at one of many places; where not, the certificate has the word."""
-    nodes = len(profile.s) - 1
-    dense = DensePath(path, nodes, np.zeros(nodes))
-    excess = dense.excess(profile, airframe, limits)
-    return bool(max((excess.upper - dense.allowance).max(), (excess.lower - dense.allowance).max()) > 0)
+    return DensePath(path, len(profile.s) - 1).exceeded(profile, airframe, limits)
+
+
+def _as_shares(at: NDArray, limits: PlanLimits) -> NDArray:
+    """(COLUMNS, N) the optimiser's rows, and the squared speed, of dense rows, (dense.ROWS, N)."""
+    middle = 0.5 * (limits.motor_thrust_max + limits.motor_thrust_min)
+    half = 0.5 * (limits.motor_thrust_max - limits.motor_thrust_min)
+    rows = np.empty((COLUMNS, at.shape[1]))
+    rows[stage.ACCELERATION] = at[dense.ACCELERATION] / limits.acceleration**2
+    rows[stage.ANGULAR_VELOCITY] = at[dense.BODY_RATE] / limits.angular_velocity**2
+    rows[stage.TILT] = (1 - at[dense.AXIS_HEIGHT]) / (1 - math.cos(limits.tilt))
+    rows[stage.SPECIFIC_THRUST] = at[dense.SPECIFIC_THRUST] / limits.specific_thrust_min
+    rows[stage.ANGULAR_ACCELERATION] = at[dense.ANGULAR_ACCELERATION] / limits.angular_acceleration**2
+    rows[stage.THRUSTS] = (at[dense.MOTOR_THRUST : dense.MOTOR_THRUST + 4] - middle) / half
+    rows[SPEED] = at[dense.SPEED] / limits.speed**2
+    return rows
 
 
 def turns(path: Path, nodes: int) -> NDArray:
     """(N,) rad, by how much the direction of the path differs from one end of each interval to the other."""
-    s = np.linspace(0.0, path.end, nodes + 1)
-    s[[0, -1]] = s[[1, -2]]  # at rest there is no direction
+    s = np.arange(nodes + 1) * (path.end / nodes)
+    s[0], s[-1] = s[1], s[-2]  # at rest there is no direction
     tangent = path(s, 1)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-12)[:, None]
-    return np.arccos(np.clip(np.sum(tangent[1:] * tangent[:-1], axis=1), -1.0, 1.0))
+    length = np.maximum(np.sqrt(np.einsum("nk,nk->n", tangent, tangent)), 1e-12)
+    cosine = np.einsum("nk,nk->n", tangent[1:], tangent[:-1]) / (length[1:] * length[:-1])
+    return np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0))
 
 
 def spread(excess: NDArray) -> NDArray:

@@ -79,7 +79,7 @@ class Search:
     feasibility: float = 1e-5
     # of the constraints, at the end
     push: float = 1e-2
-    # how far slacks start inside their bounds, of the span between them
+    # how far slacks start inside their bounds at least, of the span between them
     iterations: int = 100
 
 

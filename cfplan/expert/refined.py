@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cfplan.expert.problem import FLOOR, Ends, pose
 from cfplan.expert.program import Shape, layout_of
 from cfplan.expert.solution import Solution, Status
-from cfplan.expert.solvers import QUICKLY, QUICKLY_AGAIN, interior_point
+from cfplan.expert.solvers import interior_point, quickly, quickly_again
 from cfplan.expert.spline_profile import h_coefficients, spline_profile, yaw_of
 from cfplan.expert.stage import Penalties
 from cfplan.expert.tightening import Task, flaw, kept_between
@@ -56,16 +56,17 @@ def refine(
         shape = Shape(last - first, False, turning, (3 * (first == 0), 3 * (last == nodes)))
         task = Task(part, airframe, limits, ends, track, layout_of(shape))
         near = table[first : last + 3] if not (first == 0 and start) and not (last == nodes and end) else None
+        seconds = float(np.sum(step / np.sqrt(unit * table[first : last + 3, 0])))
         given = airframe, limits, track, 0.0, ends, Penalties()
         problem = pose(task.layout, part, *given, near)
-        attempt = interior_point(problem, None, QUICKLY)
+        attempt = interior_point(problem, None, quickly(seconds))
         if flaw(attempt, problem, task):  # not near enough
             problem = pose(task.layout, part, *given)
             attempt = interior_point(problem, None)
         if reason := flaw(attempt, problem, task):
             where = f"s = {first * step:.3g} to {last * step:.3g}"
             return Solution(Status.NOT_CONVERGED, None, f"refining {where}: {reason}")
-        kept = kept_between(attempt, problem, task, QUICKLY_AGAIN)
+        kept = kept_between(attempt, problem, task, quickly_again(seconds))
         table[first : last + 3] = kept.table
         iterations += kept.iterations
         rounds += kept.rounds

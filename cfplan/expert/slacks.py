@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 FAR = 1e20
 COMPLEMENTARY = 1e10
 # how far a multiplier may be from what the barrier makes of its slack, as a factor
-LEAST_ROOM = 1e-6
-# of the span between bounds: what starts nearer to a bound, or beyond, is moved inside
 
 _SUMS = {"contract", "reassoc", "nsz", "arcp"}  # freedom that what is not a number survives
 _LARGEST = _SUMS | {"nnan"}
@@ -31,15 +29,15 @@ def bounds_of(lower: NDArray, upper: NDArray) -> NDArray:
 
 @njit(cache=True, error_model="numpy")
 def first(g, bounds, barrier, push, state):
-    """Slacks where the constraints are, but inside; multipliers that the barrier makes of them."""
+    """Slacks where the constraints are, but inside by `push` of the span between bounds at least; multipliers that the
+    barrier makes of them.
+
+    Slacks that start next to a bound would hold back every step: better to start a little off the constraints.
+    """
     for j in range(len(g)):
         lower, upper = bounds[0, j], bounds[1, j]
-        span = min(upper - lower, 2.0)
-        s = g[j]
-        if s - lower < LEAST_ROOM * span:
-            s = lower + push * span
-        if upper - s < LEAST_ROOM * span:
-            s = upper - push * span
+        room = push * min(upper - lower, 2.0)
+        s = min(max(g[j], lower + room), upper - room)
         state[0, j] = s
         state[1, j] = bounds[2, j] * barrier / (s - lower)
         state[2, j] = bounds[3, j] * barrier / (upper - s)

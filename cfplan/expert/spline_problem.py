@@ -132,7 +132,7 @@ class _Structure(NamedTuple):
     slots: NDArray
     # (N, k) entry of v of each of an interval's coefficients, likewise
     entries: NDArray
-    # (N, k(k+1)/2, 2) entry of the flattened matrix of each pair of them, -1 where one is fixed, and how often it counts
+    # (N, k(k+1)/2, 2) entry of the flattened matrix of each pair, -1 where one is fixed, and how often it counts there
     interval: NDArray
     # (P,) of each point
     begins: NDArray
