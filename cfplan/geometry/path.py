@@ -15,6 +15,8 @@ STANDSTILL = 0.01
 # |γ'|, 1 where the path is flown at its nominal 1 m/s: below this inside a path the path is taken to stop there
 _SAMPLES = 32
 # a piece, where a path is searched
+_SIDE_BY_SIDE = 256
+# points, as many as stay near the processor with their derivatives
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
@@ -145,26 +147,35 @@ class Path:
         )
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"contract"})
 def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray, out: NDArray) -> None:
-    piece, count = 0, coefficients.shape[1]
-    for n in range(len(s)):
-        place = min(max(s[n], 0.0), breaks[-1])
-        if place < breaks[piece]:
+    """Points of one piece that follow one another are taken side by side, up to _SIDE_BY_SIDE of them."""
+    place = np.minimum(np.maximum(s, 0.0), breaks[-1])
+    begin, piece, last = 0, 0, len(origins) - 1
+    while begin < len(place):
+        if place[begin] < breaks[piece]:
             piece = 0
-        while piece < len(origins) - 1 and place >= breaks[piece + 1]:
+        while piece < last and place[begin] >= breaks[piece + 1]:
             piece += 1
-        x = place - origins[piece]
+        end, room = begin + 1, min(begin + _SIDE_BY_SIDE, len(place))
+        while end < room and breaks[piece] <= place[end] and (piece == last or place[end] < breaks[piece + 1]):
+            end += 1
+        x = place[begin:end] - origins[piece]
         for axis in range(3):
-            a = b = c = d = e = 0.0  # derivatives over factorials, by Horner
-            for power in range(count - 1, -1, -1):
-                e = e * x + d
-                d = d * x + c
-                c = c * x + b
-                b = b * x + a
-                a = a * x + coefficients[piece, power, axis]
-            out[0, axis, n], out[1, axis, n], out[2, axis, n] = a, b, 2.0 * c
-            out[3, axis, n], out[4, axis, n] = 6.0 * d, 24.0 * e
+            p, d1, d2 = out[0, axis, begin:end], out[1, axis, begin:end], out[2, axis, begin:end]
+            d3, d4 = out[3, axis, begin:end], out[4, axis, begin:end]
+            p[:], d1[:], d2[:], d3[:], d4[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+            for power in range(coefficients.shape[1] - 1, -1, -1):  # Horner, for derivatives over factorials
+                term = coefficients[piece, power, axis]
+                for n in range(len(x)):
+                    d4[n] = d4[n] * x[n] + d3[n]
+                    d3[n] = d3[n] * x[n] + d2[n]
+                    d2[n] = d2[n] * x[n] + d1[n]
+                    d1[n] = d1[n] * x[n] + p[n]
+                    p[n] = p[n] * x[n] + term
+            for n in range(len(x)):
+                d2[n], d3[n], d4[n] = 2.0 * d2[n], 6.0 * d3[n], 24.0 * d4[n]
+        begin = end
 
 
 @njit(cache=True)
