@@ -9,6 +9,7 @@ import click
 from cfplan import __version__
 from cfplan.cli import options
 from cfplan.cli.output import print_json, print_table
+from cfplan.errors import CfplanError
 
 NEEDED = ("numpy", "scipy", "numba", "casadi", "cflib", "pydantic", "mcap", "pyarrow", "rerun-sdk")
 OPTIONAL = {
@@ -17,7 +18,6 @@ OPTIONAL = {
     "rosbags": "ROS bags in cfplan replay: pip install 'cfplan[ros]'",
     "pymavlink": "MAVLink logs in cfplan replay: pip install 'cfplan[mavlink]'",
 }
-CRAZYRADIO_USB = {(0x1915, 0x7777): "Crazyradio", (0x35F0, 0xBAD2): "Crazyradio 2.0"}
 
 
 @click.command(short_help="Versions, packages, compiler, radio.", epilog="Example: cfplan doctor --json")
@@ -91,17 +91,11 @@ def _priority() -> dict[str, str]:
 
 
 def _radio() -> dict[str, str]:
-    """Look for a Crazyradio on USB, through the library that cflib uses."""
-    try:
-        import usb.core
+    """Whether a Crazyradio is plugged in and may be used."""
+    from cfplan.flight.dongle import check_radio, find_radios
 
-        found = [
-            name
-            for (vendor, product), name in CRAZYRADIO_USB.items()
-            if usb.core.find(idVendor=vendor, idProduct=product) is not None
-        ]
-    except Exception as error:  # no libusb, no permission: whatever pyusb raises is the finding
-        return _check("radio", "-", "optional", f"USB cannot be read ({error}); sim:// flies without")
-    if not found:
-        return _check("radio", "none", "optional", "plug in a Crazyradio to fly hardware; sim:// flies without")
-    return _check("radio", ", ".join(found))
+    try:
+        check_radio("radio://0")
+        return _check("radio", f"{len(find_radios())} Crazyradio")
+    except CfplanError as error:
+        return _check("radio", error.what, "optional", f"{error.hint}; sim:// flies without")

@@ -15,7 +15,7 @@ from cfplan.cli.confirm import confirmed
 from cfplan.cli.flight_progress import FlightProgress
 from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.cli.rehearsal import PlannedFlight, PlanOptions, certify_bytes, obtain_plan, rehearse
-from cfplan.cli.vehicle import check_mocap, vehicle
+from cfplan.cli.vehicle import check_uris, look_at_hardware, vehicle
 from cfplan.cli.watchers import check_watchers, watchers
 from cfplan.errors import CfplanError, ExitCode
 
@@ -76,9 +76,12 @@ def fly(
     as_json: bool,
 ) -> int:
     """Fly along PATH: plan, certify, rehearse, then take off, stream the flight, land, and keep a record."""
+    from cfplan.safety.limits import load_limits
+
     steps = Steps(as_json=as_json)
-    check_mocap(uri, mocap_uri)
+    check_uris(uri, mocap_uri)
     check_watchers(live=live, mavlink=mavlink)
+    look_at_hardware(uri, mocap_uri, load_limits(options.find_safety_file(safety_file, path_or_plan)).pose, steps)
     flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
     encoded = certify_bytes(flight, steps)
     rehearsed = rehearse(flight, encoded, steps)

@@ -11,19 +11,15 @@ from typing import Any
 
 from cfplan.errors import LinkError
 from cfplan.flight.claim import claim
+from cfplan.flight.dongle import usb_hint
 from cfplan.flight.link import Link
 from cfplan.flight.telemetry import Telemetry
+from cfplan.flight.vehicle_uri import EXAMPLES
 
 FIRST_ANSWER = 4.0  # s, from opening the link to the first packet
 WHOLE_CONNECTION = 30.0  # s, to the last parameter, over a lossy radio without a cache
 PATIENCE = 0.005  # s that a packet in flight waits for a radio that is busy; then the next, fresher one counts
 _RETRIES = 5000  # transmissions that may fail in a row, some 10 s: a vehicle that hovers alone is worth waiting for
-
-UDEV_RULES = (
-    """printf 'SUBSYSTEM=="usb", ATTRS{idVendor}=="%s", MODE="0664", GROUP="plugdev"\\n' 1915 35f0 0483 """
-    "| sudo tee /etc/udev/rules.d/99-bitcraze.rules && sudo udevadm control --reload-rules"
-)
-# for Crazyradio, Crazyradio 2.0 and the Crazyflie on a cable; Bitcraze's own page has the same
 
 
 def connect(
@@ -108,15 +104,15 @@ def _wait(done: threading.Event, failed: threading.Event, patience: float, waiti
 
 def _hint(uri: str, reason: str) -> str:
     if "No driver" in reason or "malformed" in reason:
-        return "a URI looks like radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:19850 or sim://0"
-    if "denied" in reason.lower() or "permission" in reason.lower():
-        return f"allow it once: {UDEV_RULES}; then unplug and plug in"
-    if "busy" in reason.lower():
-        return "another program has the radio: close cfclient and others"
+        return f"a URI looks like {EXAMPLES}"
+    if by_usb := usb_hint(None, reason):
+        return by_usb
     if uri.startswith("radio://") and ("dongle" in reason.lower() or "backend" in reason.lower()):
         return "plug a Crazyradio in; `cfplan doctor` shows what is found"
     if uri.startswith("radio://"):
         return "is the Crazyflie on, and are channel, rate and address right?"
+    if uri.startswith("usb://"):
+        return "is the Crazyflie on and on a cable? `lsusb` must list it"
     return "is the other end running?"
 
 

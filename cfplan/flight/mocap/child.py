@@ -20,7 +20,7 @@ from cfplan.flight.mocap.sdk import SdkDriver
 from cfplan.flight.mocap.uri import MocapUri, parse_uri
 
 HEAD = struct.Struct("<I?")  # bytes of the message behind it, and whether it is a frame
-CONNECT_ALARM = 3.0  # s to resolve the name, connect, and get the first frame's promise
+CONNECT_ALARM = 2.5  # s to resolve the name, connect, and get the first frame's promise
 FRAME_ALARM = 1.5  # s between frames
 _TRY_AGAIN = 0.1  # s
 _PRIORITY = 10  # of SCHED_FIFO; the setpoint stream's is higher

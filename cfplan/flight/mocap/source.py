@@ -14,7 +14,7 @@ from cfplan.flight.poses import Pose
 from cfplan.flight.telemetry import Quaternion
 from cfplan.safety.limits import PoseLimits
 
-OPEN_WITHIN = 4.5  # s
+OPEN_WITHIN = 3.5  # s
 _RATE_SLACK = 1.2  # over the expected rate may so much be forwarded; more only burdens the radio
 _FARTHEST = 30.0  # m; no lab is larger, and a lab in millimetres is
 _MOST_TILT = math.radians(45)  # of a vehicle that stands on the floor
@@ -168,6 +168,12 @@ class MocapSource:
                 hint="is the system live and streaming, and is this computer in its network?",
             )
         worst, count = counts.most_common(1)[0]
+        if self._uri.system == "vrpn" and worst is Verdict.OCCLUDED and count == total:
+            return LinkError(  # its client does not tell a server that is not there from one that is silent
+                f"nothing of {self._uri.subject!r} comes within {OPEN_WITHIN:g} s",
+                where=where,
+                hint="is the VRPN server running there, has it a tracker of that name, and is that in view?",
+            )
         hints = {
             Verdict.OCCLUDED: "are its markers in view, and is its name right? `cfplan mocap` lists what is there",
             Verdict.FROZEN: "is the system paused, or playing nothing?",

@@ -15,7 +15,7 @@ from cfplan.flight.mocap.sorting import Sorter, Verdict
 from cfplan.flight.mocap.uri import MocapUri, no_such_body
 from cfplan.flight.telemetry import Triple
 
-FIRST_FRAME_WITHIN = 4.5  # s
+FIRST_FRAME_WITHIN = 3.5  # s
 _JUMP = 0.15  # m
 _DROPOUT = 1.5  # periods between frames; one is missing where it takes longer
 _LOOK = 0.005  # s

@@ -1,0 +1,79 @@
+"""A look at the Crazyradio on USB before anything else is done: is it there, may it be used, is it free?"""
+
+from typing import Any
+
+from cfplan.errors import LinkError
+
+CRAZYRADIO = (0x1915, 0x7777)  # vendor and product; Crazyradio 2.0 too, with the firmware that cflib speaks to
+OTHER_FIRMWARE = (0x35F0, 0xBAD2)  # Crazyradio 2.0 with its own
+_DENIED, _BUSY = 13, 16
+
+UDEV_RULES = (
+    """printf 'SUBSYSTEM=="usb", ATTRS{idVendor}=="%s", MODE="0664", GROUP="plugdev"\\n' 1915 35f0 0483 """
+    "| sudo tee /etc/udev/rules.d/99-bitcraze.rules && sudo udevadm control --reload-rules"
+)
+# for Crazyradio, Crazyradio 2.0 and the Crazyflie on a cable; Bitcraze's own page has the same
+
+
+def find_radios(kind: tuple[int, int] = CRAZYRADIO) -> list[Any]:
+    """The radios plugged in, through the library that cflib uses. Raises LinkError where USB cannot be read."""
+    import libusb_package
+    import usb.core
+
+    try:
+        found = usb.core.find(
+            find_all=True, idVendor=kind[0], idProduct=kind[1], backend=libusb_package.get_libusb1_backend()
+        )
+        return list(found or ())
+    except (usb.core.USBError, usb.core.NoBackendError) as error:
+        raise LinkError(f"USB cannot be read: {error}", hint="install libusb") from error
+
+
+def check_radio(uri: str) -> None:
+    """Raises LinkError with a hint where the radio of a URI is absent, forbidden or another program's.
+
+    Takes the radio for a moment, as cflib will; a URI that names it otherwise than by number is left to cflib.
+    """
+    number = uri.removeprefix("radio://").partition("/")[0]
+    if not uri.startswith("radio://") or not number.isdecimal() or len(number) >= 10:
+        return
+    radios = find_radios()
+    if len(radios) <= int(number):
+        other = find_radios(OTHER_FIRMWARE) if not radios else []
+        if other:
+            raise LinkError(
+                "this Crazyradio 2.0 has other firmware than cflib speaks to",
+                where=uri,
+                hint="give it the one that emulates a Crazyradio PA",
+            )
+        if radios:
+            raise LinkError(
+                f"there is no radio {number}", where=uri, hint=f"they count from 0, and {len(radios)} are plugged in"
+            )
+        raise LinkError("no Crazyradio is plugged in", where=uri, hint="plug one in; `lsusb` lists it as 1915:7777")
+    _take(radios[int(number)], uri)
+
+
+def _take(radio: Any, uri: str) -> None:
+    import usb.core
+    import usb.util
+
+    try:
+        usb.util.claim_interface(radio, 0)
+        usb.util.release_interface(radio, 0)
+    except usb.core.USBError as error:
+        raise LinkError(
+            f"the radio cannot be opened: {error.strerror or error}", where=uri, hint=usb_hint(error.errno, str(error))
+        ) from error
+    finally:
+        usb.util.dispose_resources(radio)
+
+
+def usb_hint(number: int | None, text: str) -> str:
+    """What to do about an error of USB; "" where that is not known."""
+    text = text.lower()
+    if number == _DENIED or "denied" in text or "permission" in text:
+        return f"allow it once: {UDEV_RULES}; then unplug and plug in"
+    if number == _BUSY or "busy" in text:
+        return "another program has the radio: close cfclient and others"
+    return ""
