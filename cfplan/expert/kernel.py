@@ -212,13 +212,18 @@ def _functions(free_yaw: bool, points: int, chosen: Backend | None) -> tuple[_Bi
     kernels = point_kernels(free_yaw) if chosen == Backend.VIRTUAL_MACHINE or not machine_code() else None
     if kernels:
         return _interpreted(kernels[0], points), _interpreted(kernels[1], points)
-    loaded, family = ctypes.CDLL(str(machine_code())), stage.family(free_yaw)
+    loaded, family = _loaded(), stage.family(free_yaw)
     return _compiled(loaded[f"{family}_values"], points), _compiled(loaded[f"{family}_derivatives"], points)
+
+
+@lru_cache(maxsize=1)
+def _loaded() -> ctypes.CDLL:
+    return ctypes.CDLL(str(machine_code()))
 
 
 def _compiled(function: Any, points: int) -> _Bind:
     def bind(reads: list[NDArray], writes: list[NDArray]) -> Callable[[], None]:
-        pointers = [ctypes.c_void_p(array.ctypes.data) for array in (*reads, *writes)]
+        pointers = [ctypes.c_void_p(array.__array_interface__["data"][0]) for array in (*reads, *writes)]
         return partial(function, ctypes.c_long(points), *pointers)
 
     return bind

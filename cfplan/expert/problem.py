@@ -1,7 +1,7 @@
 """The numbers of one problem: path and limits into parameters and bounds, and a solution back into a profile."""
 
 import math
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,6 @@ class Problem:
     # h where x is 1
     step: float
     # of s, an interval
-    x0: NDArray
     p: NDArray
     lbx: NDArray
     ubx: NDArray
@@ -100,13 +99,12 @@ def pose(
     lbg, ubg = _constraint_bounds(layout, path, limits, unit, step, margin, ends)
     if table is None:
         table = _guess(layout, path, airframe, limits, yaw_angle, ends, unit, step)
-    x0 = variables_of(table, layout)
     if layout.shape.free_yaw:
         lbx[3], ubx[3] = yaw_angle, yaw_angle + math.pi / 2
-    for variable, value in _held(layout, path, ends, unit, step):
-        lbx[variable] = ubx[variable] = x0[variable] = value
     at_rest = (rests(path, 0.0), rests(path, path.end))
-    return Problem(layout, unit, step, x0, p, lbx, ubx, lbg, ubg, ends, at_rest, table)
+    for variable, value in _held(layout, at_rest, ends, unit, step):
+        lbx[variable] = ubx[variable] = value
+    return Problem(layout, unit, step, p, lbx, ubx, lbg, ubg, ends, at_rest, table)
 
 
 def tightened(problem: Problem, excess: Excess, at_points: NDArray) -> Problem:
@@ -118,8 +116,7 @@ def tightened(problem: Problem, excess: Excess, at_points: NDArray) -> Problem:
     layout = problem.layout
     upper, lower = HASTE * spread(excess.upper), HASTE * spread(excess.lower)
     lbg, ubg, ubx = problem.lbg.copy(), problem.ubg.copy(), problem.ubx.copy()
-    point, row = np.divmod(layout.selected, stage.ROWS)
-    interval = layout.interval[point]
+    row, interval = layout.row, layout.interval[layout.point]
     least = np.full(excess.upper.shape, np.inf)
     most = -least
     np.minimum.at(least, (interval, row), at_points)
@@ -191,7 +188,7 @@ def _parameters(
     psi, psi_ds, psi_dds = track.at(layout.interval, layout.place, step)
     data[:, 14], data[:, 15], data[:, 16] = psi, psi_ds * step, psi_dds * step**2
     common = stage.common_data(airframe, limits, unit / step**2)
-    return np.concatenate([data.ravel(), common, astuple(penalties)])
+    return np.concatenate([data.ravel(), common, penalties.weights()])
 
 
 def held_by(ends: Ends, nodes: int) -> NDArray:
@@ -229,14 +226,12 @@ def _constraint_bounds(
     layout: Layout, path: Path, limits: PlanLimits, unit: float, step: float, margin: NDArray, ends: Ends
 ) -> tuple[NDArray, NDArray]:
     lbg, ubg = np.zeros(layout.constraints), np.zeros(layout.constraints)
-    point, row = np.divmod(layout.selected, stage.ROWS)
-    interval, place = layout.interval[point], layout.place[point]
-    tighter = 2 * margin[interval]  # most rows are squares
+    row = layout.row
+    tighter = 2 * margin[layout.interval[layout.point]]  # most rows are squares
     # What a boundary state alone decides was checked before, and may be at its limit.
-    decided = np.isin(row, stage.JUMPING, invert=True)
-    at_start = (interval == 0) & (place == 0.0) & (ends.start is not None)
-    at_end = (interval == layout.shape.nodes - 1) & (place == 1.0) & (ends.end is not None)
-    tighter = np.where(decided & (at_start | at_end), -0.1, tighter)
+    for boundary, point in ((ends.start, 0), (ends.end, len(layout.interval) - 1)):
+        if boundary:
+            tighter[(layout.point == point) & ~np.isin(row, stage.JUMPING)] = -0.1
     lbg[layout.point_rows] = stage.LOWER[row] + tighter
     ubg[layout.point_rows] = stage.UPPER[row] - tighter
     s = (np.arange(layout.shape.nodes)[:, None] + np.array(layout.shape.speed_places)) * step
@@ -277,17 +272,17 @@ def _guess(
     return np.stack([cubic, quadratic], axis=1)
 
 
-def _held(layout: Layout, path: Path, ends: Ends, unit: float, step: float) -> list[tuple[int, float]]:
+def _held(layout: Layout, at_rest: tuple[bool, bool], ends: Ends, unit: float, step: float) -> list[tuple[int, float]]:
     """Variables that have one value: boundary states, and at rest ends the derivatives of h and the yaw rate."""
     nodes, block, states, free_yaw = layout.shape.nodes, layout.block, layout.states, layout.shape.free_yaw
     held: list[tuple[int, float]] = []
-    for boundary, node, interval in ((ends.start, 0, 0), (ends.end, nodes, nodes - 1)):
+    for boundary, rested, node, interval in ((ends.start, at_rest[0], 0, 0), (ends.end, at_rest[1], nodes, nodes - 1)):
         at = node * block
         if boundary:
             held += [(at, boundary.h / unit), (at + 1, boundary.dh * step / unit)]
             held += [(at + 2, boundary.ddh * step**2 / unit)]
             held += [(at + 3, boundary.yaw), (at + 4, boundary.dyaw * step)] if free_yaw else []
-        elif rests(path, node * step):
+        elif rested:
             held += [(interval * block + k, 0.0) for k in (1, 2, states)]
             held += [(at + 4, 0.0)] if free_yaw else []
     return held

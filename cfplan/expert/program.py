@@ -56,6 +56,10 @@ class Layout:
     # (P,) of the penalties: 1 at the left end of an interval, else 0
     selected: NDArray = field(init=False)
     # (G,) entry of the (ROWS, P) rows, column by column, that each nonlinear constraint takes
+    row: NDArray = field(init=False)
+    # (G,) which of the rows that is
+    point: NDArray = field(init=False)
+    # (G,) and at which point
     dynamics_rows: NDArray = field(init=False)
     # (N, nx) in the constraint vector
     point_rows: NDArray = field(init=False)
@@ -96,7 +100,8 @@ class Layout:
             counts.append(row - start)
         for name, value in (
             ("interval", np.array(interval)), ("place", np.array(place)), ("weight", np.array(weight)),
-            ("selected", np.array(selected)), ("dynamics_rows", np.array(dynamics_rows)),
+            ("selected", np.array(selected)), ("row", np.array(selected) % stage.ROWS),
+            ("point", np.array(selected) // stage.ROWS), ("dynamics_rows", np.array(dynamics_rows)),
             ("point_rows", np.array(point_rows)), ("speed_rows", np.array(speed_rows)), ("counts", (*counts, 0)),
         ):  # fmt: skip
             object.__setattr__(self, name, value)
@@ -246,7 +251,7 @@ class Program:
 
     def _jacobian(self, blocks: casadi.MX, linear: casadi.DM) -> casadi.MX:
         layout, block = self.layout, self.layout.block
-        point, row = np.divmod(layout.selected, stage.ROWS)
+        point, row = layout.point, layout.row
         entry = point[:, None] * (stage.ROWS * block) + np.arange(block) * stage.ROWS + row[:, None]
         rows = np.repeat(layout.point_rows, block)
         cols = (layout.interval[point][:, None] * block + np.arange(block)).ravel()

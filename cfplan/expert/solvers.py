@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cfplan.expert.compiled import Backend
 from cfplan.expert.interior_point import Search, minimise
-from cfplan.expert.problem import Problem, table_of
+from cfplan.expert.problem import Problem, table_of, variables_of
 from cfplan.expert.program import Shape, program
 from cfplan.expert.spline_problem import SplineProblem
 
@@ -82,9 +82,11 @@ def ipopt(problem: Problem, backend: Backend | None) -> Attempt:
 
     It evaluates through CasADi's virtual machine whatever `backend` says.
     """
+    held = problem.lbx == problem.ubx
+    x0 = np.where(held, problem.lbx, variables_of(problem.table, problem.layout))
     try:
         result = _ipopt(problem.layout.shape)(
-            x0=problem.x0, p=problem.p, lbx=problem.lbx, ubx=problem.ubx, lbg=problem.lbg, ubg=problem.ubg
+            x0=x0, p=problem.p, lbx=problem.lbx, ubx=problem.ubx, lbg=problem.lbg, ubg=problem.ubg
         )
         said = _ipopt(problem.layout.shape).stats()
     except RuntimeError as error:

@@ -42,16 +42,13 @@ class SplineProblem:
     def __init__(self, problem: Problem, backend: Backend | None = None) -> None:
         """What is fixed has its value from the problem's table."""
         self._structure = it = _structure(problem.layout, *_kinds(problem))
-        layout = problem.layout
-        nodes, points = layout.shape.nodes, len(layout.interval)
+        layout, points = problem.layout, len(problem.layout.interval)
         self._fixed = problem.table
-        k = coefficients(layout.shape.free_yaw)
-        local = np.arange(nodes)[:, None] + np.array([0, 1, 2, 3, 0, 1, 2][:k]), np.array([0, 0, 0, 0, 1, 1, 1][:k])
-        self._local = np.ascontiguousarray(self._fixed[local])
+        self._local = self._fixed.ravel()[it.coefficients]
 
-        spare = len(it.interval) - points
-        data = problem.p[: points * stage.POINT_DATA].reshape(points, stage.POINT_DATA)
-        data = np.pad(data, ((0, spare), (0, 0)), mode="edge").T
+        given = problem.p[: points * stage.POINT_DATA].reshape(points, stage.POINT_DATA)
+        data = np.empty((stage.POINT_DATA, len(it.interval)))
+        data[:, :points], data[:, points:] = given.T, given[-1:].T
         data[13, points:] = 0.0  # what is there to fill the lanes costs nothing
         common = problem.p[-3 - stage.COMMON_DATA : -3]
         weights = OBJECTIVE_SCALE * problem.p[-3:]
@@ -131,6 +128,8 @@ class _Structure(NamedTuple):
     # (N+3, 1 or 2) entry of v of each coefficient, -1 where it is fixed
     slots: NDArray
     # (N, k) entry of v of each of an interval's coefficients, likewise
+    coefficients: NDArray
+    # (N, k) where those lie in a flattened table
     entries: NDArray
     # (N, k(k+1)/2, 2) entry of the flattened matrix of each pair, -1 where one is fixed, and how often it counts there
     interval: NDArray
@@ -172,11 +171,12 @@ def _structure(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, bool]
     entry = np.where(low >= 0, high * (band + 1) + high - low, _NOBODY)
     entries = np.stack([entry, np.where((low == high) & (left != right), 2, 1)], axis=-1)
     interval = np.append(layout.interval, np.repeat(layout.interval[-1], -len(layout.interval) % LANES))
-    point, row = np.divmod(layout.selected, stage.ROWS)
     positive = np.flatnonzero(own[:, 0])
     return _Structure(
-        of, slots, entries, interval, np.searchsorted(interval, np.arange(nodes + 1)),
-        row * len(interval) + point, layout.point_rows, positive, *_linear_rows(layout, positive), of.size, band,
+        of, slots, local[0] * of.shape[1] + local[1], entries, interval,
+        np.searchsorted(interval, np.arange(nodes + 1)),
+        layout.row * len(interval) + layout.point, layout.point_rows, positive, *_linear_rows(layout, positive),
+        of.size, band,
     )  # fmt: skip
 
 

@@ -52,6 +52,10 @@ class Penalties:
     roughness: float = 1e-3
     # s, per squared third derivative of h over h, in grid steps, an interval
 
+    def weights(self) -> tuple[float, float, float]:
+        """As point_expressions takes them."""
+        return self.angular_acceleration, self.yaw_rate, self.roughness
+
 
 def common_data(airframe: Airframe, limits: PlanLimits, scale: float) -> NDArray:
     """(COMMON_DATA,) what is the same at every point; `scale` turns x into h in node units."""

@@ -39,7 +39,8 @@ def test_derivatives_put_together_from_blocks_are_those_of_the_whole(free_yaw):
     pieced = Program(shape)
     problem, _ = posed(shape)
     rng = np.random.default_rng(3)
-    x = problem.x0 + 0.01 * rng.normal(size=len(problem.x0))
+    x = variables_of(problem.table, problem.layout)
+    x += 0.01 * rng.normal(size=len(x))
     multipliers = rng.normal(size=pieced.layout.constraints)
 
     # The same functions without our derivatives, so that CasADi differentiates the whole.
