@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from cfplan.cli import cfplan
-from cfplan.cli.vehicle import check_mocap
+from cfplan.cli.vehicle import check_uris
 from cfplan.errors import CfplanError, InputError, LinkError
 from cfplan.simulation.virtual_cameras import ViconSettings
 from cfplan.simulation.virtual_vicon import serve
@@ -73,15 +73,15 @@ def test_nobody_there_is_an_error():
 
 def test_hardware_needs_motion_capture_before_anything_else():
     with pytest.raises(InputError, match="where do its poses come from") as caught:
-        check_mocap("radio://0/80/2M/E7E7E7E7E7", None)
+        check_uris("radio://0/80/2M/E7E7E7E7E7", None)
     assert "--mocap" in caught.value.hint
     with pytest.raises(InputError, match="which body"):
-        check_mocap("radio://0/80/2M/E7E7E7E7E7", "vicon://192.168.1.2")
-    check_mocap("radio://0/80/2M/E7E7E7E7E7", "qualisys://192.168.1.2/cf1")
+        check_uris("radio://0/80/2M/E7E7E7E7E7", "vicon://192.168.1.2")
+    check_uris("radio://0/80/2M/E7E7E7E7E7", "qualisys://192.168.1.2/cf1")
 
 
 def test_the_virtual_crazyflie_has_poses_of_its_own_and_a_virtual_vicon():
-    check_mocap("sim://0", None)
-    check_mocap("sim://0", "vicon-sdk://lab/cf1")
+    check_uris("sim://0", None)
+    check_uris("sim://0", "vicon-sdk://lab/cf1")
     with pytest.raises(InputError, match="virtual Vicon only"):
-        check_mocap("sim://0", "vrpn://lab/cf1")
+        check_uris("sim://0", "vrpn://lab/cf1")
