@@ -117,7 +117,7 @@ class Flights:
         """Title, columns and rows: the plans, the flights by path and all together, and what failed."""
         lab = self.conditions
         title = (
-            f"Flights: deviation from the reference in time, {lab.loss:.0%} of radio packets lost, "
+            f"Flights: deviation from the reference in time, {100 * lab.loss:g} % of radio packets lost, "
             f"{1e3 * lab.pose_noise:g} mm of pose noise{' by Vicon' if lab.vicon else ''}, "
             f"motor lag {self.motor_lag:g} s"
         )

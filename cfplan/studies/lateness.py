@@ -1,7 +1,7 @@
 """How late setpoints are sent while everything else runs, and how late this computer wakes a process that only sleeps.
 
 Each flight is one of the real pilot in the virtual lab, with Vicon's protocol, a record and a live view, all on this
-computer. Before each, a thread that only sleeps until the same deadlines shows what the computer itself adds.
+computer. Before it and meanwhile, a process that only sleeps until deadlines shows what the computer itself adds.
 """
 
 import contextlib
@@ -9,7 +9,6 @@ import ctypes
 import os
 import subprocess
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -19,15 +18,17 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
+from cfplan.errors import ExitCode
 from cfplan.flight.encoding import RATE
 from cfplan.flight.mission import Mission
-from cfplan.flight.pace import Pace, go_first, may_go_first
+from cfplan.flight.pace import may_go_first
 from cfplan.recording.header import RecordHeader
 from cfplan.recording.live import LiveView, live_blueprint
 from cfplan.recording.viewer import APPLICATION, free_port, viewer_program
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.missions import planned_mission
 from cfplan.studies.real_time import Conditions, fly_in_real_time
+from cfplan.studies.sleeper import Sleeper
 
 COLUMNS = ("what", "priority", "for", "p50", "p99", "p99.9", "max", "above 1 ms", "left out", "stolen")
 FIRST, ORDINARY = "SCHED_FIFO", "ordinary"
@@ -113,17 +114,18 @@ def lateness_study(
     """Measure both ways. Afterwards this process and those that it starts cannot go first any more."""
     mission = planned_mission(path_file, safety_file, stream_for=seconds).mission
     rows: list[Measured] = []
-    for step, priority in enumerate((FIRST, ORDINARY)):
-        if priority == ORDINARY:
-            give_up_priority()
-        elif not may_go_first():
-            rows.append(Measured("stream", priority, "not permitted here"))
-            continue
-        progress(2 * step, 4)
-        rows.append(_asleep(priority, seconds))
-        progress(2 * step + 1, 4)
-        rows.append(_streaming(priority, mission, seconds))
-    progress(4, 4)
+    with contextlib.suppress(KeyboardInterrupt):
+        for step, priority in enumerate((FIRST, ORDINARY)):
+            if priority == ORDINARY:
+                give_up_priority()
+            elif not may_go_first():
+                rows.append(Measured("stream", priority, "not permitted here"))
+                continue
+            progress(2 * step, 4)
+            rows.append(_asleep(priority, seconds))
+            progress(2 * step + 1, 4)
+            rows += _streaming(priority, mission)
+        progress(4, 4)
     return LatenessStudy(command, this_machine(), path_file.stem, _has_screen(), tuple(rows))
 
 
@@ -138,42 +140,37 @@ def give_up_priority() -> None:
 
 
 def _asleep(priority: str, seconds: float) -> Measured:
-    """A thread that only sleeps."""
-    late: list[float] = []
-    pace: list[Pace] = []
-
-    def sleep() -> None:
-        if priority == FIRST:
-            go_first()
-        pace.append(Pace(RATE))
-        for _ in range(round(seconds * RATE)):
-            due = pace[0].wait()
-            late.append(time.monotonic() - due)
-
+    """Only a sleeper."""
     stolen = _stolen()
-    thread = threading.Thread(target=sleep)
-    thread.start()
-    thread.join()
-    return Measured.of("asleep", priority, late, skipped=pace[0].skipped, stolen=_stolen() - stolen)
+    with Sleeper(RATE, first=priority == FIRST) as sleeper:
+        time.sleep(seconds)
+    return Measured.of("asleep, nothing else", priority, sleeper.late(), stolen=_stolen() - stolen)
 
 
-def _streaming(priority: str, mission: Mission, seconds: float) -> Measured:
-    """A flight; of it, the stream."""
+def _streaming(priority: str, mission: Mission) -> list[Measured]:
+    """A flight, of it the stream; and a sleeper over the same seconds."""
     stolen = _stolen()
-    flight = fly_in_real_time(mission, Conditions(vicon=True), name="lateness", view=_view)
+    with Sleeper(RATE, first=priority == FIRST) as sleeper:
+        flight = fly_in_real_time(mission, Conditions(vicon=True), name="lateness", view=_view)
+    if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT:
+        raise KeyboardInterrupt  # who ends the flight ends the study
     if not flight.sent or flight.outcome is None:
-        return Measured("stream", priority, flight.reason, refusals=flight.refusals)
+        return [Measured("stream", priority, flight.reason, refusals=flight.refusals)]
     late = [message.time - message.due for message in flight.sent]
-    return Measured.of(
-        "stream",
-        priority,
-        late,
-        "" if flight.landed else flight.reason,
-        skipped=flight.outcome.lateness.skipped,
-        stolen=_stolen() - stolen,
-        refusals=flight.refusals,
-        view_failure=flight.view_failure,
-    )
+    reason, stolen = "" if flight.landed else flight.reason, _stolen() - stolen
+    return [
+        Measured.of(
+            "stream",
+            priority,
+            late,
+            reason,
+            skipped=flight.outcome.lateness.skipped,
+            stolen=stolen,
+            refusals=flight.refusals,
+            view_failure=flight.view_failure,
+        ),
+        Measured.of("asleep meanwhile", priority, sleeper.late(flight.sent[0].due, flight.sent[-1].due), stolen=stolen),
+    ]
 
 
 @contextlib.contextmanager

@@ -3,11 +3,15 @@
 import json
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from cfplan.errors import ExitCode
+from cfplan.flight.outcome import Deviation, FlightOutcome, Rung
+from cfplan.flight.pace import Lateness
 from cfplan.flight.telemetry import SetpointSent
 from cfplan.studies import lateness
 from cfplan.studies.lateness import FIRST, ORDINARY, Measured, lateness_study
@@ -26,22 +30,34 @@ sys.exit(subprocess.run([sys.executable, "-c",
 """
 
 
-def flight(late, reason="landed"):
-    sent = [SetpointSent(1 + i / 100 + each, 1 + i / 100, i, *[STILL] * 3, LEVEL, STILL) for i, each in enumerate(late)]
-    return Flight(None, reason, sent=sent)
+def refused(reason):
+    return lambda: Flight(None, reason)
+
+
+def streamed(late):
+    """A flight that streams for a fifth of a second, each setpoint late by as much."""
+    begin = time.monotonic()
+    time.sleep(0.2)
+    due = [begin + index / 100 for index in range(20)]
+    sent = [SetpointSent(when + late, when, index, *[STILL] * 3, LEVEL, STILL) for index, when in enumerate(due)]
+    outcome = FlightOutcome(
+        ExitCode.OK, "landed", Rung.NONE, (), (), begin, 0.2, Lateness(late, late, late, 20, 3),
+        Deviation(0.0, 0.0, 0.0, 0), 0.0, STILL,
+    )  # fmt: skip
+    return Flight(outcome, "landed", sent=sent)
 
 
 @pytest.fixture
 def study(monkeypatch):
-    """The study with flights that are not flown; what it gives up stays in place for the other tests."""
+    """The study with flights that are not flown; nothing is given up, as other tests may need it."""
     given_up, flights = [], []
     monkeypatch.setattr(lateness, "give_up_priority", lambda: given_up.append(True))
-    monkeypatch.setattr(lateness, "fly_in_real_time", lambda *_, **__: flights.pop(0))
+    monkeypatch.setattr(lateness, "fly_in_real_time", lambda *_, **__: flights.pop(0)())
 
     def run(*ends, permitted=True):
         monkeypatch.setattr(lateness, "may_go_first", lambda: permitted)
         flights.extend(ends)
-        result = lateness_study(REPOSITORY / "flights" / "line.yaml", REPOSITORY / "safety.yaml", 0.05)
+        result = lateness_study(REPOSITORY / "flights" / "line.yaml", REPOSITORY / "safety.yaml", 0.1)
         assert given_up == [True]
         return result
 
@@ -57,19 +73,30 @@ def test_percentiles_are_those_of_the_setpoints():
     assert row.seconds == 10.0
 
 
-def test_a_sleeper_stands_beside_each_stream_and_what_did_not_fly_is_told(study):
-    result = study(flight([], "the vehicle is gone"), flight([], "too late"))
+def test_a_sleeper_stands_before_each_stream_and_beside_it_over_the_same_seconds(study):
+    result = study(lambda: streamed(1e-3), lambda: streamed(2e-3))
     assert [(row.what, row.priority) for row in result.rows] == [
-        ("asleep", FIRST), ("stream", FIRST), ("asleep", ORDINARY), ("stream", ORDINARY),
-    ]  # fmt: skip
-    assert result.rows[1].reason == "the vehicle is gone"
-    assert result.rows[0].count == 5
+        (what, priority)
+        for priority in (FIRST, ORDINARY)
+        for what in ("asleep, nothing else", "stream", "asleep meanwhile")
+    ]
+    alone, stream, meanwhile = result.rows[:3]
+    assert stream.p50 == pytest.approx(1e-3)
+    assert stream.skipped == 3
+    assert 5 <= alone.count <= 100
+    assert 15 <= meanwhile.count <= 20
     assert all(len(row) == len(columns) for _, columns, rows in result.tables() for row in rows)
     json.dumps(result.to_dict())
 
 
+def test_what_did_not_fly_is_told(study):
+    result = study(refused("the vehicle is gone"), refused("too late"))
+    assert [row.reason for row in result.rows] == ["", "the vehicle is gone", "", "too late"]
+    assert all(len(row) == len(columns) for _, columns, rows in result.tables() for row in rows)
+
+
 def test_where_it_is_not_permitted_to_go_first_the_rest_is_measured(study):
-    result = study(flight([], "too late"), permitted=False)
+    result = study(refused("too late"), permitted=False)
     assert result.rows[0].reason == "not permitted here"
     assert [row.priority for row in result.rows[1:]] == [ORDINARY, ORDINARY]
 
