@@ -29,7 +29,7 @@ from cfplan.recording.viewer import open_viewer, save
 from cfplan.vehicle.airframe import GRAVITY
 
 AXIS_LENGTH = 0.25  # m, of the body axes as drawn
-STRIPS_AT_ONCE = 250  # `rerun rrd verify` takes a time that grows with the square of the strips in one chunk
+STRIPS_AT_ONCE = 500  # `rerun rrd verify` takes a time that grows with the square of the strips in one chunk
 BODY_SCALE = 4.0  # the vehicle is drawn larger than it is, or it could not be seen in its room
 TRACK_RADIUS, TAIL_RADIUS, WANTED_RADIUS, PATH_RADIUS = 0.004, 0.02, 0.01, 0.006  # m, of the lines
 HOVER_ARROW = 0.35  # m, of the thrust in hover

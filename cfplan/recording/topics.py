@@ -19,7 +19,7 @@ PROFILE = "cfplan"
 # the profile that our MCAP files name; a file with another is not a record
 METADATA = "cfplan"
 # the metadata entry that holds format and header
-_BLOCK = 1 << 26  # bytes of JSON read at a time
+_BLOCK = 1 << 21  # bytes of JSON that one core reads at a time
 FORMAT = "1"
 # raised when older versions can no longer read a record
 
@@ -105,7 +105,7 @@ def columns_from_json(topic: Topic, payloads: list[bytes]) -> Any:
         lines = b"\n".join(payload.replace(b"\n", b" ") for payload in payloads)
     table = pa_json.read_json(
         pa.BufferReader(lines),
-        pa_json.ReadOptions(block_size=_BLOCK),
+        pa_json.ReadOptions(block_size=max(_BLOCK, 1 + max(map(len, payloads)))),
         pa_json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore"),
     )
     if len(table) != len(payloads):

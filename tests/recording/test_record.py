@@ -101,6 +101,14 @@ def test_any_text_reads_back(text):
     assert columns.text[0] == text.rstrip("\0")  # numpy's strings end before trailing NULs
 
 
+def test_a_text_of_any_length_reads_back(tmp_path, small_header):
+    texts = ["short", "long" * 2_000_000, "short again"]
+    with RecordWriter(tmp_path, small_header) as writer:
+        for text in texts:
+            writer.write(Event(1.0, Level.INFO, text))
+    assert read_record(tmp_path).events.text.tolist() == texts
+
+
 def test_messages_may_hold_numpy_numbers(tmp_path, small_header):
     with RecordWriter(tmp_path / "a", small_header) as writer:
         writer.write(PoseReceived(np.float32(1.5), np.float64(2.5), np.array([1.0, 2.0, np.nan]), (0.0, 0.0, 0.0, 1.0)))
