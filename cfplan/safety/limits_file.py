@@ -1,9 +1,11 @@
 """safety.yaml, read strictly: every mistake is named with its line and column."""
 
 import math
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
 
 from cfplan.errors import CfplanError, InputError
@@ -245,3 +247,24 @@ def _check_vehicle_can(limits: Limits, places: Places) -> None:
             where=places.where("plan", "acceleration"),
             hint="allow no more than the vehicle can do",
         )
+    against_drag = airframe.mass * level / airframe.drag[0] if airframe.drag[0] else math.inf
+    if plan.speed > against_drag:
+        raise InputError(
+            f"{airframe.name} cannot fly faster than {against_drag:.1f} m/s and hold its height",
+            where=places.where("plan", "speed"),
+            hint="allow no more than the vehicle can do",
+        )
+    quickest = _quickest_turn(airframe)
+    if plan.angular_acceleration > quickest:
+        raise InputError(
+            f"{airframe.name} cannot turn faster by more than {quickest:.0f} rad/s²",
+            where=places.where("plan", "angular_acceleration"),
+            hint="allow no more than the vehicle can do; motors follow far slower still",
+        )
+
+
+def _quickest_turn(airframe: Airframe) -> float:
+    """rad/s², the most that any motors at the ends of their range give."""
+    ends = product((airframe.motor_thrust_min, airframe.motor_thrust_max), repeat=4)
+    turns = airframe.mixing[1:] @ np.array(list(ends)).T / np.array(airframe.inertia)[:, None]
+    return float(np.linalg.norm(turns, axis=0).max())

@@ -113,6 +113,8 @@ def test_unknown_keys_are_errors(tmp_path, place):
         ({"plan.specific_thrust": 9.9}, "hovering is impossible"),
         ({"plan.motor_reserve": 0.1, "plan.tilt_deg": 50}, "cannot hold its height beyond a tilt of 44"),
         ({"plan.motor_reserve": 0.1, "plan.acceleration": 9.8}, "cannot accelerate at more than 9.6"),
+        ({"plan.speed": 20.0, "flight.speed": {"brake": 25, "land": 28, "cut": 32}}, "cannot fly faster than 17.8"),
+        ({"plan.angular_acceleration": 900.0}, r"cannot turn faster by more than \d+ rad"),
         ({"plan.speed": 3.5}, "not below flight.speed.brake"),
         ({"plan.acceleration": 10.0}, "not below flight.acceleration.brake"),
         ({"plan.angular_velocity": 12.0}, "not below flight.angular_velocity.brake"),
