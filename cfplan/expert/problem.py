@@ -161,14 +161,14 @@ def variables_of(table: NDArray, layout: Layout) -> NDArray:
     return x
 
 
-def profile_of(table: NDArray, problem: Problem, track: YawTrack, end: float) -> SpeedProfile:
+def profile_of(table: NDArray, unit: float, track: YawTrack, end: float) -> SpeedProfile:
     """The profile of these splines, and of the track where yaw is not among them."""
-    if problem.layout.shape.free_yaw:
-        quadratic, step = table[:-1, 1], problem.step
+    if table.shape[1] == 2:
+        quadratic, step = table[:-1, 1], end / (len(table) - 3)
         track = YawTrack(
             (quadratic[:-1] + quadratic[1:]) / 2, np.diff(quadratic) / step, np.diff(quadratic, 2) / step**2
         )
-    return spline_profile(table[:, 0] * problem.unit, end, track)
+    return spline_profile(table[:, 0] * unit, end, track)
 
 
 def _parameters(

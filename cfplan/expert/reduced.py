@@ -16,6 +16,8 @@ alone, an optimiser lets it run away or stop short. There h stays constant over 
 import math
 import time
 
+from numpy.typing import NDArray
+
 from cfplan.expert.compiled import Backend
 from cfplan.expert.kernel import backend as backend_in_use
 from cfplan.expert.preconditions import broken_by, check_arguments, unsolvable
@@ -24,13 +26,17 @@ from cfplan.expert.program import Shape, layout_of
 from cfplan.expert.solution import Solution, Status
 from cfplan.expert.solvers import interior_point, ipopt
 from cfplan.expert.stage import Penalties
-from cfplan.expert.tightening import Task, flaw, kept_between
+from cfplan.expert.tightening import Kept, Task, flaw, kept_between
+from cfplan.expert.windows import by_windows
 from cfplan.expert.yaw_track import fixed_yaw, tangent_yaw
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
+
+WINDOW = (400, 40)
+# intervals of a window that is searched at once, and how much further it looks; more only make the search longer
 
 
 def plan_reduced(
@@ -44,6 +50,7 @@ def plan_reduced(
     start: BoundaryState | None = None,
     end: BoundaryState | None = None,
     penalties: Penalties | None = None,
+    windows: bool = True,
     backend: Backend | None = None,
 ) -> Solution:
     """Plan over `nodes` intervals uniform in s; see Planner.
@@ -51,7 +58,8 @@ def plan_reduced(
     Yaw is that of the Hopf fibration. FIXED holds `yaw_angle`, TANGENT follows the horizontal direction of flight;
     both are laid out before the speed (see yaw_track), which then respects what turning takes. FREE leaves yaw to the
     optimiser, from a first yaw between `yaw_angle` and a quarter turn more, as the paper has it. A start or end state
-    brings its own yaw in every mode. `backend` is for tests: left out, compiled code where there is a compiler.
+    brings its own yaw in every mode. Long paths are taken window by window, unless `windows` is False. `backend` is for
+    tests: left out, compiled code where there is a compiler.
 
     Raises:
         InputError: arguments that are not numbers, or fewer nodes than the path needs.
@@ -66,25 +74,35 @@ def plan_reduced(
 
     track = (tangent_yaw if yaw is YawMode.TANGENT else fixed_yaw)(path, nodes, yaw_angle, start, end)
     shape = Shape(nodes, yaw is YawMode.FREE, turning_limited=limits.angular_acceleration < math.inf)
-    task = Task(path, airframe, limits, Ends(start, end), track, layout_of(shape), backend)
-    problem = pose(task.layout, path, airframe, limits, track, yaw_angle, task.ends, penalties or Penalties())
-
+    whole = Task(path, airframe, limits, Ends(start, end), track, layout_of(shape), backend)
     failures: list[str] = []
-    for solve in (interior_point, ipopt):
-        attempt = solve(problem, backend)
-        reason = flaw(attempt, problem, task)
-        if not reason:
-            break
-        failures.append(f"{attempt.solver}: {reason}")
-    else:
-        return Solution(Status.NOT_CONVERGED, None, "; ".join(failures))
+    solvers: set[str] = set()
 
-    kept = kept_between(attempt, problem, task)
+    def search(task: Task, _near: NDArray) -> Kept | str:
+        problem = pose(
+            task.layout, task.path, airframe, limits, task.track, yaw_angle, task.ends, penalties or Penalties()
+        )
+        reasons: list[str] = []
+        for solve in (interior_point, ipopt):
+            attempt = solve(problem, backend)
+            reason = flaw(attempt, problem, task)
+            if not reason:
+                failures.extend(reasons)
+                solvers.add(attempt.solver)
+                return kept_between(attempt, problem, task)
+            reasons.append(f"{attempt.solver}: {reason}")
+        return "; ".join(reasons)
+
+    joined = by_windows(whole, WINDOW if windows else (nodes, 0), search)
+    if isinstance(joined, str):
+        return Solution(Status.NOT_CONVERGED, None, joined)
     stats: dict[str, float | int | str] = {
         "solve_seconds": time.perf_counter() - began,
-        "iterations": kept.iterations,
-        "rounds": kept.rounds,
-        "solver": attempt.solver,
+        "iterations": joined.iterations,
+        "rounds": joined.rounds,
+        "windows": 1 + len(joined.joints),
+        "solver": " and ".join(sorted(solvers)),
         "backend": str(backend or backend_in_use()),
     }
-    return Solution(Status.SOLVED, profile_of(kept.table, problem, track, path.end), "; ".join(failures), stats)
+    profile = profile_of(joined.table, limits.speed**2, track, path.end)
+    return Solution(Status.SOLVED, profile, "; ".join(failures), stats, joined.joints)

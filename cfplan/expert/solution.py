@@ -32,6 +32,8 @@ class Solution:
     # the solver's own words, for people
     stats: Mapping[str, float | int | str] = field(default_factory=dict)
     # solve_seconds, iterations, solver, …
+    joints: tuple[float, ...] = ()
+    # s, where the windows meet that a long path was taken by
 
 
 class Planner(Protocol):

@@ -53,10 +53,9 @@ def h_coefficients(profile: SpeedProfile) -> NDArray:
     return np.concatenate([[before], inner, [inner[-2] + 2 * step * profile.dh[-1]]])
 
 
-def yaw_of(profile: SpeedProfile, first: int = 0, last: int | None = None) -> YawTrack:
-    """Yaw along the intervals from `first` to before `last`."""
-    nodes = slice(first, None if last is None else last + 1)
-    return YawTrack(profile.yaw[nodes], profile.dyaw[nodes], profile.ddyaw[first:last])
+def yaw_of(profile: SpeedProfile) -> YawTrack:
+    """Yaw all along."""
+    return YawTrack(profile.yaw, profile.dyaw, profile.ddyaw)
 
 
 def _fit(grid: NDArray, s: NDArray, values: NDArray, weights: NDArray, degree: int, stiffness: float) -> BSpline:

@@ -53,7 +53,7 @@ def kept_between(attempt: Attempt, problem: Problem, task: Task, searches: Seque
     dense = DensePath(task.path, nodes, held_by(task.ends, nodes))
     iterations = attempt.iterations
     for done in range(ROUNDS):
-        profile = profile_of(attempt.table, problem, task.track, task.path.end)
+        profile = profile_of(attempt.table, problem.unit, task.track, task.path.end)
         excess = dense.excess(profile, task.airframe, task.limits)
         if excess.worst <= ENOUGH:
             return Kept(attempt.table, done, iterations)
@@ -74,7 +74,7 @@ def flaw(attempt: Attempt, problem: Problem, task: Task) -> str:
         return "the solution is not finite"
     if (attempt.table[:, 0] > 0).all():  # then so is h, which lies between its coefficients
         return ""
-    profile = profile_of(attempt.table, problem, task.track, task.path.end)
+    profile = profile_of(attempt.table, problem.unit, task.track, task.path.end)
     places = np.linspace(0.0, 1.0, 9)
     nodes = np.arange(task.layout.shape.nodes)
     s = profile.s[:-1, None] + np.diff(profile.s)[:, None] * places

@@ -34,6 +34,10 @@ class YawTrack:
     ddyaw: NDArray
     # (N,) constant in each interval
 
+    def part(self, first: int, last: int) -> "YawTrack":
+        """The intervals from `first` to before `last`."""
+        return YawTrack(self.yaw[first : last + 1], self.dyaw[first : last + 1], self.ddyaw[first:last])
+
     def at(self, interval: NDArray, place: NDArray, step: float) -> tuple[NDArray, NDArray, NDArray]:
         """ψ, ψ', ψ'' at places 0 to 1 of intervals."""
         x = place * step

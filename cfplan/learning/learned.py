@@ -100,10 +100,11 @@ def plan_learned(
         "iterations": 0,
         "solver": "learned",
         "model": model.name,
-        "window": model.window,
     }
     track = track or track_through(turned, path.end / nodes, start, end)
-    return Solution(Status.SOLVED, spline_profile(coefficients, path.end, track), "", stats)
+    begins = (part.first for part in chain(nodes, model.window, kept(model.window)))
+    joints = tuple(path.end / nodes * first for first in begins if first > 0)
+    return Solution(Status.SOLVED, spline_profile(coefficients, path.end, track), "", stats, joints)
 
 
 def predict(

@@ -12,7 +12,6 @@ from cfplan.expert.solution import Solution
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.model_files import find_model
-from cfplan.learning.windows import chain, kept
 from cfplan.planning.certified import Plan
 from cfplan.planning.planners import AUTO, find_planner
 from cfplan.planning.repair import Repaired, repair, slow
@@ -232,17 +231,8 @@ def _ask(question: _Question, name: str, nodes: int, notes: list[str]) -> _Found
     except (InfeasibleError, NotCertifiedError) as error:
         notes.append(f"{name} with {nodes} nodes: {error}")
         return None
-    joints = repaired.joints if repaired.joints is not None else _joints(solution)
+    joints = solution.joints if repaired.joints is None else repaired.joints
     return _Found(repaired, name, nodes, joints)
-
-
-def _joints(solution: Solution) -> tuple[float, ...]:
-    """s, where a planner that works window by window joined them."""
-    window = solution.stats.get("window")
-    if solution.profile is None or not isinstance(window, int):
-        return ()
-    s = solution.profile.s
-    return tuple(float(s[part.first]) for part in chain(len(s) - 1, window, kept(window)) if part.first > 0)
 
 
 def _failure(name: str, nodes: int, solution: Solution) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cfplan.expert.between import surely_exceeds
-from cfplan.expert.refined import refine, windows_of
+from cfplan.expert.refined import refine
 from cfplan.geometry.path import Path
 from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import PlanLimits
@@ -86,7 +86,7 @@ def repair(
     return Repaired(
         slowed.trajectory, slowed.certificate, slowed.share, trajectory.duration,
         *_where_slower(profile, solution.profile),
-        joints=tuple(float(profile.s[first]) for first, _ in windows_of(len(profile.s) - 1) if first > 0),
+        joints=solution.joints,
     )  # fmt: skip
 
 

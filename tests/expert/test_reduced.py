@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
+from cfplan.expert import reduced
 from cfplan.expert.limit_sets import BOXES, LIMIT_SETS
 from cfplan.expert.reduced import plan_reduced
 from cfplan.expert.solution import Solution, Status
@@ -63,6 +64,20 @@ def test_plans_pass_the_dense_certificate_without_slowing(chosen, box):
         path = min_snap(random_waypoints(seed, box))
         profile = solved(plan_reduced(path, chosen.airframe, chosen.limits))
         assert certify(Trajectory(path, profile, chosen.airframe), chosen.limits).passed
+
+
+@pytest.mark.parametrize("yaw", YawMode)
+def test_a_long_path_by_windows_is_as_fast_as_at_once_and_certified_across_joints(yaw, monkeypatch):
+    monkeypatch.setattr(reduced, "WINDOW", (60, 30))
+    path = min_snap(np.concatenate([CORNERED, CORNERED[:2] + 0.4, CORNERED[1:] - 0.3]))
+    times = []
+    for windows in (True, False):
+        solution = plan_reduced(path, HARDWARE.airframe, HARDWARE.limits, nodes=200, yaw=yaw, windows=windows)
+        assert solution.joints == (pytest.approx((0.3 * path.end, 0.6 * path.end)) if windows else ())
+        trajectory = Trajectory(path, solved(solution), HARDWARE.airframe)  # refuses jumps of h, h', h'' and yaw
+        assert certify(trajectory, HARDWARE.limits).passed
+        times.append(trajectory.duration)
+    assert times[0] == pytest.approx(times[1], rel=5e-3)
 
 
 @pytest.mark.parametrize("yaw", YawMode)

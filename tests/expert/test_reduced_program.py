@@ -127,7 +127,7 @@ def test_rows_of_the_program_are_what_the_flatness_map_gives():
     shape = Shape(30, False)
     problem, track = posed(shape)
     attempt = interior_point(problem, None)
-    profile = profile_of(attempt.table, problem, track, PATH.end)
+    profile = profile_of(attempt.table, problem.unit, track, PATH.end)
     trajectory = Trajectory(PATH, profile, HARDWARE.airframe)
     point, row = np.divmod(problem.layout.selected, stage.ROWS)
     values = attempt.at_points
@@ -207,7 +207,8 @@ def test_both_solvers_find_the_same_flight():
     times = []
     for attempt in (interior_point(problem, None), ipopt(problem, None)):
         assert attempt.solved, attempt.words
-        times.append(Trajectory(PATH, profile_of(attempt.table, problem, track, PATH.end), HARDWARE.airframe).duration)
+        profile = profile_of(attempt.table, problem.unit, track, PATH.end)
+        times.append(Trajectory(PATH, profile, HARDWARE.airframe).duration)
     assert times[0] == pytest.approx(times[1], rel=1e-3)
 
 

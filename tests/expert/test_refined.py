@@ -7,9 +7,10 @@ import pytest
 
 from cfplan.expert.limit_sets import LIMIT_SETS
 from cfplan.expert.reduced import plan_reduced
-from cfplan.expert.refined import AHEAD, WINDOW, refine, windows_of
+from cfplan.expert.refined import WINDOW, refine
 from cfplan.expert.solution import Status
 from cfplan.expert.spline_profile import h_coefficients, spline_profile, yaw_of
+from cfplan.expert.windows import windows_of
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.safety.certificate import certify
@@ -49,18 +50,19 @@ def test_a_profile_near_the_experts_becomes_as_fast_and_certified_in_fewer_steps
 
 
 def test_windows_cover_a_path_and_each_looks_ahead():
-    for nodes in (1, 100, WINDOW + AHEAD, WINDOW + AHEAD + 1, 1000):
-        windows = windows_of(nodes)
+    kept, ahead = WINDOW
+    for nodes in (1, 100, kept + ahead, kept + ahead + 1, 1000):
+        windows = windows_of(nodes, kept, ahead)
         assert windows[0][0] == 0
         assert windows[-1][1] == nodes
         for (_, ends), (begins, _) in itertools.pairwise(windows):
-            assert ends - begins == AHEAD
+            assert ends - begins == ahead
 
 
 def test_a_long_path_by_windows_is_as_fast_as_by_the_whole_and_continuous_at_joints():
     path, chosen, expert = planned("hardware", 5, nodes=320, waypoints=(9, 9))
     solution = refine(path, disturbed(expert, path.end, 0.02), chosen.airframe, chosen.limits)
-    assert solution.stats["windows"] == len(windows_of(320)) > 2
+    assert solution.stats["windows"] == len(windows_of(320, *WINDOW)) > 2
     refined = Trajectory(path, solution.profile, chosen.airframe)  # refuses jumps of h, h', h'' and yaw
     assert certify(refined, chosen.limits).passed
     assert refined.duration == pytest.approx(Trajectory(path, expert, chosen.airframe).duration, rel=5e-3)
@@ -71,7 +73,7 @@ def test_boundary_states_are_kept():
     first, last = 30, 80
     part = path.part(expert.s[first], expert.s[last])
     start, end = expert.boundary(first), expert.boundary(last)
-    cut = spline_profile(h_coefficients(expert)[first : last + 3] * 0.98**2, part.end, yaw_of(expert, first, last))
+    cut = spline_profile(h_coefficients(expert)[first : last + 3] * 0.98**2, part.end, yaw_of(expert).part(first, last))
     profile = refine(part, cut, chosen.airframe, chosen.limits, start=start, end=end).profile
     for state, found in ((start, profile.boundary(0)), (end, profile.boundary(-1))):
         assert (found.h, found.dh, found.ddh) == pytest.approx((state.h, state.dh, state.ddh), rel=1e-6, abs=1e-6)

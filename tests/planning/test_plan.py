@@ -170,10 +170,10 @@ def test_a_plan_made_window_by_window_tells_where_they_meet(limits, make_profile
     assert refined[150].joints == pytest.approx([96 / 150 * zigzag.end])
 
     slow = make_profile(zigzag.end, np.full(150 + 3, 0.2))
-    stub(monkeypatch, learned=lambda path, nodes: Solution(Status.SOLVED, slow, "", {"window": 64}))
+    stub(monkeypatch, learned=lambda path, nodes: Solution(Status.SOLVED, slow, joints=(1.25, 2.5)))
     chained = plan(zigzag, limits.airframe, limits, planner="learned")
     assert chained.notes == ()
-    assert chained.joints == pytest.approx([48 / 150 * zigzag.end, 86 / 150 * zigzag.end])
+    assert chained.joints == (1.25, 2.5)
 
 
 def test_where_the_learned_planner_fails_the_expert_steps_in(path, limits, make_profile, monkeypatch):
