@@ -50,8 +50,11 @@ def prepare(
     cockpit.enter(Phase.ARM)
     cockpit.restart_pace()
     cockpit.floor = cockpit.pose().position[2]
-    cockpit.link.arm(True)
-    if not cockpit.until(lambda: cockpit.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, 3.0):
+    for _ in range(TRIES):  # a busy radio may give one up
+        cockpit.link.arm(True)
+        if cockpit.until(lambda: cockpit.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, 1.0):
+            break
+    else:
         raise PreflightError("the vehicle does not arm", hint="restart the vehicle")
 
 

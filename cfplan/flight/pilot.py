@@ -369,8 +369,10 @@ class Pilot:
             cockpit.enter(Phase.DISARM)
             cockpit.rung, cockpit.stream = Rung.CUT, None  # nothing ends what is over
             try:
-                cockpit.link.arm(False)
-                cockpit.until(lambda: not cockpit.bits(ARMED), 0.5)
+                for _ in range(TRIES):
+                    cockpit.link.arm(False)
+                    if cockpit.until(lambda: not cockpit.bits(ARMED), 0.2):
+                        break
             except (LinkLost, Tripped):
                 cockpit.say(Level.WARNING, "the link went before the vehicle was disarmed")
             cockpit.link.close()

@@ -100,6 +100,8 @@ class World:
     refuses: dict[int, int] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
     unknown: tuple[str, ...] = ()
+    arms_lost: int = 0
+    # orders to arm or disarm that the radio swallows
     cuts_lost: int = 0
     # emergency stops that the radio swallows
     other_body: bool = False
@@ -251,6 +253,9 @@ class World:
 
     def arm(self, do_arm: bool) -> None:
         self.calls.append("arm" if do_arm else "disarm")
+        if self.arms_lost:
+            self.arms_lost -= 1
+            return
         self.armed = do_arm
 
     def emergency_stop(self) -> None:

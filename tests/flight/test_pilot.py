@@ -202,6 +202,15 @@ def test_a_cut_while_landing_is_still_obeyed(world, fly):
     assert "emergency stop" in world.calls
 
 
+def test_an_order_to_arm_or_disarm_that_the_radio_swallows_is_sent_again(world, fly):
+    world.arms_lost = 1
+    world.when(Phase.LAND, 0.0, lambda: setattr(world, "arms_lost", 1))
+    assert fly().exit_code is ExitCode.OK
+    assert world.calls.count("arm") == 2
+    assert world.calls.count("disarm") == 2
+    assert not world.armed
+
+
 def test_a_cut_is_sent_until_the_vehicle_says_that_it_is_locked(world, fly):
     world.cuts_lost = 20
     world.when(Phase.STREAM, 1.0, lambda: cut(world))
