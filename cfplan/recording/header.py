@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan import __version__
 from cfplan.errors import InputError
-from cfplan.safety.limits import PlanLimits
+from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.vehicle.airframe import Airframe
 
 Triple = tuple[float, float, float]
@@ -34,6 +35,9 @@ class FlightBounds:
     # s
     battery_voltage: float = math.nan
     # V, least
+
+
+_NO_BOUNDS = FlightBounds()
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,36 @@ class RecordHeader:
     # s since 1970, when time.monotonic() was zero
     provenance: Mapping[str, str] = field(default_factory=dict)
     # whatever else tells where the plan came from: file, model hash, …
+
+
+def header_under(
+    limits: Limits,
+    *,
+    name: str,
+    uri: str,
+    path: NDArray,
+    travel_time: float,
+    planner: str = "",
+    bounds: FlightBounds = _NO_BOUNDS,
+    wall_time_at_zero: float = 0.0,
+    provenance: Mapping[str, str] | None = None,
+) -> RecordHeader:
+    """Of a flight under these limits, by this version."""
+    return RecordHeader(
+        name=name,
+        version=__version__,
+        uri=uri,
+        planner=planner,
+        vehicle=limits.airframe,
+        thrust_at_full_command=limits.airframe.motor_thrust_max,
+        plan_limits=limits.plan,
+        bounds=bounds,
+        travel_time=travel_time,
+        path=path,
+        fence=(limits.space.low, limits.space.high),
+        wall_time_at_zero=wall_time_at_zero,
+        provenance=provenance or {},
+    )
 
 
 def header_to_json(header: RecordHeader) -> str:

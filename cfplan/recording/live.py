@@ -116,13 +116,15 @@ class LiveView:
             fresh.append(self._waiting.popleft())
         if not fresh:
             return
+        ends = [max(message.time for message in fresh)]
         if self._start is None:
             self._start = min(message.time for message in fresh)
+            ends.insert(0, self._start)
         part = _part(self._header, [*self._carried.values(), *fresh])
         self._carried |= {type(message): message for message in fresh if isinstance(message, _CARRIED)}
         shown = plots(part)
         log_columns(self._stream, part, shown, self._start)
-        log_limits(self._stream, shown, [max(message.time for message in fresh) - self._start])
+        log_limits(self._stream, shown, [end - self._start for end in ends])
         poses = part.poses
         log_tail(self._stream, layout.FLOWN, poses.time - self._start, poses.position, FLOWN, TRACK_RADIUS)
         for entity, times, colour in ((layout.BODY, poses.time, FLOWN), (layout.GHOST, part.setpoints.due, WANTED)):

@@ -61,6 +61,10 @@ def test_the_flown_track_has_no_gap_between_batches(flight, watched):
     assert len(steps) == poses - 1
 
 
+def test_limits_are_drawn_from_the_first_message_on(watched):
+    assert min(rows(watched, f"{layout.PLOTS}/speed/limit", "Scalars:scalars")) == 0.0
+
+
 def test_messages_become_the_columns_that_a_record_reads_back(flight):
     for topic in TOPICS:
         messages = [message for message in flight.messages if type(message) is topic.message]
