@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cfplan.errors import ExitCode
-from cfplan.flight.encoding import check_bytes, encode_trajectory
+from cfplan.flight.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.mission import mission_of
 from cfplan.flight.outcome import Rung
 from cfplan.flight.process import fly
@@ -16,6 +16,7 @@ from cfplan.planning.plan import plan
 from cfplan.safety.limits import load_limits
 from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.lab import start_lab
+from cfplan.simulation.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.room import RoomPoseSource, RoomSettings
 from cfplan.simulation.sim_driver import SimDriver
 
@@ -46,6 +47,7 @@ def test_a_path_file_certifies_and_flies_as_planned(file):
     room = RoomSettings(position_noise=1e-3, attitude_noise=np.radians(0.2), latency=0.010)
     sent: list[SetpointSent] = []
     with start_lab(limits.airframe, room=room) as lab:
+        lab.disturb(RadioFault(RadioFaultKind.LOSS, size=0.05))
         outcome = fly(
             mission_of(encoded, limits),
             uri=lab.uri,
@@ -57,16 +59,19 @@ def test_a_path_file_certifies_and_flies_as_planned(file):
 
     assert (outcome.exit_code, outcome.reason) == (ExitCode.OK, "landed")
     assert outcome.rung is Rung.NONE
-    assert outcome.lateness.p99 <= 2e-3
+    planned = made.trajectory.duration
+    last = next(
+        message for message in sent if message.time > outcome.first_setpoint and message.index >= planned * RATE
+    )
+    assert last.time - outcome.first_setpoint == pytest.approx(planned, rel=0.01)
     assert truth.off_in_air[-1] == 0
     assert not truth.locked
     assert truth.position[-1, 2] < 0.02
 
-    streamed = (truth.time >= outcome.first_setpoint) & (
-        truth.time <= outcome.first_setpoint + made.trajectory.duration
-    )
-    reference = made.trajectory.at(truth.time[streamed] - outcome.first_setpoint).position
-    deviation = np.linalg.norm(truth.position[streamed] - reference, axis=1)
-    assert streamed.sum() > 90 * made.trajectory.duration
+    moving = (truth.time >= outcome.first_setpoint) & (truth.time <= outcome.first_setpoint + made.trajectory.duration)
+    reference = made.trajectory.at(truth.time[moving] - outcome.first_setpoint).position
+    deviation = np.linalg.norm(truth.position[moving] - reference, axis=1)
+    assert moving.sum() > 90 * made.trajectory.duration
     assert deviation.max() <= 0.08
-    assert np.all(limits.space.beyond(truth.position[streamed]) < 0)
+    assert np.all(limits.space.beyond(truth.position[moving]) < 0)
+    assert outcome.lateness.p99 <= 2e-3
