@@ -92,6 +92,7 @@ class Path:
 
     def part(self, low: float, high: float) -> "Path":
         """The path from s = low to s = high, s counted from there; two pieces at least, so that rests stay exact."""
+        high = min(high, float(self.breaks[-1]))  # which may be a rounding error beyond
         first = int(np.searchsorted(self.breaks, low, side="right")) - 1
         last = int(np.searchsorted(self.breaks, high, side="left"))
         piece = np.arange(first, last)

@@ -155,3 +155,10 @@ def test_a_part_of_a_path_is_that_part(low, high):
     assert np.linalg.norm(part(0.0, 1)) == pytest.approx(np.linalg.norm(path(low, 1)), abs=1e-12)
     if high == path.end:
         assert not part(part.end, 1).any()  # a rest stays exact
+
+
+def test_a_part_may_end_a_rounding_error_behind_the_path():
+    path = min_snap([[0, 0, 1], [1, 2, 1.5], [3, 1, 0.7], [2, -1, 1]])
+    part = path.part(0.4 * path.end, np.nextafter(path.end, np.inf))
+    np.testing.assert_allclose(part(part.end), path(path.end), atol=1e-12)
+    assert not part(part.end, 1).any()
