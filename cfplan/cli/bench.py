@@ -115,6 +115,29 @@ def scaling(yaw: str, output: Path | None, as_json: bool, **what: Any) -> None:
     _publish(result, output, as_json)
 
 
+@study.command(name="long", epilog="Example: cfplan study long -o docs/studies/long.json")
+@click.option(
+    "--length", "lengths", type=click.FloatRange(10, 10_000), multiple=True,
+    help="m; may be given several times, the first is compared with.  [default: 20, 50, 100, 200, 500, 1000]",
+)  # fmt: skip
+@click.option("--paths", type=click.IntRange(1), default=3, show_default=True, help="Random paths of each length.")
+@click.option("--limits", default="hardware", show_default=True, help="hardware or simulation.")
+@click.option("--seed", "first_seed", type=int, default=20_000, show_default=True, help="Of the first path.")
+@_output
+@options.as_json
+def long_paths(output: Path | None, as_json: bool, **what: Any) -> None:
+    """The learned planner on paths of up to a kilometre: time, memory, and flight time against the expert's."""
+    from cfplan.studies.machine import one_thread
+
+    one_thread()
+    from cfplan.studies.long_paths import long_paths as run
+
+    _require_free(output)
+    with _progress("planning", as_json) as progress:
+        result = run(**_given(what), command=_command(), progress=progress)
+    _publish(result, output, as_json)
+
+
 @study.command(
     epilog="Example: cfplan study flights flights/*.yaml --repeats 5 --loss 0.05 -o docs/studies/flights.json"
 )

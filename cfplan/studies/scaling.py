@@ -19,6 +19,8 @@ from cfplan.studies.trials import find_box, find_limit_set, quantiles
 
 SIZES = (100, 200, 500, 1000, 2000, 3000)
 NODES_PER_METRE = 5  # as 100 intervals on a path of 20 m, the paper's mean length
+LENGTH_ERROR = 0.05
+_ATTEMPTS = 1000
 COLUMNS = ("intervals", "length", "solved", "solve median", "per interval", "against the first", "per iteration")
 
 
@@ -119,19 +121,21 @@ def scaling(
 
 
 def path_of_length(length: float, box: str, seed: int) -> Path:
-    """A min-snap path through random waypoints in the box, of at least that length, m, and hardly more."""
+    """A min-snap path through random waypoints in the box, of that length, m, to within LENGTH_ERROR."""
     size = np.array(find_box(box))
     corners = np.stack([np.zeros(3), size])
-    most = 2 + int(np.ceil(length / (0.3 * size.max())))
-    points = random_waypoints(seed, corners, (most, most))
-    # A min-snap path is a little longer than its legs; count legs first, then measure.
-    count = 3
-    while True:
+    most = 3 + int(np.ceil(length / (0.3 * size.max())))
+    for attempt in range(_ATTEMPTS):
+        points = random_waypoints(np.random.SeedSequence([seed, attempt]), corners, (most, most))
+        # A min-snap path is a little longer than its legs; count legs first, then measure.
+        count = 3
         path = min_snap(points[:count])
-        if path.length >= length or count == len(points):
+        while path.length < (1 - LENGTH_ERROR) * length and count < most:
+            count = min(count + max(1, int((length - path.length) / size.max())), most)
+            path = min_snap(points[:count])
+        if abs(path.length - length) <= LENGTH_ERROR * length:
             return path
-        count += max(1, int((length - path.length) / (0.7 * size.max())))
-        count = min(count, len(points))
+    raise InputError(f"no random path of {length:g} m was found in the box {box}", where="length")
 
 
 def _size(nodes: int, paths: list[Path], first: float, runs: list[tuple[float, int, bool]], before: list[Size]) -> Size:

@@ -110,7 +110,7 @@ def test_scaling_grows_the_path_with_the_grid():
 @pytest.mark.parametrize("length", [20.0, 200.0, 600.0])
 def test_paths_come_in_the_length_that_was_asked_for(length):
     path = scaling.path_of_length(length, "10x10x10", 3)
-    assert length <= path.length < 1.05 * length + 15.0
+    assert path.length == pytest.approx(length, rel=scaling.LENGTH_ERROR)
 
 
 @pytest.mark.parametrize(
