@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.encoding import (
     RATE_LEAD,
+    THRUST_LEAD,
     check_bytes,
     command_quaternion,
     controller_attitude,
@@ -67,8 +68,9 @@ def test_it_begins_and_ends_in_hover(encoded, trajectory):
     )
 
 
-def test_the_acceleration_field_makes_up_for_drag(encoded, trajectory):
+def test_the_acceleration_field_makes_up_for_drag(trajectory):
     """Newton's second law: mass times planned acceleration is thrust, weight and drag together."""
+    encoded = encode_trajectory(trajectory, thrust_lead=0.0)
     states = trajectory.at(encoded.times)
     turn = Rotation.from_quat(states.quaternion)
     air = turn.inv().apply(states.velocity)
@@ -82,6 +84,13 @@ def test_the_acceleration_field_makes_up_for_drag(encoded, trajectory):
 def test_body_rates_are_sent_ahead(encoded, trajectory):
     later = trajectory.at(encoded.times + RATE_LEAD).body_rate
     assert encoded.decoded.body_rate == pytest.approx(later, abs=0.6e-3)
+
+
+def test_thrust_is_sent_ahead_and_its_direction_is_not(encoded, trajectory):
+    force = encoded.decoded.acceleration + np.array([0, 0, GRAVITY])
+    thrust = np.linalg.norm(force, axis=1)
+    assert thrust == pytest.approx(trajectory.at(encoded.times + THRUST_LEAD).specific_thrust, abs=1e-3)
+    assert force / thrust[:, None] == pytest.approx(trajectory.at(encoded.times).thrust_axis, abs=2e-4)
 
 
 def attitudes(tilt_max: float, count: int = 5000):
