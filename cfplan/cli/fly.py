@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cfplan import __version__
 from cfplan.cli import options
 from cfplan.cli.confirm import confirmed
 from cfplan.cli.flight_progress import FlightProgress
@@ -163,18 +162,15 @@ def _all(*listeners: "Callable[[Telemetry], None]") -> "Callable[[Telemetry], No
 def _header(flight: PlannedFlight, uri: str, source: Path) -> "RecordHeader":
     import numpy as np
 
-    from cfplan.recording.header import FlightBounds, RecordHeader
+    from cfplan.recording.header import FlightBounds, header_under
     from cfplan.recording.writer import wall_time_at_zero
 
     plan, limits = flight.plan, flight.limits
-    return RecordHeader(
+    return header_under(
+        limits,
         name=flight.name,
-        version=__version__,
         uri=uri,
         planner=plan.planner,
-        vehicle=limits.airframe,
-        thrust_at_full_command=limits.airframe.motor_thrust_max,
-        plan_limits=limits.plan,
         bounds=FlightBounds(
             speed=limits.flight.speed.brake,
             acceleration=limits.flight.acceleration.brake,
@@ -186,7 +182,6 @@ def _header(flight: PlannedFlight, uri: str, source: Path) -> "RecordHeader":
         ),
         travel_time=plan.trajectory.duration,
         path=plan.path(np.linspace(0.0, plan.path.end, _PATH_SAMPLES)),
-        fence=(limits.space.low, limits.space.high),
         wall_time_at_zero=wall_time_at_zero(),
         provenance={"path file": str(source), "planner": plan.planner},
     )

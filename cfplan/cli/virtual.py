@@ -79,23 +79,16 @@ def _show(truth: "Truth", view: "LiveView | None") -> None:
 def _open_view(limits: "Limits") -> "LiveView":
     import numpy as np
 
-    from cfplan import __version__
-    from cfplan.recording.header import FlightBounds, RecordHeader
+    from cfplan.recording.header import header_under
     from cfplan.recording.live import open_live
     from cfplan.recording.writer import wall_time_at_zero
 
-    header = RecordHeader(
+    header = header_under(
+        limits,
         name="virtual Crazyflie",
-        version=__version__,
         uri="udp://",
-        planner="",
-        vehicle=limits.airframe,
-        thrust_at_full_command=limits.airframe.motor_thrust_max,
-        plan_limits=limits.plan,
-        bounds=FlightBounds(),
-        travel_time=0.0,
         path=np.zeros((0, 3)),
-        fence=(limits.space.low, limits.space.high),
+        travel_time=0.0,
         wall_time_at_zero=wall_time_at_zero(),
     )
     return open_live(header, Path()).__enter__()

@@ -5,14 +5,16 @@ A Crazyradio sends one packet, gets at most one back with the acknowledgement, a
 the packet in the air and one more, the vehicle's 120. What a dead radio held comes out when it returns, and is old.
 """
 
-import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import ClassVar
 
 import numpy as np
 
 from cfplan.errors import InputError
+from cfplan.simulation.timed_fault import TimedFault
 
 TRANSACTION = 0.001  # s a transmission and its acknowledgement: 1,000 a second, as cflib gets
 COMPUTER_QUEUE = 2  # packets: the one in the air, and cflib's queue of one
@@ -27,30 +29,17 @@ class RadioFaultKind(StrEnum):
     DEAD = "dead"  # none gets through
 
 
-_SIZES = {RadioFaultKind.LOSS: 0.3, RadioFaultKind.DELAY: 0.02}
-
-
 @dataclass(frozen=True, slots=True)
-class RadioFault:
-    """One fault."""
+class RadioFault(TimedFault):
+    """One fault of the radio."""
 
     kind: RadioFaultKind
-    start: float = 0.0
-    # s since it was injected
-    duration: float = math.inf
-    # s
-    size: float | None = None
-    # in the unit of its kind; None for the usual one
+    usual: ClassVar[Mapping[StrEnum, float]] = {RadioFaultKind.LOSS: 0.3, RadioFaultKind.DELAY: 0.02}
 
     def __post_init__(self) -> None:
-        share = self.kind is RadioFaultKind.LOSS and not 0.0 <= self.strength < 1.0
-        if math.isnan(self.start) or not self.duration > 0 or share or not 0.0 <= self.strength < math.inf:
+        TimedFault.__post_init__(self)
+        if self.strength < 0.0 or (self.kind is RadioFaultKind.LOSS and self.strength >= 1.0):
             raise InputError(f"{self} makes no sense", hint="loss is a share from 0 to less than 1, delay in s")
-
-    @property
-    def strength(self) -> float:
-        """The size, or the usual one."""
-        return _SIZES.get(self.kind, 0.0) if self.size is None else self.size
 
 
 class Radio:

@@ -4,9 +4,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import ClassVar
 
-from cfplan.errors import InputError
 from cfplan.flight.telemetry import Quaternion, Triple
+from cfplan.simulation.timed_fault import TimedFault
 
 Seen = tuple[Triple, Quaternion]  # position m, body→world x y z w
 
@@ -26,31 +27,14 @@ class FaultKind(StrEnum):
     CLOSE = "close"  # connections are reset and new ones refused
 
 
-_SIZES = {FaultKind.JUMP: 1.0, FaultKind.FLIP: math.pi, FaultKind.DELAY: 0.2}
-
-
 @dataclass(frozen=True, slots=True)
-class ViconFault:
-    """One fault."""
+class ViconFault(TimedFault):
+    """One fault of motion capture; one that is there from the start counts from the server's."""
 
     kind: FaultKind
-    start: float = 0.0
-    # s since the server's start, or since it was injected
-    duration: float = math.inf
-    # s
-    size: float | None = None
-    # in the unit of its kind; None for the usual one
     subject: str | None = None
     # None: every body
-
-    def __post_init__(self) -> None:
-        if math.isnan(self.start) or not self.duration > 0 or (self.size is not None and not math.isfinite(self.size)):
-            raise InputError(f"{self} makes no sense", hint="a fault has a start, a positive duration and a size")
-
-    @property
-    def strength(self) -> float:
-        """The size, or the usual one."""
-        return _SIZES.get(self.kind, 0.0) if self.size is None else self.size
+    usual: ClassVar[Mapping[StrEnum, float]] = {FaultKind.JUMP: 1.0, FaultKind.FLIP: math.pi, FaultKind.DELAY: 0.2}
 
 
 class Faults:

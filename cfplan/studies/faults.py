@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cfplan import __version__
 from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.keys import Order
 from cfplan.flight.mission import Mission
@@ -22,7 +21,7 @@ from cfplan.flight.outcome import FlightOutcome, Rung
 from cfplan.flight.packets import decode
 from cfplan.flight.pilot import Pilot
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry, Triple
-from cfplan.recording.header import FlightBounds, RecordHeader
+from cfplan.recording.header import RecordHeader, header_under
 from cfplan.recording.reader import read_record
 from cfplan.recording.writer import RecordWriter
 from cfplan.simulation.lab import Truth
@@ -306,18 +305,5 @@ class _FullDisk:
 
 
 def _header(mission: Mission) -> RecordHeader:
-    limits = mission.limits
-    return RecordHeader(
-        name="fault",
-        version=__version__,
-        uri="stepped://0",
-        planner="",
-        vehicle=limits.airframe,
-        thrust_at_full_command=limits.airframe.motor_thrust_max,
-        plan_limits=limits.plan,
-        bounds=FlightBounds(),
-        travel_time=mission.motion_ends,
-        path=decode(mission.payloads).position[::5],
-        fence=(limits.space.low, limits.space.high),
-        wall_time_at_zero=0.0,
-    )
+    path = decode(mission.payloads).position[::5]
+    return header_under(mission.limits, name="fault", uri="stepped://0", path=path, travel_time=mission.motion_ends)

@@ -1,10 +1,11 @@
 """What can go wrong with a vehicle in the air, each for a time and by a size."""
 
-import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import ClassVar
 
-from cfplan.errors import InputError
+from cfplan.simulation.timed_fault import TimedFault
 
 
 class VehicleFaultKind(StrEnum):
@@ -18,31 +19,14 @@ class VehicleFaultKind(StrEnum):
     LOCK = "lock"  # the supervisor locks, for good
 
 
-_SIZES = {
-    VehicleFaultKind.MOTOR: 0.7,
-    VehicleFaultKind.MASS: 1.2,
-    VehicleFaultKind.GUST: 1.0,
-    VehicleFaultKind.BATTERY: 3.1,
-}
-
-
 @dataclass(frozen=True, slots=True)
-class VehicleFault:
-    """One fault."""
+class VehicleFault(TimedFault):
+    """One fault of the vehicle."""
 
     kind: VehicleFaultKind
-    start: float = 0.0
-    # s since it was injected
-    duration: float = math.inf
-    # s
-    size: float | None = None
-    # in the unit of its kind; None for the usual one
-
-    def __post_init__(self) -> None:
-        if math.isnan(self.start) or not self.duration > 0 or (self.size is not None and not math.isfinite(self.size)):
-            raise InputError(f"{self} makes no sense", hint="a fault has a start, a positive duration and a size")
-
-    @property
-    def strength(self) -> float:
-        """The size, or the usual one."""
-        return _SIZES.get(self.kind, 0.0) if self.size is None else self.size
+    usual: ClassVar[Mapping[StrEnum, float]] = {
+        VehicleFaultKind.MOTOR: 0.7,
+        VehicleFaultKind.MASS: 1.2,
+        VehicleFaultKind.GUST: 1.0,
+        VehicleFaultKind.BATTERY: 3.1,
+    }
