@@ -13,6 +13,8 @@ from pyarrow import csv
 from cfplan.errors import InputError
 
 BLOCK = 1 << 24  # bytes turned into numbers at a time
+_AT_ONCE = 1 << 20  # bytes of them that one core takes: they fit into its cache
+_LONGEST_CELL = 64  # bytes
 _NO_NUMBER = ["", " ", "NaN", "nan", "-nan", "NA", "-nan(ind)"]  # what a cell without a value holds
 
 
@@ -81,7 +83,7 @@ def _block(text: bytes, lines: Lines) -> NDArray:
     kept = [names[index] for index in lines.wanted]
     table = csv.read_csv(
         pa.BufferReader(text),
-        read_options=csv.ReadOptions(column_names=names, block_size=len(text) + 1),
+        read_options=csv.ReadOptions(column_names=names, block_size=max(_AT_ONCE, _LONGEST_CELL * lines.width)),
         parse_options=csv.ParseOptions(delimiter=lines.delimiter),
         convert_options=csv.ConvertOptions(
             include_columns=kept,
