@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.safety.limits import PlanLimits
@@ -25,6 +26,7 @@ from cfplan.vehicle.trajectory import FullState, Trajectory
 
 TIME_STEP = 1e-3  # s, the most between two samples
 BATCH = 2_000  # samples at a time, about: as many as stay near the processor
+BLOCK = 256  # samples searched for a peak at once
 LEAST_POINTS = 11  # of a piece, its ends included
 WALLS = "distance to the walls"
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
@@ -226,50 +228,87 @@ def _margin(peak: _Peak, time: float, position: Sequence[float]) -> Margin:
 def _stretches(trajectory: Trajectory) -> Stretches:
     """Cut at the grid points, at the breaks of the path, and where the timing was refined because h changes fast."""
     timing, path = trajectory.timing, trajectory.path
-    edges = np.concatenate([timing.s, path.breaks])
-    edges.sort()
-    edges = edges[np.append(True, np.diff(edges) > 1e-12 * edges[-1])]
-    edges[-1] = timing.s[-1]
-    width = np.diff(edges)
-    middle = edges[:-1] + width / 2
-    interval = timing.interval[np.searchsorted(timing.s, middle) - 1]
-    piece = np.clip(np.searchsorted(path.breaks, middle) - 1, 0, len(path.breaks) - 2)
-    h = trajectory.profile.at(edges[:-1] + np.array([[0.0], [0.25], [0.5], [0.75], [1.0]]) * width, interval).h
-    needed = width / (TIME_STEP * np.sqrt(h.min(axis=0)))
-    counts = np.maximum(np.ceil(needed).astype(int) + 1, LEAST_POINTS)
-    return Stretches(edges[:-1], edges[1:], interval, piece, counts)
+    return Stretches(*_cut(timing.s, timing.interval, timing.nodes, path.breaks))
+
+
+@njit(cache=True, error_model="numpy")
+def _cut(
+    s: NDArray, intervals: NDArray, nodes: NDArray, breaks: NDArray
+) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+    """What `_stretches` gives, of the timing's pieces, which end at `s`, and its profile's table."""
+    every = np.concatenate((s, breaks))
+    every.sort()
+    edges, count = every.copy(), 1
+    for n in range(1, len(every)):
+        if every[n] - every[n - 1] > 1e-12 * every[-1]:
+            edges[count] = every[n]
+            count += 1
+    edges = edges[:count]
+    edges[-1] = s[-1]
+    interval, piece, counts = np.empty((3, count - 1), np.int64)
+    at, on = 0, 0
+    for k in range(count - 1):
+        width = edges[k + 1] - edges[k]
+        middle = edges[k] + width / 2
+        while at < len(intervals) - 1 and s[at + 1] < middle:
+            at += 1
+        while on < len(breaks) - 2 and breaks[on + 1] < middle:
+            on += 1
+        interval[k], piece[k] = intervals[at], on
+        node, slowest = nodes[intervals[at]], np.inf
+        for quarter in range(5):
+            x = edges[k] + quarter / 4 * width - node[0]
+            slowest = min(slowest, node[1] + x * (node[2] + x * (node[3] / 2 + x * node[4] / 6)))
+        counts[k] = max(int(np.ceil(width / (TIME_STEP * np.sqrt(slowest)))) + 1, LEAST_POINTS)
+    return edges[:-1], edges[1:], interval, piece, counts
 
 
 @njit(cache=True)
 def _raise_peaks(values: NDArray, places: NDArray, table: NDArray, rows: NDArray, s: NDArray, counts: NDArray) -> None:
-    """Take over the peaks of these samples where they are higher. `table`, (Q, 3): first row, how many, and sign."""
+    """Take over the peaks of these samples where they are higher. `table`, (Q, 3): first row, how many, and sign.
+
+    Stretches have `counts` samples each, at least three, one stretch behind the other.
+    """
+    behind = np.cumsum(counts)
+    lift = np.zeros(behind[-1])  # infinite at the ends of stretches
+    lift[behind - counts], lift[behind - 1] = np.inf, np.inf
     for k in range(len(table)):
-        if not np.isnan(values[k]):  # NaN is the worst and stays
-            index, value = _peak(rows[table[k, 0] : table[k, 0] + table[k, 1]], table[k, 2], counts)
-            if not value <= values[k]:
-                values[k], places[k] = value, s[index]
+        first, count, sign = table[k]
+        for which in range(first, first + count):
+            row = rows[which]
+            for begin in range(0, len(lift) - 2, BLOCK):
+                if not np.isnan(values[k]):  # NaN is the worst and stays
+                    end = min(begin + BLOCK + 2, len(lift))
+                    index, values[k] = _peak(row[begin:end], sign, lift[begin:end], values[k])
+                    if index >= 0:
+                        places[k] = s[begin + index]
 
 
 @njit(cache=True)
-def _peak(rows: NDArray, sign: int, counts: NDArray) -> tuple[int, float]:
-    """Index of the largest of `sign` times (k, N) values, and that with what may rise above it between samples.
+def _peak(row: NDArray, sign: int, lift: NDArray, peak: float) -> tuple[int, float]:
+    """Index of the largest of `sign` times (N,), and that with what may rise above it between samples.
 
-    Stretches have `counts` samples each, at least three, one stretch behind the other. NaN is larger than everything.
+    Where that exceeds `peak`; else -1, and `peak`. NaN is larger than everything.
     """
-    index, peak = 0, -np.inf
-    for row in rows:
-        end = 0
-        for count in counts:
-            start, end = end, end + count
-            here, after = sign * row[start], sign * row[start + 1]
-            # Each inner sample answers for both gaps beside it, so all gaps of the stretch are covered.
-            for n in range(start + 1, end - 1):
-                before, here, after = here, after, sign * row[n + 1]
-                sag = 2.0 * here - before - after
-                bound = max(before, here, after) + _ALLOWANCE * (0.0 if sag <= 0.0 else sag)
-                if not bound <= peak:
-                    peak = bound
-                    index = n if here >= before and here >= after else n - 1 if before >= after else n + 1
-                    if np.isnan(bound):
-                        return n, peak
+    # Each inner sample answers for both gaps beside it, so all gaps of a stretch are covered.
+    before, here, after, lift = row[:-2], row[1:-1], row[2:], lift[1:-1]
+    index, higher = -1, 0  # counted first, which takes several samples at once; a search is seldom needed
+    for n in range(len(here)):
+        higher += not _bound(sign * before[n], sign * here[n], sign * after[n]) <= peak + lift[n]
+    if higher:
+        for n in range(len(here)):
+            left, middle, right = sign * before[n], sign * here[n], sign * after[n]
+            bound = _bound(left, middle, right)
+            if lift[n] == 0.0 and not bound <= peak:
+                peak = bound
+                if np.isnan(bound):
+                    return n + 1, peak
+                index = n + (1 if middle >= left and middle >= right else 0 if left >= right else 2)
     return index, peak
+
+
+@register_jitable(forceinline=True)
+def _bound(before: float, here: float, after: float) -> float:
+    sag = 2.0 * here - before - after
+    higher = before if before > after else after
+    return (here if here > higher else higher) + _ALLOWANCE * (0.0 if sag <= 0.0 else sag)

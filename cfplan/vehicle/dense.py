@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.flatness import Body, compiled_body, flat_state, profile_within
+from cfplan.vehicle.flatness import ROUNDING, Body, compiled_body, flat_state, profile_within
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trigonometry import cosine, sine, slope_angle
 
@@ -105,7 +105,7 @@ def sampled_rows(
 def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
     """The loops, which return `sources`: a checksum of what they call, as numba's cache does not look there."""
 
-    @njit(cache=True, error_model="numpy")
+    @njit(cache=True, error_model="numpy", fastmath=ROUNDING)
     def at_points(
         out: NDArray, body: Body, derivatives: NDArray, nodes: NDArray, places: NDArray, interval: NDArray
     ) -> int:
@@ -126,7 +126,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
                     out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
         return sources
 
-    @njit(cache=True, error_model="numpy")
+    @njit(cache=True, error_model="numpy", fastmath=ROUNDING)
     def along(
         out: NDArray, body: Body, coefficients: NDArray, origins: NDArray, nodes: NDArray,
         left: NDArray, right: NDArray, interval: NDArray, piece: NDArray, counts: NDArray,
@@ -160,7 +160,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
     return at_points, along
 
 
-@register_jitable
+@register_jitable(fastmath=ROUNDING)
 def _trace(panel: NDArray, table: NDArray, lanes: int) -> None:
     """γ to γ'''' from the coefficients, (D, 3), at x from where they count: Horner's scheme, for factorial shares."""
     lanes = min(lanes, WIDTH)  # the compiler must see that no index overflows
@@ -191,12 +191,12 @@ def _trace(panel: NDArray, table: NDArray, lanes: int) -> None:
             panel[(row + 6) * WIDTH + n] *= 24.0
 
 
-@register_jitable(forceinline=True)
+@register_jitable(forceinline=True, fastmath=ROUNDING)
 def _step(x: float, c: float, p: _Derivatives) -> _Derivatives:
     return x * p[0] + c, x * p[1] + p[0], x * p[2] + p[1], x * p[3] + p[2], x * p[4] + p[3]
 
 
-@register_jitable
+@register_jitable(fastmath=ROUNDING)
 def _flatten(panel: NDArray, body: Body, lanes: int) -> None:
     """The results from path and profile."""
     lanes = min(lanes, WIDTH)
@@ -227,7 +227,7 @@ def _flatten(panel: NDArray, body: Body, lanes: int) -> None:
         panel[(_RESULT + MOTOR_THRUST + 3) * WIDTH + n] = flat.motor_thrust[3]
 
 
-@register_jitable
+@register_jitable(fastmath=ROUNDING)
 def _finish(panel: NDArray, lanes: int) -> None:
     """Norms and tilt in place of squares and components."""
     lanes = min(lanes, WIDTH)
@@ -239,17 +239,17 @@ def _finish(panel: NDArray, lanes: int) -> None:
         panel[(_RESULT + TILT) * WIDTH + n] = slope_angle(width**0.5, height)
 
 
-@register_jitable
+@register_jitable(fastmath=ROUNDING)
 def _whole(count: int) -> int:
     return (count + LANES - 1) // LANES * LANES
 
 
-@register_jitable(forceinline=True)
+@register_jitable(forceinline=True, fastmath=ROUNDING)
 def _vector(panel: NDArray, row: int, n: int) -> tuple[float, float, float]:
     return panel[row * WIDTH + n], panel[(row + 1) * WIDTH + n], panel[(row + 2) * WIDTH + n]
 
 
-@register_jitable(forceinline=True)
+@register_jitable(forceinline=True, fastmath=ROUNDING)
 def _squared(vector: tuple[float, float, float]) -> float:
     return vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]
 

@@ -21,10 +21,13 @@ from cfplan.vehicle.profile import SpeedProfile
 
 Scalar = Any  # float, NDArray or casadi.SX
 Vector = tuple[Scalar, Scalar, Scalar]
+ROUNDING = {"contract", "arcp", "nsz"}
+# what a compiler may do to compiled arithmetic: multiply and add at once, divide by way of a reciprocal, drop the
+# sign of a zero. Nothing about order, infinities or what is not a number.
 
 
 # Compiled into the loop that calls it, so that the loop can work on several points at once.
-_within_the_loop = register_jitable(forceinline=True)
+_within_the_loop = register_jitable(forceinline=True, fastmath=ROUNDING)
 
 
 class Body(NamedTuple):
@@ -175,7 +178,7 @@ def motor_thrusts(
     )
 
 
-@_within_the_loop
+@register_jitable(forceinline=True)  # to the last bit as SpeedProfile.at has it
 def profile_within(
     x: Scalar, h: Scalar, dh: Scalar, ddh: Scalar, dddh: Scalar, yaw: Scalar, dyaw: Scalar, ddyaw: Scalar
 ) -> tuple[tuple[Scalar, Scalar, Scalar, Scalar], Vector]:

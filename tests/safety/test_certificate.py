@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
-from cfplan.safety.certificate import _peak, _stretches, certify
+from cfplan.safety.certificate import _raise_peaks, _stretches, certify
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
@@ -116,6 +116,13 @@ def trajectory(make_profile):
     return Trajectory(path, make_profile(path.end, random.uniform(0.8, 1.3, 30)), AIRFRAME)
 
 
+def _peak(rows, sign, counts):
+    """Index and value of the peak of all rows."""
+    values, places = np.array([-np.inf]), np.array([-1.0])
+    _raise_peaks(values, places, np.array([[0, len(rows), sign]]), rows, np.arange(float(rows.shape[1])), counts)
+    return int(places[0]), values[0]
+
+
 def test_a_smooth_peak_between_samples_is_not_missed():
     for shift in np.linspace(0, 1, 21):
         angles = (np.arange(20) - 9.5 + shift) * 0.2
@@ -137,6 +144,17 @@ def test_a_jump_between_pieces_is_no_peak():
     index, peak = _peak(values, 1, np.array([3, 3]))
     assert index in (3, 4, 5)
     assert peak == 5.0
+
+
+@pytest.mark.parametrize("counts", [[800], [255, 3, 542], [256, 257, 287]])
+def test_a_peak_is_found_wherever_it_stands_among_many_samples(counts):
+    last = np.cumsum(counts) - 1
+    ends = np.concatenate([last, last + 1 - counts])
+    for place in range(800):
+        values = np.zeros((2, 800))
+        values[1, place] = 1.0
+        # by an eighth of the second difference there, twice over, except where there is none
+        assert _peak(values, 1, np.array(counts)) == (place, 1.0 if place in ends else 1.5)
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
