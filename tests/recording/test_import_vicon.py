@@ -150,6 +150,7 @@ def test_sections_of_other_rates_have_times_of_their_own_and_forces_are_left_out
     np.testing.assert_allclose(log.subjects[0].time, np.arange(40) / RATE)
     np.testing.assert_allclose(log.subjects[1].time, np.arange(40) / (RATE / 2))
     assert "Devices" in log.notes[0]
+    assert log.notes[1] == f"sections of {RATE:g} and {RATE / 2:g} Hz, each with times of its own"
 
 
 def test_a_gap_in_the_frame_numbers_is_a_gap_in_time(tmp_path):

@@ -103,13 +103,17 @@ def _mistake(data: mmap.mmap, begin: int, end: int, lines: Lines, file: Path) ->
         cells = line.split(lines.delimiter)
         if line and len(cells) != lines.width:
             return InputError(
-                f"{len(cells)} cells, {lines.width} in the lines before it", where=place(data, begin, file)
+                f"{len(cells)} cells, {lines.width} in the lines before it",
+                where=place(data, begin, file),
+                hint="export it again, or take the line out",
             )
         for index in lines.wanted if line else ():
             text = cells[index].strip().strip('"')
             if not _is_number(text.replace(lines.point, ".")):
                 return InputError(
-                    f"{text[:30]!r} in column {index + 1} is not a number", where=place(data, begin, file)
+                    f"{text[:30]!r} in column {index + 1} is not a number",
+                    where=place(data, begin, file),
+                    hint="export it again, or leave the cell empty: not seen",
                 )
         begin = after
     return None

@@ -149,6 +149,9 @@ def _log(parts: list[_Rows], reading: _Reading, file: Path) -> MocapLog:
             else:
                 subjects[group.name] = _subject(group, time[keep], rows, file)
             column = after
+    rates = dict.fromkeys(f"{part.section.rate:g}" for part in parts if part.section.groups)
+    if len(rates) > 1:
+        notes.append(f"sections of {' and '.join(rates)} Hz, each with times of its own")
     assumed = [group.name for part in parts for group in part.section.groups if group.assumed]
     if assumed:
         notes.append(f"the header does not say what the angles of {', '.join(assumed)} are: taken as helical")

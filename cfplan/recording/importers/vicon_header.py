@@ -138,7 +138,11 @@ def _group(
     wanted = _QUATERNION if "RW" in at or word == Rotations.QUATERNION else _ANGLES
     missing = [column for column in (*wanted, *_POSITION) if column not in at]
     if missing:
-        raise InputError(f"subject {name!r} has no column {', '.join(missing)}", where=where)
+        raise InputError(
+            f"subject {name!r} has no column {', '.join(missing)}",
+            where=where,
+            hint="export its rotation and its translation, with all their axes",
+        )
     turn, place = tuple(at[c] for c in wanted), tuple(at[c] for c in _POSITION)
     length = _unit(units, place, LENGTHS, name, where)
     if wanted is _QUATERNION:
