@@ -95,8 +95,8 @@ def test_a_long_straight_line_takes_the_time_of_constant_acceleration():
     # line is to accelerate, cruise and brake: T = L/v + v/a.
     airframe = replace(HARDWARE.airframe, inertia=(1e-9, 1e-9, 1e-9), drag=(0.0, 0.0))
     limits = replace(
-        SIMULATION.limits, speed=2.0, acceleration=3.0, angular_velocity=1e3, motor_thrust_max=0.5,
-        motor_thrust_min=1e-3, specific_thrust_min=0.1,
+        SIMULATION.limits, speed=2.0, acceleration=3.0, angular_velocity=1e3, angular_acceleration=math.inf,
+        tilt=math.radians(85.0), motor_thrust_max=0.5, motor_thrust_min=1e-3, specific_thrust_min=0.1,
     )  # fmt: skip
     length = 12.0
     path = min_snap(np.array([[0.0, 0, 1], [length / 2, 0, 1], [length, 0, 1]]))
