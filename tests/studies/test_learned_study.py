@@ -1,11 +1,12 @@
 """The study of the learned planner counts what happened."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.studies.learned import COLUMNS, learned_study
+from cfplan.studies.learned import COLUMNS, CONVEX_EVERY, GOALS, learned_study
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +24,41 @@ def test_every_path_is_counted_and_certified_flights_are_near_the_experts(small)
         assert 0 < flight.deviation < 0.2
 
 
-def test_the_result_is_one_table_and_survives_json(small):
+def test_the_result_is_one_table_of_figures_and_goals_and_survives_json(small):
     ((_, columns, rows),) = small.tables()
-    assert columns == list(COLUMNS)
-    assert len(rows) == 1
-    assert json.loads(json.dumps(small.to_dict()))["table"][0]["paths"] == "3"
+    assert columns == [*COLUMNS, "4.5x8x2 m, hardware"]
+    assert [row[:2] for row in rows] == [list(goal) for goal in GOALS.items()]
+    document = json.loads(json.dumps(small.to_dict()))
+    figures = {row["figure"]: row["4.5x8x2 m, hardware"] for row in document["table"]}
+    assert figures["paths"] == figures["certified"] == "3"
+    assert figures["dry run: failed"] == "0 of 3"
+    by_kind = [int(figures[f"certified {kind}"]) for kind in ("as the network has it", "when refined", "when slowed")]
+    assert sum(by_kind) == 3
+
+
+def test_the_convex_planner_flies_one_path_in_ten_and_no_faster_when_slowed(small):
+    flown = [flight for flight in small.flights if flight.convex_refined > 0]
+    assert [flight.seed % CONVEX_EVERY for flight in flown] == [0]
+    assert flown[0].convex_slowed >= flown[0].convex_refined > 0.99 * flown[0].expert
+
+
+def test_times_of_about_twenty_metres_are_those_of_such_paths_alone(small):
+    some = [replace(small.flights[0], length=length, seconds=(ms / 1e3, 0, 0)) for length, ms in ((10, 99), (22, 7))]
+    study = replace(small, flights=tuple(some))
+    figures = {row[0]: row[2] for row in study.tables()[0][2]}
+    assert figures["path to bytes, about 20 m: paths"] == "1"
+    assert figures["path to bytes, about 20 m: p99"] == "7.0 ms"
+    assert figures["path to bytes: median"] == "53.0 ms"
+
+
+def test_what_was_not_measured_is_a_dash(small):
+    none = replace(small, flights=(replace(small.flights[1], length=10.0),))
+    figures = {row[0]: row[2] for row in none.tables()[0][2]}
+    assert figures["path to bytes, about 20 m: p99"] == figures["convex, slowed, against learned: median"] == "–"
+
+
+def test_nothing_measured_is_an_empty_table(small):
+    assert replace(small, flights=()).tables()[0][2] == []
 
 
 @pytest.mark.parametrize("wrong", [{"paths": 0}, {"boxes": ["3x3x3"]}, {"limit_sets": ["mild"]}])
