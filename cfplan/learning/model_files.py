@@ -229,7 +229,7 @@ def _distance(own: PlanLimits, wanted: PlanLimits) -> float:
             continue
         if asked < TIGHTEST * known and known < math.inf:
             return math.inf
-        total += min(abs(math.log(asked / known)), 1.0)
+        total += min(abs(math.log(asked / known)), 1.0) if known < math.inf else 1.0
     return total
 
 

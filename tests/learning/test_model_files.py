@@ -49,7 +49,8 @@ def test_what_was_saved_is_loaded(saved, make_card, make_weights):
 
 
 def test_unlimited_angular_acceleration_survives_the_card(tmp_path, make_card, make_weights):
-    save_model(tmp_path, make_card(airframe=SIMULATION.airframe, limits=SIMULATION.limits), make_weights())
+    free = replace(SIMULATION.limits, angular_acceleration=math.inf)
+    save_model(tmp_path, make_card(airframe=SIMULATION.airframe, limits=free), make_weights())
     assert load_card(tmp_path).limits.angular_acceleration == math.inf
 
 
@@ -140,6 +141,15 @@ def test_limits_are_used_as_far_as_the_model_knows(model):
     assert within.speed == HARDWARE.limits.speed
     assert within.acceleration == 4.0
     assert within.motor_thrust_min == HARDWARE.limits.motor_thrust_min
+
+
+def test_a_model_without_a_limit_serves_where_there_is_one_and_the_other_way_round(tmp_path, make_card, make_weights):
+    free = replace(HARDWARE.limits, angular_acceleration=math.inf)
+    for name, known, asked in (("free", free, HARDWARE.limits), ("bound", HARDWARE.limits, free)):
+        save_model(tmp_path / name / "only", make_card(name=name, limits=known), make_weights())
+        model = find_model(HARDWARE.airframe, asked, tmp_path / name)
+        assert model is not None
+        assert model.name == name
 
 
 def test_the_nearest_model_for_the_vehicle_is_found(tmp_path, make_card, make_weights):
