@@ -35,7 +35,7 @@ _BELOW_FLOOR = 0.03  # m that landings aim below it, so that motors stop on the 
 _BLIND_LAND_SPEED = 0.6  # m/s, mean, at least: without poses the vehicle drifts half a metre in 2 s
 _TOUCH = 0.3  # s on the floor before motors stop
 _MOTORS_STOPPED = 4.0  # s; the vehicle calls itself landed 2 s after they did
-_ASKED_TO_RISE, _RISEN = 0.08, 0.02  # m above the floor: asked for the first, its pose must have reached the second
+_ASKED_TO_RISE, _RISEN = 0.12, 0.015  # m above the floor: asked for the first, its pose must have reached the second
 _LOCKED_WITHIN = 2.5  # s for a cut to arrive; without setpoints the vehicle stops its motors after 2 s by itself
 
 
@@ -137,7 +137,7 @@ class Pilot:
         return asked - cockpit.floor > _ASKED_TO_RISE and pose.position[2] - cockpit.floor < _RISEN
 
     def _stay_down(self) -> None:
-        """Motors off, some centimetres up at most."""
+        """Motors off, a quarter of a metre up at most."""
         self._stop_motors()
         self._cockpit.airborne = False
         self._motors_stop()

@@ -234,7 +234,7 @@ def test_a_tracked_body_that_is_another_one_keeps_the_vehicle_on_the_floor(world
     assert outcome.exit_code is ExitCode.PREFLIGHT
     assert "stays on the floor" in outcome.reason
     assert "swapped" in outcome.reason
-    assert world.position[2] < 0.15
+    assert world.position[2] < 0.2
     assert "stop setpoint" in world.calls
     assert "emergency stop" not in world.calls
     assert not world.armed

@@ -58,7 +58,7 @@ def test_a_vehicle_that_is_late_on_its_path_is_off_its_setpoint_and_that_ends_th
 def test_two_swapped_bodies_never_let_the_vehicle_climb_away(line):
     (swapped,) = (row for row in SCENARIOS if row.name == "two bodies swapped")
     truth = fly_stepped(swapped, line).truth
-    assert truth.position[:, 2].max() < 0.25
+    assert truth.position[:, 2].max() < 0.35
     assert not truth.locked
 
 
