@@ -231,8 +231,7 @@ def _attitudes(thrusts: NDArray, quaternions: NDArray) -> NDArray:
     out = np.empty((len(thrusts), 3, 3))
     for n in range(len(thrusts)):
         x, y, z, w = quaternions[n, 0], quaternions[n, 1], quaternions[n, 2], quaternions[n, 3]
-        yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        cos, sin = math.cos(yaw), math.sin(yaw)
+        cos, sin = _direction(1.0 - 2.0 * (y * y + z * z), 2.0 * (w * z + x * y))  # of yaw
         a, b, c = thrusts[n, 0], thrusts[n, 1], thrusts[n, 2]
         norm = math.sqrt(a * a + b * b + c * c)
         a, b, c = a / norm, b / norm, c / norm
@@ -253,8 +252,7 @@ def _commands(quaternions: NDArray) -> NDArray:
     for n in range(len(quaternions)):
         frame = planned[n]
         a, b, c = frame[0, 2], frame[1, 2], frame[2, 2]
-        yaw = math.atan2(-frame[0, 1], frame[1, 1])
-        cos, sin = math.cos(yaw), math.sin(yaw)
+        cos, sin = _direction(frame[1, 1], -frame[0, 1])  # of yaw
         rise = -(cos * a + sin * b) / c
         norm = math.sqrt(1.0 + rise * rise)
         p, q, r = cos / norm, sin / norm, rise / norm
@@ -262,6 +260,13 @@ def _commands(quaternions: NDArray) -> NDArray:
         frame[0, 1], frame[1, 1], frame[2, 1] = b * r - c * q, c * p - a * r, a * q - b * p
         _write_quaternion(out[n], frame)
     return out
+
+
+@njit(error_model="numpy")
+def _direction(x: float, y: float) -> tuple[float, float]:
+    """Cosine and sine of atan2(y, x)."""
+    size = math.sqrt(x * x + y * y)
+    return (1.0, 0.0) if size == 0.0 else (x / size, y / size)
 
 
 @njit(error_model="numpy")
