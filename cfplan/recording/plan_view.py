@@ -20,7 +20,7 @@ ACTIVE = 0.95  # share from which a limit counts as what holds the plan back
 STEP = 0.01  # s, between the samples of the plan
 PIECE_RADIUS, JOINT_RADIUS, LIMIT_RADIUS = 0.02, 0.035, 0.01  # m, as drawn
 PIECE_COLOUR: Colour = (235, 235, 235)
-JOINT_COLOUR: Colour = (255, 105, 180)
+JOINT_COLOUR: Colour = (190, 255, 60)
 FREE, FREE_COLOUR = "none", (60, 66, 76)
 LIMIT_COLOURS: dict[str, Colour] = {
     "speed": (0, 158, 115),
