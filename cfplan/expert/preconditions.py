@@ -35,7 +35,8 @@ def check_arguments(
 
 def unsolvable(airframe: Airframe, limits: PlanLimits) -> str:
     """Which limit excludes every flight, because it excludes hovering; empty where none does."""
-    for name, value in zip(PlanLimits.__slots__, astuple(limits), strict=True):
+    for name in PlanLimits.__slots__:
+        value = getattr(limits, name)
         unbounded = name == "angular_acceleration" and value == math.inf
         if not (math.isfinite(value) or unbounded) or value < 0 or (value == 0 and name != "motor_thrust_min"):
             return f"the limit {name} is {value}"

@@ -77,8 +77,8 @@ class Model:
 
     def limits_within(self, limits: PlanLimits) -> PlanLimits:
         """Of these limits, as much as the model knows: where they are looser, its own."""
-        own, theirs = asdict(self.card.limits), asdict(limits)
-        return PlanLimits(**{name: (max if name.endswith("_min") else min)(own[name], theirs[name]) for name in own})
+        both = ((name, getattr(self.card.limits, name), getattr(limits, name)) for name in PlanLimits.__slots__)
+        return PlanLimits(**{name: (max if name.endswith("_min") else min)(own, other) for name, own, other in both})
 
     def differences(self, limits: PlanLimits) -> tuple[str, ...]:
         """In what these limits are not those that the model was trained with, a sentence each."""
