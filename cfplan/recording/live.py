@@ -31,7 +31,7 @@ from cfplan.recording.rerun_view import (
     log_tail,
 )
 from cfplan.recording.topics import TOPICS, columns_of
-from cfplan.recording.viewer import APPLICATION, free_port, require_screen, viewer_program
+from cfplan.recording.viewer import APPLICATION, free_port, lay_out, require_screen, viewer_program
 
 PERIOD = 0.1  # s between batches
 CAPACITY = 50_000  # messages that wait at most; more are left out of the view, never of the record
@@ -55,7 +55,8 @@ def open_live(header: RecordHeader, folder: Path) -> "LiveView":
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
     )  # fmt: skip
     stream = rr.RecordingStream(APPLICATION)
-    stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=live_blueprint(header))
+    stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
+    lay_out(stream, live_blueprint(header))
     return LiveView(stream, header, folder)
 
 

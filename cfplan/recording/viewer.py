@@ -23,7 +23,8 @@ def save(file: Path, blueprint: rrb.Blueprint, draw: Draw, *, overwrite: bool = 
     with whole_file(file) as unfinished:
         unfinished.touch()
         with rr.RecordingStream(APPLICATION) as stream:
-            stream.save(unfinished, default_blueprint=blueprint)
+            stream.save(unfinished)
+            lay_out(stream, blueprint)
             draw(stream)
             stream.flush()
             stream.disconnect()
@@ -36,11 +37,16 @@ def open_viewer(blueprint: rrb.Blueprint, draw: Draw) -> None:
         rr.spawn(
             hide_welcome_screen=True,
             executable_path=str(viewer_program()),
-            default_blueprint=blueprint,
             recording=stream,
         )
+        lay_out(stream, blueprint)
         draw(stream)
         stream.flush()
+
+
+def lay_out(stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
+    """Have the viewer take this blueprint; else it takes the one in which its window was left the last time."""
+    stream.send_blueprint(blueprint, make_active=True, make_default=True)
 
 
 def require_screen(hint: str) -> None:

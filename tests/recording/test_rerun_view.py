@@ -58,8 +58,12 @@ def rrd(flight, tmp_path_factory):
 
 
 def verify(file):
+    return rrd_tool("verify", file)
+
+
+def rrd_tool(word, file):
     environment = {**os.environ, "RERUN_ANALYTICS": "false"}
-    return subprocess.run([RERUN, "rrd", "verify", file], capture_output=True, text=True, env=environment, timeout=60)
+    return subprocess.run([RERUN, "rrd", word, file], capture_output=True, text=True, env=environment, timeout=60)
 
 
 def rows(file, entity, component):
@@ -79,8 +83,9 @@ def test_rerun_accepts_the_recording(rrd):
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_the_blueprint_is_inside(rrd):
+def test_the_blueprint_is_inside_and_goes_before_the_one_that_the_viewer_remembers(rrd):
     assert len(RrdReader(rrd).blueprints()) == 1
+    assert "make_active: true" in rrd_tool("print", rrd).stdout
 
 
 @pytest.mark.parametrize(
