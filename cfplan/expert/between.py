@@ -57,9 +57,9 @@ class Excess:
 class DensePath:
     """A path's derivatives at many places of every interval, evaluated once."""
 
-    def __init__(self, path: Path, nodes: int, held: NDArray | None = None) -> None:
+    def __init__(self, path: Path, nodes: int, held: NDArray) -> None:
         """`held`, (N,): how far, 0 to 1, each interval is bound by a boundary state and had better be left alone."""
-        self.held = held
+        self.held = held[:, None]
         step = path.end / nodes
         brisk = turns(path, nodes) > SHARP
         brisk[:END_INTERVALS] = brisk[-END_INTERVALS:] = True
@@ -81,15 +81,7 @@ class DensePath:
         """Of a profile with as many intervals; h must be positive."""
         highest, lowest = self._extremes(profile, airframe, limits)
         upper, lower = highest.T - _ABOVE + self.allowance, _BELOW - lowest.T + self.allowance
-        if self.held is not None:
-            upper -= self.held[:, None] * np.maximum(upper, 0.0)
-            lower -= self.held[:, None] * np.maximum(lower, 0.0)
-        return Excess(upper, lower)
-
-    def exceeded(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> bool:
-        """Whether such a profile leaves its limits, without any allowance, at one of the places."""
-        highest, lowest = self._extremes(profile, airframe, limits)
-        return bool((highest.T > _ABOVE).any() or (lowest.T < _BELOW).any())
+        return Excess(upper - self.held * np.maximum(upper, 0.0), lower - self.held * np.maximum(lower, 0.0))
 
     def _extremes(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> tuple[NDArray, NDArray]:
         """(COLUMNS, N) twice: the most and the least that each row comes to in each interval."""
@@ -107,8 +99,11 @@ class DensePath:
 
 
 def surely_exceeds(path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> bool:
-    """Whether a limit is exceeded at one of many places; where not, the certificate has the word."""
-    return DensePath(path, len(profile.s) - 1).exceeded(profile, airframe, limits)
+    """Whether a limit is exceeded at a node; where not, the certificate has the word."""
+    first, nodes = profile.s[:-1], np.arange(len(profile.s) - 1)
+    at = dense.dense_rows(airframe, path.derivatives(first)[1:], profile, np.zeros(len(first)), nodes)
+    rows = _as_shares(at, limits).T
+    return bool((rows > _ABOVE).any() or (rows < _BELOW).any())
 
 
 def _by_place(path: Path, s: NDArray) -> NDArray:
