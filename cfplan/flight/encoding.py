@@ -19,7 +19,7 @@ from cfplan.errors import NotCertifiedError
 from cfplan.flight.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, encode
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.trajectory import FullState, Trajectory
+from cfplan.vehicle.trajectory import Trajectory
 
 RATE = 100.0  # Hz
 HOLD = 0.5  # s of hover after the end, so that what the vehicle keeps when the stream stops is a hover
@@ -98,19 +98,26 @@ def setpoints_at(
     trajectory: Trajectory, times: NDArray, rate_lead: float = RATE_LEAD, thrust_lead: float = THRUST_LEAD
 ) -> FullStateSetpoints:
     """What the controller is to be told at each time, (N,) s: the acceleration includes what makes up for drag."""
-    return _setpoints(trajectory.at(times), trajectory.at(times + rate_lead), trajectory.at(times + thrust_lead))
+    return _setpoints_at(trajectory, times, rate_lead, thrust_lead)[0]
 
 
-def _setpoints(states: FullState, turning: FullState, pushing: FullState) -> FullStateSetpoints:
-    """Of the states that are due, with the body rates and the thrust of those ahead."""
-    force = pushing.specific_thrust[:, None] * states.thrust_axis
-    return FullStateSetpoints(
-        position=states.position,
-        velocity=states.velocity,
-        acceleration=force - np.array([0.0, 0.0, GRAVITY]),
-        quaternion=command_quaternion(states.quaternion),
-        body_rate=turning.body_rate,
+def _setpoints_at(
+    trajectory: Trajectory, times: NDArray, rate_lead: float, thrust_lead: float
+) -> tuple[FullStateSetpoints, NDArray, NDArray]:
+    """And the planned accelerations and attitudes at those times, (N, 3) and (N, 4)."""
+    states = trajectory.at(np.concatenate([times, times + rate_lead, times + thrust_lead]))
+    due, turning, pushing = (slice(k * len(times), (k + 1) * len(times)) for k in range(3))
+    acceleration = states.specific_thrust[pushing, None] * states.thrust_axis[due]
+    acceleration[:, 2] -= GRAVITY
+    attitude = states.quaternion[due]
+    setpoints = FullStateSetpoints(
+        position=states.position[due],
+        velocity=states.velocity[due],
+        acceleration=acceleration,
+        quaternion=command_quaternion(attitude),
+        body_rate=states.body_rate[turning],
     )
+    return setpoints, states.acceleration[due], attitude
 
 
 def command_quaternion(quaternion: NDArray) -> NDArray:
@@ -148,30 +155,30 @@ def _check_rows(
         _require(good, what, values, rows.start)
 
     times = encoded.times[rows] + encoded.lead
-    states = trajectory.at(times)
-    meant = _setpoints(states, trajectory.at(times + encoded.rate_lead), trajectory.at(times + encoded.thrust_lead))
-    for name in ("position", "velocity", "acceleration", "body_rate"):
-        error = np.abs(getattr(told, name) - getattr(meant, name)).max(axis=1)
+    meant, acceleration, attitude = _setpoints_at(trajectory, times, encoded.rate_lead, encoded.thrust_lead)
+    (
+        position, velocity, thrust_error, rate_error, thrust, tilt, turned, made, speed, planned, body_rate
+    ) = _inspected(
+        told.position, told.velocity, told.acceleration, told.quaternion, told.body_rate,
+        meant.position, meant.velocity, meant.acceleration, meant.quaternion, meant.body_rate, acceleration, attitude,
+    )  # fmt: skip
+    for name, error in (
+        ("position", position), ("velocity", velocity), ("acceleration", thrust_error), ("body_rate", rate_error)
+    ):  # fmt: skip
         require(error <= HALF_QUANTUM + _ROUNDING, f"{name} in the packet is not that of the trajectory, off by", error)
 
-    force = told.acceleration + np.array([0.0, 0.0, GRAVITY])
-    thrust = np.linalg.norm(force, axis=1)
     quantum = np.sqrt(3) * HALF_QUANTUM + _ROUNDING
     require(thrust >= limits.specific_thrust_min - quantum, "too little specific thrust in the packet, m/s²", thrust)
-    tilt = np.arccos(np.clip(force[:, 2] / thrust, -1.0, 1.0))
-    off = _angles(_frames(told.quaternion), _frames(meant.quaternion))
-    require(off <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", off)
+    require(turned <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", turned)
     # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(tilt) as far.
-    off = _angles(controller_attitude(force, told.quaternion), _frames(states.quaternion.copy()))
     require(
-        off * np.cos(tilt) <= ATTITUDE_QUANTUM, "the controller would not make the planned attitude, off by rad", off
+        made * np.cos(tilt) <= ATTITUDE_QUANTUM, "the controller would not make the planned attitude, off by rad", made
     )
-    for name, values, limit in (
-        ("speed", told.velocity, limits.speed),
-        ("acceleration", told.acceleration - (meant.acceleration - states.acceleration), limits.acceleration),
-        ("angular velocity", told.body_rate, limits.angular_velocity),
+    for name, size, limit in (
+        ("speed", speed, limits.speed),
+        ("acceleration", planned, limits.acceleration),
+        ("angular velocity", body_rate, limits.angular_velocity),
     ):
-        size = np.linalg.norm(values, axis=1)
         require(size <= limit + quantum, f"{name} in the packet exceeds its limit, {limit:g}, with", size)
     require(
         tilt <= limits.tilt + quantum / thrust, f"tilt in the packet exceeds its limit, {limits.tilt:.4g}, with", tilt
@@ -194,6 +201,50 @@ def _require(good: NDArray, what: str, values: NDArray, first: int = 0) -> None:
     if not np.all(good):
         row = int(np.flatnonzero(~good)[0])
         raise NotCertifiedError(f"{what} {values[row]:.4g}", where=f"setpoint {first + row}")
+
+
+@njit(cache=True, error_model="numpy")
+def _inspected(
+    position: NDArray, velocity: NDArray, acceleration: NDArray, quaternion: NDArray, body_rate: NDArray,
+    meant_position: NDArray, meant_velocity: NDArray, meant_acceleration: NDArray, meant_quaternion: NDArray,
+    meant_body_rate: NDArray, planned: NDArray, attitude: NDArray,
+) -> NDArray:  # fmt: skip
+    """(11, N) of what setpoints say and what is meant.
+
+    The largest errors of position, velocity, acceleration and body rate; specific thrust and tilt; rad by which the
+    quaternion is off, and the attitude that the controller makes; speed, planned acceleration as sent, body rate.
+    """
+    out = np.empty((11, len(position)))
+    force = acceleration.copy()
+    force[:, 2] += GRAVITY
+    out[6] = _angles(_frames(quaternion), _frames(meant_quaternion))
+    out[7] = _angles(_attitudes(force, quaternion), _frames(attitude))
+    for n in range(len(position)):
+        a, b, c, d = position[n], velocity[n], acceleration[n], body_rate[n]
+        e, f, g, h = meant_position[n], meant_velocity[n], meant_acceleration[n], meant_body_rate[n]
+        out[0, n] = _largest(a[0] - e[0], a[1] - e[1], a[2] - e[2])
+        out[1, n] = _largest(b[0] - f[0], b[1] - f[1], b[2] - f[2])
+        out[2, n] = _largest(c[0] - g[0], c[1] - g[1], c[2] - g[2])
+        out[3, n] = _largest(d[0] - h[0], d[1] - h[1], d[2] - h[2])
+        out[4, n] = thrust = _norm(force[n, 0], force[n, 1], force[n, 2])
+        out[5, n] = math.acos(min(max(force[n, 2] / thrust, -1.0), 1.0))
+        out[8, n] = _norm(b[0], b[1], b[2])
+        wanted = planned[n]  # the acceleration sent makes up for drag besides
+        out[9, n] = _norm(c[0] - g[0] + wanted[0], c[1] - g[1] + wanted[1], c[2] - g[2] + wanted[2])
+        out[10, n] = _norm(d[0], d[1], d[2])
+    return out
+
+
+@njit(error_model="numpy")
+def _largest(x: float, y: float, z: float) -> float:
+    """Of the sizes; not a number where one is none."""
+    sizes = abs(x) + abs(y) + abs(z)
+    return max(abs(x), abs(y), abs(z)) if sizes == sizes else sizes
+
+
+@njit(error_model="numpy")
+def _norm(x: float, y: float, z: float) -> float:
+    return math.sqrt(x * x + y * y + z * z)
 
 
 @njit(cache=True, error_model="numpy")
