@@ -1,4 +1,4 @@
-"""What limits bind, at thousands of points: some 40 ns each, where full states take several times that.
+"""What limits bind, at thousands of points: some 40 ns each; and full states, which take twice that.
 
 Points are taken side by side, up to WIDTH at a time. A panel holds rows of one quantity each, WIDTH long, one behind
 the other in one array: so the compiler knows that they do not overlap, and works on several points with one
@@ -41,11 +41,20 @@ PLACE = 14
 # s
 SAMPLED_ROWS = 15
 
+# What `flat_states` gives, by row.
+STATES: dict[str, slice | int] = {
+    "position": slice(0, 3), "velocity": slice(3, 6), "acceleration": slice(6, 9), "jerk": slice(9, 12),
+    "snap": slice(12, 15), "thrust_axis": slice(15, 18), "body_rate": slice(18, 21),
+    "angular_acceleration": slice(21, 24), "torque": slice(24, 27), "motor_thrust": slice(27, 31),
+    "quaternion": slice(31, 35), "yaw": 35, "specific_thrust": 36,
+}  # fmt: skip
+STATE_ROWS = 37
+
 WIDTH = 64
 LANES = 16  # points that the compiler may want to take at once: the places in use are a multiple
 _CURVE, _X, _NODE, _RESULT = 0, 15, 16, 23
 # rows of a panel: γ to γ'''', the place in the interval, the profile where that begins, and what comes of them
-_SIZE = (_RESULT + ROWS) * WIDTH
+_SIZE = (_RESULT + STATE_ROWS) * WIDTH
 _BLOCK = 8  # coefficients at a time
 _Derivatives = tuple[float, float, float, float, float]
 
@@ -81,6 +90,21 @@ def dense_rows(
     return out
 
 
+def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray, interval: NDArray) -> NDArray:
+    """(STATE_ROWS, N): position, the full state, and the attitude at each s, (N,).
+
+    `interval` tells whose polynomials of the profile hold; a break of the path belongs to the piece on its right.
+    """
+    count = len(s)
+    if count < LANES:
+        more = np.r_[:count, np.zeros(LANES - count, dtype=int)]
+        return flat_states(airframe, path, profile, s[more], interval[more])[:, :count]
+    out = np.empty((STATE_ROWS, count))
+    curves = path.derivatives(s).reshape(15, count)
+    _states(out, compiled_body(airframe), curves, profile.table(), s - profile.s[interval], interval)
+    return out
+
+
 def sampled_rows(
     airframe: Airframe, path: Path, profile: SpeedProfile, stretches: Stretches, out: NDArray | None = None
 ) -> NDArray:
@@ -102,7 +126,7 @@ def sampled_rows(
     return out
 
 
-def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
+def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Callable[..., int]]:
     """The loops, which return `sources`: a checksum of what they call, as numba's cache does not look there."""
 
     @njit(cache=True, error_model="numpy", fastmath=ROUNDING)
@@ -157,7 +181,29 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
                 out[PLACE, at : at + count] = s[:count]
         return sources
 
-    return at_points, along
+    @njit(cache=True, error_model="numpy", fastmath=ROUNDING)
+    def states(out: NDArray, body: Body, curves: NDArray, nodes: NDArray, places: NDArray, interval: NDArray) -> int:
+        panel = np.empty(_SIZE)
+        for start in range(0, len(places), WIDTH):
+            lanes = min(WIDTH, _whole(len(places) - start))
+            begin = min(start, len(places) - lanes)
+            for row in range(15):
+                for n in range(lanes):
+                    panel[(_CURVE + row) * WIDTH + n] = curves[row, begin + n]
+            for n in range(lanes):
+                panel[_X * WIDTH + n] = places[begin + n]
+                for row in range(7):
+                    panel[(_NODE + row) * WIDTH + n] = nodes[interval[begin + n], 1 + row]
+            _flatten_whole(panel, body, lanes)
+            for row in range(3):
+                for n in range(lanes):
+                    out[row, begin + n] = panel[(_CURVE + row) * WIDTH + n]
+            for row in range(3, STATE_ROWS):
+                for n in range(lanes):
+                    out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
+        return sources
+
+    return at_points, along, states
 
 
 @register_jitable(fastmath=ROUNDING)
@@ -228,6 +274,47 @@ def _flatten(panel: NDArray, body: Body, lanes: int) -> None:
 
 
 @register_jitable(fastmath=ROUNDING)
+def _flatten_whole(panel: NDArray, body: Body, lanes: int) -> None:
+    """The full state from path and profile, as STATES has it but for the position."""
+    lanes = min(lanes, WIDTH)
+    for n in range(lanes):
+        h, dh, ddh = _vector(panel, _NODE, n)
+        speed, turn = profile_within(
+            panel[_X * WIDTH + n], h, dh, ddh, panel[(_NODE + 3) * WIDTH + n], *_vector(panel, _NODE + 4, n)
+        )
+        flat = flat_state(
+            body,
+            (_vector(panel, 3, n), _vector(panel, 6, n), _vector(panel, 9, n), _vector(panel, 12, n)),
+            speed,
+            turn,
+            cosine,
+            sine,
+        )
+        _write(panel, 3, n, flat.velocity)
+        _write(panel, 6, n, flat.acceleration)
+        _write(panel, 9, n, flat.jerk)
+        _write(panel, 12, n, flat.snap)
+        _write(panel, 15, n, flat.thrust_axis)
+        _write(panel, 18, n, flat.body_rate)
+        _write(panel, 21, n, flat.angular_acceleration)
+        _write(panel, 24, n, flat.torque)
+        _write(panel, 27, n, flat.motor_thrust[:3])
+        panel[(_RESULT + 30) * WIDTH + n] = flat.motor_thrust[3]
+        # The least turn from the vertical to the thrust axis, after a turn by yaw.
+        a, b, c = flat.thrust_axis
+        cos, sin, norm = cosine(turn[0] / 2), sine(turn[0] / 2), (2.0 * (1.0 + c)) ** 0.5
+        _write(panel, 31, n, ((a * sin - b * cos) / norm, (a * cos + b * sin) / norm, sin * norm / 2))
+        _write(panel, 34, n, (cos * norm / 2, turn[0], flat.specific_thrust))
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def _write(panel: NDArray, row: int, n: int, vector: tuple[float, float, float]) -> None:
+    panel[(_RESULT + row) * WIDTH + n] = vector[0]
+    panel[(_RESULT + row + 1) * WIDTH + n] = vector[1]
+    panel[(_RESULT + row + 2) * WIDTH + n] = vector[2]
+
+
+@register_jitable(fastmath=ROUNDING)
 def _finish(panel: NDArray, lanes: int) -> None:
     """Norms and tilt in place of squares and components."""
     lanes = min(lanes, WIDTH)
@@ -255,4 +342,4 @@ def _squared(vector: tuple[float, float, float]) -> float:
 
 
 _CALLED = [FilePath(__file__).with_name(name).read_bytes() for name in ("flatness.py", "trigonometry.py")]
-_at_points, _along = _compile(zlib.crc32(b"".join(_CALLED)))
+_at_points, _along, _states = _compile(zlib.crc32(b"".join(_CALLED)))

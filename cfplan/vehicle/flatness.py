@@ -7,17 +7,11 @@ fibration on SO(3)" (2017); drag after Faessler, Franchi and Scaramuzza (2018), 
 body x and y.
 """
 
-import math
 from typing import Any, NamedTuple
 
-import numpy as np
-from numba import njit
 from numba.extending import register_jitable
-from numpy.typing import NDArray
 
-from cfplan.geometry.path import Path
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.profile import SpeedProfile
 
 Scalar = Any  # float, NDArray or casadi.SX
 Vector = tuple[Scalar, Scalar, Scalar]
@@ -178,7 +172,7 @@ def motor_thrusts(
     )
 
 
-@register_jitable(forceinline=True)  # to the last bit as SpeedProfile.at has it
+@_within_the_loop
 def profile_within(
     x: Scalar, h: Scalar, dh: Scalar, ddh: Scalar, dddh: Scalar, yaw: Scalar, dyaw: Scalar, ddyaw: Scalar
 ) -> tuple[tuple[Scalar, Scalar, Scalar, Scalar], Vector]:
@@ -196,70 +190,3 @@ def compiled_body(airframe: Airframe) -> Body:
         float(airframe.mass), (float(jx), float(jy), float(jz)), float(airframe.arm),
         float(airframe.thrust_to_torque), (float(planar), float(axial)),
     )  # fmt: skip
-
-
-COLUMNS: dict[str, slice | int] = {
-    "position": slice(0, 3), "velocity": slice(3, 6), "acceleration": slice(6, 9), "jerk": slice(9, 12),
-    "snap": slice(12, 15), "thrust_axis": slice(15, 18), "body_rate": slice(18, 21),
-    "angular_acceleration": slice(21, 24), "torque": slice(24, 27), "motor_thrust": slice(27, 31),
-    "quaternion": slice(31, 35), "yaw": 35, "specific_thrust": 36,
-}  # fmt: skip
-WIDTH = 37
-
-
-def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray, interval: NDArray) -> NDArray:
-    """(N, WIDTH), laid out as COLUMNS says: position, the full state, and the attitude at each s, (N,).
-
-    `interval` tells whose polynomials of the profile hold; a break of the path belongs to the piece on its right.
-    """
-    out = np.empty((len(s), WIDTH))
-    _fill(
-        out, compiled_body(airframe), path.breaks, path.origins, path.coefficients, profile.table(),
-        np.array(s, dtype=float), interval,
-    )  # fmt: skip
-    return out
-
-
-# Here and not in a file of its own, because numba's cache only notices changes of the file that a function stands in.
-@njit(cache=True, error_model="numpy")
-def _fill(
-    out: NDArray, body: Body, breaks: NDArray, origins: NDArray, coefficients: NDArray, nodes: NDArray, s: NDArray,
-    intervals: NDArray,
-) -> None:  # fmt: skip
-    power, last, piece = coefficients.shape[1], len(origins) - 1, 0
-    for n in range(len(out)):
-        if not (breaks[piece] <= s[n] and (s[n] < breaks[piece + 1] or piece == last)):
-            piece = min(max(int(np.searchsorted(breaks, s[n], side="right")) - 1, 0), last)
-        table, x = coefficients[piece], s[n] - origins[piece]
-        # Horner's scheme for the value and four derivatives over their factorials
-        p0 = p1 = p2 = p3 = p4 = (0.0, 0.0, 0.0)
-        for k in range(power - 1, -1, -1):
-            p4, p3, p2, p1 = _sum2(x, p4, 1.0, p3), _sum2(x, p3, 1.0, p2), _sum2(x, p2, 1.0, p1), _sum2(x, p1, 1.0, p0)
-            p0 = _sum2(x, p0, 1.0, (table[k, 0], table[k, 1], table[k, 2]))
-        node = nodes[intervals[n]]
-        speed, turn = profile_within(s[n] - node[0], node[1], node[2], node[3], node[4], node[5], node[6], node[7])
-        psi = turn[0]
-        derivatives = (p1, _scaled(2.0, p2), _scaled(6.0, p3), _scaled(24.0, p4))
-        flat = flat_state(body, derivatives, speed, turn, math.cos, math.sin)
-        row = out[n]
-        for k in range(3):
-            row[k] = p0[k]
-            row[3 + k] = flat.velocity[k]
-            row[6 + k] = flat.acceleration[k]
-            row[9 + k] = flat.jerk[k]
-            row[12 + k] = flat.snap[k]
-            row[15 + k] = flat.thrust_axis[k]
-            row[18 + k] = flat.body_rate[k]
-            row[21 + k] = flat.angular_acceleration[k]
-            row[24 + k] = flat.torque[k]
-        for k in range(4):
-            row[27 + k] = flat.motor_thrust[k]
-        # The least turn from the vertical to the thrust axis, after a turn by yaw.
-        a, b, c = flat.thrust_axis
-        cos, sin, norm = math.cos(psi / 2), math.sin(psi / 2), math.sqrt(2.0 * (1.0 + c))
-        row[31] = (a * sin - b * cos) / norm
-        row[32] = (a * cos + b * sin) / norm
-        row[33] = sin * norm / 2
-        row[34] = cos * norm / 2
-        row[35] = psi
-        row[36] = flat.specific_thrust

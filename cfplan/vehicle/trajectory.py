@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from cfplan.errors import NotCertifiedError
 from cfplan.geometry.path import Path
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.flatness import COLUMNS, flat_states
+from cfplan.vehicle.dense import STATES, flat_states
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import Timing, measure
 
@@ -109,7 +109,7 @@ def state_at(
     if interval is None:
         interval = profile.interval(s)
     table = flat_states(airframe, path, profile, s, interval)
-    return FullState(time=time, s=s, **{name: table[:, columns] for name, columns in COLUMNS.items()})
+    return FullState(time=time, s=s, **{name: table[rows].T for name, rows in STATES.items()})
 
 
 def _hover(state: FullState, ascending: NDArray, airframe: Airframe) -> None:
