@@ -155,7 +155,7 @@ def _walk(path: Path, seed: int, chosen: LimitSet, repeats: int) -> Walk:
         runs = [seconds] + [_planned(path, chosen)[1] for _ in range(repeats - 1)]
         values |= {"seconds": min(runs, key=sum), "share": found.share, "flight": found.trajectory.duration}
         values["worst_share"] = found.certificate.worst.share
-        expert = plan_reduced(path, chosen.airframe, chosen.limits, nodes=nodes)
+        expert = plan_reduced(path, chosen.airframe, chosen.limits, nodes=nodes, windows=False)
         if expert.profile is not None:
             values["expert_flight"] = Trajectory(path, expert.profile, chosen.airframe).duration
     except InputError:
