@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.flatness import ROUNDING, Body, compiled_body, flat_state, profile_within
+from cfplan.vehicle.flatness import ROUNDING, Body, Flat, compiled_body, flat_state, profile_within
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trigonometry import cosine, sine, slope_angle
 
@@ -137,13 +137,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Call
         for start in range(0, len(places), WIDTH):
             lanes = min(WIDTH, _whole(len(places) - start))
             begin = min(start, len(places) - lanes)
-            for row in range(12):
-                for n in range(lanes):
-                    panel[(_CURVE + 3 + row) * WIDTH + n] = derivatives[row, begin + n]
-            for n in range(lanes):
-                panel[_X * WIDTH + n] = places[begin + n]
-                for row in range(7):
-                    panel[(_NODE + row) * WIDTH + n] = nodes[interval[begin + n], 1 + row]
+            _place(panel, 3, derivatives, nodes, places, interval, begin, lanes)
             _flatten(panel, body, lanes)
             for row in range(ROWS):
                 for n in range(lanes):
@@ -187,13 +181,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Call
         for start in range(0, len(places), WIDTH):
             lanes = min(WIDTH, _whole(len(places) - start))
             begin = min(start, len(places) - lanes)
-            for row in range(15):
-                for n in range(lanes):
-                    panel[(_CURVE + row) * WIDTH + n] = curves[row, begin + n]
-            for n in range(lanes):
-                panel[_X * WIDTH + n] = places[begin + n]
-                for row in range(7):
-                    panel[(_NODE + row) * WIDTH + n] = nodes[interval[begin + n], 1 + row]
+            _place(panel, 0, curves, nodes, places, interval, begin, lanes)
             _flatten_whole(panel, body, lanes)
             for row in range(3):
                 for n in range(lanes):
@@ -204,6 +192,21 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Call
         return sources
 
     return at_points, along, states
+
+
+@register_jitable(fastmath=ROUNDING)
+def _place(
+    panel: NDArray, first: int, curves: NDArray, nodes: NDArray, places: NDArray, interval: NDArray, begin: int,
+    lanes: int,
+) -> None:  # fmt: skip
+    """Points from `begin` on, whose path is known from its row `first` on."""
+    for row in range(len(curves)):
+        for n in range(lanes):
+            panel[(_CURVE + first + row) * WIDTH + n] = curves[row, begin + n]
+    for n in range(lanes):
+        panel[_X * WIDTH + n] = places[begin + n]
+        for row in range(7):
+            panel[(_NODE + row) * WIDTH + n] = nodes[interval[begin + n], 1 + row]
 
 
 @register_jitable(fastmath=ROUNDING)
@@ -242,23 +245,23 @@ def _step(x: float, c: float, p: _Derivatives) -> _Derivatives:
     return x * p[0] + c, x * p[1] + p[0], x * p[2] + p[1], x * p[3] + p[2], x * p[4] + p[3]
 
 
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def _flat_at(panel: NDArray, body: Body, n: int) -> tuple[Flat, float]:
+    """The full state, and yaw, from path and profile."""
+    h, dh, ddh = _vector(panel, _NODE, n)
+    speed, turn = profile_within(
+        panel[_X * WIDTH + n], h, dh, ddh, panel[(_NODE + 3) * WIDTH + n], *_vector(panel, _NODE + 4, n)
+    )
+    derivatives = _vector(panel, 3, n), _vector(panel, 6, n), _vector(panel, 9, n), _vector(panel, 12, n)
+    return flat_state(body, derivatives, speed, turn, cosine, sine), turn[0]
+
+
 @register_jitable(fastmath=ROUNDING)
 def _flatten(panel: NDArray, body: Body, lanes: int) -> None:
     """The results from path and profile."""
     lanes = min(lanes, WIDTH)
     for n in range(lanes):
-        h, dh, ddh = _vector(panel, _NODE, n)
-        speed, turn = profile_within(
-            panel[_X * WIDTH + n], h, dh, ddh, panel[(_NODE + 3) * WIDTH + n], *_vector(panel, _NODE + 4, n)
-        )
-        flat = flat_state(
-            body,
-            (_vector(panel, 3, n), _vector(panel, 6, n), _vector(panel, 9, n), _vector(panel, 12, n)),
-            speed,
-            turn,
-            cosine,
-            sine,
-        )
+        flat, _ = _flat_at(panel, body, n)
         axis = flat.thrust_axis
         panel[(_RESULT + SPEED) * WIDTH + n] = _squared(flat.velocity)
         panel[(_RESULT + ACCELERATION) * WIDTH + n] = _squared(flat.acceleration)
@@ -278,18 +281,7 @@ def _flatten_whole(panel: NDArray, body: Body, lanes: int) -> None:
     """The full state from path and profile, as STATES has it but for the position."""
     lanes = min(lanes, WIDTH)
     for n in range(lanes):
-        h, dh, ddh = _vector(panel, _NODE, n)
-        speed, turn = profile_within(
-            panel[_X * WIDTH + n], h, dh, ddh, panel[(_NODE + 3) * WIDTH + n], *_vector(panel, _NODE + 4, n)
-        )
-        flat = flat_state(
-            body,
-            (_vector(panel, 3, n), _vector(panel, 6, n), _vector(panel, 9, n), _vector(panel, 12, n)),
-            speed,
-            turn,
-            cosine,
-            sine,
-        )
+        flat, yaw = _flat_at(panel, body, n)
         _write(panel, 3, n, flat.velocity)
         _write(panel, 6, n, flat.acceleration)
         _write(panel, 9, n, flat.jerk)
@@ -302,9 +294,9 @@ def _flatten_whole(panel: NDArray, body: Body, lanes: int) -> None:
         panel[(_RESULT + 30) * WIDTH + n] = flat.motor_thrust[3]
         # The least turn from the vertical to the thrust axis, after a turn by yaw.
         a, b, c = flat.thrust_axis
-        cos, sin, norm = cosine(turn[0] / 2), sine(turn[0] / 2), (2.0 * (1.0 + c)) ** 0.5
+        cos, sin, norm = cosine(yaw / 2), sine(yaw / 2), (2.0 * (1.0 + c)) ** 0.5
         _write(panel, 31, n, ((a * sin - b * cos) / norm, (a * cos + b * sin) / norm, sin * norm / 2))
-        _write(panel, 34, n, (cos * norm / 2, turn[0], flat.specific_thrust))
+        _write(panel, 34, n, (cos * norm / 2, yaw, flat.specific_thrust))
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)

@@ -51,7 +51,8 @@ def finely(trajectory, parts=20):
             "speed": np.linalg.norm(state.velocity, axis=1).max(),
             "acceleration": np.linalg.norm(state.acceleration, axis=1).max(),
             "angular velocity": np.linalg.norm(state.body_rate, axis=1).max(),
-            "tilt": np.arccos(np.clip(state.thrust_axis[:, 2], -1, 1)).max(),
+            # not by the cosine, which makes 1e-8 rad of a rounding error
+            "tilt": np.arctan2(np.hypot(*state.thrust_axis[:, :2].T), state.thrust_axis[:, 2]).max(),
             "motor thrust, most": state.motor_thrust.max(),
             "motor thrust, least": -state.motor_thrust.min(),
             "specific thrust, least": -state.specific_thrust.min(),
