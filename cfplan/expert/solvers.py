@@ -16,8 +16,10 @@ from cfplan.expert.spline_problem import SplineProblem
 
 TOLERANCE = 1e-2
 # of the scaled problem: 1e-5 s in the cost's gradient
-FROM_AFAR = (Search(),)
-# from a guess
+FROM_AFAR = (
+    Search(iterations=60), Search(barrier=0.1, push=0.3, iterations=100)
+)  # fmt: skip
+# from a guess; what the first does not solve begins far inside the bounds
 AGAIN = (
     Search(barrier=3e-3, push=1e-4, iterations=20), Search(barrier=0.05, push=1e-3, iterations=40), *FROM_AFAR
 )  # fmt: skip
