@@ -24,7 +24,7 @@ from cfplan.flight.mission import Mission
 from cfplan.flight.pace import may_go_first
 from cfplan.recording.header import RecordHeader
 from cfplan.recording.live import LiveView, live_blueprint
-from cfplan.recording.viewer import APPLICATION, free_port, viewer_program
+from cfplan.recording.viewer import APPLICATION, free_port, lay_out, viewer_program
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.missions import planned_mission
 from cfplan.studies.real_time import Conditions, fly_in_real_time
@@ -196,7 +196,8 @@ def _view(header: RecordHeader) -> Iterator[LiveView]:
         try:
             time.sleep(_VIEWER_STARTS)
             stream = rr.RecordingStream(APPLICATION)
-            stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=live_blueprint(header))
+            stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
+            lay_out(stream, live_blueprint(header))
             with LiveView(stream, header) as view:
                 yield view
         finally:
