@@ -1,8 +1,10 @@
 """Deadlines at a fixed rate that do not drift, and how well they were met."""
 
 import contextlib
+import ctypes
 import math
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -11,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 STREAM_PRIORITY = 20  # of SCHED_FIFO, for the thread that sends setpoints
+_LOCK_ALL_IN_USE = 1 | 2 | 4
+# MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of mlockall(2): every page, now and later, once it is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,3 +108,20 @@ def may_go_first() -> bool:
     thread.start()
     thread.join()
     return permitted[0]
+
+
+def stay_in_memory() -> bool:
+    """Keep the pages that this process uses from being taken away and read again; whether that is permitted.
+
+    Of code that runs once a second they are taken where a system trims its caches, and reading them back takes
+    milliseconds.
+    """
+    if not sys.platform.startswith("linux"):
+        return False
+    import resource
+
+    # Under a limit that is not reached yet, some allocation in flight would be refused instead.
+    unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
+    if not unlimited and os.geteuid() != 0:
+        return False
+    return int(ctypes.CDLL(None).mlockall(_LOCK_ALL_IN_USE)) == 0

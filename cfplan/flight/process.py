@@ -18,7 +18,7 @@ from cfplan.flight.connection import connect
 from cfplan.flight.keys import Keyboard, Order
 from cfplan.flight.mission import Mission
 from cfplan.flight.outcome import FlightOutcome
-from cfplan.flight.pace import STREAM_PRIORITY, go_first
+from cfplan.flight.pace import STREAM_PRIORITY, go_first, stay_in_memory
 from cfplan.flight.pilot import Pilot
 from cfplan.flight.poses import PoseSource
 from cfplan.flight.reporter import Reporter
@@ -196,3 +196,4 @@ def _quieten() -> None:
         for thread in os.listdir("/proc/self/task"):
             go_first(_THREAD_PRIORITY, int(thread))
     go_first()
+    stay_in_memory()

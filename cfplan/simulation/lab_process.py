@@ -15,6 +15,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 
 from cfplan.errors import CfplanError, InputError
+from cfplan.flight.pace import stay_in_memory
 from cfplan.simulation.lab import CLOSE, LATEST, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME, TRUTH
 from cfplan.simulation.radio import Radio, RadioFault
 from cfplan.simulation.room import SUBSCRIBE, SUBSCRIPTION_LASTS, MotionCapture, RoomSettings
@@ -260,6 +261,7 @@ def serve(control: Connection) -> None:
 
 def _take_priority() -> None:
     """Be on time on a busy computer, where permitted: it stands for hardware, which would not wait either."""
+    stay_in_memory()
     if hasattr(os, "sched_setscheduler"):
         with suppress(PermissionError):
             os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))

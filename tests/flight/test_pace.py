@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from cfplan.flight import pace
-from cfplan.flight.pace import go_first, go_with_all, goes_first, may_go_first
+from cfplan.flight.pace import go_first, go_with_all, goes_first, may_go_first, stay_in_memory
 
 pytestmark = pytest.mark.unit
 
@@ -58,3 +58,31 @@ def test_a_child_of_the_stream_goes_with_all_others():
             return os.sched_getscheduler(child.pid)
 
     assert in_a_thread(start) == os.SCHED_OTHER
+
+
+LOCKED = """
+import resource
+from cfplan.flight.pace import stay_in_memory
+resource.setrlimit(resource.RLIMIT_MEMLOCK, {limit})
+permitted = stay_in_memory()
+more = bytearray(30_000_000)  # must be given in any case
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+print(permitted, int(status["VmLck"].split()[0]) > 30_000)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="locks memory on Linux alone")
+def test_memory_is_locked_exactly_where_it_is_permitted():
+    found = subprocess.run([sys.executable, "-c", LOCKED.format(limit="resource.getrlimit(resource.RLIMIT_MEMLOCK)")],
+                           capture_output=True, text=True, check=True).stdout.split()  # fmt: skip
+    assert found in (["True", "True"], ["False", "False"])
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="locks memory on Linux alone")
+def test_a_limit_that_is_not_reached_yet_locks_nothing(monkeypatch):
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    import resource
+
+    monkeypatch.setattr(resource, "getrlimit", lambda _which: (8 << 20, 8 << 20))
+    monkeypatch.setattr(pace.ctypes, "CDLL", lambda _name: pytest.fail("asked for it"))
+    assert not stay_in_memory()
