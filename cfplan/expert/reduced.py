@@ -35,8 +35,8 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
 
-WINDOW = (400, 40)
-# intervals of a window that is searched at once, and how much further it looks; more only make the search longer
+WINDOW = (96, 24)
+# intervals that a window keeps, and how much further it looks: longer windows take more steps
 
 
 def plan_reduced(

@@ -22,7 +22,7 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 
-WINDOW = (96, 32)
+WINDOW = (224, 32)
 # intervals that a window keeps, and how much further it looks
 
 
@@ -60,12 +60,12 @@ def refine(
 
 def _refined(task: Task, near: NDArray) -> Kept | str:
     nodes, unit = task.layout.shape.nodes, task.limits.speed**2
-    seconds = float(np.sum(task.path.end / nodes / np.sqrt(unit * near[:, 0])))
+    interval = task.path.end / nodes * float(np.mean(1.0 / np.sqrt(unit * near[:, 0])))
     given = task.layout, task.path, task.airframe, task.limits, task.track, 0.0, task.ends, Penalties()
     agrees = not task.ends.end and (task.ends.continues or not task.ends.start)
     problem = pose(*given, near if agrees else None)
-    attempt = interior_point(problem, None, quickly(seconds))
+    attempt = interior_point(problem, None, quickly(interval))
     if flaw(attempt, problem, task):  # not near enough
         problem = pose(*given)
         attempt = interior_point(problem, None)
-    return flaw(attempt, problem, task) or kept_between(attempt, problem, task, quickly_again(seconds))
+    return flaw(attempt, problem, task) or kept_between(attempt, problem, task, quickly_again(interval))

@@ -24,19 +24,19 @@ AGAIN = (
     Search(barrier=3e-3, push=1e-4, iterations=20), Search(barrier=0.05, push=1e-3, iterations=40), *FROM_AFAR
 )  # fmt: skip
 # from the answer to a problem almost the same: near the bounds from the start, and further off where that fails
-NEARLY = 0.01
-# the barrier, by second of flight, that keeps within a few thousandths of the best
+NEARLY = 1.0
+# the barrier, by second that an interval takes, that keeps within a few thousandths of the best
 
 
-def quickly(seconds: float) -> Sequence[Search]:
-    """From what is nearly right and takes so long, to what takes a few thousandths longer than the best."""
-    barrier = NEARLY * seconds
+def quickly(interval: float) -> Sequence[Search]:
+    """From what is nearly right to what takes a few thousandths longer than the best; `interval` takes so long, s."""
+    barrier = NEARLY * interval
     return Search(barrier=barrier, last_barrier=barrier, push=min(barrier, 0.1), iterations=40), *FROM_AFAR
 
 
-def quickly_again(seconds: float) -> Sequence[Search]:
+def quickly_again(interval: float) -> Sequence[Search]:
     """The same, from the answer to a problem almost the same."""
-    barrier = NEARLY * seconds
+    barrier = NEARLY * interval
     return Search(barrier=barrier, last_barrier=barrier, push=3e-3, iterations=20), *AGAIN
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cfplan.errors import CfplanError, InfeasibleError, InputError
+from cfplan.expert import refined
 from cfplan.expert.solution import Solution, Status
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
@@ -164,10 +165,11 @@ def test_too_fast_a_profile_of_the_learned_planner_is_refined_and_the_plan_says_
 
 def test_a_plan_made_window_by_window_tells_where_they_meet(limits, make_profile, monkeypatch):
     zigzag = min_snap([[(-1) ** turn, 0.4 * turn - 1.6, 1.0] for turn in range(9)])
-    refined = {n: plan(zigzag, limits.airframe, limits, planner="convex", nodes=n) for n in (100, 150)}
-    assert all("refined" in made.notes[-1] for made in refined.values())
-    assert refined[100].joints == ()
-    assert refined[150].joints == pytest.approx([96 / 150 * zigzag.end])
+    monkeypatch.setattr(refined, "WINDOW", (96, 32))
+    found = {n: plan(zigzag, limits.airframe, limits, planner="convex", nodes=n) for n in (100, 150)}
+    assert all("refined" in made.notes[-1] for made in found.values())
+    assert found[100].joints == ()
+    assert found[150].joints == pytest.approx([96 / 150 * zigzag.end])
 
     slow = make_profile(zigzag.end, np.full(150 + 3, 0.2))
     stub(monkeypatch, learned=lambda path, nodes: Solution(Status.SOLVED, slow, joints=(1.25, 2.5)))
