@@ -172,7 +172,7 @@ def motor_thrusts(
     )
 
 
-@_within_the_loop
+@register_jitable(forceinline=True, fastmath=False)  # to the last bit as SpeedProfile.at has it
 def profile_within(
     x: Scalar, h: Scalar, dh: Scalar, ddh: Scalar, dddh: Scalar, yaw: Scalar, dyaw: Scalar, ddyaw: Scalar
 ) -> tuple[tuple[Scalar, Scalar, Scalar, Scalar], Vector]:

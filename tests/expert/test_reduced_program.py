@@ -190,6 +190,20 @@ def test_the_library_is_made_once_and_left_alone(monkeypatch, tmp_path):
         kernel.machine_code.cache_clear()
 
 
+def test_an_instruction_that_cannot_be_written_out_leaves_the_virtual_machine(monkeypatch, tmp_path):
+    x = casadi.SX.sym("x")
+    unknown = casadi.Function("unknown", [x], [casadi.atan(x)])
+    monkeypatch.setattr(kernel, "point_kernels", lambda free_yaw: (unknown, unknown))
+    monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path))
+    with pytest.raises(NotImplementedError, match="unknown: instruction"):
+        kernel.source()
+    kernel.machine_code.cache_clear()
+    try:
+        assert kernel.backend() is Backend.VIRTUAL_MACHINE
+    finally:
+        kernel.machine_code.cache_clear()
+
+
 def test_ipopt_takes_over_where_the_first_solver_fails(monkeypatch):
     def gives_up(problem, backend, searches=()):
         return Attempt("interior point", problem.table, problem.lbg, False, 3, "gave up")

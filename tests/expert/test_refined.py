@@ -24,7 +24,7 @@ def planned(limit_set: str, seed: int, nodes: int = 100, waypoints: tuple[int, i
     """(path, limit set, the expert's profile)."""
     chosen = LIMIT_SETS[limit_set]
     path = min_snap(random_waypoints(seed, BOX, waypoints))
-    return path, chosen, plan_reduced(path, chosen.airframe, chosen.limits, nodes=nodes).profile
+    return path, chosen, plan_reduced(path, chosen.airframe, chosen.limits, nodes=nodes, windows=False).profile
 
 
 def disturbed(profile, end, size, seed=0):

@@ -1,6 +1,7 @@
 """What is written is what is read, however the writing ended."""
 
 import errno
+import io
 import signal
 import struct
 import subprocess
@@ -225,7 +226,7 @@ class FullDisk:
     """A file on a disk with so much room; it takes what still fits, as a disk does."""
 
     def __init__(self, path, room):
-        self.file, self.room = open(path, "xb", buffering=0), room  # noqa: SIM115
+        self.file, self.room = io.FileIO(path, "x"), room
 
     def write(self, data):
         if self.room == 0:

@@ -86,7 +86,7 @@ def test_compiled_and_interpreted_flatness_agree(trajectory, inner_times):
         expected = np.stack(getattr(flat, name), axis=-1)
         np.testing.assert_allclose(getattr(state, name), expected, atol=1e-12 * (1 + np.abs(expected).max()))
     np.testing.assert_allclose(state.specific_thrust, flat.specific_thrust, rtol=1e-13)
-    np.testing.assert_allclose(state.yaw, sample.yaw, rtol=1e-15, atol=1e-15)
+    np.testing.assert_array_equal(state.yaw, sample.yaw)
 
 
 def test_rotorpy_moves_the_same_under_the_same_motor_thrusts(make_profile):
