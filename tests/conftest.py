@@ -1,10 +1,70 @@
-"""What tests of several packages need."""
+"""What tests of several packages need, and what becomes of real time on a computer that stands still.
+
+A virtual machine whose host is busy stands still for tenths of seconds, and a flight in real time then ends as it
+should: the vehicle brakes, or preflight refuses. Such a test is repeated, but only where a process that does nothing
+but sleep was late meanwhile: a fault of our own fails at once on a computer that keeps time, and on any in the end.
+"""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
 from cfplan.vehicle.profile import SpeedProfile
+
+MOST_REPEATS = 3
+
+
+class Standstills:
+    """When this computer stood still, by a process that only sleeps."""
+
+    def __init__(self) -> None:
+        script = Path(__file__).with_name("standstills.py")
+        self._process = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE)
+        assert self._process.stdout is not None
+        self._told = self._process.stdout
+        os.set_blocking(self._told.fileno(), False)
+        self._last = 0.0
+        self.since = 0.0
+        # when the present attempt at a test began, by time.monotonic()
+
+    def seen(self) -> bool:
+        """Whether there was one during the present attempt."""
+        self._last = max([self._last, *map(float, (self._told.read() or b"").split())])
+        return self._last >= self.since
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+
+_standstills = pytest.StashKey[Standstills]()
+
+
+@pytest.hookimpl(trylast=True)  # when what is not selected has gone
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Whatever runs in real time may be repeated."""
+    in_real_time = [item for item in items if item.get_closest_marker("integration")]
+    if in_real_time and not config.option.collectonly:
+        watch = config.stash[_standstills] = Standstills()
+        for item in in_real_time:
+            item.add_marker(pytest.mark.flaky(reruns=MOST_REPEATS, condition=watch.seen))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if _standstills in item.config.stash:
+        item.config.stash[_standstills].since = time.monotonic()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if _standstills in config.stash:
+        config.stash[_standstills].close()
 
 
 def spline_profile(end, h_coefficients, yaw_coefficients=None) -> SpeedProfile:
