@@ -9,7 +9,9 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -18,6 +20,9 @@ from scipy.interpolate import BSpline
 from cfplan.vehicle.profile import SpeedProfile
 
 MOST_REPEATS = 3
+
+
+Result = TypeVar("Result")
 
 
 class Standstills:
@@ -37,6 +42,15 @@ class Standstills:
         """Whether there was one during the present attempt."""
         self._last = max([self._last, *map(float, (self._told.read() or b"").split())])
         return self._last >= self.since
+
+    def without(self, act: Callable[[], Result]) -> Result:
+        """What an act comes to, repeated likewise: for fixtures that several tests look at."""
+        for _ in range(1 + MOST_REPEATS):
+            self.since = time.monotonic()
+            result = act()
+            if not self.seen():
+                break
+        return result
 
     def close(self) -> None:
         self._process.kill()
@@ -65,6 +79,11 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_unconfigure(config: pytest.Config) -> None:
     if _standstills in config.stash:
         config.stash[_standstills].close()
+
+
+@pytest.fixture(scope="session")
+def standstills(pytestconfig) -> Standstills:
+    return pytestconfig.stash[_standstills]
 
 
 def spline_profile(end, h_coefficients, yaw_coefficients=None) -> SpeedProfile:

@@ -51,8 +51,8 @@ def wait_until(condition: Callable[[], bool], patience: float) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole_flight(lab, fly_in):
-    return fly_in(lab)
+def whole_flight(lab, fly_in, standstills):
+    return standstills.without(lambda: fly_in(lab))
 
 
 def test_a_flight_ends_landed_disarmed_and_unlocked(whole_flight):

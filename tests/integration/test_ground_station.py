@@ -115,8 +115,12 @@ def refused(action: Callable[[], object]) -> ActionResult:
 
 
 @pytest.fixture(scope="module")
-def landed(lab, mission, tmp_path_factory) -> Watched:
+def landed(lab, mission, tmp_path_factory, standstills) -> Watched:
     """A flight that the ground station looks at, tries to arm and to take off with, and lands."""
+    return standstills.without(lambda: watched_flight(lab, mission, tmp_path_factory))
+
+
+def watched_flight(lab, mission, tmp_path_factory) -> Watched:
     watched = Watched(log=tmp_path_factory.mktemp("log") / "flight.tlog")
     station = Station()
     newest: Estimate | None = None
@@ -201,7 +205,8 @@ def test_the_ground_station_stops_the_motors(limits, mission, station, tmp_path,
 
     with start_lab(limits.airframe, number=number) as lab:
         outcome = fly_with(station, mission, lab, tmp_path / "flight.tlog", react)
-        assert not lab.truth().motor[-1].any()
-        assert lab.truth().locked
-    assert outcome.exit_code is ExitCode.ENDED_BY_PILOT
+        truth = lab.truth()
+    assert outcome.exit_code is ExitCode.ENDED_BY_PILOT, outcome.reason
     assert outcome.rung is Rung.CUT
+    assert not truth.motor[-1].any()
+    assert truth.locked
