@@ -123,7 +123,7 @@ def _read_plan(file: Path, limits: "Limits") -> "Plan":
 def certify_bytes(flight: PlannedFlight, steps: Steps) -> "EncodedFlight":
     """Show the certificate's worst share, encode the flight, and check what the bytes say."""
     from cfplan.errors import NotCertifiedError
-    from cfplan.flight.encoding import check_bytes, encode_trajectory
+    from cfplan.flight.encoding import encode_checked
 
     plan, certificate = flight.plan, flight.plan.certificate
     with steps.step("certificate") as said:
@@ -136,8 +136,7 @@ def certify_bytes(flight: PlannedFlight, steps: Steps) -> "EncodedFlight":
                 hint="plan the path again under this safety.yaml",
             )
     with steps.step("bytes") as said:
-        encoded = encode_trajectory(plan.trajectory)
-        check_bytes(encoded, plan.trajectory, flight.limits.plan)
+        encoded = encode_checked(plan.trajectory, flight.limits.plan)
         said.append(f"{len(encoded.payloads)} setpoints")
     return encoded
 

@@ -26,18 +26,25 @@ AGAIN = (
 # from the answer to a problem almost the same: near the bounds from the start, and further off where that fails
 NEARLY = 1.0
 # the barrier, by second that an interval takes, that keeps within a few thousandths of the best
+NEARLY_FEASIBLE, NEARLY_FLAT = 5e-5, 0.05
+# what then remains of the constraints is a fraction of the margin that they are tightened by
 
 
 def quickly(interval: float) -> Sequence[Search]:
     """From what is nearly right to what takes a few thousandths longer than the best; `interval` takes so long, s."""
-    barrier = NEARLY * interval
-    return Search(barrier=barrier, last_barrier=barrier, push=min(barrier, 0.1), iterations=40), *FROM_AFAR
+    return _nearly(NEARLY * interval, push=1e-2, iterations=40), *FROM_AFAR
 
 
 def quickly_again(interval: float) -> Sequence[Search]:
     """The same, from the answer to a problem almost the same."""
-    barrier = NEARLY * interval
-    return Search(barrier=barrier, last_barrier=barrier, push=3e-3, iterations=20), *AGAIN
+    return _nearly(NEARLY * interval, push=3e-3, iterations=20), *AGAIN
+
+
+def _nearly(barrier: float, push: float, iterations: int) -> Search:
+    return Search(
+        barrier=barrier, last_barrier=barrier, push=push, iterations=iterations,
+        feasibility=NEARLY_FEASIBLE, gradient=NEARLY_FLAT,
+    )  # fmt: skip
 
 
 class Attempt(NamedTuple):

@@ -1,6 +1,7 @@
 """SpeedProfiles and splines on their grid: from coefficients and back, and penalised splines through samples."""
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import BSpline
@@ -30,19 +31,25 @@ def profile_through(
 
 def spline_profile(cubic: NDArray, end: float, yaw: YawTrack) -> SpeedProfile:
     """The profile whose h is the cubic B-spline with these coefficients, (N+3,), on the grid from 0 to `end`."""
-    step = end / (len(cubic) - 3)
-    difference = np.diff(cubic)
-    second = np.diff(difference)
-    return SpeedProfile(
-        s=np.linspace(0.0, end, len(cubic) - 2),
-        h=cubic[1:-1] + second / 6,
-        dh=(difference[1:] + difference[:-1]) / (2 * step),
-        ddh=second / step**2,
-        dddh=np.diff(second) / step**3,
-        yaw=yaw.yaw,
-        dyaw=yaw.dyaw,
-        ddyaw=yaw.ddyaw,
-    )
+    return SpeedProfile(*_h_on_grid(cubic, end), yaw.yaw, yaw.dyaw, yaw.ddyaw)
+
+
+@njit(cache=True)
+def _h_on_grid(cubic: NDArray, end: float) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+    """s, and h with two derivatives, at nodes; the third in intervals."""
+    count = len(cubic) - 3
+    step = end / count
+    s, h, dh, ddh = np.empty(count + 1), np.empty(count + 1), np.empty(count + 1), np.empty(count + 1)
+    dddh = np.empty(count)
+    for n in range(count + 1):
+        rise, next_rise = cubic[n + 1] - cubic[n], cubic[n + 2] - cubic[n + 1]
+        second = next_rise - rise
+        s[n], h[n] = n * step, cubic[n + 1] + second / 6
+        dh[n], ddh[n] = (next_rise + rise) / (2 * step), second / step**2
+        if n < count:
+            dddh[n] = (cubic[n + 3] - cubic[n + 2] - next_rise - second) / step**3
+    s[count] = end
+    return s, h, dh, ddh, dddh
 
 
 def h_coefficients(profile: SpeedProfile) -> NDArray:

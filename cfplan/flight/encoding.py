@@ -8,8 +8,9 @@ planned attitude, and the controller, reading it, is not.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -77,17 +78,31 @@ def encode_trajectory(
     that are as old make up for each other. Raises NotCertifiedError with the setpoint where a value is not finite or
     does not fit its 16 bits.
     """
-    if not (
-        np.isfinite(trajectory.duration) and rate > 0 and hold >= 0 and np.isfinite(lead + rate_lead + thrust_lead)
-    ):
+    times = _times(trajectory, rate, hold, (lead, rate_lead, thrust_lead))
+    payloads = np.empty((len(times), PAYLOAD_SIZE), np.uint8)
+    for rows in _batches(len(times)):
+        payloads[rows] = encode(setpoints_at(trajectory, times[rows] + lead, rate_lead, thrust_lead), rows.start)
+    return EncodedFlight(times, payloads, decode(payloads), lead, rate_lead, thrust_lead)
+
+
+def encode_checked(trajectory: Trajectory, limits: PlanLimits, *, hold: float = HOLD) -> EncodedFlight:
+    """What encode_trajectory() makes, certified as by check_bytes(); the trajectory is evaluated once for both."""
+    times = _times(trajectory, RATE, hold, (RATE_LEAD, THRUST_LEAD))
+    payloads = np.empty((len(times), PAYLOAD_SIZE), np.uint8)
+    for rows in _batches(len(times)):
+        meant = _meant_at(trajectory, times[rows], RATE_LEAD, THRUST_LEAD)
+        payloads[rows] = encode(meant.setpoints, rows.start)
+        _check_rows(payloads[rows], meant, limits, rows.start)
+    decoded = decode(payloads)
+    _require_hover(decoded, trajectory, len(payloads))
+    return EncodedFlight(times, payloads, decoded, 0.0, RATE_LEAD, THRUST_LEAD)
+
+
+def _times(trajectory: Trajectory, rate: float, hold: float, leads: Sequence[float]) -> NDArray:
+    if not (np.isfinite(trajectory.duration) and rate > 0 and hold >= 0 and np.isfinite(sum(leads))):
         raise NotCertifiedError(f"cannot sample {trajectory.duration} s at {rate} Hz with a hold of {hold} s")
     moving = int(np.ceil(trajectory.duration * rate)) + 1
-    times = np.arange(moving + int(np.ceil(hold * rate))) / rate
-    parts = _batches(len(times))
-    payloads = np.concatenate(
-        [encode(setpoints_at(trajectory, times[rows] + lead, rate_lead, thrust_lead), rows.start) for rows in parts]
-    )
-    return EncodedFlight(times, payloads, decode(payloads), lead, rate_lead, thrust_lead)
+    return np.arange(moving + int(np.ceil(hold * rate))) / rate
 
 
 def _batches(count: int) -> Iterator[slice]:
@@ -98,13 +113,20 @@ def setpoints_at(
     trajectory: Trajectory, times: NDArray, rate_lead: float = RATE_LEAD, thrust_lead: float = THRUST_LEAD
 ) -> FullStateSetpoints:
     """What the controller is to be told at each time, (N,) s: the acceleration includes what makes up for drag."""
-    return _setpoints_at(trajectory, times, rate_lead, thrust_lead)[0]
+    return _meant_at(trajectory, times, rate_lead, thrust_lead).setpoints
 
 
-def _setpoints_at(
-    trajectory: Trajectory, times: NDArray, rate_lead: float, thrust_lead: float
-) -> tuple[FullStateSetpoints, NDArray, NDArray]:
-    """And the planned accelerations and attitudes at those times, (N, 3) and (N, 4)."""
+class _Meant(NamedTuple):
+    """What is to be told at N times, and what the plan has there."""
+
+    setpoints: FullStateSetpoints
+    acceleration: NDArray
+    # (N, 3)
+    attitude: NDArray
+    # (N, 4)
+
+
+def _meant_at(trajectory: Trajectory, times: NDArray, rate_lead: float, thrust_lead: float) -> _Meant:
     states = trajectory.at(np.concatenate([times, times + rate_lead, times + thrust_lead]))
     due, turning, pushing = (slice(k * len(times), (k + 1) * len(times)) for k in range(3))
     acceleration = states.specific_thrust[pushing, None] * states.thrust_axis[due]
@@ -117,7 +139,7 @@ def _setpoints_at(
         quaternion=command_quaternion(attitude),
         body_rate=states.body_rate[turning],
     )
-    return setpoints, states.acceleration[due], attitude
+    return _Meant(setpoints, states.acceleration[due], attitude)
 
 
 def command_quaternion(quaternion: NDArray) -> NDArray:
@@ -140,27 +162,26 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimi
     payloads = np.asarray(encoded.payloads)
     if payloads.ndim != 2 or payloads.shape != (len(encoded.times), PAYLOAD_SIZE) or len(payloads) == 0:
         raise NotCertifiedError(f"payloads of shape {payloads.shape} for {len(encoded.times)} times")
-    _require(payloads[:, 0] == FULL_STATE_TYPE, "the payload is no full state", payloads[:, 0])
     for rows in _batches(len(payloads)):
-        _check_rows(decode(payloads[rows]), encoded, trajectory, limits, rows)
-    _require_hover(decode(payloads[-1:]), len(payloads), trajectory.at(np.array([trajectory.duration])).position[0])
+        meant = _meant_at(trajectory, encoded.times[rows] + encoded.lead, encoded.rate_lead, encoded.thrust_lead)
+        _check_rows(payloads[rows], meant, limits, rows.start)
+    _require_hover(decode(payloads[-1:]), trajectory, len(payloads))
 
 
-def _check_rows(
-    told: FullStateSetpoints, encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimits, rows: slice
-) -> None:
-    """What check_bytes asks of each setpoint, for those of `rows`, which the vehicle reads as `told`."""
+def _check_rows(payloads: NDArray, meant: _Meant, limits: PlanLimits, first: int) -> None:
+    """What check_bytes asks of each setpoint, of those from number `first` on."""
 
     def require(good: NDArray, what: str, values: NDArray) -> None:
-        _require(good, what, values, rows.start)
+        _require(good, what, values, first)
 
-    times = encoded.times[rows] + encoded.lead
-    meant, acceleration, attitude = _setpoints_at(trajectory, times, encoded.rate_lead, encoded.thrust_lead)
+    require(payloads[:, 0] == FULL_STATE_TYPE, "the payload is no full state", payloads[:, 0])
+    told, wanted = decode(payloads), meant.setpoints
     (
         position, velocity, thrust_error, rate_error, thrust, tilt, turned, made, speed, planned, body_rate
     ) = _inspected(
         told.position, told.velocity, told.acceleration, told.quaternion, told.body_rate,
-        meant.position, meant.velocity, meant.acceleration, meant.quaternion, meant.body_rate, acceleration, attitude,
+        wanted.position, wanted.velocity, wanted.acceleration, wanted.quaternion, wanted.body_rate,
+        meant.acceleration, meant.attitude,
     )  # fmt: skip
     for name, error in (
         ("position", position), ("velocity", velocity), ("acceleration", thrust_error), ("body_rate", rate_error)
@@ -185,9 +206,10 @@ def _check_rows(
     )
 
 
-def _require_hover(told: FullStateSetpoints, count: int, end: NDArray) -> None:
+def _require_hover(told: FullStateSetpoints, trajectory: Trajectory, count: int) -> None:
     """The last setpoint is what the vehicle is left with if nothing more comes."""
     moves = [told.velocity[-1], told.acceleration[-1], told.body_rate[-1]]
+    end = trajectory.path(trajectory.path.end)
     if np.any(moves) or np.any(np.abs(told.position[-1] - end) > HALF_QUANTUM + _ROUNDING):
         raise NotCertifiedError(
             "the last setpoint is not a hover at the end of the path",

@@ -15,7 +15,7 @@ from cfplan.errors import CfplanError, InputError, NotCertifiedError
 from cfplan.expert.convex import plan_convex
 from cfplan.expert.limit_sets import BOXES, LIMIT_SETS, LimitSet
 from cfplan.expert.reduced import plan_reduced
-from cfplan.flight.encoding import EncodedFlight, check_bytes, encode_trajectory
+from cfplan.flight.encoding import encode_checked
 from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
 from cfplan.planning.repair import repair, slow
@@ -251,15 +251,14 @@ def _fly(path: Path, box: str, seed: int, chosen: LimitSet) -> Flight:
             values |= _convex(path, airframe, limits)
 
         encoding = time.perf_counter()
-        encoded = encode_trajectory(found.trajectory)
-        values["bytes_refused"] = _refusal(encoded, found.trajectory, limits)
+        encoded = encode_checked(found.trajectory, limits)
         values["seconds"] = planned - begun, repaired - planned, time.perf_counter() - encoding
         run = dry_run(encoded, found.trajectory, airframe, _lost_alone())
         values |= {"deviation": run.deviation, "dry_run": run.reason}
         quick = dry_run(encoded, found.trajectory, replace(airframe, motor_time_constant=PAPER_LAG), _lost_alone())
         values |= {"deviation_at_paper_lag": quick.deviation, "dry_run_at_paper_lag": quick.reason}
         return Flight(**values)
-    except NotCertifiedError as error:  # a place too far out for a packet
+    except NotCertifiedError as error:  # the bytes: a place too far out for a packet
         return Flight(**values | {"bytes_refused": str(error)})
     except CfplanError as error:
         return Flight(**values | {"reason": str(error)})
@@ -272,14 +271,6 @@ def _convex(path: Path, airframe: Airframe, limits: PlanLimits) -> dict[str, flo
         return {}
     refined, slowed = repair(path, profile, airframe, limits), slow(path, profile, airframe, limits)
     return {"convex_refined": refined.trajectory.duration, "convex_slowed": slowed.trajectory.duration}
-
-
-def _refusal(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimits) -> str:
-    try:
-        check_bytes(encoded, trajectory, limits)
-    except NotCertifiedError as error:
-        return str(error)
-    return ""
 
 
 def _lost_alone() -> FlightLimits:

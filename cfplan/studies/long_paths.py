@@ -14,7 +14,7 @@ import numpy as np
 from cfplan.errors import CfplanError, InputError
 from cfplan.expert.limit_sets import LimitSet
 from cfplan.expert.reduced import plan_reduced
-from cfplan.flight.encoding import check_bytes, encode_trajectory
+from cfplan.flight.encoding import encode_checked
 from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
 from cfplan.planning.plan import default_nodes
@@ -174,7 +174,7 @@ def _planned(path: Path, chosen: LimitSet) -> tuple[Repaired, tuple[float, float
         raise CfplanError(solution.reason or str(solution.status))
     found = repair(path, solution.profile, chosen.airframe, chosen.limits)
     repaired = time.process_time()
-    check_bytes(encode_trajectory(found.trajectory), found.trajectory, chosen.limits)
+    encode_checked(found.trajectory, chosen.limits)
     return found, (planned - begun, repaired - planned, time.process_time() - repaired)
 
 

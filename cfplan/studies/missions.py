@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.encoding import HOLD, EncodedFlight, check_bytes, encode_trajectory
+from cfplan.flight.encoding import HOLD, EncodedFlight, encode_checked
 from cfplan.flight.mission import Mission, mission_of
 from cfplan.geometry.path_file import load_path_file
 from cfplan.planning.plan import Plan, plan
@@ -39,6 +39,5 @@ def planned_mission(path_file: Path, safety_file: Path, *, stream_for: float = 0
     )
     if not made.certificate.passed:
         raise NotCertifiedError("the plan does not pass its certificate", where=str(path_file))
-    encoded = encode_trajectory(made.trajectory, hold=max(HOLD, stream_for - made.trajectory.duration))
-    check_bytes(encoded, made.trajectory, limits.plan)
+    encoded = encode_checked(made.trajectory, limits.plan, hold=max(HOLD, stream_for - made.trajectory.duration))
     return PlannedMission(made, encoded, mission_of(encoded, limits))

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 
@@ -76,10 +77,7 @@ class SpeedProfile:
 
     def table(self) -> NDArray:
         """(N+1, 8), for compiled code: s, h with three derivatives, yaw with two; what has N values ends in 0."""
-        rows = np.zeros((len(self.s), 8))
-        for k, values in enumerate((self.s, self.h, self.dh, self.ddh, self.dddh, self.yaw, self.dyaw, self.ddyaw)):
-            rows[: len(values), k] = values
-        return rows
+        return _table(self.s, self.h, self.dh, self.ddh, self.dddh, self.yaw, self.dyaw, self.ddyaw)
 
     def boundary(self, node: int) -> BoundaryState:
         """The state at a grid point."""
@@ -92,3 +90,16 @@ class SpeedProfile:
             self.s, self.h * factor, self.dh * factor, self.ddh * factor, self.dddh * factor,
             self.yaw, self.dyaw, self.ddyaw,
         )  # fmt: skip
+
+
+@njit(cache=True)
+def _table(
+    s: NDArray, h: NDArray, dh: NDArray, ddh: NDArray, dddh: NDArray, yaw: NDArray, dyaw: NDArray, ddyaw: NDArray
+) -> NDArray:
+    rows = np.zeros((len(s), 8))
+    for n in range(len(s)):
+        rows[n, 0], rows[n, 1], rows[n, 2], rows[n, 3] = s[n], h[n], dh[n], ddh[n]
+        rows[n, 5], rows[n, 6] = yaw[n], dyaw[n]
+    for n in range(len(s) - 1):
+        rows[n, 4], rows[n, 7] = dddh[n], ddyaw[n]
+    return rows

@@ -19,7 +19,8 @@ _SPLITS = 40  # halvings of an interval before its speed counts as zero
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = (_NODES + 1.0) / 2.0, _WEIGHTS / 2.0
 _PROBES = (0.2, 0.5, 0.8)  # where in a piece the inverse is tried
-_CONTINUOUS = [1, 2, 3, 5, 6]  # columns of a profile's table that must not jump: h, h', h'', yaw, yaw'
+_CONTINUOUS = (1, 2, 3, 5, 6)  # columns of a profile's table that must not jump: h, h', h'', yaw, yaw'
+_JUMP = 1e-6  # of one and the most that there is, allowed for rounding
 # Coefficients 4 to 7 of a polynomial on [0, 1] from what is left of it and three derivatives at 1.
 _FAR_END = np.linalg.inv(np.array([[1, 1, 1, 1], [4, 5, 6, 7], [12, 20, 30, 42], [24, 60, 120, 210]], dtype=float))
 
@@ -70,6 +71,11 @@ def measure(profile: SpeedProfile) -> Timing:
     )
 
 
+def travel_time(profile: SpeedProfile) -> float:
+    """s that a profile takes, within 1e-6 of it. Raises NotCertifiedError where h is not positive or not smooth."""
+    return float(_travel_time(check(profile)))
+
+
 def check(profile: SpeedProfile) -> NDArray:
     """The profile's table. Raises NotCertifiedError unless it is finite, smooth as promised, and h positive."""
     intervals = len(profile.s) - 1
@@ -78,6 +84,9 @@ def check(profile: SpeedProfile) -> NDArray:
         if values.shape != (intervals + (name not in ("dddh", "ddyaw")),) or intervals < 1:
             raise NotCertifiedError(f"the speed profile has {values.shape} values of {name} for {intervals} intervals")
     nodes = profile.table()
+    sound, least, jumps, allowed = _inspect(nodes)
+    if sound:
+        return nodes
     wrong = ~np.isfinite(nodes)
     if wrong.any():
         column = int(np.argmax(wrong.any(axis=0)))
@@ -86,10 +95,8 @@ def check(profile: SpeedProfile) -> NDArray:
         )
     if not np.all(np.diff(nodes[:, 0]) > 0):
         raise NotCertifiedError("the speed profile's grid does not ascend")
-    least, jumps = _inspect(nodes)
     if not np.all(least > 0):
         raise NotCertifiedError("the speed profile falls to zero or below", where=_node(nodes, ~(least > 0)))
-    allowed = 1e-6 * (1.0 + np.abs(nodes[:, _CONTINUOUS]).max(axis=0))
     for column, jump, limit in zip(_CONTINUOUS, jumps.T, allowed, strict=True):
         if not np.all(jump <= limit):
             raise NotCertifiedError(
@@ -105,10 +112,15 @@ def _node(nodes: NDArray, bad: NDArray) -> str:
 
 
 @njit(cache=True, error_model="numpy")
-def _inspect(nodes: NDArray) -> tuple[NDArray, NDArray]:
-    """The least h in each interval, (N,), and by how much h, h', h'', yaw and yaw' jump at its end, (N, 5)."""
+def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
+    """Whether nothing is wrong; the least h in each interval, (N,); by how much h, h', h'', yaw and yaw' jump at its
+    end, (N, 5), and by how much they may, (5,)."""
     count = len(nodes) - 1
-    least, jumps = np.empty(count), np.empty((count, 5))
+    least, jumps, allowed = np.empty(count), np.empty((count, 5)), np.zeros(5)
+    for k in range(count + 1):
+        for j in range(5):
+            allowed[j] = max(allowed[j], abs(nodes[k, _CONTINUOUS[j]]))
+    allowed[:] = _JUMP * (1.0 + allowed)
     for k in range(count):
         node, after = nodes[k], nodes[k + 1]
         slope, bend, jerk, x = node[2], node[3], node[4], after[0] - node[0]
@@ -123,7 +135,8 @@ def _inspect(nodes: NDArray) -> tuple[NDArray, NDArray]:
         jumps[k, 2] = abs(bend + x * jerk - after[3])
         jumps[k, 3] = abs(node[5] + x * (node[6] + x * node[7] / 2) - after[5])
         jumps[k, 4] = abs(node[6] + x * node[7] - after[6])
-    return least, jumps
+    sound = np.isfinite(nodes).all() and (least > 0.0).all() and (jumps <= allowed).all()
+    return sound and (nodes[1:, 0] > nodes[:-1, 0]).all(), least, jumps, allowed
 
 
 @njit(cache=True, error_model="numpy")
@@ -160,6 +173,14 @@ def _split(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
                 ends[waiting], depths[waiting] = middle, depth + 1
                 waiting += 1
     return starts[:count], durations[:count], intervals[:count], polynomials[:count], np.nan
+
+
+@njit(cache=True, error_model="numpy")
+def _travel_time(nodes: NDArray) -> float:
+    total = 0.0
+    for k in range(len(nodes) - 1):
+        total += _quadrature(nodes[k], nodes[k, 0], nodes[k + 1, 0])
+    return total
 
 
 @njit(cache=True, error_model="numpy")
