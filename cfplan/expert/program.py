@@ -206,7 +206,7 @@ class Program:
         self.nlp = casadi.Function("nlp", [x, p], [f, g], names[0], ["f", "g"])
         self.f = casadi.Function("nlp_f", [x, p], [f], names[0], ["f"])
         self.g = casadi.Function("nlp_g", [x, p], [g], names[0], ["g"])
-        gradient = [f, gradient_f]
+        gradient = [f, casadi.densify(gradient_f)]  # IPOPT is handed the entries as they lie, as if all were there
         self.gradient = casadi.Function("nlp_grad_f", [x, p], gradient, names[0], ["f", "grad_f_x"])
         self.jacobian = casadi.Function(
             "nlp_jac_g", [x, p], [self._constraints(casadi.vec(rows_again), linear, x), jacobian], names[0],

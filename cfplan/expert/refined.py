@@ -5,12 +5,13 @@ Searched from near, the expert's problem takes a fraction of its steps.
 
 import math
 import time
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.expert.problem import FLOOR, Ends, pose
+from cfplan.expert.problem import FLOOR, Ends, pose, profile_of
 from cfplan.expert.program import Shape, layout_of
 from cfplan.expert.solution import Solution, Status
 from cfplan.expert.solvers import interior_point, quickly, quickly_again
@@ -38,19 +39,19 @@ def refine(
     *,
     start: BoundaryState | None = None,
     end: BoundaryState | None = None,
-    between: bool = True,
+    passes: Callable[[SpeedProfile], bool] | None = None,
 ) -> Solution:
     """A profile within a few thousandths of the fastest, on the grid and with the yaw of the given one.
 
-    `start` and `end` are kept where given. Long paths are taken window by window. Without `between`, a path of one
-    window is spared the search for limits exceeded between the grid's points: most pass the certificate, which tells.
+    `start` and `end` are kept where given. Long paths are taken window by window. On a path of one window limits are
+    held at points first; what exceeds them between is looked for where `passes` says that it must be.
     """
     began = time.perf_counter()
     nodes, unit, track = len(profile.s) - 1, limits.speed**2, yaw_of(profile)
     near = np.maximum(h_coefficients(profile) / unit, FLOOR)[:, None]
     layout = layout_of(Shape(nodes, False, turning_limited=limits.angular_acceleration < math.inf))
     whole = Task(path, airframe, limits, Ends(start, end), track, layout)
-    joined = by_windows(whole, WINDOW, partial(_refined, between=between), near)
+    joined = by_windows(whole, WINDOW, partial(_refined, passes=passes), near)
     if isinstance(joined, str):
         return Solution(Status.NOT_CONVERGED, None, f"refining: {joined}")
     stats: dict[str, float | int | str] = {
@@ -64,7 +65,7 @@ def refine(
     return Solution(Status.SOLVED, refined, "", stats, joined.joints)
 
 
-def _refined(task: Task, near: NDArray, between: bool) -> Kept | str:
+def _refined(task: Task, near: NDArray, passes: Callable[[SpeedProfile], bool] | None) -> Kept | str:
     nodes, unit = task.layout.shape.nodes, task.limits.speed**2
     interval = task.path.end / nodes * float(np.mean(1.0 / np.sqrt(unit * near[:, 0])))
     given = task.layout, task.path, task.airframe, task.limits, task.track, 0.0, task.ends, Penalties()
@@ -76,9 +77,10 @@ def _refined(task: Task, near: NDArray, between: bool) -> Kept | str:
         attempt = interior_point(problem, None)
     if why := flaw(attempt, problem, task):
         return why
-    if between or task.ends.continues or task.ends.joint is not None:
-        return kept_between(attempt, problem, task, quickly_again(interval))
-    return Kept(attempt.table, 0, attempt.iterations)
+    whole = not task.ends.continues and task.ends.joint is None
+    if passes and whole and passes(profile_of(attempt.table, unit, task.track, task.path.end)):
+        return Kept(attempt.table, 0, attempt.iterations)
+    return kept_between(attempt, problem, task, quickly_again(interval))
 
 
 def _lowered(near: NDArray, ends: Ends) -> NDArray:

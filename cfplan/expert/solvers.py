@@ -24,7 +24,7 @@ AGAIN = (
     Search(barrier=3e-3, push=1e-4, iterations=20), Search(barrier=0.05, push=1e-3, iterations=40), *FROM_AFAR
 )  # fmt: skip
 # from the answer to a problem almost the same: near the bounds from the start, and further off where that fails
-NEARLY = 1.0
+NEARLY = 1.25
 # the barrier, by second that an interval takes, that keeps within a few thousandths of the best
 NEARLY_FEASIBLE, NEARLY_FLAT = 5e-5, 0.05
 # what then remains of the constraints is a fraction of the margin that they are tightened by
@@ -115,8 +115,6 @@ def _ipopt(shape: Shape) -> casadi.Function:
         "ipopt": {
             "print_level": 0, "sb": "yes", "max_iter": 400, "tol": TOLERANCE, "constr_viol_tol": 1e-6,
             "dual_inf_tol": 10 * TOLERANCE, "compl_inf_tol": TOLERANCE,
-            # Taking fixed variables out makes it read numbers that nobody wrote.
-            "fixed_variable_treatment": "make_constraint",
         },
         "cache": {f.name(): f for f in (p.f, p.g, p.gradient, p.jacobian, p.upper_hessian, p.multipliers)},
     }  # fmt: skip

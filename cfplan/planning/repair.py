@@ -18,7 +18,7 @@ from cfplan.safety.slowing import Slowed, slow_until_certified
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
-from cfplan.vehicle.timing import travel_time
+from cfplan.vehicle.timing import duration_of
 from cfplan.vehicle.trajectory import Trajectory
 
 NOTICEABLE = 0.01
@@ -75,28 +75,29 @@ def repair(
         InfeasibleError: hovering, or the path itself, breaks a limit; says which.
         NotCertifiedError: the profile is not finite, not smooth, or h is not positive.
     """
-    before = travel_time(profile)
+    before = duration_of(profile)
     if not surely_exceeds(path, profile, airframe, limits):
         trajectory = Trajectory(path, profile, airframe)
         certificate = certify(trajectory, limits, space)
         if certificate.passed:
             return Repaired(trajectory, certificate, 1.0, trajectory.duration)
-    refined, slowed = profile, None
-    for between in (False, True):  # where the certificate finds something between the grid's points, with a look there
-        solution = refine(path, refined, airframe, limits, start=start, end=end, between=between)
-        if solution.profile is None:
-            return slow(path, profile, airframe, limits, space, failed=solution.reason)
-        refined = solution.profile
-        faster = Trajectory(path, refined, airframe)
-        certificate = certify(faster, limits, space)
+    certified: list[Slowed] = []
+
+    def passes(refined: SpeedProfile) -> bool:
+        trajectory = Trajectory(path, refined, airframe)
+        certificate = certify(trajectory, limits, space)
         if certificate.passed:
-            slowed = Slowed(faster, certificate, 1.0)
-            break
-        if solution.joints:  # it has been looked at
-            break
-    slowed = slowed or slow_until_certified(faster, limits, space)
+            certified.append(Slowed(trajectory, certificate, 1.0))
+        return certificate.passed
+
+    solution = refine(path, profile, airframe, limits, start=start, end=end, passes=passes)
+    if solution.profile is None:
+        return slow(path, profile, airframe, limits, space, failed=solution.reason)
+    if not certified:
+        certified.append(slow_until_certified(Trajectory(path, solution.profile, airframe), limits, space))
+    (slowed,) = certified
     return Repaired(
-        slowed.trajectory, slowed.certificate, slowed.share, before, *_where_slower(profile, refined),
+        slowed.trajectory, slowed.certificate, slowed.share, before, *_where_slower(profile, solution.profile),
         joints=solution.joints,
     )  # fmt: skip
 

@@ -71,9 +71,12 @@ def measure(profile: SpeedProfile) -> Timing:
     )
 
 
-def travel_time(profile: SpeedProfile) -> float:
-    """s that a profile takes, within 1e-6 of it. Raises NotCertifiedError where h is not positive or not smooth."""
-    return float(_travel_time(check(profile)))
+def duration_of(profile: SpeedProfile) -> float:
+    """s that a profile takes, by one quadrature an interval: within 1e-6 of it where h changes less than tenfold there.
+
+    Raises NotCertifiedError as measure() does, but for speeds that fall to almost zero.
+    """
+    return float(_duration(check(profile)))
 
 
 def check(profile: SpeedProfile) -> NDArray:
@@ -135,8 +138,9 @@ def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
         jumps[k, 2] = abs(bend + x * jerk - after[3])
         jumps[k, 3] = abs(node[5] + x * (node[6] + x * node[7] / 2) - after[5])
         jumps[k, 4] = abs(node[6] + x * node[7] - after[6])
-    sound = np.isfinite(nodes).all() and (least > 0.0).all() and (jumps <= allowed).all()
-    return sound and (nodes[1:, 0] > nodes[:-1, 0]).all(), least, jumps, allowed
+    ascends = (nodes[1:, 0] > nodes[:-1, 0]).all()
+    sound = bool(ascends and np.isfinite(nodes).all() and (least > 0.0).all() and (jumps <= allowed).all())
+    return sound, least, jumps, allowed
 
 
 @njit(cache=True, error_model="numpy")
@@ -176,7 +180,7 @@ def _split(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
 
 
 @njit(cache=True, error_model="numpy")
-def _travel_time(nodes: NDArray) -> float:
+def _duration(nodes: NDArray) -> float:
     total = 0.0
     for k in range(len(nodes) - 1):
         total += _quadrature(nodes[k], nodes[k, 0], nodes[k + 1, 0])

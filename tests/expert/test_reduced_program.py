@@ -11,7 +11,7 @@ from cfplan.expert.between import Excess
 from cfplan.expert.compiled import Backend
 from cfplan.expert.limit_sets import LIMIT_SETS
 from cfplan.expert.problem import Ends, pose, profile_of, table_of, tightened, variables_of
-from cfplan.expert.program import Program, Shape, layout_of
+from cfplan.expert.program import Program, Shape, layout_of, program
 from cfplan.expert.reduced import plan_reduced
 from cfplan.expert.solution import Status
 from cfplan.expert.solvers import Attempt, interior_point, ipopt
@@ -202,6 +202,18 @@ def test_an_instruction_that_cannot_be_written_out_leaves_the_virtual_machine(mo
         assert kernel.backend() is Backend.VIRTUAL_MACHINE
     finally:
         kernel.machine_code.cache_clear()
+
+
+def test_ipopt_is_told_the_whole_gradient_and_finds_the_same_flight_each_time():
+    problem, _ = posed(Shape(40, False, turning_limited=True))
+    assert program(problem.layout.shape).gradient.nnz_out(1) == problem.layout.variables
+    tables = []
+    for size in np.geomspace(3, 3e5, 5):
+        junk = [np.full(int(size), np.nan) for _ in range(50)]  # memory that holds no numbers when it is given back
+        del junk
+        tables.append(ipopt(problem, None).table)
+    for table in tables[1:]:
+        np.testing.assert_array_equal(table, tables[0])
 
 
 def test_ipopt_takes_over_where_the_first_solver_fails(monkeypatch):

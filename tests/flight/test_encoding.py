@@ -13,6 +13,7 @@ from cfplan.flight.encoding import (
     check_bytes,
     command_quaternion,
     controller_attitude,
+    encode_checked,
     encode_trajectory,
     setpoints_at,
 )
@@ -123,9 +124,37 @@ def test_its_own_bytes_pass(encoded, trajectory):
     check_bytes(encoded, trajectory, LIMITS)
 
 
+def test_bytes_checked_as_they_are_made_are_the_same(encoded, trajectory):
+    checked = encode_checked(trajectory, LIMITS)
+    np.testing.assert_array_equal(checked.payloads, encoded.payloads)
+    np.testing.assert_array_equal(checked.times, encoded.times)
+    assert (checked.lead, checked.rate_lead, checked.thrust_lead) == (
+        encoded.lead, encoded.rate_lead, encoded.thrust_lead,
+    )  # fmt: skip
+    check_bytes(checked, trajectory, LIMITS)
+
+
+def test_bytes_that_would_not_pass_are_not_made(trajectory):
+    with pytest.raises(NotCertifiedError, match="speed"):
+        encode_checked(trajectory, replace(LIMITS, speed=1.5))
+
+
+def test_bytes_that_do_not_say_what_was_meant_are_not_made(trajectory, monkeypatch):
+    def forged(setpoints, first):
+        payloads = encode(setpoints, first)
+        payloads[40, 3] ^= 0x40
+        return payloads
+
+    monkeypatch.setattr("cfplan.flight.encoding.encode", forged)
+    with pytest.raises(NotCertifiedError, match="position") as caught:
+        encode_checked(trajectory, LIMITS)
+    assert caught.value.where == "setpoint 40"
+
+
 def test_a_long_flight_is_encoded_and_checked_by_parts_alike(encoded, trajectory, monkeypatch):
     monkeypatch.setattr("cfplan.flight.encoding._BATCH", 100)
     np.testing.assert_array_equal(encode_trajectory(trajectory).payloads, encoded.payloads)
+    np.testing.assert_array_equal(encode_checked(trajectory, LIMITS).payloads, encoded.payloads)
     check_bytes(encoded, trajectory, LIMITS)
     payloads = encoded.payloads.copy()
     payloads[250, 3] ^= 0x40

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
 
 from cfplan.errors import NotCertifiedError
-from cfplan.vehicle.timing import LONGEST, measure
+from cfplan.vehicle.timing import LONGEST, duration_of, measure
 
 coefficients = st.lists(st.floats(0.01, 9.0), min_size=5, max_size=40)
 
@@ -29,6 +29,13 @@ def test_the_duration_is_the_integral_of_one_over_speed(make_profile, values, en
     ]
     times = measure(profile).time_at(profile.s)
     np.testing.assert_allclose(np.diff(times), by_interval, rtol=1e-9, atol=1e-9 / len(by_interval))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(0.8, 4.0), min_size=5, max_size=40), st.floats(0.3, 20.0))
+def test_the_duration_alone_is_that_of_the_timing(make_profile, values, end):
+    profile = make_profile(end, values)
+    assert duration_of(profile) == pytest.approx(measure(profile).time[-1], rel=1e-6)
 
 
 @settings(max_examples=60, deadline=None)
