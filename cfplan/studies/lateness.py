@@ -30,7 +30,20 @@ from cfplan.studies.missions import planned_mission
 from cfplan.studies.real_time import Conditions, fly_in_real_time
 from cfplan.studies.sleeper import Sleeper
 
-COLUMNS = ("what", "priority", "for", "p50", "p99", "p99.9", "max", "above 1 ms", "left out", "stolen")
+COLUMNS = (
+    "what",
+    "priority",
+    "for",
+    "p50",
+    "p99",
+    "p99.9",
+    "max",
+    "above 1 ms",
+    "left out",
+    "in all",
+    "queued",
+    "stolen",
+)
 FIRST, ORDINARY = "SCHED_FIFO", "ordinary"
 _DROP_CAPABILITY, _NICE_CAPABILITY = 24, 23  # PR_CAPBSET_DROP, CAP_SYS_NICE
 _VIEWER_STARTS = 2.0  # s
@@ -55,6 +68,10 @@ class Measured:
     # by more than 1 ms
     skipped: int = 0
     # deadlines that passed altogether
+    total: float = 0.0
+    # s late, all together
+    queued: float | None = None
+    # s of that, at most, spent waiting for a processor behind what else runs here; None where it was not measured
     stolen: float = 0.0
     # s that the host took from this virtual machine meanwhile, over all its processors
     refusals: int = 0
@@ -69,7 +86,7 @@ class Measured:
         above = int(np.sum(np.array(late) > 1e-3))
         return Measured(
             what, priority, reason, len(late) / RATE, float(p50), float(p99), float(p999), float(np.max(late)),
-            len(late), above, **others,
+            len(late), above, total=float(np.sum(late)), **others,
         )  # fmt: skip
 
     def texts(self) -> list[str]:
@@ -79,7 +96,8 @@ class Measured:
         return [
             self.what, self.priority, f"{self.seconds:.0f} s" + (f", then {self.reason}" if self.reason else ""),
             *(f"{1e3 * value:.3f} ms" for value in (self.p50, self.p99, self.p999, self.max)),
-            f"{self.above} of {self.count}", str(self.skipped), f"{self.stolen:.2f} s",
+            f"{self.above} of {self.count}", str(self.skipped), f"{self.total:.2f} s",
+            "–" if self.queued is None else f"{self.queued:.2f} s", f"{self.stolen:.2f} s",
         ]  # fmt: skip
 
 
@@ -171,6 +189,7 @@ def _streaming(priority: str, mission: Mission) -> list[Measured]:
             late,
             reason,
             skipped=flight.outcome.lateness.skipped,
+            queued=flight.queued,
             stolen=stolen,
             refusals=flight.refusals,
             view_failure=flight.view_failure,

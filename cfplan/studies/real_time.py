@@ -1,5 +1,6 @@
 """A mission flown in real time on the virtual Crazyflie: the pilot's process, cflib, packets, poses and a record."""
 
+import multiprocessing
 import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -66,6 +67,8 @@ class Flight:
     truth: Truth | None = None
     view_failure: str = ""
     # why the live view ended early
+    queued: float = 0.0
+    # s of the stream in which the thread that sends was ready to and waited for a processor, as the system counts it
 
     @property
     def landed(self) -> bool:
@@ -108,6 +111,8 @@ def _fly_once(mission: Mission, conditions: Conditions, name: str, view: View | 
         if watching is not None:
             watching.show(message)
         if isinstance(message, PhaseEntered):
+            if Phase.STREAM in (phase, message.phase):
+                flight.queued = _queued() - flight.queued
             phase = message.phase
         elif isinstance(message, SetpointSent) and phase is Phase.STREAM:
             flight.sent.append(message)
@@ -132,6 +137,15 @@ def _fly_once(mission: Mission, conditions: Conditions, name: str, view: View | 
     except CfplanError as error:
         flight.reason = str(error)
     return flight
+
+
+def _queued() -> float:
+    """s so far in which the pilot's first thread waited for a processor; 0 where the system does not tell."""
+    try:
+        pilot = next(child.pid for child in multiprocessing.active_children() if child.name == "pilot")
+        return int(Path(f"/proc/{pilot}/task/{pilot}/schedstat").read_text(encoding="ascii").split()[1]) / 1e9
+    except (StopIteration, OSError, IndexError, ValueError):
+        return 0.0
 
 
 def _lab(mission: Mission, conditions: Conditions) -> Lab:

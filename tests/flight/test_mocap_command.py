@@ -85,3 +85,11 @@ def test_the_virtual_crazyflie_has_poses_of_its_own_and_a_virtual_vicon():
     check_uris("sim://0", "vicon-sdk://lab/cf1")
     with pytest.raises(InputError, match="virtual Vicon only"):
         check_uris("sim://0", "vrpn://lab/cf1")
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("uri", ["vrpn://127.0.0.1:3999", "vrpn://127.0.0.1:3999/cf1"])
+def test_a_vrpn_server_that_is_not_there_is_an_error_not_an_empty_table(uri):
+    with pytest.raises(LinkError, match="nothing") as caught:
+        run("mocap", uri, "--seconds", "0.5")
+    assert "server" in caught.value.hint

@@ -44,7 +44,7 @@ def streamed(late):
         ExitCode.OK, "landed", Rung.NONE, (), (), begin, 0.2, Lateness(late, late, late, 20, 3),
         Deviation(0.0, 0.0, 0.0, 0), 0.0, STILL,
     )  # fmt: skip
-    return Flight(outcome, "landed", sent=sent)
+    return Flight(outcome, "landed", sent=sent, queued=late)
 
 
 @pytest.fixture
@@ -83,6 +83,8 @@ def test_a_sleeper_stands_before_each_stream_and_beside_it_over_the_same_seconds
     alone, stream, meanwhile = result.rows[:3]
     assert stream.p50 == pytest.approx(1e-3)
     assert stream.skipped == 3
+    assert stream.total == pytest.approx(20e-3)
+    assert (alone.queued, stream.queued, meanwhile.queued) == (None, 1e-3, None)
     assert 5 <= alone.count <= 100
     assert 15 <= meanwhile.count <= 20
     assert all(len(row) == len(columns) for _, columns, rows in result.tables() for row in rows)

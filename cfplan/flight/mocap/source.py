@@ -9,7 +9,7 @@ from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Frame, Scene
 from cfplan.flight.mocap.sorting import Sorter, Verdict
-from cfplan.flight.mocap.uri import MocapUri, no_such_body, parse_uri
+from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn, parse_uri
 from cfplan.flight.poses import Pose
 from cfplan.flight.telemetry import Quaternion
 from cfplan.safety.limits import PoseLimits
@@ -169,11 +169,7 @@ class MocapSource:
             )
         worst, count = counts.most_common(1)[0]
         if self._uri.system == "vrpn" and worst is Verdict.OCCLUDED and count == total:
-            return LinkError(  # its client does not tell a server that is not there from one that is silent
-                f"nothing of {self._uri.subject!r} comes within {OPEN_WITHIN:g} s",
-                where=where,
-                hint="is the VRPN server running there, has it a tracker of that name, and is that in view?",
-            )
+            return nothing_by_vrpn(self._uri, OPEN_WITHIN)
         hints = {
             Verdict.OCCLUDED: "are its markers in view, and is its name right? `cfplan mocap` lists what is there",
             Verdict.FROZEN: "is the system paused, or playing nothing?",

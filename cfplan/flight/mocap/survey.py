@@ -12,7 +12,7 @@ from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Body, Frame, Scene
 from cfplan.flight.mocap.sorting import Sorter, Verdict
-from cfplan.flight.mocap.uri import MocapUri, no_such_body
+from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn
 from cfplan.flight.telemetry import Triple
 
 FIRST_FRAME_WITHIN = 3.5  # s
@@ -189,6 +189,8 @@ def survey(uri: MocapUri, seconds: float, show: Callable[[Survey], None] = lambd
             hint = "is the system live and streaming?"
             raise LinkError(f"no frame within {FIRST_FRAME_WITHIN:g} s ({feed.stage})", where=str(uri), hint=hint)
     found = surveyor.report()
+    if uri.system == "vrpn" and not found.bodies:
+        raise nothing_by_vrpn(uri, found.seconds)
     _check_subject(uri, {body.name for body in found.bodies})
     return found
 

@@ -5,7 +5,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from urllib.parse import unquote, urlsplit
 
-from cfplan.errors import InputError
+from cfplan.errors import InputError, LinkError
 
 VICON_PORT = 801
 # What stands before :// and the default port, None where the port cannot be chosen.
@@ -70,6 +70,16 @@ def parse_uri(text: str, *, subject_needed: bool) -> MocapUri:
     if port == 0:
         raise InputError("port 0 is none", where=text, hint=f"leave it out for {usual}")
     return MocapUri(parts.scheme, host, port or usual, subject)
+
+
+def nothing_by_vrpn(uri: MocapUri, seconds: float) -> LinkError:
+    """The error where VRPN is silent: its client does not tell a server that is not there from one without trackers."""
+    whose = f" of {uri.subject!r}" if uri.subject else ""
+    return LinkError(
+        f"nothing{whose} comes within {seconds:.1f} s",
+        where=str(uri),
+        hint="is the VRPN server running there, has it a tracker of that name, and is that in view?",
+    )
 
 
 def no_such_body(uri: MocapUri, there: Collection[str]) -> InputError:
