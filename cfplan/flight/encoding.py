@@ -37,6 +37,7 @@ THRUST_LEAD = 0.06
 HALF_QUANTUM = 0.5e-3  # of position m, velocity m/s, acceleration m/s², body rate rad/s
 ATTITUDE_QUANTUM = np.radians(0.25)  # the most by which the compressed quaternion turns
 _ROUNDING = 1e-9
+_SAME_TIME = 1e-9  # s
 _BATCH = 4096  # setpoints at a time, so that memory does not grow with the states of a long flight
 
 
@@ -127,8 +128,11 @@ class _Meant(NamedTuple):
 
 
 def _meant_at(trajectory: Trajectory, times: NDArray, rate_lead: float, thrust_lead: float) -> _Meant:
-    states = trajectory.at(np.concatenate([times, times + rate_lead, times + thrust_lead]))
-    due, turning, pushing = (slice(k * len(times), (k + 1) * len(times)) for k in range(3))
+    # Often the times ahead are those of later setpoints: then only what lies beyond the last is evaluated besides.
+    count, ahead = len(times), _steps_ahead(times, thrust_lead)
+    beyond = times[count - ahead :] + thrust_lead
+    states = trajectory.at(np.concatenate([times, beyond, times + rate_lead]))
+    due, pushing, turning = slice(count), slice(ahead, ahead + count), slice(count + ahead, None)
     acceleration = states.specific_thrust[pushing, None] * states.thrust_axis[due]
     acceleration[:, 2] -= GRAVITY
     attitude = states.quaternion[due]
@@ -140,6 +144,12 @@ def _meant_at(trajectory: Trajectory, times: NDArray, rate_lead: float, thrust_l
         body_rate=states.body_rate[turning],
     )
     return _Meant(setpoints, states.acceleration[due], attitude)
+
+
+def _steps_ahead(times: NDArray, lead: float) -> int:
+    """How many times later each time is that much later; all of them where that is none of them."""
+    steps = int(np.searchsorted(times, times[0] + lead - _SAME_TIME))
+    return steps if np.all(np.abs(times[steps:] - times[: len(times) - steps] - lead) < _SAME_TIME) else len(times)
 
 
 def command_quaternion(quaternion: NDArray) -> NDArray:
