@@ -30,21 +30,10 @@ from cfplan.studies.missions import planned_mission
 from cfplan.studies.real_time import Conditions, fly_in_real_time
 from cfplan.studies.sleeper import Sleeper
 
-COLUMNS = (
-    "what",
-    "priority",
-    "for",
-    "p50",
-    "p99",
-    "p99.9",
-    "max",
-    "above 1 ms",
-    "left out",
-    "in all",
-    "queued",
-    "stolen",
-)
+COLUMNS = ("what", "priority", "for", "p50", "p99", "p99.9", "max", "above 1 ms", "left out", "stolen")
 FIRST, ORDINARY = "SCHED_FIFO", "ordinary"
+QUEUED = "stream, of that waiting for a processor"
+# behind what else runs on this computer, in each period of the stream, as its system counts it
 _DROP_CAPABILITY, _NICE_CAPABILITY = 24, 23  # PR_CAPBSET_DROP, CAP_SYS_NICE
 _VIEWER_STARTS = 2.0  # s
 
@@ -68,10 +57,6 @@ class Measured:
     # by more than 1 ms
     skipped: int = 0
     # deadlines that passed altogether
-    total: float = 0.0
-    # s late, all together
-    queued: float | None = None
-    # s of that, at most, spent waiting for a processor behind what else runs here; None where it was not measured
     stolen: float = 0.0
     # s that the host took from this virtual machine meanwhile, over all its processors
     refusals: int = 0
@@ -86,7 +71,7 @@ class Measured:
         above = int(np.sum(np.array(late) > 1e-3))
         return Measured(
             what, priority, reason, len(late) / RATE, float(p50), float(p99), float(p999), float(np.max(late)),
-            len(late), above, total=float(np.sum(late)), **others,
+            len(late), above, **others,
         )  # fmt: skip
 
     def texts(self) -> list[str]:
@@ -96,8 +81,7 @@ class Measured:
         return [
             self.what, self.priority, f"{self.seconds:.0f} s" + (f", then {self.reason}" if self.reason else ""),
             *(f"{1e3 * value:.3f} ms" for value in (self.p50, self.p99, self.p999, self.max)),
-            f"{self.above} of {self.count}", str(self.skipped), f"{self.total:.2f} s",
-            "–" if self.queued is None else f"{self.queued:.2f} s", f"{self.stolen:.2f} s",
+            f"{self.above} of {self.count}", str(self.skipped), f"{self.stolen:.2f} s",
         ]  # fmt: skip
 
 
@@ -175,12 +159,14 @@ def _streaming(priority: str, mission: Mission) -> list[Measured]:
     """A flight, of it the stream; and a sleeper over the same seconds."""
     stolen = _stolen()
     with Sleeper(RATE, first=priority == FIRST) as sleeper:
-        flight = fly_in_real_time(mission, Conditions(vicon=True), name="lateness", view=_view)
+        flight = fly_in_real_time(mission, Conditions(vicon=True), name="lateness", view=_view, on_stream=sleeper.watch)
     if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT:
         raise KeyboardInterrupt  # who ends the flight ends the study
     if not flight.sent or flight.outcome is None:
         return [Measured("stream", priority, flight.reason, refusals=flight.refusals)]
     late = [message.time - message.due for message in flight.sent]
+    begin, end = flight.sent[0].due, flight.sent[-1].due
+    queued = sleeper.queued(begin, end)
     reason, stolen = "" if flight.landed else flight.reason, _stolen() - stolen
     return [
         Measured.of(
@@ -189,12 +175,12 @@ def _streaming(priority: str, mission: Mission) -> list[Measured]:
             late,
             reason,
             skipped=flight.outcome.lateness.skipped,
-            queued=flight.queued,
             stolen=stolen,
             refusals=flight.refusals,
             view_failure=flight.view_failure,
         ),
-        Measured.of("asleep meanwhile", priority, sleeper.late(flight.sent[0].due, flight.sent[-1].due), stolen=stolen),
+        *([Measured.of(QUEUED, priority, queued, stolen=stolen)] if queued else []),
+        Measured.of("asleep meanwhile", priority, sleeper.late(begin, end), stolen=stolen),
     ]
 
 

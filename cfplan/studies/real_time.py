@@ -67,8 +67,6 @@ class Flight:
     truth: Truth | None = None
     view_failure: str = ""
     # why the live view ended early
-    queued: float = 0.0
-    # s of the stream in which the thread that sends was ready to and waited for a processor, as the system counts it
 
     @property
     def landed(self) -> bool:
@@ -84,11 +82,21 @@ class Flight:
 View = Callable[[RecordHeader], AbstractContextManager[LiveView]]
 
 
-def fly_in_real_time(mission: Mission, conditions: Conditions, *, name: str, view: View | None = None) -> Flight:
-    """Fly it; again where preflight refused for lateness alone. What goes wrong is told, not raised."""
+def fly_in_real_time(
+    mission: Mission,
+    conditions: Conditions,
+    *,
+    name: str,
+    view: View | None = None,
+    on_stream: Callable[[int], None] = lambda _: None,
+) -> Flight:
+    """Fly it; again where preflight refused for lateness alone. What goes wrong is told, not raised.
+
+    `on_stream` is called with the number of the pilot's process when the stream begins.
+    """
     refusals = 0
     while True:
-        flight = _fly_once(mission, conditions, name, view)
+        flight = _fly_once(mission, conditions, name, view, on_stream)
         flight.refusals = refusals
         if refusals == RETRIES or not _refused_for_lateness(flight.outcome):
             return flight
@@ -101,7 +109,9 @@ def _refused_for_lateness(outcome: FlightOutcome | None) -> bool:
     return {check.name for check in outcome.checks if not check.passed} == {LATENESS_CHECK}
 
 
-def _fly_once(mission: Mission, conditions: Conditions, name: str, view: View | None) -> Flight:
+def _fly_once(
+    mission: Mission, conditions: Conditions, name: str, view: View | None, on_stream: Callable[[int], None]
+) -> Flight:
     flight = Flight(None, "")
     header, phase = _header(mission, name), Phase.CLOSED
 
@@ -111,9 +121,9 @@ def _fly_once(mission: Mission, conditions: Conditions, name: str, view: View | 
         if watching is not None:
             watching.show(message)
         if isinstance(message, PhaseEntered):
-            if Phase.STREAM in (phase, message.phase):
-                flight.queued = _queued() - flight.queued
             phase = message.phase
+            if phase is Phase.STREAM:
+                on_stream(_pilot())
         elif isinstance(message, SetpointSent) and phase is Phase.STREAM:
             flight.sent.append(message)
 
@@ -139,13 +149,10 @@ def _fly_once(mission: Mission, conditions: Conditions, name: str, view: View | 
     return flight
 
 
-def _queued() -> float:
-    """s so far in which the pilot's first thread waited for a processor; 0 where the system does not tell."""
-    try:
-        pilot = next(child.pid for child in multiprocessing.active_children() if child.name == "pilot")
-        return int(Path(f"/proc/{pilot}/task/{pilot}/schedstat").read_text(encoding="ascii").split()[1]) / 1e9
-    except (StopIteration, OSError, IndexError, ValueError):
-        return 0.0
+def _pilot() -> int:
+    """The number of the pilot's process."""
+    pilots = (child.pid for child in multiprocessing.active_children() if child.name == "pilot")
+    return next(pilots, 0) or 0
 
 
 def _lab(mission: Mission, conditions: Conditions) -> Lab:

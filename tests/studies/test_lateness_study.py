@@ -1,6 +1,7 @@
 """Lateness: of a sleeper and of the stream, with and without going first; who gives that up has given it up."""
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -16,8 +17,8 @@ from cfplan.flight.telemetry import SetpointSent
 from cfplan.studies import lateness
 from cfplan.studies.lateness import FIRST, ORDINARY, Measured, lateness_study
 from cfplan.studies.real_time import Flight
+from cfplan.studies.sleeper import Sleeper
 
-pytestmark = pytest.mark.unit
 REPOSITORY = Path(__file__).parents[2]
 STILL, LEVEL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
@@ -44,7 +45,7 @@ def streamed(late):
         ExitCode.OK, "landed", Rung.NONE, (), (), begin, 0.2, Lateness(late, late, late, 20, 3),
         Deviation(0.0, 0.0, 0.0, 0), 0.0, STILL,
     )  # fmt: skip
-    return Flight(outcome, "landed", sent=sent, queued=late)
+    return Flight(outcome, "landed", sent=sent)
 
 
 @pytest.fixture
@@ -83,12 +84,29 @@ def test_a_sleeper_stands_before_each_stream_and_beside_it_over_the_same_seconds
     alone, stream, meanwhile = result.rows[:3]
     assert stream.p50 == pytest.approx(1e-3)
     assert stream.skipped == 3
-    assert stream.total == pytest.approx(20e-3)
-    assert (alone.queued, stream.queued, meanwhile.queued) == (None, 1e-3, None)
     assert 5 <= alone.count <= 100
     assert 15 <= meanwhile.count <= 20
     assert all(len(row) == len(columns) for _, columns, rows in result.tables() for row in rows)
     json.dumps(result.to_dict())
+
+
+@pytest.mark.skipif(not Path("/proc/self/schedstat").is_file(), reason="this system does not tell who waits")
+@pytest.mark.integration
+def test_a_process_that_waits_for_its_processor_is_seen_to_wait():
+    processor = {min(os.sched_getaffinity(0))}
+    busy = "import time; end = time.monotonic() + 1.5\nwhile time.monotonic() < end: pass"
+    commands = [[sys.executable, "-c", f"import os; os.sched_setaffinity(0, {processor})\n{busy}"]] * 2
+    with Sleeper(100.0, first=False) as sleeper:
+        first, second = (subprocess.Popen(command) for command in commands)  # both on one processor
+        sleeper.watch(first.pid)
+        begin = time.monotonic() + 0.4
+        time.sleep(1.0)
+        end = time.monotonic()
+        first.wait()
+        second.wait()
+    waited = sum(sleeper.queued(begin, end))
+    assert 0.2 * (end - begin) < waited < 0.9 * (end - begin)
+    assert sleeper.queued(end + 5.0, end + 6.0) == []
 
 
 def test_what_did_not_fly_is_told(study):
