@@ -74,3 +74,4 @@ def test_a_path_file_certifies_and_flies_as_planned(file):
     assert moving.sum() > 90 * made.trajectory.duration
     assert deviation.max() <= 0.08
     assert np.all(limits.space.beyond(truth.position[moving]) < 0)
+    assert outcome.lateness.p99 <= 2e-3

@@ -82,6 +82,7 @@ def test_the_vehicle_stays_with_its_setpoints(whole_flight, mission):
 def test_setpoints_are_sent_by_the_clock_and_reported_as_sent(whole_flight, mission):
     sent = whole_flight.of(SetpointSent)
     planned = decode(mission.payloads).position
+    assert len({message.index for message in sent}) > 0.9 * len(mission.payloads)  # a busy computer may skip some
     # Each deadline was met, or passed altogether on a computer that stood still, and was counted then.
     moving = [message for message in sent if message.index < len(planned) - 1]
     assert len(moving) + whole_flight.outcome.lateness.skipped >= len(planned) - 2
