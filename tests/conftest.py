@@ -5,21 +5,22 @@ should: the vehicle brakes, or preflight refuses. Such a test is repeated, but o
 but sleep was late meanwhile: a fault of our own fails at once on a computer that keeps time, and on any in the end.
 """
 
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
+from cfplan.studies.sleeper import Sleeper
 from cfplan.vehicle.profile import SpeedProfile
 
 MOST_REPEATS = 3
+RATE = 200.0
+# Hz, of the sleeper's wakings
+STANDSTILL = 0.02
+# s late
 
 
 Result = TypeVar("Result")
@@ -29,19 +30,13 @@ class Standstills:
     """When this computer stood still, by a process that only sleeps."""
 
     def __init__(self) -> None:
-        script = Path(__file__).with_name("standstills.py")
-        self._process = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE)
-        assert self._process.stdout is not None
-        self._told = self._process.stdout
-        os.set_blocking(self._told.fileno(), False)
-        self._last = 0.0
+        self._sleeper = Sleeper(RATE, first=True).__enter__()
         self.since = 0.0
         # when the present attempt at a test began, by time.monotonic()
 
     def seen(self) -> bool:
         """Whether there was one during the present attempt."""
-        self._last = max([self._last, *map(float, (self._told.read() or b"").split())])
-        return self._last >= self.since
+        return max(self._sleeper.late(begin=self.since), default=0.0) > STANDSTILL
 
     def without(self, act: Callable[[], Result]) -> Result:
         """What an act comes to, repeated likewise: for fixtures that several tests look at."""
@@ -53,8 +48,7 @@ class Standstills:
         return result
 
     def close(self) -> None:
-        self._process.kill()
-        self._process.communicate()
+        self._sleeper.__exit__()
 
 
 _standstills = pytest.StashKey[Standstills]()

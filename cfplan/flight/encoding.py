@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, encode
+from cfplan.flight.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, encode, joined
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.trajectory import Trajectory
@@ -79,24 +79,35 @@ def encode_trajectory(
     that are as old make up for each other. Raises NotCertifiedError with the setpoint where a value is not finite or
     does not fit its 16 bits.
     """
-    times = _times(trajectory, rate, hold, (lead, rate_lead, thrust_lead))
-    payloads = np.empty((len(times), PAYLOAD_SIZE), np.uint8)
-    for rows in _batches(len(times)):
-        payloads[rows] = encode(setpoints_at(trajectory, times[rows] + lead, rate_lead, thrust_lead), rows.start)
-    return EncodedFlight(times, payloads, decode(payloads), lead, rate_lead, thrust_lead)
+    return _encoded(trajectory, rate, hold, lead, rate_lead, thrust_lead, limits=None)
 
 
 def encode_checked(trajectory: Trajectory, limits: PlanLimits, *, hold: float = HOLD) -> EncodedFlight:
     """What encode_trajectory() makes, certified as by check_bytes(); the trajectory is evaluated once for both."""
-    times = _times(trajectory, RATE, hold, (RATE_LEAD, THRUST_LEAD))
-    payloads = np.empty((len(times), PAYLOAD_SIZE), np.uint8)
+    encoded = _encoded(trajectory, RATE, hold, 0.0, RATE_LEAD, THRUST_LEAD, limits)
+    _require_hover(encoded.decoded, trajectory, len(encoded.payloads))
+    return encoded
+
+
+def _encoded(
+    trajectory: Trajectory,
+    rate: float,
+    hold: float,
+    lead: float,
+    rate_lead: float,
+    thrust_lead: float,
+    limits: PlanLimits | None,
+) -> EncodedFlight:
+    """Each setpoint is checked against limits where there are any."""
+    times = _times(trajectory, rate, hold, (lead, rate_lead, thrust_lead))
+    payloads, told = [], []
     for rows in _batches(len(times)):
-        meant = _meant_at(trajectory, times[rows], RATE_LEAD, THRUST_LEAD)
-        payloads[rows] = encode(meant.setpoints, rows.start)
-        _check_rows(payloads[rows], meant, limits, rows.start)
-    decoded = decode(payloads)
-    _require_hover(decoded, trajectory, len(payloads))
-    return EncodedFlight(times, payloads, decoded, 0.0, RATE_LEAD, THRUST_LEAD)
+        meant = _meant_at(trajectory, times[rows] + lead, rate_lead, thrust_lead)
+        payloads.append(encode(meant.setpoints, rows.start))
+        told.append(decode(payloads[-1]))
+        if limits is not None:
+            _check_rows(payloads[-1], told[-1], meant, limits, rows.start)
+    return EncodedFlight(times, np.concatenate(payloads), joined(told), lead, rate_lead, thrust_lead)
 
 
 def _times(trajectory: Trajectory, rate: float, hold: float, leads: Sequence[float]) -> NDArray:
@@ -174,18 +185,18 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimi
         raise NotCertifiedError(f"payloads of shape {payloads.shape} for {len(encoded.times)} times")
     for rows in _batches(len(payloads)):
         meant = _meant_at(trajectory, encoded.times[rows] + encoded.lead, encoded.rate_lead, encoded.thrust_lead)
-        _check_rows(payloads[rows], meant, limits, rows.start)
+        _check_rows(payloads[rows], decode(payloads[rows]), meant, limits, rows.start)
     _require_hover(decode(payloads[-1:]), trajectory, len(payloads))
 
 
-def _check_rows(payloads: NDArray, meant: _Meant, limits: PlanLimits, first: int) -> None:
-    """What check_bytes asks of each setpoint, of those from number `first` on."""
+def _check_rows(payloads: NDArray, told: FullStateSetpoints, meant: _Meant, limits: PlanLimits, first: int) -> None:
+    """What check_bytes asks of each setpoint, of those from number `first` on; `told` is what the payloads say."""
 
     def require(good: NDArray, what: str, values: NDArray) -> None:
         _require(good, what, values, first)
 
     require(payloads[:, 0] == FULL_STATE_TYPE, "the payload is no full state", payloads[:, 0])
-    told, wanted = decode(payloads), meant.setpoints
+    wanted = meant.setpoints
     (
         position, velocity, thrust_error, rate_error, thrust, tilt, turned, made, speed, planned, body_rate
     ) = _inspected(

@@ -4,6 +4,8 @@ import contextlib
 import ctypes
 import math
 import os
+import platform
+import struct
 import sys
 import threading
 import time
@@ -15,6 +17,11 @@ import numpy as np
 STREAM_PRIORITY = 20  # of SCHED_FIFO, for the thread that sends setpoints
 _LOCK_ALL_IN_USE = 1 | 2 | 4
 # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of mlockall(2): every page, now and later, once it is used
+_SHORT_SLICE = 100_000  # ns, the shortest that Linux grants
+_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
+# numbers of the system call, which has no name in older C libraries
+_SCHED_ATTR = struct.Struct("=IIQiIQQQ")
+# struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +100,20 @@ def go_first(priority: int = STREAM_PRIORITY, thread: int = 0) -> bool:
     except (OSError, AttributeError):  # not permitted; not on this system
         return False
     return True
+
+
+def wake_promptly(thread: int = 0) -> bool:
+    """Have a thread of this process wait less for the processor, for shorter turns on it; whether that was granted.
+
+    Needs no permission, unlike `go_first`. Linux from 6.12 on knows turns of one's own; an older one grants this and
+    does nothing.
+    """
+    number = _SCHED_SETATTR.get(platform.machine()) if sys.platform.startswith("linux") else None
+    if number is None:
+        return False
+    nice = os.getpriority(os.PRIO_PROCESS, thread)
+    wanted = _SCHED_ATTR.pack(_SCHED_ATTR.size, os.SCHED_OTHER, 0, nice, 0, _SHORT_SLICE, 0, 0)
+    return int(ctypes.CDLL(None).syscall(number, thread, wanted, 0)) == 0
 
 
 def go_with_all(process: int) -> None:

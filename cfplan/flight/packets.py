@@ -6,7 +6,8 @@ cflib's own call truncates towards zero; here values are rounded, which halves t
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numba import njit
@@ -46,6 +47,12 @@ class FullStateSetpoints:
     # (N, 4) body→world, x y z w
     body_rate: NDArray
     # (N, 3) rad/s, body axes
+
+
+def joined(parts: Sequence[FullStateSetpoints]) -> FullStateSetpoints:
+    """All their rows, in order."""
+    names = (field.name for field in fields(FullStateSetpoints))
+    return FullStateSetpoints(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def encode(setpoints: FullStateSetpoints, first: int = 0) -> NDArray:

@@ -18,13 +18,13 @@ from cfplan.flight.connection import connect
 from cfplan.flight.keys import Keyboard, Order
 from cfplan.flight.mission import Mission
 from cfplan.flight.outcome import FlightOutcome
-from cfplan.flight.pace import STREAM_PRIORITY, go_first, stay_in_memory
+from cfplan.flight.pace import STREAM_PRIORITY, go_first, stay_in_memory, wake_promptly
 from cfplan.flight.pilot import Pilot
 from cfplan.flight.poses import PoseSource
 from cfplan.flight.reporter import Reporter
 from cfplan.flight.telemetry import Telemetry
 
-_SWITCH_INTERVAL = 0.0005  # s; the stream gets the interpreter back after at most this
+_SWITCH_INTERVAL = 0.0001  # s; the stream gets the interpreter back after at most this
 _THREAD_PRIORITY = STREAM_PRIORITY // 2
 _POLL = 0.05  # s
 _LANDING = 60.0  # s that a pilot without a main process has to come down
@@ -193,7 +193,8 @@ def _quieten() -> None:
     with contextlib.suppress(OSError):
         # The other threads too: one that is kept from the processor while it holds the interpreter keeps the stream
         # waiting as well.
-        for thread in os.listdir("/proc/self/task"):
-            go_first(_THREAD_PRIORITY, int(thread))
+        for thread in map(int, os.listdir("/proc/self/task")):
+            if not go_first(_THREAD_PRIORITY, thread):
+                wake_promptly(thread)
     go_first()
     stay_in_memory()

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from cfplan.errors import ExitCode
+from cfplan.errors import ExitCode, InputError
 from cfplan.flight.encoding import RATE
 from cfplan.flight.mission import Mission
 from cfplan.flight.pace import may_go_first
@@ -79,7 +79,8 @@ class Measured:
         if not self.count:
             return [self.what, self.priority, self.reason, *["–"] * (len(COLUMNS) - 3)]
         return [
-            self.what, self.priority, f"{self.seconds:.0f} s" + (f", then {self.reason}" if self.reason else ""),
+            self.what, self.priority,
+            "; ".join([f"{self.seconds:.0f} s", *filter(None, (self.reason, self.view_failure))]),
             *(f"{1e3 * value:.3f} ms" for value in (self.p50, self.p99, self.p999, self.max)),
             f"{self.above} of {self.count}", str(self.skipped), f"{self.stolen:.2f} s",
         ]  # fmt: skip
@@ -152,7 +153,7 @@ def _asleep(priority: str, seconds: float) -> Measured:
     stolen = _stolen()
     with Sleeper(RATE, first=priority == FIRST) as sleeper:
         time.sleep(seconds)
-    return Measured.of("asleep, nothing else", priority, sleeper.late(), stolen=_stolen() - stolen)
+        return Measured.of("asleep, nothing else", priority, sleeper.late(), stolen=_stolen() - stolen)
 
 
 def _streaming(priority: str, mission: Mission) -> list[Measured]:
@@ -160,13 +161,13 @@ def _streaming(priority: str, mission: Mission) -> list[Measured]:
     stolen = _stolen()
     with Sleeper(RATE, first=priority == FIRST) as sleeper:
         flight = fly_in_real_time(mission, Conditions(vicon=True), name="lateness", view=_view, on_stream=sleeper.watch)
-    if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT:
-        raise KeyboardInterrupt  # who ends the flight ends the study
-    if not flight.sent or flight.outcome is None:
-        return [Measured("stream", priority, flight.reason, refusals=flight.refusals)]
+        if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT:
+            raise KeyboardInterrupt  # who ends the flight ends the study
+        if not flight.sent or flight.outcome is None:
+            return [Measured("stream", priority, flight.reason, refusals=flight.refusals)]
+        begin, end = flight.sent[0].due, flight.sent[-1].due
+        queued, asleep = sleeper.queued(begin, end), sleeper.late(begin, end)
     late = [message.time - message.due for message in flight.sent]
-    begin, end = flight.sent[0].due, flight.sent[-1].due
-    queued = sleeper.queued(begin, end)
     reason, stolen = "" if flight.landed else flight.reason, _stolen() - stolen
     return [
         Measured.of(
@@ -180,7 +181,7 @@ def _streaming(priority: str, mission: Mission) -> list[Measured]:
             view_failure=flight.view_failure,
         ),
         *([Measured.of(QUEUED, priority, queued, stolen=stolen)] if queued else []),
-        Measured.of("asleep meanwhile", priority, sleeper.late(begin, end), stolen=stolen),
+        Measured.of("asleep meanwhile", priority, asleep, stolen=stolen),
     ]
 
 
@@ -200,6 +201,11 @@ def _view(header: RecordHeader) -> Iterator[LiveView]:
         )  # fmt: skip
         try:
             time.sleep(_VIEWER_STARTS)
+            if viewer.poll() is not None:
+                raise InputError(
+                    "rerun's viewer ended as soon as it was started, so nothing would be shown meanwhile",
+                    hint="it needs a graphics driver, also without a window; Debian's is mesa-vulkan-drivers",
+                )
             stream = rr.RecordingStream(APPLICATION)
             stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
             lay_out(stream, live_blueprint(header))

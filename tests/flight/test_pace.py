@@ -1,6 +1,9 @@
 """Who goes first on the processor: the stream where that is permitted, and nothing that it starts."""
 
+import ctypes
 import os
+import platform
+import struct
 import subprocess
 import sys
 import threading
@@ -8,7 +11,7 @@ import threading
 import pytest
 
 from cfplan.flight import pace
-from cfplan.flight.pace import go_first, go_with_all, goes_first, may_go_first, stay_in_memory
+from cfplan.flight.pace import go_first, go_with_all, goes_first, may_go_first, stay_in_memory, wake_promptly
 
 pytestmark = pytest.mark.unit
 
@@ -47,6 +50,35 @@ def test_a_system_that_knows_of_no_such_thing_is_no_fault(monkeypatch):
         monkeypatch.delattr(pace.os, name)
     assert not may_go_first()
     assert not goes_first()
+
+
+def slice_of_this_thread():
+    """(nice, s) of it, as Linux tells by sched_getattr(2)."""
+    told = ctypes.create_string_buffer(56)
+    assert ctypes.CDLL(None).syscall({"x86_64": 315, "aarch64": 275}[platform.machine()], 0, told, len(told), 0) == 0
+    _, _, _, nice, _, runtime = struct.unpack_from("=IIQiIQ", told)
+    return nice, runtime / 1e9
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or tuple(map(int, platform.release().split(".")[:2])) < (6, 12),
+    reason="this system gives no thread turns of its own length",
+)
+def test_without_permission_a_thread_asks_for_short_turns_and_keeps_its_niceness():
+    def ask():
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 5)
+        before = slice_of_this_thread()
+        return before, wake_promptly(), slice_of_this_thread()
+
+    (_, usual), granted, after = in_a_thread(ask)
+    assert granted
+    assert after == (5, 1e-4)
+    assert usual > 1e-4
+
+
+def test_a_system_without_short_turns_is_no_fault(monkeypatch):
+    monkeypatch.setattr(pace.platform, "machine", lambda: "unknown")
+    assert not wake_promptly()
 
 
 def test_a_child_of_the_stream_goes_with_all_others():

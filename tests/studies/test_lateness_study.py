@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cfplan.errors import ExitCode
+from cfplan.errors import ExitCode, InputError
 from cfplan.flight.outcome import Deviation, FlightOutcome, Rung
 from cfplan.flight.pace import Lateness
 from cfplan.flight.telemetry import SetpointSent
@@ -104,9 +104,9 @@ def test_a_process_that_waits_for_its_processor_is_seen_to_wait():
         end = time.monotonic()
         first.wait()
         second.wait()
-    waited = sum(sleeper.queued(begin, end))
-    assert 0.2 * (end - begin) < waited < 0.9 * (end - begin)
-    assert sleeper.queued(end + 5.0, end + 6.0) == []
+        waited = sum(sleeper.queued(begin, end))
+        assert 0.2 * (end - begin) < waited < 0.9 * (end - begin)
+        assert sleeper.queued(end + 5.0, end + 6.0) == []
 
 
 def test_what_did_not_fly_is_told(study):
@@ -127,4 +127,15 @@ def test_after_giving_priority_up_no_child_can_have_it():
 
 def test_a_stream_that_ends_early_is_measured_as_far_as_it_came():
     row = replace(Measured.of("stream", ORDINARY, [1e-4] * 300), reason="poses stopped")
-    assert "3 s, then poses stopped" in row.texts()
+    assert "3 s; poses stopped" in row.texts()
+
+
+def test_a_live_view_that_ended_early_is_told():
+    row = replace(Measured.of("stream", ORDINARY, [1e-4] * 300), view_failure="the live view ended: closed")
+    assert "3 s; the live view ended: closed" in row.texts()
+
+
+def test_a_viewer_that_does_not_run_is_an_error_and_no_quieter_computer(monkeypatch):
+    monkeypatch.setattr(lateness, "viewer_program", lambda: "/bin/false")
+    with pytest.raises(InputError, match="graphics driver"), lateness._view(None):
+        pass
