@@ -212,13 +212,14 @@ def _functions(free_yaw: bool, points: int, chosen: Backend | None) -> tuple[_Bi
     kernels = point_kernels(free_yaw) if chosen == Backend.VIRTUAL_MACHINE or not machine_code() else None
     if kernels:
         return _interpreted(kernels[0], points), _interpreted(kernels[1], points)
-    loaded, family = _loaded(), stage.family(free_yaw)
-    return _compiled(loaded[f"{family}_values"], points), _compiled(loaded[f"{family}_derivatives"], points)
+    values, derivatives = _loaded(stage.family(free_yaw))
+    return _compiled(values, points), _compiled(derivatives, points)
 
 
-@lru_cache(maxsize=1)
-def _loaded() -> ctypes.CDLL:
-    return ctypes.CDLL(str(machine_code()))
+@lru_cache(maxsize=2)
+def _loaded(family: str) -> tuple[Any, Any]:
+    library = ctypes.CDLL(str(machine_code()))
+    return library[f"{family}_values"], library[f"{family}_derivatives"]
 
 
 def _compiled(function: Any, points: int) -> _Bind:

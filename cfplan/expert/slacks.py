@@ -19,12 +19,15 @@ _SUMS = {"contract", "reassoc", "nsz", "arcp"}  # freedom that what is not a num
 _LARGEST = _SUMS | {"nnan"}
 
 
+@njit(cache=True)
 def bounds_of(lower: NDArray, upper: NDArray) -> NDArray:
     """(5, m) lower and upper bound, whether each is there, and whether either is."""
-    has_low, has_high = lower > -np.inf, upper < np.inf
-    return np.array([
-        np.where(has_low, lower, -FAR), np.where(has_high, upper, FAR), has_low, has_high, has_low | has_high
-    ])  # fmt: skip
+    bounds = np.empty((5, len(lower)))
+    for j in range(len(lower)):
+        has_low, has_high = lower[j] > -np.inf, upper[j] < np.inf
+        bounds[0, j], bounds[1, j] = lower[j] if has_low else -FAR, upper[j] if has_high else FAR
+        bounds[2, j], bounds[3, j], bounds[4, j] = has_low, has_high, has_low or has_high
+    return bounds
 
 
 @njit(cache=True, error_model="numpy")

@@ -26,7 +26,7 @@ AGAIN = (
 # from the answer to a problem almost the same: near the bounds from the start, and further off where that fails
 NEARLY = 1.25
 # the barrier, by second that an interval takes, that keeps within a few thousandths of the best
-NEARLY_FEASIBLE, NEARLY_FLAT = 5e-5, 0.05
+NEARLY_FEASIBLE, NEARLY_FLAT = 2e-4, 0.05
 # what then remains of the constraints is a fraction of the margin that they are tightened by
 
 

@@ -302,21 +302,23 @@ def _assemble(
             e = b * k - b * (b - 1) // 2
             for a in range(b, k if of_yaw else 4):
                 of_hessian[e + a - b, linear_interval[j]] += pull * linear[j, a]
-    for i in range(count):
-        for q in range(len(weights)):
-            x = 0.0
-            for a in range(4):
-                x += places[q, a] * local[i, a]
-            x = max(x, stage.LEAST)
-            first = -0.5 * scale * weights[q] / (x * math.sqrt(x))
-            second = -1.5 * first / x
-            e = 0
-            for b in range(4):
-                of_gradient[b, i] += first * places[q, b]
-                for a in range(b, 4):
-                    of_hessian[e, i] += second * places[q, b] * places[q, a]
-                    e += 1
-                e += k - 4
+    first, second = np.empty(count), np.empty(count)  # derivatives of the time by x
+    for q in range(len(weights)):
+        for i in range(count):
+            x = places[q, 0] * local[i, 0] + places[q, 1] * local[i, 1] + places[q, 2] * local[i, 2]
+            x = max(x + places[q, 3] * local[i, 3], stage.LEAST)
+            first[i] = -0.5 * scale * weights[q] / (x * math.sqrt(x))
+            second[i] = -1.5 * first[i] / x
+        e = 0
+        for b in range(4):
+            for i in range(count):
+                of_gradient[b, i] += first[i] * places[q, b]
+            for a in range(b, 4):
+                both, row = places[q, b] * places[q, a], of_hessian[e]
+                for i in range(count):
+                    row[i] += second[i] * both
+                e += 1
+            e += k - 4
     gradient[:] = 0.0
     flat = matrix.ravel()
     flat[:] = 0.0

@@ -190,3 +190,15 @@ def fill_inputs(
         out[n, COLUMNS + 6] = math.cos(2.0 * relative)
         out[n, COLUMNS + 7] = math.sin(2.0 * relative)
         out[n, COLUMNS + 8] = turning
+
+
+@njit(cache=True)
+def turn(yaw: NDArray, first: float, answer: NDArray) -> None:
+    """Write yaw at a window's first nodes, (K,) rad, not wrapped: `first`, then as the network's answer turns."""
+    before = math.atan2(answer[0, 2], answer[0, 1])
+    yaw[0] = first
+    for n in range(1, len(yaw)):
+        here = math.atan2(answer[n, 2], answer[n, 1])
+        change = here - before
+        yaw[n] = yaw[n - 1] + change - 2.0 * math.pi * np.round(change / (2.0 * math.pi))
+        before = here

@@ -30,6 +30,7 @@ from cfplan.learning.features import (
     start_coefficients,
     start_logs,
     told,
+    turn,
     window_inputs,
 )
 from cfplan.learning.inference import Network
@@ -147,8 +148,7 @@ def predict(
         logs[first : first + window + 3] = smooth
         begin, settled = Begin.KNOWN, smooth[part.keep : part.keep + 3]
         if track is None:
-            turned = np.unwrap(np.arctan2(answer[:, 2], answer[:, 1]))[: part.keep + 1]
-            yaw[first : stop + 1] = angle + turned - turned[0]
+            turn(yaw[first : stop + 1], angle, answer)
             angle, turning = yaw[stop], yaw[stop] - yaw[stop - 1]
     if allowed is not None:
         asked = node_table(path, 0.0, step, nodes + 1, allowed)[:, REFERENCE]

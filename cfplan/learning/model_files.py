@@ -191,6 +191,7 @@ def other_vehicle(card: Card, airframe: Airframe) -> str:
     return f"{card.airframe.name} there, {airframe.name} here: {'; '.join(differs)}" if differs else ""
 
 
+@lru_cache(maxsize=1)
 def models_folder() -> Path:
     """Where the models are that come with cfplan: in a checkout beside the package, else where pip put them."""
     checkout = Path(__file__).parents[2]

@@ -50,7 +50,7 @@ class Options:
     """What decides a training, beside the dataset and the machine."""
 
     architecture: Architecture = Architecture.BILSTM
-    hidden: int = 64
+    hidden: int = 48
     layers: int = 2
     window: int = WINDOW
     epochs: int = 40
