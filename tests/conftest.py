@@ -3,6 +3,7 @@
 A virtual machine whose host is busy stands still for tenths of seconds, and a flight in real time then ends as it
 should: the vehicle brakes, or preflight refuses. Such a test is repeated, but only where a process that does nothing
 but sleep was late meanwhile: a fault of our own fails at once on a computer that keeps time, and on any in the end.
+A flight that several tests look at is flown once, and anew for a test that is repeated.
 """
 
 import time
@@ -32,20 +33,11 @@ class Standstills:
     def __init__(self) -> None:
         self._sleeper = Sleeper(RATE, first=True).__enter__()
         self.since = 0.0
-        # when the present attempt at a test began, by time.monotonic()
+        # when that began which the present attempt at a test looks at, by time.monotonic()
 
     def seen(self) -> bool:
-        """Whether there was one during the present attempt."""
+        """Whether there was one in what the present attempt looks at."""
         return max(self._sleeper.late(begin=self.since), default=0.0) > STANDSTILL
-
-    def without(self, act: Callable[[], Result]) -> Result:
-        """What an act comes to, repeated likewise: for fixtures that several tests look at."""
-        for _ in range(1 + MOST_REPEATS):
-            self.since = time.monotonic()
-            result = act()
-            if not self.seen():
-                break
-        return result
 
     def close(self) -> None:
         self._sleeper.__exit__()
@@ -75,9 +67,26 @@ def pytest_unconfigure(config: pytest.Config) -> None:
         config.stash[_standstills].close()
 
 
-@pytest.fixture(scope="session")
-def standstills(pytestconfig) -> Standstills:
-    return pytestconfig.stash[_standstills]
+@pytest.fixture(scope="module")
+def kept() -> dict[str, tuple[float, object]]:
+    """When each act began, by its name, and what it came to."""
+    return {}
+
+
+@pytest.fixture
+def once(request, kept) -> Callable[[Callable[[], Result]], Result]:
+    """Does an act in real time once for all tests of a module that look at it, and anew where one is repeated."""
+    standstills = request.config.stash[_standstills]
+
+    def do(act: Callable[[], Result]) -> Result:
+        name = act.__qualname__
+        if name not in kept or request.node.execution_count > 1:
+            begin = time.monotonic()
+            kept[name] = begin, act()
+        standstills.since, result = kept[name]
+        return result
+
+    return do
 
 
 def spline_profile(end, h_coefficients, yaw_coefficients=None) -> SpeedProfile:

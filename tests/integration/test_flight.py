@@ -50,9 +50,9 @@ def wait_until(condition: Callable[[], bool], patience: float) -> None:
     assert condition()
 
 
-@pytest.fixture(scope="module")
-def whole_flight(lab, fly_in, standstills):
-    return standstills.without(lambda: fly_in(lab))
+@pytest.fixture
+def whole_flight(lab, fly_in, once):
+    return once(lambda: fly_in(lab))
 
 
 def test_a_flight_ends_landed_disarmed_and_unlocked(whole_flight):

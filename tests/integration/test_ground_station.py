@@ -1,5 +1,6 @@
 """MAVSDK as the ground station of a flight on the virtual Crazyflie: what it sees, and what it can do."""
 
+import contextlib
 import math
 import socket
 import subprocess
@@ -114,15 +115,19 @@ def refused(action: Callable[[], object]) -> ActionResult:
     return caught.value.result
 
 
-@pytest.fixture(scope="module")
-def landed(lab, mission, tmp_path_factory, standstills) -> Watched:
+@pytest.fixture
+def landed(lab, mission, tmp_path_factory, once) -> Watched:
     """A flight that the ground station looks at, tries to arm and to take off with, and lands."""
-    return standstills.without(lambda: watched_flight(lab, mission, tmp_path_factory))
+
+    def fly_watched() -> Watched:
+        with contextlib.closing(Station()) as station:
+            return watched_flight(station, lab, mission, tmp_path_factory.mktemp("log") / "flight.tlog")
+
+    return once(fly_watched)
 
 
-def watched_flight(lab, mission, tmp_path_factory) -> Watched:
-    watched = Watched(log=tmp_path_factory.mktemp("log") / "flight.tlog")
-    station = Station()
+def watched_flight(station: Station, lab: Lab, mission: Mission, log: Path) -> Watched:
+    watched = Watched(log)
     newest: Estimate | None = None
     status: VehicleStatus | None = None
 
@@ -153,8 +158,7 @@ def watched_flight(lab, mission, tmp_path_factory) -> Watched:
             watched.refused += [refused(station.action.arm), refused(station.action.disarm)]
             station.action.land()
 
-    watched.outcome = fly_with(station, mission, lab, watched.log, react)
-    station.close()
+    watched.outcome = fly_with(station, mission, lab, log, react)
     return watched
 
 
