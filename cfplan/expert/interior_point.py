@@ -78,6 +78,8 @@ class Search:
     # of the Lagrangian, at the end
     feasibility: float = 1e-5
     # of the constraints, at the end
+    left_by_step: float | None = None
+    # share of that gradient which a whole step is taken to leave; else it is computed anew before the search ends
     push: float = 1e-2
     # how far slacks start inside their bounds at least, of the span between them
     iterations: int = 100
@@ -99,25 +101,18 @@ def minimise(functions: Functions, v: NDArray, search: Search) -> Ended:
     state, step = np.empty((3, len(g))), np.zeros((3, len(g)))
     force, pull, factor = np.empty(len(g)), np.empty(len(g)), np.empty_like(functions.matrix)
     cost = functions.values(v)
-    slacks.first(g, bounds, barrier, search.push, state)
+    slacks.first(g, bounds, barrier, search.push, state, multipliers, stiffness)
     infeasible, walls = slacks.standing(g, bounds, state, step, 0.0, barrier, rows)
     most_infeasible, regularised = 1e4 * max(1.0, infeasible), 0.0
     filtered: list[tuple[float, float]] = []
     for iteration in range(search.iterations):
-        slacks.pulls(bounds, state, multipliers, stiffness)
         functions.expand()
         off_gradient = float(np.abs(functions.gradient + functions.transposed(multipliers)).max())
         if not math.isfinite(infeasible + off_gradient + cost):
             return Ended(v, False, iteration, "met what is not a number")
         lowered = False
         while True:
-            off_constraints, off_complementary = slacks.errors(g, bounds, state, barrier)
-            error = max(
-                off_constraints / search.feasibility * search.last_barrier,
-                off_gradient / search.gradient * search.last_barrier,
-                off_complementary,
-            )
-            if error > BARRIER_SOLVED * barrier:
+            if _error(g, bounds, state, barrier, off_gradient, search) > BARRIER_SOLVED * barrier:
                 break
             if barrier <= search.last_barrier:
                 return Ended(v, True, iteration, f"solved in {iteration} iterations")
@@ -157,8 +152,24 @@ def minimise(functions: Functions, v: NDArray, search: Search) -> Ended:
         if verdict == "widens":
             filtered.append(((1 - FILTER) * infeasible, merit - FILTER * infeasible))
         v, cost, infeasible = there, cost_there, infeasible_there
-        slacks.advance(bounds, state, step, share, share_dual, barrier)
+        slacks.advance(bounds, state, step, share, share_dual, barrier, multipliers, stiffness)
+        if search.left_by_step is not None and share == share_dual == 1.0 and barrier <= search.last_barrier:
+            left = search.left_by_step * off_gradient
+            if _error(g, bounds, state, barrier, left, search) <= BARRIER_SOLVED * barrier:
+                return Ended(v, True, iteration + 1, f"solved in {iteration + 1} iterations")
     return Ended(v, False, search.iterations, f"not solved in {search.iterations} iterations")
+
+
+def _error(g: NDArray, bounds: NDArray, state: NDArray, barrier: float, off_gradient: float, search: Search) -> float:
+    """How far this is from the barrier's solution, in units of the barrier."""
+    off_constraints, off_complementary = slacks.errors(g, bounds, state, barrier)
+    return float(
+        max(
+            off_constraints / search.feasibility * search.last_barrier,
+            off_gradient / search.gradient * search.last_barrier,
+            off_complementary,
+        )
+    )
 
 
 def _factorise(matrix: NDArray, regularised: float, factor: NDArray) -> float:

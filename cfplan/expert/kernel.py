@@ -9,7 +9,7 @@ Arrays hold a quantity a row and a point a column; columns are a multiple of LAN
 """
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from pathlib import Path as FilePath
 from typing import Any
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from cfplan.expert import stage
 from cfplan.expert.compiled import Backend, shared_library
-from cfplan.vehicle import airframe, flatness
+from cfplan.vehicle import airframe, flatness, trigonometry
 
 LANES = 8
 H_SPLINE = np.array([[1 / 6, 4 / 6, 1 / 6, 0], [-1 / 2, 0, 1 / 2, 0], [1, -2, 1, 0], [-1, 3, -3, 1]])
@@ -30,12 +30,35 @@ YAW_SPLINE = np.array([[1 / 2, 1 / 2, 0], [-1, 1, 0], [1, -2, 1]])
 
 _PREAMBLE = """
 typedef double wide __attribute__((vector_size(64), aligned(8)));
-#define LANEWISE(name, of) static inline wide name(wide x) { for (int i = 0; i < 8; ++i) x[i] = of(x[i]); return x; }
-LANEWISE(w_sqrt, __builtin_sqrt)
-LANEWISE(w_cos, __builtin_cos)
-LANEWISE(w_sin, __builtin_sin)
+typedef long long mask __attribute__((vector_size(64), aligned(8)));
+static inline wide w_sqrt(wide x) { for (int i = 0; i < 8; ++i) x[i] = __builtin_sqrt(x[i]); return x; }
 static inline wide w_max(wide x, double y) { for (int i = 0; i < 8; ++i) x[i] = x[i] > y ? x[i] : y; return x; }
 static inline wide w_le(wide x, wide y) { for (int i = 0; i < 8; ++i) x[i] = x[i] <= y[i]; return x; }
+static inline wide w_round(wide x) { return x + 0x1.8p52 - 0x1.8p52; }
+static inline wide w_pick(mask m, wide x, wide y) { return (wide)(((mask)x & m) | ((mask)y & ~m)); }
+"""
+
+
+def _polynomial(coefficients: Sequence[float]) -> str:
+    return "".join(f"{c!r} + z * (" for c in coefficients[:-1]) + repr(coefficients[-1]) + ")" * (len(coefficients) - 1)
+
+
+_TRIGONOMETRY = f"""
+/* as in trigonometry.py; rounding r - 3/8 is the floor where r is a multiple of 1/4 */
+static inline wide wave(wide angle, double quarters) {{
+  const wide turns = w_round(angle * {trigonometry.PER_QUARTER!r});
+  const wide x = ((angle - turns * {trigonometry.QUARTER[0]!r}) - turns * {trigonometry.QUARTER[1]!r})
+    - turns * {trigonometry.QUARTER[2]!r};
+  const wide z = x * x;
+  const wide sine = x + x * z * ({_polynomial(trigonometry.SINE)});
+  const wide cosine = 1.0 - 0.5 * z + z * z * ({_polynomial(trigonometry.COSINE)});
+  const wide all = turns + quarters;
+  const wide quadrant = all - 4.0 * w_round(0.25 * all - 0.375);
+  const wide value = w_pick((mask)((quadrant == 1.0) | (quadrant == 3.0)), cosine, sine);
+  return w_pick((mask)(quadrant >= 2.0), -value, value);
+}}
+static inline wide w_sin(wide x) {{ return wave(x, 0.0); }}
+static inline wide w_cos(wide x) {{ return wave(x, 1.0); }}
 """
 
 
@@ -115,7 +138,11 @@ UNIFORM = (2, 3)
 
 def source() -> str:
     """The C source of all kernels."""
-    return _PREAMBLE + "\n".join(_c_function(f) for free_yaw in (False, True) for f in point_kernels(free_yaw))
+    return (
+        _PREAMBLE
+        + _TRIGONOMETRY
+        + "\n".join(_c_function(f) for free_yaw in (False, True) for f in point_kernels(free_yaw))
+    )
 
 
 _BINARY = {casadi.OP_ADD: "+", casadi.OP_SUB: "-", casadi.OP_MUL: "*"}
@@ -194,7 +221,10 @@ def _c_function(f: casadi.Function) -> str:
 @lru_cache(maxsize=1)
 def machine_code() -> FilePath | None:
     """The compiled kernels, or None where that is not possible."""
-    files = [FilePath(str(file)) for file in (__file__, stage.__file__, flatness.__file__, airframe.__file__)]
+    files = [
+        FilePath(str(file))
+        for file in (__file__, stage.__file__, flatness.__file__, airframe.__file__, trigonometry.__file__)
+    ]
     return shared_library("kernels", files, source)
 
 

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 FAR = 1e20
@@ -16,7 +17,7 @@ COMPLEMENTARY = 1e10
 # how far a multiplier may be from what the barrier makes of its slack, as a factor
 
 _SUMS = {"contract", "reassoc", "nsz", "arcp"}  # freedom that what is not a number survives
-_LARGEST = _SUMS | {"nnan"}
+_LANES = 16  # numbers that the compiler may want to compare at once
 
 
 @njit(cache=True)
@@ -31,42 +32,50 @@ def bounds_of(lower: NDArray, upper: NDArray) -> NDArray:
 
 
 @njit(cache=True, error_model="numpy")
-def first(g, bounds, barrier, push, state):
+def first(g, bounds, barrier, push, state, multipliers, stiffness):
     """Slacks where the constraints are, but inside by `push` of the span between bounds at least; multipliers that the
     barrier makes of them.
 
-    Slacks that start next to a bound would hold back every step: better to start a little off the constraints.
+    Fills in the multipliers of the constraints and the stiffness of their slacks too, as advance() does. Slacks that
+    start next to a bound would hold back every step: better to start a little off the constraints.
     """
     for j in range(len(g)):
         lower, upper = bounds[0, j], bounds[1, j]
         room = push * min(upper - lower, 2.0)
         s = min(max(g[j], lower + room), upper - room)
-        state[0, j] = s
-        state[1, j] = bounds[2, j] * barrier / (s - lower)
-        state[2, j] = bounds[3, j] * barrier / (upper - s)
+        low, high = bounds[2, j] * barrier / (s - lower), bounds[3, j] * barrier / (upper - s)
+        state[0, j], state[1, j], state[2, j] = s, low, high
+        multipliers[j], stiffness[j] = high - low, low / (s - lower) + high / (upper - s)
+
+
+@register_jitable
+def _largest(values):
+    """The largest of non-negative numbers. The compiler would compare one by one, as it may not change the order."""
+    most, whole = np.zeros(_LANES), len(values) - len(values) % _LANES
+    for begin in range(0, whole, _LANES):
+        for lane in range(_LANES):
+            value = values[begin + lane]
+            most[lane] = value if value > most[lane] else most[lane]
+    largest = 0.0
+    for value in most:
+        largest = max(largest, value)
+    for value in values[whole:]:
+        largest = max(largest, value)
+    return largest
 
 
 @njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def pulls(bounds, state, multipliers, stiffness):
-    """Fill in the multipliers of the constraints and the stiffness of their slacks."""
-    lower, upper = bounds[0], bounds[1]
-    s, low, high = state[0], state[1], state[2]
-    for j in range(len(s)):
-        multipliers[j] = high[j] - low[j]
-        stiffness[j] = low[j] / (s[j] - lower[j]) + high[j] / (upper[j] - s[j])
-
-
-@njit(cache=True, error_model="numpy", fastmath=_LARGEST)
 def errors(g, bounds, state, barrier):
     """The largest |g - s|, and the largest difference of a slack's product from the barrier. For finite numbers."""
     lower, upper, has_low, has_high, active = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
     s, low, high = state[0], state[1], state[2]
-    infeasible, off = 0.0, 0.0
+    infeasible, off = np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
-        infeasible = max(infeasible, active[j] * abs(g[j] - s[j]))
-        off = max(off, abs(low[j] * (s[j] - lower[j]) - has_low[j] * barrier))
-        off = max(off, abs(high[j] * (upper[j] - s[j]) - has_high[j] * barrier))
-    return infeasible, off
+        infeasible[j] = active[j] * abs(g[j] - s[j])
+        below = abs(low[j] * (s[j] - lower[j]) - has_low[j] * barrier)
+        above = abs(high[j] * (upper[j] - s[j]) - has_high[j] * barrier)
+        off[j] = below if below > above else above
+    return _largest(infeasible), _largest(off)
 
 
 @njit(cache=True, error_model="numpy", fastmath=_SUMS)
@@ -79,7 +88,7 @@ def forces(g, bounds, state, stiffness, barrier, force, pull):
         pull[j] = force[j] + active[j] * stiffness[j] * (g[j] - s[j])
 
 
-@njit(cache=True, error_model="numpy", fastmath=_LARGEST)
+@njit(cache=True, error_model="numpy", fastmath=_SUMS)
 def steps(g, along, bounds, state, force, barrier, most, step):
     """Fill in the step, where g changes by `along`.
 
@@ -89,19 +98,19 @@ def steps(g, along, bounds, state, force, barrier, most, step):
     lower, upper, has_low, has_high, active = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
     s, low, high = state[0], state[1], state[2]
     ds, dlow, dhigh = step[0], step[1], step[2]
-    slope, fastest, fastest_dual = 0.0, 0.0, 0.0
+    slope, fastest, fastest_dual = 0.0, np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
-        below, above = s[j] - lower[j], upper[j] - s[j]
+        by_below, by_above = 1.0 / (s[j] - lower[j]), 1.0 / (upper[j] - s[j])
         d = active[j] * (g[j] - s[j] + along[j])
         ds[j] = d
         slope += force[j] * d
-        fastest = max(fastest, max(-d / below, d / above))
-        dl = (has_low[j] * barrier - low[j] * d) / below - low[j]
-        dh = (has_high[j] * barrier + high[j] * d) / above - high[j]
+        fastest[j] = d * by_above if d > 0.0 else -d * by_below
+        dl = (has_low[j] * barrier - low[j] * d) * by_below - low[j]
+        dh = (has_high[j] * barrier + high[j] * d) * by_above - high[j]
         dlow[j], dhigh[j] = dl, dh
-        fastest_dual = max(fastest_dual, -dl / (low[j] + 1e-300))
-        fastest_dual = max(fastest_dual, -dh / (high[j] + 1e-300))
-    return slope, min(1.0, most / max(fastest, 1e-30)), min(1.0, most / max(fastest_dual, 1e-30))
+        of_low, of_high = -dl / (low[j] + 1e-300), -dh / (high[j] + 1e-300)
+        fastest_dual[j] = of_low if of_low > of_high else of_high
+    return slope, min(1.0, most / max(_largest(fastest), 1e-30)), min(1.0, most / max(_largest(fastest_dual), 1e-30))
 
 
 @njit(cache=True, error_model="numpy", fastmath=_SUMS)
@@ -134,13 +143,17 @@ def standing(g, bounds, state, step, share, barrier, rows):
 
 
 @njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def advance(bounds, state, step, share, share_dual, barrier):
+def advance(bounds, state, step, share, share_dual, barrier, multipliers, stiffness):
     """Take the step, in place; multipliers stay within a factor of what the barrier makes of their slacks."""
     lower, upper, has_low, has_high = bounds[0], bounds[1], bounds[2], bounds[3]
     s, low, high = state[0], state[1], state[2]
+    ds, dlow, dhigh = step[0], step[1], step[2]
     for j in range(len(s)):
-        s[j] += share * step[0, j]
-        middle = has_low[j] * barrier / (s[j] - lower[j])
-        low[j] = min(max(low[j] + share_dual * step[1, j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
-        middle = has_high[j] * barrier / (upper[j] - s[j])
-        high[j] = min(max(high[j] + share_dual * step[2, j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
+        there = s[j] + share * ds[j]
+        by_below, by_above = 1.0 / (there - lower[j]), 1.0 / (upper[j] - there)
+        middle = has_low[j] * barrier * by_below
+        of_low = min(max(low[j] + share_dual * dlow[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
+        middle = has_high[j] * barrier * by_above
+        of_high = min(max(high[j] + share_dual * dhigh[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
+        s[j], low[j], high[j] = there, of_low, of_high
+        multipliers[j], stiffness[j] = of_high - of_low, of_low * by_below + of_high * by_above

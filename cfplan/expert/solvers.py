@@ -26,8 +26,9 @@ AGAIN = (
 # from the answer to a problem almost the same: near the bounds from the start, and further off where that fails
 NEARLY = 1.25
 # the barrier, by second that an interval takes, that keeps within a few thousandths of the best
-NEARLY_FEASIBLE, NEARLY_FLAT = 2e-4, 0.05
-# what then remains of the constraints is a fraction of the margin that they are tightened by
+NEARLY_FEASIBLE, NEARLY_FLAT, LEFT_BY_STEP = 2e-4, 0.05, 0.2
+# what then remains of the constraints is a fraction of the margin that they are tightened by; whole steps leave less
+# than a tenth of the gradient
 
 
 def quickly(interval: float) -> Sequence[Search]:
@@ -43,7 +44,7 @@ def quickly_again(interval: float) -> Sequence[Search]:
 def _nearly(barrier: float, push: float, iterations: int) -> Search:
     return Search(
         barrier=barrier, last_barrier=barrier, push=push, iterations=iterations,
-        feasibility=NEARLY_FEASIBLE, gradient=NEARLY_FLAT,
+        feasibility=NEARLY_FEASIBLE, gradient=NEARLY_FLAT, left_by_step=LEFT_BY_STEP,
     )  # fmt: skip
 
 

@@ -69,10 +69,11 @@ class SplineProblem:
 
     def _bounds(self, problem: Problem) -> NDArray:
         it = self._structure
-        lower, upper = np.full(len(self.g), -np.inf), np.full(len(self.g), np.inf)
-        lower[it.selected], upper[it.selected] = problem.lbg[it.point_rows], problem.ubg[it.point_rows]
-        lower[-len(it.linear) :], upper[-len(it.linear) :] = _linear_bounds(problem, len(it.positive))
-        return bounds_of(lower, upper)
+        low, high = _linear_bounds(problem, len(it.positive))
+        return bounds_of(
+            _spread(problem.lbg, it.point_rows, it.selected, low, len(self.g), -np.inf),
+            _spread(problem.ubg, it.point_rows, it.selected, high, len(self.g), np.inf),
+        )
 
     def v_of(self, table: NDArray) -> NDArray:
         """The variables of a table of coefficients; the smallest counts where several have one value."""
@@ -233,6 +234,16 @@ def _linear_bounds(problem: Problem, positive: int) -> tuple[NDArray, NDArray]:
         lower.append(np.array([-np.inf]) if held else problem.lbx[3:4])
         upper.append(np.array([np.inf]) if held else problem.ubx[3:4])
     return np.concatenate(lower), np.concatenate(upper)
+
+
+@njit(cache=True)
+def _spread(limits, point_rows, selected, linear, count, nothing):
+    """(count,) those of the kernel's rows, where something asks for them, and those of the linear ones behind."""
+    spread = np.full(count, nothing)
+    for k in range(len(selected)):
+        spread[selected[k]] = limits[point_rows[k]]
+    spread[count - len(linear) :] = linear
+    return spread
 
 
 _FREELY = {"contract", "reassoc", "nsz"}  # what is not a number survives

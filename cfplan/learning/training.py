@@ -50,7 +50,7 @@ class Options:
     """What decides a training, beside the dataset and the machine."""
 
     architecture: Architecture = Architecture.BILSTM
-    hidden: int = 48
+    hidden: int = 32
     layers: int = 2
     window: int = WINDOW
     epochs: int = 40

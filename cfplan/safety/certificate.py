@@ -21,11 +21,11 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.safety.space import Space
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.dense import Stretches, sampled_rows
+from cfplan.vehicle.dense import Sampler, Stretches
 from cfplan.vehicle.trajectory import FullState, Trajectory
 
 TIME_STEP = 1e-3  # s, the most between two samples
-BATCH = 2_000  # samples at a time, about: as many as stay near the processor
+BATCH = 4_000  # samples at a time, about: as many as stay near the processor
 BLOCK = 256  # samples searched for a peak at once
 LEAST_POINTS = 11  # of a piece, its ends included
 WALLS = "distance to the walls"
@@ -109,7 +109,7 @@ class _Quantity:
     unit: str
     sign: int
     row: int
-    # of dense.sampled_rows
+    # of dense.Sampler
     count: int
     # of rows, all of which must keep the same limit
     limit: float
@@ -129,6 +129,7 @@ class _Peak(NamedTuple):
 def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Certificate:
     """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
     stretches, quantities = _stretches(trajectory), list(_quantities(trajectory, limits, space))
+    sampler = Sampler(trajectory.airframe, trajectory.path, trajectory.profile)
     table = np.array([(quantity.row, quantity.count, quantity.sign) for quantity in quantities])
     ends = np.cumsum(stretches.counts)
     bounds = [0, *(1 + np.flatnonzero(np.diff(ends // BATCH))).tolist(), len(ends)]
@@ -136,7 +137,7 @@ def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = No
     values, places = np.full(len(table), -np.inf), np.zeros(len(table))
     for first, last in pairwise(bounds):
         batch = Stretches(*(each[first:last] for each in stretches))
-        sampled_rows(trajectory.airframe, trajectory.path, trajectory.profile, batch, rows)
+        sampler.rows(batch, rows)
         if space is not None:
             _put_distances(rows[dense.POSITION : dense.POSITION + 3, : batch.counts.sum()], space)
         _raise_peaks(values, places, table, rows, rows[dense.PLACE], batch.counts)
@@ -162,7 +163,7 @@ def shares(trajectory: Trajectory, limits: PlanLimits, time: NDArray) -> dict[st
 
 
 def _rows(state: FullState) -> NDArray:
-    """What `sampled_rows` gives, of full states."""
+    """What a Sampler gives, of full states."""
     rows = np.empty((dense.SAMPLED_ROWS, len(state.s)))
     x, y, z = state.thrust_axis.T
     rows[dense.SPEED] = np.linalg.norm(state.velocity, axis=1)

@@ -32,7 +32,7 @@ MOTOR_THRUST = 7
 # N, and the three rows behind
 ROWS = 11
 
-# What `sampled_rows` gives: the first four as norms, SPECIFIC_THRUST and MOTOR_THRUST as above, and
+# What a Sampler's rows are: the first four as norms, SPECIFIC_THRUST and MOTOR_THRUST as above, and
 TILT = 4
 # rad, in place of AXIS_HEIGHT
 POSITION = 11
@@ -105,25 +105,27 @@ def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArra
     return out
 
 
-def sampled_rows(
-    airframe: Airframe, path: Path, profile: SpeedProfile, stretches: Stretches, out: NDArray | None = None
-) -> NDArray:
-    """(SAMPLED_ROWS, N) at the samples of all stretches, one stretch behind the other.
+class Sampler:
+    """Samples of one flight, stretch by stretch; what holds for all of them is made ready once."""
 
-    `out` is where they are written, if given; it may have more columns than are needed.
-    The last sample of a stretch is the last number below its right end, so that it falls on its own side of a break.
-    """
-    if out is None:
-        out = np.empty((SAMPLED_ROWS, int(stretches.counts.sum())))
-    coefficients = path.coefficients
-    if missing := -coefficients.shape[1] % _BLOCK:
-        coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
-        coefficients.setflags(write=False)
-    _along(
-        out, compiled_body(airframe), coefficients, path.origins[stretches.piece], profile.table(),
-        *stretches,
-    )  # fmt: skip
-    return out
+    def __init__(self, airframe: Airframe, path: Path, profile: SpeedProfile) -> None:
+        coefficients = path.coefficients
+        if missing := -coefficients.shape[1] % _BLOCK:
+            coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
+        coefficients.setflags(write=False)  # as a path's are: one type for the compiler
+        self._given = compiled_body(airframe), coefficients, path.origins, profile.table()
+
+    def rows(self, stretches: Stretches, out: NDArray | None = None) -> NDArray:
+        """(SAMPLED_ROWS, N) at the samples of all stretches, one stretch behind the other.
+
+        `out` is where they are written, if given; it may have more columns than are needed.
+        The last sample of a stretch is the last number below its right end, so that it falls on its own side of a
+        break.
+        """
+        if out is None:
+            out = np.empty((SAMPLED_ROWS, int(stretches.counts.sum())))
+        _along(out, *self._given, *stretches)
+        return out
 
 
 def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Callable[..., int]]:
@@ -161,7 +163,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Call
                 lanes = min(WIDTH, _whole(counts[k] - done))
                 for n in range(lanes):
                     s[n] = first_s + (done + n) / last * width if done + n < last else last_s
-                    panel[_X * WIDTH + n] = s[n] - origins[k]
+                    panel[_X * WIDTH + n] = s[n] - origins[piece[k]]
                 _trace(panel, coefficients[piece[k]], lanes)
                 for n in range(lanes):
                     panel[_X * WIDTH + n] = s[n] - nodes[interval[k], 0]

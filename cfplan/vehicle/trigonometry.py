@@ -9,14 +9,14 @@ import math
 import numpy as np
 from numba.extending import register_jitable
 
-_PER_QUARTER = 2.0 / math.pi
-_QUARTER = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
+PER_QUARTER = 2.0 / math.pi
+QUARTER = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 # π/2 in parts, the first two with zeros at their ends, so that a small multiple of them is exact
-_SINE = (
+SINE = (
     -1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04, 2.75573137070700676789e-06,
     -2.50507602534068634195e-08, 1.58969099521155010221e-10,
 )  # fmt: skip
-_COSINE = (
+COSINE = (
     4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015872894767294178e-05, -2.75573143513906633035e-07,
     2.08757232129817482790e-09, -1.13596475577881948265e-11,
 )  # fmt: skip
@@ -72,10 +72,10 @@ def _series(z: float) -> float:
 @register_jitable(forceinline=True)
 def _wave(angle: float, quarters: float) -> float:
     """sin(angle + quarters π/2)."""
-    turns = np.floor(angle * _PER_QUARTER + 0.5)
-    x = ((angle - turns * _QUARTER[0]) - turns * _QUARTER[1]) - turns * _QUARTER[2]
+    turns = np.floor(angle * PER_QUARTER + 0.5)
+    x = ((angle - turns * QUARTER[0]) - turns * QUARTER[1]) - turns * QUARTER[2]
     z = x * x
-    s, c = _SINE, _COSINE
+    s, c = SINE, COSINE
     sine = x + x * z * (s[0] + z * (s[1] + z * (s[2] + z * (s[3] + z * (s[4] + z * s[5])))))
     cosine = 1.0 - 0.5 * z + z * z * (c[0] + z * (c[1] + z * (c[2] + z * (c[3] + z * (c[4] + z * c[5])))))
     quadrant = turns + quarters

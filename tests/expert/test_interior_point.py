@@ -1,11 +1,13 @@
 """The interior point method on problems whose answers others know."""
 
+from dataclasses import replace
+
 import casadi
 import numpy as np
 import pytest
 from scipy.linalg import solveh_banded
 
-from cfplan.expert import banded
+from cfplan.expert import banded, slacks
 from cfplan.expert.interior_point import Search, minimise
 from cfplan.expert.slacks import bounds_of
 
@@ -75,6 +77,50 @@ def test_it_ends_where_another_solver_does(lower, upper, least):
     options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10}}
     best = casadi.nlpsol("ipopt", "ipopt", problem, options)(x0=start, lbg=lower, ubg=upper, lbx=least)
     np.testing.assert_allclose(ended.v, np.array(best["x"]).ravel(), atol=2e-5)
+
+
+def test_a_search_that_takes_whole_steps_at_their_word_saves_looking_and_ends_as_near():
+    class Looks(Valley):
+        count = 0
+
+        def expand(self):
+            super().expand()
+            self.count += 1
+
+    start = np.linspace(0.5, 1.5, 8)
+    near = Search(barrier=1e-3, last_barrier=1e-3, gradient=1e-3, feasibility=1e-3, iterations=300)
+    first, second = Looks(8, -np.inf, 0.5), Looks(8, -np.inf, 0.5)
+    looked = minimise(first, start, near)
+    believed = minimise(second, start, replace(near, left_by_step=1e-3))
+    assert looked.solved
+    assert believed.solved
+    assert second.count < first.count
+    np.testing.assert_allclose(believed.v, looked.v, atol=5e-3)
+
+
+@pytest.mark.parametrize("size", [1, 15, 16, 17, 50])
+def test_the_worst_of_all_slacks_counts_wherever_it_is(size):
+    rng = np.random.default_rng(size)
+    lower, upper = np.where(rng.random(size) < 0.3, -np.inf, -1.0), np.where(rng.random(size) < 0.3, np.inf, 1.0)
+    bounds = bounds_of(lower, upper)
+    for worst in range(size):
+        g, along = rng.uniform(-0.9, 0.9, (2, size))
+        state, step = np.stack([rng.uniform(-0.9, 0.9, size), *rng.uniform(0.1, 1.0, (2, size))]), np.empty((3, size))
+        along[worst] *= 50.0
+        s, low, high = state[0], state[1] * bounds[2], state[2] * bounds[3]
+        state[1], state[2] = low, high
+        active = np.isfinite(lower) | np.isfinite(upper)
+        below, above = np.where(bounds[2], s - lower, 1.0), np.where(bounds[3], upper - s, 1.0)
+        off = max((bounds[2] * abs(low * below - 0.01)).max(), (bounds[3] * abs(high * above - 0.01)).max())
+        assert slacks.errors(g, bounds, state, 0.01) == pytest.approx(((active * abs(g - s)).max(), off))
+        d = active * (g - s + along)
+        dlow, dhigh = bounds[2] * ((0.01 - low * d) / below - low), bounds[3] * ((0.01 + high * d) / above - high)
+        most = max((-bounds[2] * d / below).max(), (bounds[3] * d / above).max())
+        dual = max((-dlow / (low + 1e-300)).max(), (-dhigh / (high + 1e-300)).max())
+        _, share, share_dual = slacks.steps(g, along, bounds, state, np.zeros(size), 0.01, 0.99, step)
+        assert share == pytest.approx(min(1.0, 0.99 / max(most, 1e-30)))
+        assert share_dual == pytest.approx(min(1.0, 0.99 / max(dual, 1e-30)))
+        np.testing.assert_allclose(step, [d, dlow, dhigh], rtol=1e-9, atol=1e-9)
 
 
 def test_bounds_that_contradict_each_other_are_not_called_solved():
