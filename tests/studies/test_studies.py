@@ -74,19 +74,35 @@ def test_a_failing_planner_is_counted_with_its_reason(monkeypatch):
 
 
 def test_an_interrupt_keeps_what_is_measured(monkeypatch):
-    calls = []
+    paths = []
     true = planners.find_planner("minsnap")
 
-    def stopping(*arguments, **options):
-        calls.append(1)
-        if len(calls) > 3:  # warming up, then two paths
+    def stopping(path, *arguments, **options):
+        if path not in paths:
+            paths.append(path)
+        if len(paths) > 3:  # warming up, then two paths
             raise KeyboardInterrupt
-        return true(*arguments, **options)
+        return true(path, *arguments, **options)
 
     monkeypatch.setattr(trials, "find_planner", lambda name: stopping)
     result = bench(paths=5, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=["minsnap"])
     assert result.interrupted
     assert result.rows[0].paths == 2
+
+
+@pytest.mark.parametrize(
+    ("takes", "seconds"), [([0.2], 0.2), ([0.04, 0.01, 0.03, 0.9, 0.02], 0.03), ([0.0499] + 4 * [0.06], 0.06)]
+)
+def test_what_is_short_is_timed_several_times_and_the_median_counts(monkeypatch, takes, seconds):
+    clock, left = [0.0], list(takes)
+
+    def act():
+        clock[0] += left.pop(0)
+        return len(left)
+
+    monkeypatch.setattr(trials.time, "perf_counter", lambda: clock[0])
+    assert trials.timed(act) == (0, pytest.approx(seconds))
+    assert not left
 
 
 def test_feasibility_shares_its_paths_out_and_keeps_failures():
