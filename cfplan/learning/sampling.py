@@ -35,6 +35,8 @@ from cfplan.learning.features import (
 
 LEAST_CERTIFIED = 0.97
 # share of its speed at which a label must be certified to be learned from
+LONGEST = 100.0
+# m; the few longer paths are min-snap's excursions to hundreds of metres, and long flights are chains of windows anyway
 CLOSEST = 0.08
 # m of path between nodes, the closest windows
 WIDEST = 1.05
@@ -120,12 +122,15 @@ def read_material(folder: FilePath) -> Material:
     spec, rows = read_dataset(folder)
     if spec.limits not in LIMIT_SETS:
         raise InputError(f"unknown limit set {spec.limits!r}", where=str(folder), hint="make the dataset again")
-    solved = pa.compute.equal(rows["status"], Status.SOLVED.name)
-    usable = rows.filter(pa.compute.and_(solved, pa.compute.greater_equal(rows["certified_share"], LEAST_CERTIFIED)))
+    usable = rows.filter(
+        (pa.compute.field("status") == Status.SOLVED.name)
+        & (pa.compute.field("certified_share") >= LEAST_CERTIFIED)
+        & (pa.compute.field("length") <= LONGEST)
+    )
     if usable.num_rows < 2:
         raise InputError(
-            f"{usable.num_rows} of {rows.num_rows} rows are usable (solved, and certified at {LEAST_CERTIFIED:.0%} of "
-            "their speed); two are the least",
+            f"{usable.num_rows} of {rows.num_rows} rows are usable (solved, certified at {LEAST_CERTIFIED:.0%} of "
+            f"their speed, and no longer than {LONGEST:g} m); two are the least",
             where=str(folder),
             hint="see `cfplan dataset info`, and make another",
         )

@@ -8,6 +8,7 @@ import pytest
 from cfplan.errors import InputError
 from cfplan.learning.dataset import read_dataset
 from cfplan.learning.features import COLUMNS, REFERENCE
+from cfplan.learning import sampling
 from cfplan.learning.sampling import START_NOISE, draw, read_material
 
 
@@ -81,6 +82,14 @@ def test_noise_moves_paths_by_at_most_epsilon_and_keeps_the_answers(material):
     )  # fmt: skip
     heights = np.abs(clean.inputs[:, :, 2] - moved.inputs[:, :, 2])
     assert 0 < heights.max() <= 0.02  # both ends of a difference moved
+
+
+def test_what_is_longer_than_a_flight_is_not_learned_from(tiny, material, monkeypatch):
+    longest = np.sort(material.labels.length)[-3]
+    monkeypatch.setattr(sampling, "LONGEST", longest)
+    kept = read_material(tiny)
+    assert len(kept.rows) == len(material.rows) - 2
+    assert kept.labels.length.max() == longest
 
 
 def test_a_dataset_without_usable_rows_is_refused(tiny, tmp_path):
