@@ -1,9 +1,10 @@
 """What tests of several packages need, and what becomes of real time on a computer that stands still.
 
 A virtual machine whose host is busy stands still for tenths of seconds, and a flight in real time then ends as it
-should: the vehicle brakes, or preflight refuses. Such a test is repeated, but only where a process that does nothing
-but sleep was late meanwhile: a fault of our own fails at once on a computer that keeps time, and on any in the end.
-A flight that several tests look at is flown once, and anew for a test that is repeated.
+should: the vehicle brakes, or preflight refuses. Such a test is repeated, if possible in a calmer moment, but only
+where a process that does nothing but sleep was late meanwhile: a fault of our own fails at once on a computer that
+keeps time, and on any in the end. A flight that several tests look at is flown once, and anew for a test that is
+repeated.
 """
 
 import time
@@ -17,11 +18,13 @@ from scipy.interpolate import BSpline
 from cfplan.studies.sleeper import Sleeper
 from cfplan.vehicle.profile import SpeedProfile
 
-MOST_REPEATS = 3
+MOST_REPEATS = 5
 RATE = 200.0
 # Hz, of the sleeper's wakings
 STANDSTILL = 0.02
 # s late
+CALM, PATIENCE = 2.0, 30.0
+# s without one, before a test is repeated; and how long that is waited for
 
 
 Result = TypeVar("Result")
@@ -38,6 +41,14 @@ class Standstills:
     def seen(self) -> bool:
         """Whether there was one in what the present attempt looks at."""
         return max(self._sleeper.late(begin=self.since), default=0.0) > STANDSTILL
+
+    def settle(self) -> None:
+        """Wait until there has been none for a while, but not for ever."""
+        end = time.monotonic() + PATIENCE
+        while (now := time.monotonic()) < end:
+            if max(self._sleeper.late(begin=now - CALM), default=0.0) <= STANDSTILL:
+                break
+            time.sleep(CALM / 4)
 
     def close(self) -> None:
         self._sleeper.__exit__()
@@ -58,8 +69,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    if _standstills in item.config.stash:
-        item.config.stash[_standstills].since = time.monotonic()
+    watch = item.config.stash.get(_standstills, None)
+    if watch is not None:
+        if _is_repeated(item):
+            watch.settle()
+        watch.since = time.monotonic()
+
+
+def _is_repeated(item: pytest.Item) -> bool:
+    return getattr(item, "execution_count", 1) > 1
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
@@ -80,7 +98,7 @@ def once(request, kept) -> Callable[[Callable[[], Result]], Result]:
 
     def do(act: Callable[[], Result]) -> Result:
         name = act.__qualname__
-        if name not in kept or request.node.execution_count > 1:
+        if name not in kept or _is_repeated(request.node):
             begin = time.monotonic()
             kept[name] = begin, act()
         standstills.since, result = kept[name]

@@ -112,7 +112,7 @@ class Sampler:
         coefficients = path.coefficients
         if missing := -coefficients.shape[1] % _BLOCK:
             coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
-        coefficients.setflags(write=False)  # as a path's are: one type for the compiler
+            coefficients.setflags(write=False)  # as a path's are: one type for the compiler
         self._given = compiled_body(airframe), coefficients, path.origins, profile.table()
 
     def rows(self, stretches: Stretches, out: NDArray | None = None) -> NDArray:
