@@ -6,9 +6,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from cfplan.errors import InputError
+from cfplan.learning import sampling
 from cfplan.learning.dataset import read_dataset
 from cfplan.learning.features import COLUMNS, REFERENCE
-from cfplan.learning import sampling
 from cfplan.learning.sampling import START_NOISE, draw, read_material
 
 
