@@ -151,6 +151,26 @@ def test_compiled_code_and_virtual_machine_agree():
     np.testing.assert_allclose(profiles[0].h, profiles[1].h, rtol=1e-5)
 
 
+@pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("turned", [-40.0, -3.2, 0.0, 0.8, 1.6, 3.1, 4.7, 900.0])
+@pytest.mark.parametrize("free_yaw", [False, True])
+def test_compiled_code_and_virtual_machine_agree_at_each_point_whichever_way_it_looks(free_yaw, turned):
+    problem, _ = posed(Shape(24, free_yaw, turning_limited=True))
+    points = len(problem.layout.interval)
+    problem.p[: points * stage.POINT_DATA].reshape(points, -1)[:, 14] += turned
+    problem.table[:, 1:] += turned
+    results = []
+    for backend in Backend:
+        splines = SplineProblem(problem, backend)
+        cost = splines.values(splines.v_of(problem.table))
+        splines.multipliers[:], splines.stiffness[:] = np.random.default_rng(1).uniform(0.0, 1.0, (2, len(splines.g)))
+        splines.expand()
+        along = splines.along(np.random.default_rng(2).normal(size=len(splines.gradient)))
+        results.append([np.array(cost), splines.g.copy(), splines.gradient, splines.matrix, along.copy()])
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * abs(other).max())
+
+
 def test_without_a_compiler_the_virtual_machine_plans(monkeypatch, tmp_path):
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "empty"))
     monkeypatch.setattr(shutil, "which", lambda *_: None)
