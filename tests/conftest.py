@@ -18,7 +18,7 @@ from scipy.interpolate import BSpline
 from cfplan.studies.sleeper import Sleeper
 from cfplan.vehicle.profile import SpeedProfile
 
-MOST_REPEATS = 5
+MOST_REPEATS = 3
 RATE = 200.0
 # Hz, of the sleeper's wakings
 STANDSTILL = 0.02

@@ -116,7 +116,7 @@ def tightened(problem: Problem, excess: Excess, at_points: NDArray) -> Problem:
     layout = problem.layout
     upper, lower = HASTE * spread(excess.upper), HASTE * spread(excess.lower)
     lbg, ubg, ubx = problem.lbg.copy(), problem.ubg.copy(), problem.ubx.copy()
-    row, interval = layout.row, layout.row_interval
+    row, interval = layout.row, layout.interval[layout.point]
     least = np.full(excess.upper.shape, np.inf)
     most = -least
     np.minimum.at(least, (interval, row), at_points)
@@ -226,13 +226,14 @@ def _constraint_bounds(
     layout: Layout, path: Path, limits: PlanLimits, unit: float, step: float, margin: NDArray, ends: Ends
 ) -> tuple[NDArray, NDArray]:
     lbg, ubg = np.zeros(layout.constraints), np.zeros(layout.constraints)
-    tighter = (2 * margin)[layout.row_interval]  # most rows are squares
+    row = layout.row
+    tighter = 2 * margin[layout.interval[layout.point]]  # most rows are squares
     # What a boundary state alone decides was checked before, and may be at its limit.
     for boundary, point in ((ends.start, 0), (ends.end, len(layout.interval) - 1)):
         if boundary:
-            tighter[(layout.point == point) & ~np.isin(layout.row, stage.JUMPING)] = -0.1
-    lbg[layout.point_rows] = layout.lower + tighter
-    ubg[layout.point_rows] = layout.upper - tighter
+            tighter[(layout.point == point) & ~np.isin(row, stage.JUMPING)] = -0.1
+    lbg[layout.point_rows] = stage.LOWER[row] + tighter
+    ubg[layout.point_rows] = stage.UPPER[row] - tighter
     s = (np.arange(layout.shape.nodes)[:, None] + np.array(layout.shape.speed_places)) * step
     lbg[layout.speed_rows] = FLOOR
     ubg[layout.speed_rows] = _highest(path, limits, s, margin[:, None], unit)

@@ -60,12 +60,6 @@ class Layout:
     # (G,) which of the rows that is
     point: NDArray = field(init=False)
     # (G,) and at which point
-    row_interval: NDArray = field(init=False)
-    # (G,) and in which interval
-    lower: NDArray = field(init=False)
-    # (G,) what bounds it from below
-    upper: NDArray = field(init=False)
-    # (G,) and from above
     dynamics_rows: NDArray = field(init=False)
     # (N, nx) in the constraint vector
     point_rows: NDArray = field(init=False)
@@ -104,12 +98,10 @@ class Layout:
             speed_rows.append(np.arange(row, row + len(shape.speed_places)))
             row += len(shape.speed_places)
             counts.append(row - start)
-        point, of_rows = np.divmod(selected, stage.ROWS)
         for name, value in (
             ("interval", np.array(interval)), ("place", np.array(place)), ("weight", np.array(weight)),
-            ("selected", np.array(selected)), ("row", of_rows), ("point", point),
-            ("row_interval", np.array(interval)[point]), ("lower", stage.LOWER[of_rows]),
-            ("upper", stage.UPPER[of_rows]), ("dynamics_rows", np.array(dynamics_rows)),
+            ("selected", np.array(selected)), ("row", np.array(selected) % stage.ROWS),
+            ("point", np.array(selected) // stage.ROWS), ("dynamics_rows", np.array(dynamics_rows)),
             ("point_rows", np.array(point_rows)), ("speed_rows", np.array(speed_rows)), ("counts", (*counts, 0)),
         ):  # fmt: skip
             object.__setattr__(self, name, value)

@@ -1,8 +1,7 @@
 """All planners on the same paths in one run: time to plan, time of flight, the certificate's word, the proven bound.
 
 Every path is given to every planner before the next path is drawn, so that what else the machine does meets all alike.
-Each planner first solves one path that does not count: compiling and building are no planning time. What takes less
-than 50 ms is done five times, and the median counts.
+Each planner first solves one path that does not count: compiling and building are no planning time.
 """
 
 import time

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,10 +25,6 @@ WAYPOINTS = (3, 6)
 BAD_PATH = "bad path"
 REFINED = ", refined"
 # behind a planner's name: its profile is refined where it does not pass, not just slowed
-SHORT, REPEATS = 0.05, 5
-# s; what takes less is done so often, and the median counts: once would tell what another planner left in the caches
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,16 +132,19 @@ def run_trial(
     name: str, entrant: Entrant, path: Path, seed: int, chosen: LimitSet, *, nodes: int, yaw: YawMode, bound: float
 ) -> Trial:
     """Plan, certify, repair. Whatever fails is a trial with a reason."""
-    solution, plan_seconds = timed(lambda: entrant.plan(path, chosen.airframe, chosen.limits, nodes=nodes, yaw=yaw))
+    begun = time.perf_counter()
+    solution = entrant.plan(path, chosen.airframe, chosen.limits, nodes=nodes, yaw=yaw)
+    plan_seconds = time.perf_counter() - begun
     solve_seconds = float(solution.stats.get("solve_seconds", np.nan))
     values = {"plan_seconds": plan_seconds, "solve_seconds": solve_seconds, "bound": bound}
-    profile = solution.profile
-    if profile is None:
+    if solution.profile is None:
         return failed_trial(name, seed, solution.status.name, solution.reason or str(solution.status), **values)
     try:
-        planned = Trajectory(path, profile, chosen.airframe)
+        planned = Trajectory(path, solution.profile, chosen.airframe)
         certificate = certify(planned, chosen.limits)
-        repaired, repair_seconds = timed(lambda: entrant.mend(path, profile, chosen.airframe, chosen.limits))
+        begun = time.perf_counter()
+        repaired = entrant.mend(path, solution.profile, chosen.airframe, chosen.limits)
+        repair_seconds = time.perf_counter() - begun
     except CfplanError as error:
         return failed_trial(name, seed, Status.SOLVED.name, f"not certified: {error}", **values)
     return Trial(
@@ -154,16 +153,6 @@ def run_trial(
         certified_time=repaired.trajectory.duration,
         slowed_to=repaired.share, **values,
     )  # fmt: skip
-
-
-def timed(act: Callable[[], Result]) -> tuple[Result, float]:
-    """What an act comes to, and how long it takes, s: at its first time, or the median of REPEATS where it is SHORT."""
-    seconds: list[float] = []
-    while len(seconds) < (REPEATS if not seconds or seconds[0] < SHORT else 1):
-        begun = time.perf_counter()
-        result = act()
-        seconds.append(time.perf_counter() - begun)
-    return result, float(np.median(seconds))
 
 
 def failed_trial(

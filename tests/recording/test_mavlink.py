@@ -229,7 +229,6 @@ def test_a_ground_station_learns_where_the_vehicle_is(station, link):
     assert (common.MAV_SEVERITY_WARNING, "the battery is low") in texts
 
 
-@pytest.mark.integration
 def test_each_kind_comes_at_its_rate(station, link):
     hover(link, time.monotonic())
     link.show(SetpointSent(0.0, 0.0, 5, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, (0, 0, 0, 1.0), (0.0,) * 3))

@@ -90,21 +90,6 @@ def test_an_interrupt_keeps_what_is_measured(monkeypatch):
     assert result.rows[0].paths == 2
 
 
-@pytest.mark.parametrize(
-    ("takes", "seconds"), [([0.2], 0.2), ([0.04, 0.01, 0.03, 0.9, 0.02], 0.03), ([0.0499] + 4 * [0.06], 0.06)]
-)
-def test_what_is_short_is_timed_several_times_and_the_median_counts(monkeypatch, takes, seconds):
-    clock, left = [0.0], list(takes)
-
-    def act():
-        clock[0] += left.pop(0)
-        return len(left)
-
-    monkeypatch.setattr(trials.time, "perf_counter", lambda: clock[0])
-    assert trials.timed(act) == (0, pytest.approx(seconds))
-    assert not left
-
-
 def test_feasibility_shares_its_paths_out_and_keeps_failures():
     result = feasibility.dense_feasibility(
         paths=2, boxes=["4.5x8x2"], limit_sets=["hardware", "simulation"], planner="convex", nodes=60
