@@ -4,6 +4,9 @@ import math
 
 from numba import njit
 
+REGULARISED, REGULARISED_MOST = 1e-4, 1e14
+# added to a diagonal where it must, at first and at most
+
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def factorise(matrix, added, factor):
@@ -45,3 +48,19 @@ def solve(factor, x):
         x[r] = value
         for d in range(1, min(width - 1, r) + 1):
             x[r - d] -= factor[r, d] * value
+
+
+@njit(cache=True, error_model="numpy")
+def solve_regularised(matrix, regularised, factor, x):
+    """Solve for the right side x, in place, with as much added to the diagonal as makes the matrix positive definite.
+
+    Gives what was added; `regularised` is what that was the last time. Where nothing helps x becomes NaN.
+    """
+    added = 0.0
+    while not factorise(matrix, added, factor):
+        added = 8.0 * added if added > 0.0 else max(REGULARISED, regularised / 3.0)
+        if added > REGULARISED_MOST:
+            x[:] = math.nan
+            return added
+    solve(factor, x)
+    return added

@@ -31,9 +31,6 @@ FILTER = 1e-5
 SWITCH_COST, SWITCH_FEASIBILITY = 2.3, 1.1
 ARMIJO = 1e-4
 HALVINGS = 14
-REGULARISED = 1e-4
-# added to the diagonal where it must, at first
-REGULARISED_MOST = 1e14
 
 
 class Functions(Protocol):
@@ -45,12 +42,10 @@ class Functions(Protocol):
     # g begins with so many rows of as many constraints each
     g: NDArray
     # (m,) by values()
-    multipliers: NDArray
-    # (m,) y, for expand()
-    stiffness: NDArray
-    # (m,) Σ, for expand()
-    gradient: NDArray
-    # (size,) of f, by expand()
+    pulls: NDArray
+    # (4, m) slacks.PULLS, for expand()
+    gradients: NDArray
+    # (4, size) of f, and J' times each of the pulls but the first; by expand()
     matrix: NDArray
     # (size, band + 1) the Hessian of f + y·g, plus J'ΣJ, see banded; by expand()
 
@@ -58,13 +53,10 @@ class Functions(Protocol):
         """f; and g."""
 
     def expand(self) -> None:
-        """Gradient and matrix, around the last v."""
-
-    def transposed(self, w: NDArray) -> NDArray:
-        """(size,) J'w, J of the last expand()."""
+        """Gradients and matrix, around the last v."""
 
     def along(self, dv: NDArray) -> NDArray:
-        """(m,) J dv, likewise. Overwritten by the next call."""
+        """(m,) J dv, J of the last expand(). Overwritten by the next call."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,43 +89,40 @@ class Ended(NamedTuple):
 def minimise(functions: Functions, v: NDArray, search: Search) -> Ended:
     """Search from v, where the functions must be defined. They are left at the end of the search."""
     barrier, bounds, rows = search.barrier, functions.bounds, functions.rows
-    g, multipliers, stiffness = functions.g, functions.multipliers, functions.stiffness
+    g, pulls = functions.g, functions.pulls
+    gradient, by_multipliers, by_walls, by_missing = functions.gradients
     state, step = np.empty((3, len(g))), np.zeros((3, len(g)))
-    force, pull, factor = np.empty(len(g)), np.empty(len(g)), np.empty_like(functions.matrix)
+    factor = np.empty_like(functions.matrix)
     cost = functions.values(v)
-    slacks.first(g, bounds, barrier, search.push, state, multipliers, stiffness)
+    slacks.first(g, bounds, barrier, search.push, state, pulls)
+    errors = slacks.errors(g, bounds, state, barrier)
     infeasible, walls = slacks.standing(g, bounds, state, step, 0.0, barrier, rows)
     most_infeasible, regularised = 1e4 * max(1.0, infeasible), 0.0
     filtered: list[tuple[float, float]] = []
     for iteration in range(search.iterations):
         functions.expand()
-        off_gradient = float(np.abs(functions.gradient + functions.transposed(multipliers)).max())
+        off_gradient = float(np.abs(gradient + by_multipliers).max())
         if not math.isfinite(infeasible + off_gradient + cost):
             return Ended(v, False, iteration, "met what is not a number")
         lowered = False
-        while True:
-            if _error(g, bounds, state, barrier, off_gradient, search) > BARRIER_SOLVED * barrier:
-                break
+        while _error(errors, off_gradient, search) <= BARRIER_SOLVED * barrier:
             if barrier <= search.last_barrier:
                 return Ended(v, True, iteration, f"solved in {iteration} iterations")
             barrier = max(search.last_barrier, min(BARRIER_FACTOR * barrier, barrier**BARRIER_POWER))
+            errors = slacks.errors(g, bounds, state, barrier)
             lowered = True
         if lowered:
             filtered.clear()
             infeasible, walls = slacks.standing(g, bounds, state, step, 0.0, barrier, rows)
 
-        slacks.forces(g, bounds, state, stiffness, barrier, force, pull)
-        dv = -functions.gradient - functions.transposed(pull)
-        added = _factorise(functions.matrix, regularised, factor)
-        if added > REGULARISED_MOST:
-            return Ended(v, False, iteration, "no direction to go")
+        dv = -(gradient + barrier * by_walls + by_missing)
+        added = banded.solve_regularised(functions.matrix, regularised, factor, dv)
         regularised = added if added > 0.0 else regularised / 3.0
-        banded.solve(factor, dv)
-        slope = float(functions.gradient @ dv)
+        slope = float(gradient @ dv)
         if not math.isfinite(slope):
             return Ended(v, False, iteration, "no direction to go")
         of_walls, share, share_dual = slacks.steps(
-            g, functions.along(dv), bounds, state, force, barrier, max(BOUNDARY, 1 - barrier), step
+            g, functions.along(dv), bounds, state, barrier, max(BOUNDARY, 1 - barrier), step
         )
         slope += of_walls
         merit = cost + walls
@@ -152,32 +141,22 @@ def minimise(functions: Functions, v: NDArray, search: Search) -> Ended:
         if verdict == "widens":
             filtered.append(((1 - FILTER) * infeasible, merit - FILTER * infeasible))
         v, cost, infeasible = there, cost_there, infeasible_there
-        slacks.advance(bounds, state, step, share, share_dual, barrier, multipliers, stiffness)
+        errors = slacks.advance(g, bounds, state, step, share, share_dual, barrier, pulls)
         if search.left_by_step is not None and share == share_dual == 1.0 and barrier <= search.last_barrier:
             left = search.left_by_step * off_gradient
-            if _error(g, bounds, state, barrier, left, search) <= BARRIER_SOLVED * barrier:
+            if _error(errors, left, search) <= BARRIER_SOLVED * barrier:
                 return Ended(v, True, iteration + 1, f"solved in {iteration + 1} iterations")
     return Ended(v, False, search.iterations, f"not solved in {search.iterations} iterations")
 
 
-def _error(g: NDArray, bounds: NDArray, state: NDArray, barrier: float, off_gradient: float, search: Search) -> float:
+def _error(errors: tuple[float, float], off_gradient: float, search: Search) -> float:
     """How far this is from the barrier's solution, in units of the barrier."""
-    off_constraints, off_complementary = slacks.errors(g, bounds, state, barrier)
-    return float(
-        max(
-            off_constraints / search.feasibility * search.last_barrier,
-            off_gradient / search.gradient * search.last_barrier,
-            off_complementary,
-        )
+    off_constraints, off_complementary = errors
+    return max(
+        off_constraints / search.feasibility * search.last_barrier,
+        off_gradient / search.gradient * search.last_barrier,
+        off_complementary,
     )
-
-
-def _factorise(matrix: NDArray, regularised: float, factor: NDArray) -> float:
-    """What had to be added to the diagonal, more than REGULARISED_MOST where nothing helps."""
-    added = 0.0
-    while added <= REGULARISED_MOST and not banded.factorise(matrix, added, factor):
-        added = 8.0 * added or max(REGULARISED, regularised / 3.0)
-    return added
 
 
 def _judge(

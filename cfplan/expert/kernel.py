@@ -18,7 +18,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.expert import stage
+from cfplan.expert import slacks, stage
 from cfplan.expert.compiled import Backend, shared_library
 from cfplan.vehicle import airframe, flatness, trigonometry
 
@@ -78,21 +78,21 @@ def point_kernels(free_yaw: bool) -> tuple[casadi.Function, casadi.Function]:
     # Differentiated by what holds at the point itself, which is sparser, and led to the coefficients from there.
     here = casadi.SX.sym("here", w.numel())
     rows, penalty = of_z(here, _at_left_end(inputs[1]), *inputs[2:])
-    multipliers, stiffness = casadi.SX.sym("multipliers", stage.ROWS), casadi.SX.sym("stiffness", stage.ROWS)
+    pulls = [casadi.SX.sym(name, stage.ROWS) for name in slacks.PULLS]
+    stiffness, multipliers = pulls[:2]
     jacobian = casadi.jacobian(rows, here)
+    gradients = casadi.horzcat(casadi.gradient(penalty, here), casadi.mtimes(jacobian.T, casadi.horzcat(*pulls[1:])))
     hessian = casadi.jacobian(casadi.gradient(penalty + casadi.dot(multipliers, rows), here), here)
     hessian += casadi.mtimes(jacobian.T, casadi.repmat(stiffness, 1, w.numel()) * jacobian)
+    hessian = casadi.tril2symm(casadi.tril(hessian))  # what lies above is not computed
     by_here = casadi.Function(
-        "by_here", [here, *inputs[1:], multipliers, stiffness],
-        [rows, penalty, jacobian, casadi.gradient(penalty, here), hessian],
+        "by_here", [here, *inputs[1:], *pulls], [rows, penalty, jacobian, gradients, hessian]
     )  # fmt: skip
     led = casadi.jacobian(casadi.vertcat(*_local(z, free_yaw, place)), z)
     led = casadi.mtimes(led, casadi.DM(_spline(free_yaw)))
-    rows, penalty, jacobian, gradient, hessian = by_here(
-        casadi.mtimes(led, w), *inputs[1:], multipliers, stiffness
-    )  # fmt: skip
+    rows, penalty, jacobian, gradients, hessian = by_here(casadi.mtimes(led, w), *inputs[1:], *pulls)
     inputs[0] = w
-    jacobian, gradient = casadi.mtimes(jacobian, led), casadi.mtimes(led.T, gradient)
+    jacobian, gradients = casadi.mtimes(jacobian, led), casadi.mtimes(led.T, gradients)
     hessian = casadi.mtimes(led.T, casadi.mtimes(hessian, led))
     size = range(w.numel())
     lower = casadi.vertcat(*(hessian[i, j] for j in size for i in size if i >= j))
@@ -105,8 +105,8 @@ def point_kernels(free_yaw: bool) -> tuple[casadi.Function, casadi.Function]:
         function("values", inputs, [rows, penalty]),
         function(
             "derivatives",
-            [*inputs, multipliers, stiffness],
-            [rows, casadi.vec(jacobian), gradient, lower],
+            [*inputs, *pulls],
+            [casadi.vec(jacobian), casadi.vec(gradients), lower],
         ),
     )
 
@@ -221,10 +221,8 @@ def _c_function(f: casadi.Function) -> str:
 @lru_cache(maxsize=1)
 def machine_code() -> FilePath | None:
     """The compiled kernels, or None where that is not possible."""
-    files = [
-        FilePath(str(file))
-        for file in (__file__, stage.__file__, flatness.__file__, airframe.__file__, trigonometry.__file__)
-    ]
+    modules = (slacks, stage, flatness, airframe, trigonometry)
+    files = [FilePath(__file__), *(FilePath(str(module.__file__)) for module in modules)]
     return shared_library("kernels", files, source)
 
 
@@ -290,35 +288,30 @@ class Points:
         k, points = coefficients(free_yaw), data.shape[1]
         self.coefficients = np.ones((k, points))
         # to read
-        self.multipliers = np.zeros(stage.ROWS * points + spare)
-        # to read, row by row; differentiate() alone needs them
-        self.stiffness = np.zeros(stage.ROWS * points + spare)
-        # likewise
+        self.pulls = np.zeros((len(slacks.PULLS), stage.ROWS * points + spare))
+        # to read, each row by row; differentiate() alone needs them
         self.rows = np.zeros(stage.ROWS * points + spare)
-        # row by row
+        # row by row; by evaluate() alone
         self.penalty = np.empty((1, points))
-        # by evaluate() alone
+        # likewise
         self.jacobian = np.empty((stage.ROWS * k, points))
         # all rows by the first coefficient first
-        self.gradient = np.empty((k, points))
-        # of the penalty
+        self.gradients = np.empty((len(slacks.PULLS) * k, points))
+        # of the penalty, and of rows · each of the pulls but the first
         self.hessian = np.empty((k * (k + 1) // 2, points))
         # of penalty + multipliers · rows, plus Σ stiffness · (row of the Jacobian)² as an outer product: the lower
         # triangle, column by column
         given = [np.ascontiguousarray(a, dtype=float) for a in (data, common, weights)]
-        rows, multipliers, stiffness = (
-            array[: stage.ROWS * points].reshape(stage.ROWS, points)
-            for array in (self.rows, self.multipliers, self.stiffness)
-        )
-        self._reads = [self.coefficients, *given, multipliers, stiffness]  # kept, as C has their addresses
+        rows, *pulls = (array[: stage.ROWS * points].reshape(stage.ROWS, points) for array in (self.rows, *self.pulls))
+        self._reads = [self.coefficients, *given, *pulls]  # kept, as C has their addresses
         values, derivatives = _functions(free_yaw, points, chosen)
         self._evaluate = values(self._reads[:4], [rows, self.penalty])
-        self._differentiate = derivatives(self._reads, [rows, self.jacobian, self.gradient, self.hessian])
+        self._differentiate = derivatives(self._reads, [self.jacobian, self.gradients, self.hessian])
 
     def evaluate(self) -> None:
         """Rows and penalty."""
         self._evaluate()
 
     def differentiate(self) -> None:
-        """Rows, their Jacobian, the penalty's gradient, and the Hessian."""
+        """The rows' Jacobian, gradients, and the Hessian."""
         self._differentiate()

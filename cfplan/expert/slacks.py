@@ -1,8 +1,8 @@
 """Slacks of constraints between bounds, the multipliers of those bounds, and the barrier that keeps slacks inside.
 
-Arrays of (m,) lie together as rows: BOUNDS of what is given, STATE of what a search changes, and a step of it. A bound
-that is not there lies far away and has no barrier, so that all constraints go through the same arithmetic, several at
-a time.
+Arrays of (m,) lie together as rows: bounds, a state that a search changes, a step of it, and what constraints then pull
+with (PULLS). A bound that is not there lies far away and has no barrier, so that all constraints go through the same
+arithmetic, several at a time.
 """
 
 import math
@@ -12,6 +12,8 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+PULLS = ("stiffness", "multiplier", "wall", "missing")
+# of each constraint: Σ of its slack; y; the slope that a barrier of 1 has there; and Σ times what it is off its slack
 FAR = 1e20
 COMPLEMENTARY = 1e10
 # how far a multiplier may be from what the barrier makes of its slack, as a factor
@@ -32,20 +34,22 @@ def bounds_of(lower: NDArray, upper: NDArray) -> NDArray:
 
 
 @njit(cache=True, error_model="numpy")
-def first(g, bounds, barrier, push, state, multipliers, stiffness):
+def first(g, bounds, barrier, push, state, pulls):
     """Slacks where the constraints are, but inside by `push` of the span between bounds at least; multipliers that the
-    barrier makes of them.
+    barrier makes of them. Fills in the pulls too.
 
-    Fills in the multipliers of the constraints and the stiffness of their slacks too, as advance() does. Slacks that
-    start next to a bound would hold back every step: better to start a little off the constraints.
+    Slacks that start next to a bound would hold back every step: better to start a little off the constraints.
     """
     for j in range(len(g)):
-        lower, upper = bounds[0, j], bounds[1, j]
+        lower, upper, active = bounds[0, j], bounds[1, j], bounds[4, j]
         room = push * min(upper - lower, 2.0)
         s = min(max(g[j], lower + room), upper - room)
-        low, high = bounds[2, j] * barrier / (s - lower), bounds[3, j] * barrier / (upper - s)
+        by_below, by_above = bounds[2, j] / (s - lower), bounds[3, j] / (upper - s)
+        low, high = barrier * by_below, barrier * by_above
+        stiffness = low * by_below + high * by_above
         state[0, j], state[1, j], state[2, j] = s, low, high
-        multipliers[j], stiffness[j] = high - low, low / (s - lower) + high / (upper - s)
+        pulls[0, j], pulls[1, j] = stiffness, high - low
+        pulls[2, j], pulls[3, j] = by_above - by_below, active * stiffness * (g[j] - s)
 
 
 @register_jitable
@@ -79,17 +83,7 @@ def errors(g, bounds, state, barrier):
 
 
 @njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def forces(g, bounds, state, stiffness, barrier, force, pull):
-    """The barrier's gradient by slack; and what constraints add to the right side of the Newton step, by constraint."""
-    lower, upper, has_low, has_high, active = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
-    s = state[0]
-    for j in range(len(s)):
-        force[j] = barrier * (has_high[j] / (upper[j] - s[j]) - has_low[j] / (s[j] - lower[j]))
-        pull[j] = force[j] + active[j] * stiffness[j] * (g[j] - s[j])
-
-
-@njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def steps(g, along, bounds, state, force, barrier, most, step):
+def steps(g, along, bounds, state, barrier, most, step):
     """Fill in the step, where g changes by `along`.
 
     Gives (slope of the barrier along it, longest share of it that leaves (1 - most) of the room, the same for
@@ -100,17 +94,22 @@ def steps(g, along, bounds, state, force, barrier, most, step):
     ds, dlow, dhigh = step[0], step[1], step[2]
     slope, fastest, fastest_dual = 0.0, np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
-        by_below, by_above = 1.0 / (s[j] - lower[j]), 1.0 / (upper[j] - s[j])
+        below, above = s[j] - lower[j], upper[j] - s[j]
+        inverse = 1.0 / (below * above)  # divisions take longest
+        by_below, by_above = above * inverse, below * inverse
         d = active[j] * (g[j] - s[j] + along[j])
         ds[j] = d
-        slope += force[j] * d
+        slope += (has_high[j] * by_above - has_low[j] * by_below) * d
         fastest[j] = d * by_above if d > 0.0 else -d * by_below
         dl = (has_low[j] * barrier - low[j] * d) * by_below - low[j]
         dh = (has_high[j] * barrier + high[j] * d) * by_above - high[j]
         dlow[j], dhigh[j] = dl, dh
-        of_low, of_high = -dl / (low[j] + 1e-300), -dh / (high[j] + 1e-300)
+        its_low, its_high = low[j] + (1.0 - has_low[j]), high[j] + (1.0 - has_high[j])
+        inverse = 1.0 / (its_low * its_high)
+        of_low, of_high = -dl * its_high * inverse, -dh * its_low * inverse
         fastest_dual[j] = of_low if of_low > of_high else of_high
-    return slope, min(1.0, most / max(_largest(fastest), 1e-30)), min(1.0, most / max(_largest(fastest_dual), 1e-30))
+    share, share_dual = most / max(_largest(fastest), 1e-30), most / max(_largest(fastest_dual), 1e-30)
+    return barrier * slope, min(1.0, share), min(1.0, share_dual)
 
 
 @njit(cache=True, error_model="numpy", fastmath=_SUMS)
@@ -143,17 +142,32 @@ def standing(g, bounds, state, step, share, barrier, rows):
 
 
 @njit(cache=True, error_model="numpy", fastmath=_SUMS)
-def advance(bounds, state, step, share, share_dual, barrier, multipliers, stiffness):
-    """Take the step, in place; multipliers stay within a factor of what the barrier makes of their slacks."""
-    lower, upper, has_low, has_high = bounds[0], bounds[1], bounds[2], bounds[3]
+def advance(g, bounds, state, step, share, share_dual, barrier, pulls):
+    """Take the step, in place, and fill in the pulls where g is now; gives the errors there.
+
+    Multipliers stay within a factor of what the barrier makes of their slacks.
+    """
+    lower, upper, has_low, has_high, active = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
     s, low, high = state[0], state[1], state[2]
     ds, dlow, dhigh = step[0], step[1], step[2]
+    stiffness, multiplier, wall, missing = pulls[0], pulls[1], pulls[2], pulls[3]
+    infeasible, off = np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
         there = s[j] + share * ds[j]
-        by_below, by_above = 1.0 / (there - lower[j]), 1.0 / (upper[j] - there)
-        middle = has_low[j] * barrier * by_below
+        below, above = there - lower[j], upper[j] - there
+        inverse = 1.0 / (below * above)
+        by_below, by_above = has_low[j] * above * inverse, has_high[j] * below * inverse
+        middle = barrier * by_below
         of_low = min(max(low[j] + share_dual * dlow[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
-        middle = has_high[j] * barrier * by_above
+        middle = barrier * by_above
         of_high = min(max(high[j] + share_dual * dhigh[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
         s[j], low[j], high[j] = there, of_low, of_high
-        multipliers[j], stiffness[j] = of_high - of_low, of_low * by_below + of_high * by_above
+        by_slack = of_low * by_below + of_high * by_above
+        missed = active[j] * (g[j] - there)
+        stiffness[j], multiplier[j] = by_slack, of_high - of_low
+        wall[j], missing[j] = by_above - by_below, by_slack * missed
+        infeasible[j] = abs(missed)
+        below = abs(of_low * (there - lower[j]) - has_low[j] * barrier)
+        above = abs(of_high * (upper[j] - there) - has_high[j] * barrier)
+        off[j] = below if below > above else above
+    return _largest(infeasible), _largest(off)

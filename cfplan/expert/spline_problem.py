@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.expert import stage
@@ -20,7 +21,7 @@ from cfplan.expert.compiled import Backend
 from cfplan.expert.kernel import H_SPLINE, LANES, YAW_SPLINE, Points, coefficients
 from cfplan.expert.problem import FLOOR, Problem
 from cfplan.expert.program import OBJECTIVE_SCALE, Layout
-from cfplan.expert.slacks import bounds_of
+from cfplan.expert.slacks import PULLS, bounds_of
 
 
 def h_weights(place: NDArray) -> NDArray:
@@ -47,17 +48,16 @@ class SplineProblem:
         self._local = self._fixed.ravel()[it.coefficients]
 
         given = problem.p[: points * stage.POINT_DATA].reshape(points, stage.POINT_DATA)
-        data = np.empty((stage.POINT_DATA, len(it.interval)))
-        data[:, :points], data[:, points:] = given.T, given[-1:].T
+        data = given.T[:, it.order]
         data[13, points:] = 0.0  # what is there to fill the lanes costs nothing
         common = problem.p[-3 - stage.COMMON_DATA : -3]
         weights = OBJECTIVE_SCALE * problem.p[-3:]
-        self._points = Points(layout.shape.free_yaw, data, common, weights, backend, spare=len(it.linear))
+        self._points = Points(layout.shape.free_yaw, data, common, weights, backend, spare=len(it.linear_interval))
         self._scale = OBJECTIVE_SCALE / math.sqrt(common[14])
         self.rows = stage.ROWS
-        self.g, self.multipliers, self.stiffness = self._points.rows, self._points.multipliers, self._points.stiffness
+        self.g, self.pulls = self._points.rows, self._points.pulls
         self.bounds = self._bounds(problem)
-        self.gradient = np.empty(it.size)
+        self.gradients = np.empty((len(PULLS), it.size))
         self.matrix = np.empty((it.size, it.band + 1))
         self._along = np.empty(len(self.g))
 
@@ -95,30 +95,26 @@ class SplineProblem:
     def values(self, v: NDArray) -> float:
         """f; and g."""
         at, it = self._points, self._structure
-        _place(v, it.slots, it.interval, self._local, at.coefficients)
+        time = _place(
+            v, it.slots, it.interval, self._local, at.coefficients, it.linear, it.linear_interval, it.of_yaw, self.g,
+            _GAUSS, stage.GAUSS_WEIGHTS,
+        )  # fmt: skip
         at.evaluate()
-        _linear_values(it.linear, it.linear_interval, self._local, self.g)
-        return float(self._scale * _time(self._local, _GAUSS, stage.GAUSS_WEIGHTS) + at.penalty.sum())
+        return float(self._scale * time + at.penalty.sum())
 
     def expand(self) -> None:
-        """Gradient and matrix, around the last v."""
+        """Gradients and matrix, around the last v."""
         at, it = self._points, self._structure
         at.differentiate()
         _assemble(
-            at.gradient, at.hessian, it.begins, it.slots, it.entries, it.linear, it.linear_interval, self.stiffness,
-            self._local, self._scale, _GAUSS, stage.GAUSS_WEIGHTS, self.gradient, self.matrix,
+            at.gradients, at.hessian, it.interval, it.slots, it.entries, it.linear, it.linear_interval, it.of_yaw,
+            self.pulls, self._local, self._scale, _GAUSS, stage.GAUSS_WEIGHTS, self.gradients, self.matrix,
         )  # fmt: skip
 
-    def transposed(self, w: NDArray) -> NDArray:
-        """(size,) J'w, J of the last expand()."""
-        it, result = self._structure, np.zeros(len(self.gradient))
-        _transposed(self._points.jacobian, it.begins, it.slots, it.linear, it.linear_interval, w, result)
-        return result
-
     def along(self, dv: NDArray) -> NDArray:
-        """(m,) J dv, likewise. Overwritten by the next call."""
+        """(m,) J dv, J of the last expand(). Overwritten by the next call."""
         it = self._structure
-        _along(self._points.jacobian, it.interval, it.slots, it.linear, it.linear_interval, dv, self._along)
+        _along(self._points.jacobian, it.interval, it.slots, it.linear, it.linear_interval, it.of_yaw, dv, self._along)
         return self._along
 
 
@@ -133,10 +129,10 @@ class _Structure(NamedTuple):
     # (N, k) where those lie in a flattened table
     entries: NDArray
     # (N, k(k+1)/2, 2) entry of the flattened matrix of each pair, -1 where one is fixed, and how often it counts there
+    order: NDArray
+    # (P,) which of the layout's points each is: the first of all intervals, then the second of all, and so on
     interval: NDArray
     # (P,) of each point
-    begins: NDArray
-    # (N+1,) first point of each interval
     selected: NDArray
     # (G,) entry of g of each of the layout's rows at points
     point_rows: NDArray
@@ -144,9 +140,11 @@ class _Structure(NamedTuple):
     positive: NDArray
     # coefficients of h of their own
     linear: NDArray
-    # (E, k)
+    # (4, E) weights of four of an interval's coefficients: the first, but the last in rows of yaw, which come last
     linear_interval: NDArray
     # (E,)
+    of_yaw: int
+    # how many those are
     size: int
     # of v
     band: int
@@ -171,12 +169,14 @@ def _structure(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, bool]
     low, high = np.minimum(slots[:, left], slots[:, right]), np.maximum(slots[:, left], slots[:, right])
     entry = np.where(low >= 0, high * (band + 1) + high - low, _NOBODY)
     entries = np.stack([entry, np.where((low == high) & (left != right), 2, 1)], axis=-1)
-    interval = np.append(layout.interval, np.repeat(layout.interval[-1], -len(layout.interval) % LANES))
+    of_its_interval = np.arange(len(layout.interval)) - np.searchsorted(layout.interval, layout.interval)
+    order = np.lexsort((layout.interval, of_its_interval))
+    position = np.argsort(order)
+    order = np.append(order, np.repeat(order[-1], -len(order) % LANES))
     positive = np.flatnonzero(own[:, 0])
     return _Structure(
-        of, slots, local[0] * of.shape[1] + local[1], entries, interval,
-        np.searchsorted(interval, np.arange(nodes + 1)),
-        layout.row * len(interval) + layout.point, layout.point_rows, positive, *_linear_rows(layout, positive),
+        of, slots, local[0] * of.shape[1] + local[1], entries, order, layout.interval[order],
+        layout.row * len(order) + position[layout.point], layout.point_rows, positive, *_linear_rows(layout, positive),
         of.size, band,
     )  # fmt: skip
 
@@ -200,31 +200,30 @@ def _slots(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, bool]) ->
     return of, of == own
 
 
-def _linear_rows(layout: Layout, positive: NDArray) -> tuple[NDArray, NDArray]:
-    """(weights (E, k), interval): speeds at nodes and between, the coefficients of h, and where yaw starts."""
+def _linear_rows(layout: Layout, positive: NDArray) -> tuple[NDArray, NDArray, int]:
+    """(weights (4, E), interval, how many of yaw): speeds at nodes and between, the coefficients of h, and where yaw
+    starts."""
     nodes = layout.shape.nodes
-    k = coefficients(layout.shape.free_yaw)
     node = np.arange(nodes + 1)
     between = np.array(layout.shape.speed_places)
     of_positive = np.clip(positive - 1, 0, nodes - 1)
     weights = [
         h_weights((node == nodes) * 1.0),
-        np.tile(h_weights(between), (nodes, 1)),
+        np.repeat(h_weights(between), nodes, axis=0),
         np.eye(4)[positive - of_positive],
     ]
-    rows = np.pad(np.concatenate(weights), ((0, 0), (0, k - 4)))
-    interval = np.concatenate([np.minimum(node, nodes - 1), np.repeat(node[:-1], len(between)), of_positive])
+    interval = [np.minimum(node, nodes - 1), np.tile(node[:-1], len(between)), of_positive]
     if layout.shape.free_yaw:
-        start = np.pad(YAW_SPLINE[:1], ((0, 0), (4, 0)))
-        rows, interval = np.concatenate([rows, start]), np.append(interval, 0)
-    return rows, interval
+        weights.append(np.pad(YAW_SPLINE[:1], ((0, 0), (1, 0))))
+        interval.append(np.zeros(1, dtype=int))
+    return np.ascontiguousarray(np.concatenate(weights).T), np.concatenate(interval), int(layout.shape.free_yaw)
 
 
 def _linear_bounds(problem: Problem, positive: int) -> tuple[NDArray, NDArray]:
     """(lower, upper) of what _linear_rows has."""
     layout = problem.layout
     nodes = np.arange(layout.shape.nodes + 1) * layout.block
-    speeds = problem.ubg[layout.speed_rows].ravel()
+    speeds = problem.ubg[layout.speed_rows].T.ravel()
     free = problem.lbx[nodes] < problem.ubx[nodes]
     never = np.full(len(nodes) + len(speeds), -np.inf)
     lower = [never, np.full(positive, FLOOR)]
@@ -249,9 +248,22 @@ def _spread(limits, point_rows, selected, linear, count, nothing):
 _FREELY = {"contract", "reassoc", "nsz"}  # what is not a number survives
 
 
-@njit(cache=True, error_model="numpy")
-def _place(v, slots, interval, local, at_points):
-    """Each interval's coefficients, (N, k), where they are free; and all of them at its points."""
+@register_jitable(fastmath=_FREELY)
+def _weigh(linear, linear_interval, of_yaw, local, result):
+    """What is linear in the coefficients, (N, k), of each interval."""
+    of_h, later = len(result) - of_yaw, local.shape[1] - 4
+    for j in range(len(result)):
+        first, i = 0 if j < of_h else later, linear_interval[j]
+        value = linear[0, j] * local[i, first] + linear[1, j] * local[i, first + 1]
+        result[j] = value + linear[2, j] * local[i, first + 2] + linear[3, j] * local[i, first + 3]
+
+
+@njit(cache=True, error_model="numpy", fastmath=_FREELY)
+def _place(v, slots, interval, local, at_points, linear, linear_interval, of_yaw, g, places, weights):
+    """Each interval's coefficients, (N, k), where they are free; all of them at its points; and what is linear in them.
+
+    Gives Σ ∫ds/√x over all intervals, in node units.
+    """
     for i in range(slots.shape[0]):
         for a in range(slots.shape[1]):
             if slots[i, a] >= 0:
@@ -259,21 +271,7 @@ def _place(v, slots, interval, local, at_points):
     for a in range(slots.shape[1]):
         for p in range(len(interval)):
             at_points[a, p] = local[interval[p], a]
-
-
-@njit(cache=True, error_model="numpy", fastmath=_FREELY)
-def _linear_values(linear, interval, local, g):
-    before = len(g) - len(linear)
-    for j in range(len(linear)):
-        value = 0.0
-        for a in range(linear.shape[1]):
-            value += linear[j, a] * local[interval[j], a]
-        g[before + j] = value
-
-
-@njit(cache=True, error_model="numpy", fastmath=_FREELY)
-def _time(local, places, weights):
-    """Σ ∫ds/√x over all intervals, in node units."""
+    _weigh(linear, linear_interval, of_yaw, local, g[len(g) - len(linear_interval) :])
     total = 0.0
     for i in range(local.shape[0]):
         for q in range(len(weights)):
@@ -285,90 +283,70 @@ def _time(local, places, weights):
 
 
 @njit(cache=True, error_model="numpy", fastmath=_FREELY)
-def _sum_by_interval(at_points, begins, by_interval):
-    for a in range(by_interval.shape[0]):
+def _sum_by_interval(at_points, interval, by_interval):
+    for a in range(len(by_interval)):
         row, result = at_points[a], by_interval[a]
-        for i in range(len(result)):
-            value = 0.0
-            for p in range(begins[i], begins[i + 1]):
-                value += row[p]
-            result[i] = value
+        for p in range(len(interval)):
+            result[interval[p]] += row[p]
+
+
+@register_jitable
+def _entry(column, row, size):
+    """Of a lower triangle, which lies column by column."""
+    return column * size - column * (column - 1) // 2 + row - column
 
 
 @njit(cache=True, error_model="numpy", fastmath=_FREELY)
 def _assemble(
-    at_gradient, at_hessian, begins, slots, entries, linear, linear_interval, stiffness, local, scale, places, weights,
-    gradient, matrix,
+    at_gradients, at_hessian, interval, slots, entries, linear, linear_interval, of_yaw, pulls, local, scale, places,
+    weights, gradients, matrix,
 ):  # fmt: skip
-    """Gradient and matrix from what the kernel gives at points, the linear constraints, and the time spent."""
+    """Gradients and matrix from what the kernel gives at points, the linear constraints, and the time spent."""
     count, k = slots.shape
-    of_gradient, of_hessian = np.zeros((k, count)), np.zeros((entries.shape[1], count))
-    _sum_by_interval(at_gradient, begins, of_gradient)
-    _sum_by_interval(at_hessian, begins, of_hessian)
-    before = len(stiffness) - len(linear)
-    for j in range(len(linear)):
-        of_yaw = linear[j, 0] + linear[j, 1] + linear[j, 2] + linear[j, 3] == 0.0
-        for b in range(4 if of_yaw else 0, k if of_yaw else 4):
-            pull = stiffness[before + j] * linear[j, b]
-            e = b * k - b * (b - 1) // 2
-            for a in range(b, k if of_yaw else 4):
-                of_hessian[e + a - b, linear_interval[j]] += pull * linear[j, a]
-    first, second = np.empty(count), np.empty(count)  # derivatives of the time by x
+    kinds = len(gradients)
+    of_gradients, of_hessian = np.zeros((kinds * k, count)), np.zeros((entries.shape[1], count))
+    _sum_by_interval(at_gradients, interval, of_gradients)
+    _sum_by_interval(at_hessian, interval, of_hessian)
+    before, of_h = pulls.shape[1] - len(linear_interval), len(linear_interval) - of_yaw
+    for begin, end, first in ((0, of_h, 0), (of_h, len(linear_interval), k - 4)):
+        for b in range(4):
+            for kind in range(1, kinds):
+                row = of_gradients[kind * k + first + b]
+                for j in range(begin, end):
+                    row[linear_interval[j]] += pulls[kind, before + j] * linear[b, j]
+            for a in range(b, 4):
+                row = of_hessian[_entry(first + b, first + a, k)]
+                for j in range(begin, end):
+                    row[linear_interval[j]] += pulls[0, before + j] * linear[b, j] * linear[a, j]
+    slope, bend = np.empty(count), np.empty(count)  # derivatives of the time by x
     for q in range(len(weights)):
         for i in range(count):
             x = places[q, 0] * local[i, 0] + places[q, 1] * local[i, 1] + places[q, 2] * local[i, 2]
             x = max(x + places[q, 3] * local[i, 3], stage.LEAST)
-            first[i] = -0.5 * scale * weights[q] / (x * math.sqrt(x))
-            second[i] = -1.5 * first[i] / x
-        e = 0
+            slope[i] = -0.5 * scale * weights[q] / (x * math.sqrt(x))
+            bend[i] = -1.5 * slope[i] / x
         for b in range(4):
             for i in range(count):
-                of_gradient[b, i] += first[i] * places[q, b]
+                of_gradients[b, i] += slope[i] * places[q, b]
             for a in range(b, 4):
-                both, row = places[q, b] * places[q, a], of_hessian[e]
+                both, row = places[q, b] * places[q, a], of_hessian[_entry(b, a, k)]
                 for i in range(count):
-                    row[i] += second[i] * both
-                e += 1
-            e += k - 4
-    gradient[:] = 0.0
+                    row[i] += bend[i] * both
+    gradients[:] = 0.0
     flat = matrix.ravel()
     flat[:] = 0.0
     for i in range(count):
         for a in range(k):
             if slots[i, a] >= 0:
-                gradient[slots[i, a]] += of_gradient[a, i]
+                for kind in range(kinds):
+                    gradients[kind, slots[i, a]] += of_gradients[kind * k + a, i]
         for e in range(entries.shape[1]):
             if entries[i, e, 0] >= 0:
                 flat[entries[i, e, 0]] += entries[i, e, 1] * of_hessian[e, i]
 
 
 @njit(cache=True, error_model="numpy", fastmath=_FREELY)
-def _transposed(jacobian, begins, slots, linear, linear_interval, w, result):
-    count, k = slots.shape
-    points = jacobian.shape[1]
-    rows = jacobian.shape[0] // k
-    of_point, local = np.empty(points), np.zeros((count, k))
-    for a in range(k):
-        of_point[:] = 0.0
-        for r in range(rows):
-            for p in range(points):
-                of_point[p] += w[r * points + p] * jacobian[a * rows + r, p]
-        for i in range(count):
-            value = 0.0
-            for p in range(begins[i], begins[i + 1]):
-                value += of_point[p]
-            local[i, a] = value
-    for j in range(len(linear)):
-        for a in range(k):
-            local[linear_interval[j], a] += w[rows * points + j] * linear[j, a]
-    for i in range(count):
-        for a in range(k):
-            if slots[i, a] >= 0:
-                result[slots[i, a]] += local[i, a]
-
-
-@njit(cache=True, error_model="numpy", fastmath=_FREELY)
-def _along(jacobian, interval, slots, linear, linear_interval, dv, result):
+def _along(jacobian, interval, slots, linear, linear_interval, of_yaw, dv, result):
     count, k = slots.shape
     points = jacobian.shape[1]
     rows = jacobian.shape[0] // k
@@ -377,13 +355,11 @@ def _along(jacobian, interval, slots, linear, linear_interval, dv, result):
         for a in range(k):
             if slots[i, a] >= 0:
                 local[i, a] = dv[slots[i, a]]
-    result[:] = 0.0
+    result[: rows * points] = 0.0
     for a in range(k):
         for p in range(points):
             of_point[p] = local[interval[p], a]
         for r in range(rows):
             for p in range(points):
                 result[r * points + p] += jacobian[a * rows + r, p] * of_point[p]
-    for j in range(len(linear)):
-        for a in range(k):
-            result[rows * points + j] += linear[j, a] * local[linear_interval[j], a]
+    _weigh(linear, linear_interval, of_yaw, local, result[rows * points :])

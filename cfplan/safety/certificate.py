@@ -7,10 +7,11 @@ the larger of them by at most an eighth of its second difference there; that is 
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -20,13 +21,13 @@ from numpy.typing import NDArray
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.space import Space
 from cfplan.vehicle import dense
-from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.dense import Sampler, Stretches
 from cfplan.vehicle.trajectory import FullState, Trajectory
 
 TIME_STEP = 1e-3  # s, the most between two samples
 BATCH = 4_000  # samples at a time, about: as many as stay near the processor
-BLOCK = 256  # samples searched for a peak at once
+BLOCK = 512  # samples searched for a peak at once
 LEAST_POINTS = 11  # of a piece, its ends included
 WALLS = "distance to the walls"
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
@@ -101,6 +102,14 @@ class Certificate:
         }
 
 
+def _itself(value: Any) -> Any:
+    return value
+
+
+def _tilt(squared_tangent_of_half: Any) -> Any:
+    return 2.0 * np.arctan(np.sqrt(squared_tangent_of_half))
+
+
 @dataclass(frozen=True, slots=True)
 class _Quantity:
     """What must not rise above 1 as a share; `sign` is -1 where the limit is a least value."""
@@ -115,25 +124,17 @@ class _Quantity:
     limit: float
     at_rest: float
     # what it is in hover, which counts as share 0
-
-
-class _Peak(NamedTuple):
-    """The worst of one quantity."""
-
-    quantity: _Quantity
-    value: float
-    # its sign times the value
-    s: float
+    of_row: Callable[[Any], Any] = _itself
+    # what it is where the row has a value; rises with that
 
 
 def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Certificate:
     """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
-    stretches, quantities = _stretches(trajectory), list(_quantities(trajectory, limits, space))
+    stretches, (quantities, table) = _stretches(trajectory), _quantities(trajectory.airframe, limits, space)
     sampler = Sampler(trajectory.airframe, trajectory.path, trajectory.profile)
-    table = np.array([(quantity.row, quantity.count, quantity.sign) for quantity in quantities])
     ends = np.cumsum(stretches.counts)
-    bounds = [0, *(1 + np.flatnonzero(np.diff(ends // BATCH))).tolist(), len(ends)]
-    rows = np.empty((dense.SAMPLED_ROWS, int(np.diff(np.append(0, ends)[bounds]).max())))
+    bounds = sorted({0, *np.searchsorted(ends, np.arange(BATCH, ends[-1], BATCH)).tolist(), len(ends)})
+    rows = np.empty((dense.SAMPLED_ROWS, BATCH + int(stretches.counts.max())))
     values, places = np.full(len(table), -np.inf), np.zeros(len(table))
     for first, last in pairwise(bounds):
         batch = Stretches(*(each[first:last] for each in stretches))
@@ -141,10 +142,10 @@ def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = No
         if space is not None:
             _put_distances(rows[dense.POSITION : dense.POSITION + 3, : batch.counts.sum()], space)
         _raise_peaks(values, places, table, rows, rows[dense.PLACE], batch.counts)
-    peaks = [_Peak(*each) for each in zip(quantities, values.tolist(), places.tolist(), strict=True)]
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
+    peaks = zip(quantities, values.tolist(), when, places.tolist(), where, strict=True)
     return Certificate(
-        margins=tuple(_margin(*each) for each in zip(peaks, when, where, strict=True)),
+        margins=tuple(_margin(*each) for each in peaks),
         duration=trajectory.duration,
         samples=int(ends[-1]),
     )
@@ -155,10 +156,10 @@ def shares(trajectory: Trajectory, limits: PlanLimits, time: NDArray) -> dict[st
     rows = _rows(trajectory.at(time))
     return {
         quantity.name: (
-            (rows[quantity.row : quantity.row + quantity.count] - quantity.at_rest)
+            (quantity.of_row(rows[quantity.row : quantity.row + quantity.count]) - quantity.at_rest)
             / (quantity.limit - quantity.at_rest)
         ).max(axis=0)
-        for quantity in _quantities(trajectory, limits, None)
+        for quantity in _quantities(trajectory.airframe, limits, None)[0]
     }
 
 
@@ -166,11 +167,11 @@ def _rows(state: FullState) -> NDArray:
     """What a Sampler gives, of full states."""
     rows = np.empty((dense.SAMPLED_ROWS, len(state.s)))
     x, y, z = state.thrust_axis.T
-    rows[dense.SPEED] = np.linalg.norm(state.velocity, axis=1)
-    rows[dense.ACCELERATION] = np.linalg.norm(state.acceleration, axis=1)
-    rows[dense.BODY_RATE] = np.linalg.norm(state.body_rate, axis=1)
-    rows[dense.ANGULAR_ACCELERATION] = np.linalg.norm(state.angular_acceleration, axis=1)
-    rows[dense.TILT] = np.arctan2(np.hypot(x, y), z)
+    rows[dense.SPEED] = np.square(state.velocity).sum(axis=1)
+    rows[dense.ACCELERATION] = np.square(state.acceleration).sum(axis=1)
+    rows[dense.BODY_RATE] = np.square(state.body_rate).sum(axis=1)
+    rows[dense.ANGULAR_ACCELERATION] = np.square(state.angular_acceleration).sum(axis=1)
+    rows[dense.AXIS_HEIGHT], rows[dense.HALF_TILT] = z, (x * x + y * y) / (1.0 + z) ** 2
     rows[dense.SPECIFIC_THRUST] = state.specific_thrust
     rows[dense.MOTOR_THRUST : dense.MOTOR_THRUST + 4] = state.motor_thrust.T
     rows[dense.POSITION : dense.POSITION + 3] = state.position.T
@@ -178,22 +179,29 @@ def _rows(state: FullState) -> NDArray:
     return rows
 
 
-def _quantities(trajectory: Trajectory, limits: PlanLimits, space: Space | None) -> Iterator[_Quantity]:
-    hover = trajectory.airframe.hover_thrust
-    yield _Quantity("speed", "m/s", 1, dense.SPEED, 1, limits.speed, 0.0)
-    yield _Quantity("acceleration", "m/s²", 1, dense.ACCELERATION, 1, limits.acceleration, 0.0)
-    yield _Quantity("angular velocity", "rad/s", 1, dense.BODY_RATE, 1, limits.angular_velocity, 0.0)
-    if limits.angular_acceleration != math.inf:
-        most = limits.angular_acceleration
-        yield _Quantity("angular acceleration", "rad/s²", 1, dense.ANGULAR_ACCELERATION, 1, most, 0.0)
-    yield _Quantity("tilt", "rad", 1, dense.TILT, 1, limits.tilt, 0.0)
-    yield _Quantity("motor thrust, most", "N", 1, dense.MOTOR_THRUST, 4, limits.motor_thrust_max, 0.0)
-    yield _Quantity("motor thrust, least", "N", -1, dense.MOTOR_THRUST, 4, limits.motor_thrust_min, hover)
-    least = limits.specific_thrust_min
-    yield _Quantity("specific thrust, least", "m/s²", -1, dense.SPECIFIC_THRUST, 1, least, GRAVITY)
+@lru_cache(maxsize=16)
+def _quantities(airframe: Airframe, limits: PlanLimits, space: Space | None) -> tuple[tuple[_Quantity, ...], NDArray]:
+    """What is limited; and for compiled code, (Q, 3), the first row of each, how many, and its sign."""
+    turning = limits.angular_acceleration
+    quantities = [
+        _Quantity("speed", "m/s", 1, dense.SPEED, 1, limits.speed, 0.0, np.sqrt),
+        _Quantity("acceleration", "m/s²", 1, dense.ACCELERATION, 1, limits.acceleration, 0.0, np.sqrt),
+        _Quantity("angular velocity", "rad/s", 1, dense.BODY_RATE, 1, limits.angular_velocity, 0.0, np.sqrt),
+        _Quantity("angular acceleration", "rad/s²", 1, dense.ANGULAR_ACCELERATION, 1, turning, 0.0, np.sqrt),
+        _Quantity("tilt", "rad", 1, dense.HALF_TILT, 1, limits.tilt, 0.0, _tilt),
+        _Quantity("motor thrust, most", "N", 1, dense.MOTOR_THRUST, 4, limits.motor_thrust_max, 0.0),
+        _Quantity(
+            "motor thrust, least", "N", -1, dense.MOTOR_THRUST, 4, limits.motor_thrust_min, airframe.hover_thrust
+        ),
+        _Quantity("specific thrust, least", "m/s²", -1, dense.SPECIFIC_THRUST, 1, limits.specific_thrust_min, GRAVITY),
+    ]
     if space is not None:
         half = float((np.array(space.high) - np.array(space.low)).min()) / 2
-        yield _Quantity(WALLS, "m", -1, dense.POSITION, 3, space.margin, half)
+        quantities.append(_Quantity(WALLS, "m", -1, dense.POSITION, 3, space.margin, half))
+    limited = tuple(
+        quantity for quantity in quantities if quantity.row != dense.ANGULAR_ACCELERATION or turning != math.inf
+    )
+    return limited, np.array([(quantity.row, quantity.count, quantity.sign) for quantity in limited])
 
 
 def _put_distances(position: NDArray, space: Space) -> None:
@@ -208,20 +216,20 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _margin(peak: _Peak, time: float, position: Sequence[float]) -> Margin:
-    quantity = peak.quantity
-    worst = quantity.sign * peak.value
+def _margin(quantity: _Quantity, peak: float, time: float, s: float, position: Sequence[float]) -> Margin:
+    """`peak` is the sign times the row's value."""
+    worst = float(quantity.of_row(quantity.sign * peak))
     room = quantity.limit - quantity.at_rest
     share = (worst - quantity.at_rest) / room if room * quantity.sign > 0 else math.inf
     x, y, z = position
     return Margin(
         name=quantity.name,
         unit=quantity.unit,
-        worst=float(worst),
+        worst=worst,
         limit=float(quantity.limit),
         share=max(0.0, float(share)) if math.isfinite(worst) and math.isfinite(quantity.limit) else math.nan,
         time=time,
-        s=peak.s,
+        s=s,
         position=(x, y, z),
     )
 

@@ -19,22 +19,20 @@ from cfplan.geometry.path import Path
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.flatness import ROUNDING, Body, Flat, compiled_body, flat_state, profile_within
 from cfplan.vehicle.profile import SpeedProfile
-from cfplan.vehicle.trigonometry import cosine, sine, slope_angle
+from cfplan.vehicle.trigonometry import cosine, sine
 
-# What `dense_rows` gives, by row: squares of norms, components, and thrusts of motors 1 to 4.
+# What `dense_rows` gives, by row; all of it is smooth where path and profile are, as norms and angles near 0 are not.
 SPEED, ACCELERATION, BODY_RATE, ANGULAR_ACCELERATION = range(4)
 # squared: m²/s², m²/s⁴, rad²/s², rad²/s⁴
-AXIS_HEIGHT, AXIS_WIDTH = 4, 5
-# of the unit thrust axis: its z, and the square of what it has besides
+AXIS_HEIGHT, HALF_TILT = 4, 5
+# cosine of the tilt, and the squared tangent of half of it
 SPECIFIC_THRUST = 6
 # m/s²
 MOTOR_THRUST = 7
 # N, and the three rows behind
 ROWS = 11
 
-# What a Sampler's rows are: the first four as norms, SPECIFIC_THRUST and MOTOR_THRUST as above, and
-TILT = 4
-# rad, in place of AXIS_HEIGHT
+# What a Sampler gives besides:
 POSITION = 11
 # m, and the two rows behind
 PLACE = 14
@@ -51,12 +49,14 @@ STATES: dict[str, slice | int] = {
 STATE_ROWS = 37
 
 WIDTH = 64
-LANES = 16  # points that the compiler may want to take at once: the places in use are a multiple
+LANES = 4  # points that the compiler may want to take at once: the places in use are a multiple
 _CURVE, _X, _NODE, _RESULT = 0, 15, 16, 23
 # rows of a panel: γ to γ'''', the place in the interval, the profile where that begins, and what comes of them
 _SIZE = (_RESULT + STATE_ROWS) * WIDTH
 _BLOCK = 8  # coefficients at a time
 _Derivatives = tuple[float, float, float, float, float]
+_Node = tuple[float, float, float, float, float, float, float]
+# h with three derivatives and yaw with two, where an interval begins
 
 
 class Stretches(NamedTuple):
@@ -156,9 +156,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Call
         for k in range(len(counts)):
             begin, end = end, end + counts[k]
             last, first_s, width, last_s = counts[k] - 1, left[k], right[k] - left[k], np.nextafter(right[k], -np.inf)
-            for row in range(7):
-                for n in range(WIDTH):
-                    panel[(_NODE + row) * WIDTH + n] = nodes[interval[k], 1 + row]
+            node = _node(nodes, interval[k])
             for done in range(0, counts[k], WIDTH):
                 lanes = min(WIDTH, _whole(counts[k] - done))
                 for n in range(lanes):
@@ -167,8 +165,7 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Call
                 _trace(panel, coefficients[piece[k]], lanes)
                 for n in range(lanes):
                     panel[_X * WIDTH + n] = s[n] - nodes[interval[k], 0]
-                _flatten(panel, body, lanes)
-                _finish(panel, lanes)
+                _flatten_stretch(panel, body, node, lanes)
                 at, count = begin + done, min(WIDTH, counts[k] - done)
                 for row in range(ROWS):
                     out[row, at : at + count] = panel[(_RESULT + row) * WIDTH : (_RESULT + row) * WIDTH + count]
@@ -215,26 +212,25 @@ def _place(
 def _trace(panel: NDArray, table: NDArray, lanes: int) -> None:
     """γ to γ'''' from the coefficients, (D, 3), at x from where they count: Horner's scheme, for factorial shares."""
     lanes = min(lanes, WIDTH)  # the compiler must see that no index overflows
-    for row in range(15):
-        for n in range(lanes):
-            panel[(_CURVE + row) * WIDTH + n] = 0.0
     for axis in range(3):
         for k in range(len(table) - _BLOCK, -1, -_BLOCK):
             c0, c1, c2, c3 = table[k, axis], table[k + 1, axis], table[k + 2, axis], table[k + 3, axis]
             c4, c5, c6, c7 = table[k + 4, axis], table[k + 5, axis], table[k + 6, axis], table[k + 7, axis]
-            for n in range(lanes):
-                x, at = panel[_X * WIDTH + n], axis * WIDTH + n
-                p = (
-                    panel[at], panel[3 * WIDTH + at], panel[6 * WIDTH + at], panel[9 * WIDTH + at],
-                    panel[12 * WIDTH + at],
-                )  # fmt: skip
-                p = _step(x, c4, _step(x, c5, _step(x, c6, _step(x, c7, p))))
-                p = _step(x, c0, _step(x, c1, _step(x, c2, _step(x, c3, p))))
-                panel[at] = p[0]
-                panel[3 * WIDTH + at] = p[1]
-                panel[6 * WIDTH + at] = p[2]
-                panel[9 * WIDTH + at] = p[3]
-                panel[12 * WIDTH + at] = p[4]
+            if k == len(table) - _BLOCK:
+                for n in range(lanes):
+                    x = panel[_X * WIDTH + n]
+                    p = _step(x, c0, _step(x, c1, _step(x, c2, _begun(x, c3, c4, c5, c6, c7))))
+                    _write_curve(panel, axis, n, p)
+            else:
+                for n in range(lanes):
+                    x, at = panel[_X * WIDTH + n], axis * WIDTH + n
+                    p = (
+                        panel[at], panel[3 * WIDTH + at], panel[6 * WIDTH + at], panel[9 * WIDTH + at],
+                        panel[12 * WIDTH + at],
+                    )  # fmt: skip
+                    p = _step(x, c4, _step(x, c5, _step(x, c6, _step(x, c7, p))))
+                    p = _step(x, c0, _step(x, c1, _step(x, c2, _step(x, c3, p))))
+                    _write_curve(panel, axis, n, p)
     for row in range(6, 9):
         for n in range(lanes):
             panel[row * WIDTH + n] *= 2.0
@@ -243,19 +239,47 @@ def _trace(panel: NDArray, table: NDArray, lanes: int) -> None:
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
+def _write_curve(panel: NDArray, axis: int, n: int, p: _Derivatives) -> None:
+    panel[(_CURVE + axis) * WIDTH + n] = p[0]
+    panel[(_CURVE + 3 + axis) * WIDTH + n] = p[1]
+    panel[(_CURVE + 6 + axis) * WIDTH + n] = p[2]
+    panel[(_CURVE + 9 + axis) * WIDTH + n] = p[3]
+    panel[(_CURVE + 12 + axis) * WIDTH + n] = p[4]
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def _begun(x: float, c3: float, c4: float, c5: float, c6: float, c7: float) -> _Derivatives:
+    """Five steps from nothing, less what would multiply zeros."""
+    p1, p0 = c7, x * c7 + c6
+    p2, p1, p0 = p1, x * p1 + p0, x * p0 + c5
+    p3, p2, p1, p0 = p2, x * p2 + p1, x * p1 + p0, x * p0 + c4
+    return x * p0 + c3, x * p1 + p0, x * p2 + p1, x * p3 + p2, p3
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
 def _step(x: float, c: float, p: _Derivatives) -> _Derivatives:
     return x * p[0] + c, x * p[1] + p[0], x * p[2] + p[1], x * p[3] + p[2], x * p[4] + p[3]
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
-def _flat_at(panel: NDArray, body: Body, n: int) -> tuple[Flat, float]:
+def _flat_at(panel: NDArray, body: Body, node: _Node, n: int) -> tuple[Flat, float]:
     """The full state, and yaw, from path and profile."""
-    h, dh, ddh = _vector(panel, _NODE, n)
-    speed, turn = profile_within(
-        panel[_X * WIDTH + n], h, dh, ddh, panel[(_NODE + 3) * WIDTH + n], *_vector(panel, _NODE + 4, n)
-    )
+    speed, turn = profile_within(panel[_X * WIDTH + n], *node)
     derivatives = _vector(panel, 3, n), _vector(panel, 6, n), _vector(panel, 9, n), _vector(panel, 12, n)
     return flat_state(body, derivatives, speed, turn, cosine, sine), turn[0]
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def _node(nodes: NDArray, k: int) -> _Node:
+    """The profile where interval k begins."""
+    return nodes[k, 1], nodes[k, 2], nodes[k, 3], nodes[k, 4], nodes[k, 5], nodes[k, 6], nodes[k, 7]
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def _node_at(panel: NDArray, n: int) -> _Node:
+    """The same, of a point's own interval."""
+    (h, dh, ddh), (dddh, yaw, dyaw) = _vector(panel, _NODE, n), _vector(panel, _NODE + 3, n)
+    return h, dh, ddh, dddh, yaw, dyaw, panel[(_NODE + 6) * WIDTH + n]
 
 
 @register_jitable(fastmath=ROUNDING)
@@ -263,19 +287,34 @@ def _flatten(panel: NDArray, body: Body, lanes: int) -> None:
     """The results from path and profile."""
     lanes = min(lanes, WIDTH)
     for n in range(lanes):
-        flat, _ = _flat_at(panel, body, n)
-        axis = flat.thrust_axis
-        panel[(_RESULT + SPEED) * WIDTH + n] = _squared(flat.velocity)
-        panel[(_RESULT + ACCELERATION) * WIDTH + n] = _squared(flat.acceleration)
-        panel[(_RESULT + BODY_RATE) * WIDTH + n] = _squared(flat.body_rate)
-        panel[(_RESULT + ANGULAR_ACCELERATION) * WIDTH + n] = _squared(flat.angular_acceleration)
-        panel[(_RESULT + AXIS_HEIGHT) * WIDTH + n] = axis[2]
-        panel[(_RESULT + AXIS_WIDTH) * WIDTH + n] = axis[0] * axis[0] + axis[1] * axis[1]
-        panel[(_RESULT + SPECIFIC_THRUST) * WIDTH + n] = flat.specific_thrust
-        panel[(_RESULT + MOTOR_THRUST) * WIDTH + n] = flat.motor_thrust[0]
-        panel[(_RESULT + MOTOR_THRUST + 1) * WIDTH + n] = flat.motor_thrust[1]
-        panel[(_RESULT + MOTOR_THRUST + 2) * WIDTH + n] = flat.motor_thrust[2]
-        panel[(_RESULT + MOTOR_THRUST + 3) * WIDTH + n] = flat.motor_thrust[3]
+        flat, _ = _flat_at(panel, body, _node_at(panel, n), n)
+        _write_rows(panel, n, flat)
+
+
+@register_jitable(fastmath=ROUNDING)
+def _flatten_stretch(panel: NDArray, body: Body, node: _Node, lanes: int) -> None:
+    """The same where all points lie in one interval."""
+    lanes = min(lanes, WIDTH)
+    for n in range(lanes):
+        flat, _ = _flat_at(panel, body, node, n)
+        _write_rows(panel, n, flat)
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def _write_rows(panel: NDArray, n: int, flat: Flat) -> None:
+    x, y, z = flat.thrust_axis
+    panel[(_RESULT + SPEED) * WIDTH + n] = _squared(flat.velocity)
+    panel[(_RESULT + ACCELERATION) * WIDTH + n] = _squared(flat.acceleration)
+    panel[(_RESULT + BODY_RATE) * WIDTH + n] = _squared(flat.body_rate)
+    panel[(_RESULT + ANGULAR_ACCELERATION) * WIDTH + n] = _squared(flat.angular_acceleration)
+    panel[(_RESULT + AXIS_HEIGHT) * WIDTH + n] = z
+    lift = 1.0 / (1.0 + z)
+    panel[(_RESULT + HALF_TILT) * WIDTH + n] = (x * x + y * y) * lift * lift
+    panel[(_RESULT + SPECIFIC_THRUST) * WIDTH + n] = flat.specific_thrust
+    panel[(_RESULT + MOTOR_THRUST) * WIDTH + n] = flat.motor_thrust[0]
+    panel[(_RESULT + MOTOR_THRUST + 1) * WIDTH + n] = flat.motor_thrust[1]
+    panel[(_RESULT + MOTOR_THRUST + 2) * WIDTH + n] = flat.motor_thrust[2]
+    panel[(_RESULT + MOTOR_THRUST + 3) * WIDTH + n] = flat.motor_thrust[3]
 
 
 @register_jitable(fastmath=ROUNDING)
@@ -283,7 +322,7 @@ def _flatten_whole(panel: NDArray, body: Body, lanes: int) -> None:
     """The full state from path and profile, as STATES has it but for the position."""
     lanes = min(lanes, WIDTH)
     for n in range(lanes):
-        flat, yaw = _flat_at(panel, body, n)
+        flat, yaw = _flat_at(panel, body, _node_at(panel, n), n)
         _write(panel, 3, n, flat.velocity)
         _write(panel, 6, n, flat.acceleration)
         _write(panel, 9, n, flat.jerk)
@@ -306,18 +345,6 @@ def _write(panel: NDArray, row: int, n: int, vector: tuple[float, float, float])
     panel[(_RESULT + row) * WIDTH + n] = vector[0]
     panel[(_RESULT + row + 1) * WIDTH + n] = vector[1]
     panel[(_RESULT + row + 2) * WIDTH + n] = vector[2]
-
-
-@register_jitable(fastmath=ROUNDING)
-def _finish(panel: NDArray, lanes: int) -> None:
-    """Norms and tilt in place of squares and components."""
-    lanes = min(lanes, WIDTH)
-    for row in range(_RESULT, _RESULT + 4):
-        for n in range(lanes):
-            panel[row * WIDTH + n] = panel[row * WIDTH + n] ** 0.5
-    for n in range(lanes):
-        width, height = panel[(_RESULT + AXIS_WIDTH) * WIDTH + n], panel[(_RESULT + AXIS_HEIGHT) * WIDTH + n]
-        panel[(_RESULT + TILT) * WIDTH + n] = slope_angle(width**0.5, height)
 
 
 @register_jitable(fastmath=ROUNDING)

@@ -24,8 +24,8 @@ class Valley:
         low[: size - 1], high[: size - 1] = lower, upper  # the last product is of nobody
         low[size:] = least
         self.bounds = bounds_of(low, high)
-        self.g, self.multipliers, self.stiffness = np.zeros(m), np.zeros(m), np.zeros(m)
-        self.gradient, self.matrix = np.zeros(size), np.zeros((size, 2))
+        self.g, self.pulls = np.zeros(m), np.zeros((4, m))
+        self.gradients, self.matrix = np.zeros((4, size)), np.zeros((size, 2))
 
     def cost(self, x):
         return sum(100 * (x[k + 1] - x[k] ** 2) ** 2 + (1 - x[k]) ** 2 for k in range(self.size - 1))
@@ -43,20 +43,18 @@ class Valley:
         return rows
 
     def expand(self):
-        x = self.v
-        self.gradient[:] = 0.0
-        self.gradient[:-1] = -400 * x[:-1] * (x[1:] - x[:-1] ** 2) - 2 * (1 - x[:-1])
-        self.gradient[1:] += 200 * (x[1:] - x[:-1] ** 2)
+        x, (stiffness, multipliers, *_) = self.v, self.pulls
+        self.gradients[0] = 0.0
+        self.gradients[0, :-1] = -400 * x[:-1] * (x[1:] - x[:-1] ** 2) - 2 * (1 - x[:-1])
+        self.gradients[0, 1:] += 200 * (x[1:] - x[:-1] ** 2)
+        self.gradients[1:] = self.pulls[1:] @ self.jacobian()
         whole = np.zeros((self.size, self.size))
         k = np.arange(self.size - 1)
         whole[k, k] = -400 * x[1:] + 1200 * x[:-1] ** 2 + 2
         whole[k + 1, k + 1] += 200
-        whole[k + 1, k] = whole[k, k + 1] = -400 * x[:-1] + self.multipliers[: self.size - 1]
-        whole += self.jacobian().T @ (self.stiffness[:, None] * self.jacobian())
+        whole[k + 1, k] = whole[k, k + 1] = -400 * x[:-1] + multipliers[: self.size - 1]
+        whole += self.jacobian().T @ (stiffness[:, None] * self.jacobian())
         self.matrix[:, 0], self.matrix[1:, 1] = np.diag(whole), np.diag(whole, -1)
-
-    def transposed(self, w):
-        return self.jacobian().T @ w
 
     def along(self, dv):
         return self.jacobian() @ dv
@@ -117,7 +115,7 @@ def test_the_worst_of_all_slacks_counts_wherever_it_is(size):
         dlow, dhigh = bounds[2] * ((0.01 - low * d) / below - low), bounds[3] * ((0.01 + high * d) / above - high)
         most = max((-bounds[2] * d / below).max(), (bounds[3] * d / above).max())
         dual = max((-dlow / (low + 1e-300)).max(), (-dhigh / (high + 1e-300)).max())
-        _, share, share_dual = slacks.steps(g, along, bounds, state, np.zeros(size), 0.01, 0.99, step)
+        _, share, share_dual = slacks.steps(g, along, bounds, state, 0.01, 0.99, step)
         assert share == pytest.approx(min(1.0, 0.99 / max(most, 1e-30)))
         assert share_dual == pytest.approx(min(1.0, 0.99 / max(dual, 1e-30)))
         np.testing.assert_allclose(step, [d, dlow, dhigh], rtol=1e-9, atol=1e-9)

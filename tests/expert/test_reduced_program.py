@@ -93,25 +93,23 @@ def test_derivatives_by_the_splines_are_those_of_differences(free_yaw):
     splines, v = near_the_guess(problem, 0.02)
     rng = np.random.default_rng(7)
     direction = rng.normal(size=len(v))
-    splines.multipliers[:] = y = rng.normal(size=len(splines.g))
-    splines.stiffness[:] = stiffness = rng.uniform(size=len(splines.g))
+    splines.pulls[:] = pulls = rng.uniform(0.0, 1.0, splines.pulls.shape)
 
     def around(at):
         cost = splines.values(at)
         splines.expand()
-        of_lagrangian = splines.gradient + splines.transposed(y)
-        return cost, splines.g.copy(), splines.gradient @ direction, splines.along(direction).copy(), of_lagrangian
+        gradients = splines.gradients.copy()
+        return cost, splines.g.copy(), gradients @ direction, splines.along(direction).copy(), gradients[:2].sum(axis=0)
 
     size = 1e-5
     (before, g_before, _, _, lagrangian_before), (after, g_after, _, _, lagrangian_after) = (
         around(v + k * size * direction) for k in (-1, 1)
     )
-    _, _, of_f, of_g, _ = around(v)
+    _, _, along_gradients, of_g, _ = around(v)
     bounded = splines.bounds[4] == 1
-    assert of_f == pytest.approx((after - before) / (2 * size), rel=1e-5)
+    assert along_gradients[0] == pytest.approx((after - before) / (2 * size), rel=1e-5)
     np.testing.assert_allclose(of_g[bounded], (g_after - g_before)[bounded] / (2 * size), rtol=1e-4, atol=1e-5)
-    w = rng.normal(size=len(y))
-    assert splines.transposed(w) @ direction == pytest.approx(w @ of_g, rel=1e-10)
+    assert along_gradients[1:] == pytest.approx(pulls[1:] @ of_g, rel=1e-10)
 
     curvature = (lagrangian_after - lagrangian_before) / (2 * size)
     size, width = splines.matrix.shape
@@ -119,7 +117,9 @@ def test_derivatives_by_the_splines_are_those_of_differences(free_yaw):
     for d in range(width):
         whole[np.arange(d, size), np.arange(size - d)] = splines.matrix[d:, d]
     whole += np.tril(whole, -1).T
-    product = whole @ direction - splines.transposed(stiffness * of_g)  # expand() adds J'ΣJ
+    splines.pulls[1] = pulls[0] * of_g
+    splines.expand()
+    product = whole @ direction - splines.gradients[1]  # expand() adds J'ΣJ
     np.testing.assert_allclose(product, curvature, rtol=1e-3, atol=1e-4 * np.abs(curvature).max())
 
 
@@ -163,10 +163,10 @@ def test_compiled_code_and_virtual_machine_agree_at_each_point_whichever_way_it_
     for backend in Backend:
         splines = SplineProblem(problem, backend)
         cost = splines.values(splines.v_of(problem.table))
-        splines.multipliers[:], splines.stiffness[:] = np.random.default_rng(1).uniform(0.0, 1.0, (2, len(splines.g)))
+        splines.pulls[:] = np.random.default_rng(1).uniform(0.0, 1.0, splines.pulls.shape)
         splines.expand()
-        along = splines.along(np.random.default_rng(2).normal(size=len(splines.gradient)))
-        results.append([np.array(cost), splines.g.copy(), splines.gradient, splines.matrix, along.copy()])
+        along = splines.along(np.random.default_rng(2).normal(size=splines.gradients.shape[1]))
+        results.append([np.array(cost), splines.g.copy(), splines.gradients, splines.matrix, along.copy()])
     for one, other in zip(*results, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * abs(other).max())
 
