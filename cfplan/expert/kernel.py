@@ -252,7 +252,7 @@ def _loaded(family: str) -> tuple[Any, Any]:
 
 def _compiled(function: Any, points: int) -> _Bind:
     def bind(reads: list[NDArray], writes: list[NDArray]) -> Callable[[], None]:
-        pointers = [ctypes.c_void_p(array.__array_interface__["data"][0]) for array in (*reads, *writes)]
+        pointers = [ctypes.byref(ctypes.c_char.from_buffer(array)) for array in (*reads, *writes)]  # holds the arrays
         return partial(function, ctypes.c_long(points), *pointers)
 
     return bind
@@ -286,11 +286,11 @@ class Points:
         Arrays of the rows have `spare` entries after those of the points, which the kernels leave alone.
         """
         k, points = coefficients(free_yaw), data.shape[1]
-        self.coefficients = np.ones((k, points))
+        self.coefficients = np.empty((k, points))
         # to read
-        self.pulls = np.zeros((len(slacks.PULLS), stage.ROWS * points + spare))
+        self.pulls = np.empty((len(slacks.PULLS), stage.ROWS * points + spare))
         # to read, each row by row; differentiate() alone needs them
-        self.rows = np.zeros(stage.ROWS * points + spare)
+        self.rows = np.empty(stage.ROWS * points + spare)
         # row by row; by evaluate() alone
         self.penalty = np.empty((1, points))
         # likewise
@@ -301,12 +301,12 @@ class Points:
         self.hessian = np.empty((k * (k + 1) // 2, points))
         # of penalty + multipliers · rows, plus Σ stiffness · (row of the Jacobian)² as an outer product: the lower
         # triangle, column by column
-        given = [np.ascontiguousarray(a, dtype=float) for a in (data, common, weights)]
+        given = [np.array(a, dtype=float, order="C") for a in (data, common, weights)]
         rows, *pulls = (array[: stage.ROWS * points].reshape(stage.ROWS, points) for array in (self.rows, *self.pulls))
-        self._reads = [self.coefficients, *given, *pulls]  # kept, as C has their addresses
+        reads = [self.coefficients, *given]
         values, derivatives = _functions(free_yaw, points, chosen)
-        self._evaluate = values(self._reads[:4], [rows, self.penalty])
-        self._differentiate = derivatives(self._reads, [self.jacobian, self.gradients, self.hessian])
+        self._evaluate = values(reads, [rows, self.penalty])
+        self._differentiate = derivatives([*reads, *pulls], [self.jacobian, self.gradients, self.hessian])
 
     def evaluate(self) -> None:
         """Rows and penalty."""

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.expert import stage
@@ -34,6 +35,7 @@ FLOOR = 1e-4
 # h at least, likewise
 REST = 1e-9
 # |γ'| below which a path stands still
+_JUMPS = np.isin(np.arange(stage.ROWS), stage.JUMPING)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,17 +93,26 @@ def pose(
     """
     nodes = layout.shape.nodes
     step, unit = path.end / nodes, limits.speed**2
-    p = _parameters(layout, path, airframe, limits, track, penalties, unit, step)
+    common = stage.common_data(airframe, limits, unit / step**2)
+    p = _parameters(
+        path.derivatives(layout.s * step), layout.interval, layout.place, layout.weight, track.yaw, track.dyaw,
+        track.ddyaw, step, np.concatenate([common, penalties.weights()]),
+    )  # fmt: skip
     margin = MARGIN * (1.0 - held_by(ends, nodes))
     if ends.joint is not None:
         margin[ends.joint - AROUND_JOINT : ends.joint + AROUND_JOINT] = JOINT_MARGIN
-    lbx, ubx = _variable_bounds(layout, path, limits, unit, step, margin)
-    lbg, ubg = _constraint_bounds(layout, path, limits, unit, step, margin, ends)
+    velocity = path(layout.speed_s * step, 1)
+    # What a boundary state alone decides was checked before, and may be at its limit.
+    decided = (0 if ends.start else -1, len(layout.interval) - 1 if ends.end else -1)
+    lbx, ubx, lbg, ubg = _bounds(
+        velocity, margin, limits.speed, unit, layout.block, layout.variables, layout.constraints, layout.interval,
+        layout.row, layout.point, layout.point_rows, layout.speed_rows, decided, _JUMPS, stage.LOWER, stage.UPPER,
+    )  # fmt: skip
     if table is None:
         table = _guess(layout, path, airframe, limits, yaw_angle, ends, unit, step)
     if layout.shape.free_yaw:
         lbx[3], ubx[3] = yaw_angle, yaw_angle + math.pi / 2
-    at_rest = (rests(path, 0.0), rests(path, path.end))
+    at_rest = (math.hypot(*velocity[0]) < REST, math.hypot(*velocity[nodes]) < REST)
     for variable, value in _held(layout, at_rest, ends, unit, step):
         lbx[variable] = ubx[variable] = value
     return Problem(layout, unit, step, p, lbx, ubx, lbg, ubg, ends, at_rest, table)
@@ -171,24 +182,54 @@ def profile_of(table: NDArray, unit: float, track: YawTrack, end: float) -> Spee
     return spline_profile(table[:, 0] * unit, end, track)
 
 
+@njit(cache=True, error_model="numpy")
 def _parameters(
-    layout: Layout,
-    path: Path,
-    airframe: Airframe,
-    limits: PlanLimits,
-    track: YawTrack,
-    penalties: stage.Penalties,
-    unit: float,
-    step: float,
-) -> NDArray:
-    data = np.zeros((len(layout.interval), stage.POINT_DATA))
-    s = (layout.interval + layout.place) * step
-    data[:, :12] = (path.derivatives(s)[1:] * step ** np.arange(1, 5)[:, None, None]).reshape(12, -1).T
-    data[:, 12], data[:, 13] = layout.place, layout.weight
-    psi, psi_ds, psi_dds = track.at(layout.interval, layout.place, step)
-    data[:, 14], data[:, 15], data[:, 16] = psi, psi_ds * step, psi_dds * step**2
-    common = stage.common_data(airframe, limits, unit / step**2)
-    return np.concatenate([data.ravel(), common, penalties.weights()])
+    curve: NDArray, interval: NDArray, place: NDArray, weight: NDArray, yaw: NDArray, dyaw: NDArray, ddyaw: NDArray,
+    step: float, behind: NDArray,
+) -> NDArray:  # fmt: skip
+    """The point data, in node units, of points where the path has the derivatives `curve`; and what is put behind."""
+    p = np.empty(len(place) * stage.POINT_DATA + len(behind))
+    for n in range(len(place)):
+        k, data = interval[n], p[n * stage.POINT_DATA : (n + 1) * stage.POINT_DATA]
+        unit = 1.0
+        for order in range(4):
+            unit *= step
+            for axis in range(3):
+                data[3 * order + axis] = curve[order + 1, axis, n] * unit
+        data[12], data[13] = place[n], weight[n]
+        x = place[n] * step
+        data[14] = yaw[k] + x * (dyaw[k] + x * ddyaw[k] / 2)
+        data[15], data[16] = (dyaw[k] + x * ddyaw[k]) * step, ddyaw[k] * step**2
+    p[len(p) - len(behind) :] = behind
+    return p
+
+
+@njit(cache=True, error_model="numpy")
+def _bounds(
+    velocity: NDArray, margin: NDArray, speed: float, unit: float, block: int, variables: int, constraints: int,
+    interval: NDArray, row: NDArray, point: NDArray, point_rows: NDArray, speed_rows: NDArray,
+    decided: tuple[int, int], jumps: NDArray, lower: NDArray, upper: NDArray,
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:  # fmt: skip
+    """Of variables, lower and upper, and of constraints. `velocity`, (…, 3), is γ' as layout.speed_s has the places;
+    `decided` are points whose rows a boundary state decides, but for those that jump."""
+    lbx, ubx = np.full(variables, -np.inf), np.full(variables, np.inf)
+    lbg, ubg = np.zeros(constraints), np.zeros(constraints)
+    nodes, between = speed_rows.shape
+    for n in range(len(velocity)):
+        k = min(n, nodes - 1) if n <= nodes else (n - nodes - 1) // between
+        nominal = max(math.sqrt(velocity[n, 0] ** 2 + velocity[n, 1] ** 2 + velocity[n, 2] ** 2), REST)
+        highest = min(((1 - margin[k]) * speed / nominal) ** 2 / unit, CEILING)
+        if n <= nodes:
+            lbx[n * block], ubx[n * block] = FLOOR, highest
+        else:
+            at = speed_rows[k, (n - nodes - 1) % between]
+            lbg[at], ubg[at] = FLOOR, highest
+    for j in range(len(row)):
+        tighter = 2.0 * margin[interval[point[j]]]  # most rows are squares
+        if (point[j] == decided[0] or point[j] == decided[1]) and not jumps[row[j]]:
+            tighter = -0.1
+        lbg[point_rows[j]], ubg[point_rows[j]] = lower[row[j]] + tighter, upper[row[j]] - tighter
+    return lbx, ubx, lbg, ubg
 
 
 def held_by(ends: Ends, nodes: int) -> NDArray:
@@ -196,6 +237,8 @@ def held_by(ends: Ends, nodes: int) -> NDArray:
 
     A state may lie at a limit, and what follows is all but decided: there is no room to lower limits there.
     """
+    if not ends.start and not ends.end:
+        return np.zeros(nodes)
     free = np.ones(nodes)
     distance = np.arange(nodes) + 0.5
     if ends.start and not ends.continues:
@@ -203,41 +246,6 @@ def held_by(ends: Ends, nodes: int) -> NDArray:
     if ends.end:
         free = np.minimum(free, (nodes - distance - 1.5) / FADE)
     return 1.0 - np.clip(free, 0.0, 1.0)
-
-
-def _highest(path: Path, limits: PlanLimits, s: NDArray, margin: NDArray, unit: float) -> NDArray:
-    """x where the speed limit is reached."""
-    nominal = np.maximum(np.linalg.norm(path(s, 1), axis=-1), REST)
-    return np.minimum(((1 - margin) * limits.speed / nominal) ** 2 / unit, CEILING)
-
-
-def _variable_bounds(
-    layout: Layout, path: Path, limits: PlanLimits, unit: float, step: float, margin: NDArray
-) -> tuple[NDArray, NDArray]:
-    nodes = layout.shape.nodes
-    first = np.arange(nodes + 1) * layout.block
-    lbx, ubx = np.full(layout.variables, -np.inf), np.full(layout.variables, np.inf)
-    lbx[first] = FLOOR
-    ubx[first] = _highest(path, limits, np.arange(nodes + 1) * step, np.append(margin, margin[-1]), unit)
-    return lbx, ubx
-
-
-def _constraint_bounds(
-    layout: Layout, path: Path, limits: PlanLimits, unit: float, step: float, margin: NDArray, ends: Ends
-) -> tuple[NDArray, NDArray]:
-    lbg, ubg = np.zeros(layout.constraints), np.zeros(layout.constraints)
-    row = layout.row
-    tighter = 2 * margin[layout.interval[layout.point]]  # most rows are squares
-    # What a boundary state alone decides was checked before, and may be at its limit.
-    for boundary, point in ((ends.start, 0), (ends.end, len(layout.interval) - 1)):
-        if boundary:
-            tighter[(layout.point == point) & ~np.isin(row, stage.JUMPING)] = -0.1
-    lbg[layout.point_rows] = stage.LOWER[row] + tighter
-    ubg[layout.point_rows] = stage.UPPER[row] - tighter
-    s = (np.arange(layout.shape.nodes)[:, None] + np.array(layout.shape.speed_places)) * step
-    lbg[layout.speed_rows] = FLOOR
-    ubg[layout.speed_rows] = _highest(path, limits, s, margin[:, None], unit)
-    return lbg, ubg
 
 
 def _guess(

@@ -52,6 +52,8 @@ class Layout:
     # (P,) of each point
     place: NDArray = field(init=False)
     # (P,) in its interval, 0 to 1
+    s: NDArray = field(init=False)
+    # (P,) the same from the first node on, in intervals
     weight: NDArray = field(init=False)
     # (P,) of the penalties: 1 at the left end of an interval, else 0
     selected: NDArray = field(init=False)
@@ -66,6 +68,8 @@ class Layout:
     # (G,) in the constraint vector
     speed_rows: NDArray = field(init=False)
     # (N, speed places) in the constraint vector
+    speed_s: NDArray = field(init=False)
+    # (N + 1 + N speed places,) where the speed limit holds, in intervals: at the nodes, and then between
     counts: tuple[int, ...] = field(init=False)
     # (N+1,) constraints of each stage that are not dynamics
 
@@ -98,8 +102,11 @@ class Layout:
             speed_rows.append(np.arange(row, row + len(shape.speed_places)))
             row += len(shape.speed_places)
             counts.append(row - start)
+        nodes = np.arange(shape.nodes + 1.0)
+        between = (nodes[:-1, None] + np.array(shape.speed_places)).ravel()
         for name, value in (
             ("interval", np.array(interval)), ("place", np.array(place)), ("weight", np.array(weight)),
+            ("s", np.array(interval) + np.array(place)), ("speed_s", np.concatenate([nodes, between])),
             ("selected", np.array(selected)), ("row", np.array(selected) % stage.ROWS),
             ("point", np.array(selected) // stage.ROWS), ("dynamics_rows", np.array(dynamics_rows)),
             ("point_rows", np.array(point_rows)), ("speed_rows", np.array(speed_rows)), ("counts", (*counts, 0)),

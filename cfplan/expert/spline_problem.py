@@ -68,12 +68,12 @@ class SplineProblem:
         return other
 
     def _bounds(self, problem: Problem) -> NDArray:
-        it = self._structure
-        low, high = _linear_bounds(problem, len(it.positive))
-        return bounds_of(
-            _spread(problem.lbg, it.point_rows, it.selected, low, len(self.g), -np.inf),
-            _spread(problem.ubg, it.point_rows, it.selected, high, len(self.g), np.inf),
-        )
+        it, layout = self._structure, problem.layout
+        lower, upper = _limits(
+            problem.lbx, problem.ubx, problem.lbg, problem.ubg, it.point_rows, it.selected, layout.speed_rows,
+            layout.block, len(it.positive), it.of_yaw, problem.ends.start is not None, len(self.g),
+        )  # fmt: skip
+        return bounds_of(lower, upper)
 
     def v_of(self, table: NDArray) -> NDArray:
         """The variables of a table of coefficients; the smallest counts where several have one value."""
@@ -219,30 +219,29 @@ def _linear_rows(layout: Layout, positive: NDArray) -> tuple[NDArray, NDArray, i
     return np.ascontiguousarray(np.concatenate(weights).T), np.concatenate(interval), int(layout.shape.free_yaw)
 
 
-def _linear_bounds(problem: Problem, positive: int) -> tuple[NDArray, NDArray]:
-    """(lower, upper) of what _linear_rows has."""
-    layout = problem.layout
-    nodes = np.arange(layout.shape.nodes + 1) * layout.block
-    speeds = problem.ubg[layout.speed_rows].T.ravel()
-    free = problem.lbx[nodes] < problem.ubx[nodes]
-    never = np.full(len(nodes) + len(speeds), -np.inf)
-    lower = [never, np.full(positive, FLOOR)]
-    upper = [np.where(free, problem.ubx[nodes], np.inf), speeds, np.full(positive, np.inf)]
-    if layout.shape.free_yaw:
-        held = problem.ends.start is not None
-        lower.append(np.array([-np.inf]) if held else problem.lbx[3:4])
-        upper.append(np.array([np.inf]) if held else problem.ubx[3:4])
-    return np.concatenate(lower), np.concatenate(upper)
-
-
 @njit(cache=True)
-def _spread(limits, point_rows, selected, linear, count, nothing):
-    """(count,) those of the kernel's rows, where something asks for them, and those of the linear ones behind."""
-    spread = np.full(count, nothing)
+def _limits(
+    lbx, ubx, lbg, ubg, point_rows, selected, speed_rows, block, positive, of_yaw, yaw_held, count
+):  # fmt: skip
+    """(2, count) of the kernel's rows, where something asks for them, and of what _linear_rows has behind."""
+    limits = np.empty((2, count))
+    limits[0], limits[1] = -np.inf, np.inf
     for k in range(len(selected)):
-        spread[selected[k]] = limits[point_rows[k]]
-    spread[count - len(linear) :] = linear
-    return spread
+        limits[0, selected[k]], limits[1, selected[k]] = lbg[point_rows[k]], ubg[point_rows[k]]
+    nodes, between = speed_rows.shape
+    at = count - (nodes + 1 + nodes * between + positive + of_yaw)
+    for n in range(nodes + 1):
+        if lbx[n * block] < ubx[n * block]:
+            limits[1, at + n] = ubx[n * block]
+    at += nodes + 1
+    for k in range(nodes):
+        for q in range(between):
+            limits[1, at + q * nodes + k] = ubg[speed_rows[k, q]]
+    at += nodes * between
+    limits[0, at : at + positive] = FLOOR
+    if of_yaw and not yaw_held:
+        limits[0, at + positive], limits[1, at + positive] = lbx[3], ubx[3]
+    return limits
 
 
 _FREELY = {"contract", "reassoc", "nsz"}  # what is not a number survives

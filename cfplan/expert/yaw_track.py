@@ -38,13 +38,6 @@ class YawTrack:
         """The intervals from `first` to before `last`."""
         return YawTrack(self.yaw[first : last + 1], self.dyaw[first : last + 1], self.ddyaw[first:last])
 
-    def at(self, interval: NDArray, place: NDArray, step: float) -> tuple[NDArray, NDArray, NDArray]:
-        """ψ, ψ', ψ'' at places 0 to 1 of intervals."""
-        x = place * step
-        turn = self.ddyaw[interval]
-        slope = self.dyaw[interval]
-        return self.yaw[interval] + x * (slope + x * turn / 2), slope + x * turn, turn
-
 
 def fixed_yaw(path: Path, nodes: int, angle: float, start: BoundaryState | None, end: BoundaryState | None) -> YawTrack:
     """One angle all along; from and to the yaw of boundary states where given."""

@@ -11,7 +11,6 @@ from enum import IntEnum
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from cfplan.expert.yaw_track import YawTrack
 from cfplan.vehicle.profile import BoundaryState
@@ -20,6 +19,8 @@ DURATION = 0.07
 # s, over which answers are smoothed
 YAW_WIDTH = 3.0
 # nodes, over which yaw is smoothed
+_YAW_REACH = 12
+# nodes on each side, likewise
 STIFFEST = 1e6
 # of third differences against changes, at most
 _BAND = 3
@@ -94,14 +95,31 @@ def _solve(band: NDArray, right: NDArray) -> None:
 
 def track_through(yaw: NDArray, step: float, start: BoundaryState | None, end: BoundaryState | None) -> YawTrack:
     """A smooth track by yaw at the nodes, (N+1,): a quadratic spline, with the yaw and its rate of states given."""
-    smooth = gaussian_filter1d(yaw, YAW_WIDTH, mode="nearest")
-    inner = (smooth[1:] + smooth[:-1]) / 2
-    spline = np.concatenate([inner[:1], inner, inner[-1:]])
-    for state, places, sign in ((start, [0, 1], -1.0), (end, [-1, -2], 1.0)):
-        if state is not None:
-            half = sign * state.dyaw * step / 2
-            spline[places] = state.yaw + half, state.yaw - half
-    return YawTrack((spline[:-1] + spline[1:]) / 2, np.diff(spline) / step, np.diff(spline, 2) / step**2)
+    states = [(state is not None, state.yaw, state.dyaw) if state else (False, 0.0, 0.0) for state in (start, end)]
+    return YawTrack(*_track_through(np.asarray(yaw, dtype=float), step, *states))
+
+
+@njit(cache=True, error_model="numpy")
+def _track_through(
+    yaw: NDArray, step: float, start: tuple[bool, float, float], end: tuple[bool, float, float]
+) -> tuple[NDArray, NDArray, NDArray]:
+    """What a YawTrack has. Smoothed by a Gaussian, as if the first and last yaw went on."""
+    weights = np.exp(-0.5 * (np.arange(-_YAW_REACH, _YAW_REACH + 1) / YAW_WIDTH) ** 2)
+    weights /= weights.sum()
+    last = len(yaw) - 1
+    smooth = np.zeros(len(yaw))
+    for k in range(-_YAW_REACH, _YAW_REACH + 1):
+        for n in range(len(yaw)):
+            smooth[n] += weights[_YAW_REACH + k] * yaw[min(max(n + k, 0), last)]
+    spline = np.empty(len(yaw) + 1)
+    spline[1:-1] = (smooth[1:] + smooth[:-1]) / 2
+    spline[0], spline[-1] = spline[1], spline[-2]
+    if start[0]:
+        spline[0], spline[1] = start[1] - start[2] * step / 2, start[1] + start[2] * step / 2
+    if end[0]:
+        spline[-1], spline[-2] = end[1] + end[2] * step / 2, end[1] - end[2] * step / 2
+    turning = spline[1:] - spline[:-1]
+    return (spline[:-1] + spline[1:]) / 2, turning / step, (turning[1:] - turning[:-1]) / step**2
 
 
 def travel_time(coefficients: NDArray, step: float) -> float:
