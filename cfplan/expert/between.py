@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.expert import stage
@@ -116,14 +117,27 @@ def _as_shares(at: NDArray, limits: PlanLimits) -> NDArray:
     """(COLUMNS, N) the optimiser's rows, and the squared speed, of dense rows, (dense.ROWS, N)."""
     middle = 0.5 * (limits.motor_thrust_max + limits.motor_thrust_min)
     half = 0.5 * (limits.motor_thrust_max - limits.motor_thrust_min)
+    scales = np.array([
+        limits.acceleration**2, limits.angular_velocity**2, 1.0 - math.cos(limits.tilt), limits.specific_thrust_min,
+        limits.angular_acceleration**2, half, half, half, half, limits.speed**2,
+    ])  # fmt: skip
+    return _scaled(at, middle, scales)
+
+
+@njit(cache=True, error_model="numpy")
+def _scaled(at: NDArray, middle: float, scales: NDArray) -> NDArray:
     rows = np.empty((COLUMNS, at.shape[1]))
-    rows[stage.ACCELERATION] = at[dense.ACCELERATION] / limits.acceleration**2
-    rows[stage.ANGULAR_VELOCITY] = at[dense.BODY_RATE] / limits.angular_velocity**2
-    rows[stage.TILT] = (1 - at[dense.AXIS_HEIGHT]) / (1 - math.cos(limits.tilt))
-    rows[stage.SPECIFIC_THRUST] = at[dense.SPECIFIC_THRUST] / limits.specific_thrust_min
-    rows[stage.ANGULAR_ACCELERATION] = at[dense.ANGULAR_ACCELERATION] / limits.angular_acceleration**2
-    rows[stage.THRUSTS] = (at[dense.MOTOR_THRUST : dense.MOTOR_THRUST + 4] - middle) / half
-    rows[SPEED] = at[dense.SPEED] / limits.speed**2
+    for n in range(at.shape[1]):
+        rows[stage.ACCELERATION, n] = at[dense.ACCELERATION, n]
+        rows[stage.ANGULAR_VELOCITY, n] = at[dense.BODY_RATE, n]
+        rows[stage.TILT, n] = 1.0 - at[dense.AXIS_HEIGHT, n]
+        rows[stage.SPECIFIC_THRUST, n] = at[dense.SPECIFIC_THRUST, n]
+        rows[stage.ANGULAR_ACCELERATION, n] = at[dense.ANGULAR_ACCELERATION, n]
+        for motor in range(4):
+            rows[stage.THRUSTS.start + motor, n] = at[dense.MOTOR_THRUST + motor, n] - middle
+        rows[SPEED, n] = at[dense.SPEED, n]
+        for column in range(COLUMNS):
+            rows[column, n] /= scales[column]
     return rows
 
 

@@ -71,11 +71,6 @@ class Problem:
     # (N+3, 1 or 2) spline coefficients of x, and of yaw where it is free, from which to search
 
 
-def rests(path: Path, s: float) -> bool:
-    """Whether the path stands still there, whatever h is."""
-    return bool(np.linalg.norm(path(s, 1)) < REST)
-
-
 def pose(
     layout: Layout,
     path: Path,

@@ -47,9 +47,7 @@ class SplineProblem:
         self._fixed = problem.table
         self._local = self._fixed.ravel()[it.coefficients]
 
-        given = problem.p[: points * stage.POINT_DATA].reshape(points, stage.POINT_DATA)
-        data = given.T[:, it.order]
-        data[13, points:] = 0.0  # what is there to fill the lanes costs nothing
+        data = _by_quantity(problem.p[: points * stage.POINT_DATA].reshape(points, stage.POINT_DATA), it.order)
         common = problem.p[-3 - stage.COMMON_DATA : -3]
         weights = OBJECTIVE_SCALE * problem.p[-3:]
         self._points = Points(layout.shape.free_yaw, data, common, weights, backend, spare=len(it.linear_interval))
@@ -77,11 +75,7 @@ class SplineProblem:
 
     def v_of(self, table: NDArray) -> NDArray:
         """The variables of a table of coefficients; the smallest counts where several have one value."""
-        it = self._structure
-        v = np.full(it.size, np.inf)
-        free = it.of >= 0
-        np.minimum.at(v, it.of[free], table[free])
-        return np.where(np.isfinite(v), v, 0.0)
+        return _smallest(table, self._structure.of, self._structure.size)
 
     def table_of(self, v: NDArray) -> NDArray:
         """(N+3, 1 or 2)"""
@@ -217,6 +211,31 @@ def _linear_rows(layout: Layout, positive: NDArray) -> tuple[NDArray, NDArray, i
         weights.append(np.pad(YAW_SPLINE[:1], ((0, 0), (1, 0))))
         interval.append(np.zeros(1, dtype=int))
     return np.ascontiguousarray(np.concatenate(weights).T), np.concatenate(interval), int(layout.shape.free_yaw)
+
+
+@njit(cache=True)
+def _by_quantity(of_points, order):
+    """(POINT_DATA, P) from (points, POINT_DATA). What is there to fill the lanes costs nothing."""
+    data = np.empty((of_points.shape[1], len(order)))
+    for row in range(len(data)):
+        for p in range(len(order)):
+            data[row, p] = of_points[order[p], row]
+    data[13, len(of_points) :] = 0.0
+    return data
+
+
+@njit(cache=True)
+def _smallest(table, of, size):
+    v = np.full(size, np.inf)
+    for n in range(table.shape[0]):
+        for column in range(table.shape[1]):
+            at = of[n, column]
+            if at >= 0:
+                v[at] = min(v[at], table[n, column])
+    for k in range(size):
+        if not np.isfinite(v[k]):
+            v[k] = 0.0
+    return v
 
 
 @njit(cache=True)

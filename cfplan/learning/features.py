@@ -95,7 +95,7 @@ def told(before: float, first: float, after: float) -> tuple[float, float, float
 
 def rests(path: Path, s: float) -> bool:
     """Whether the path stands still there."""
-    return bool(np.linalg.norm(path(s, 1)) < TINY)
+    return math.hypot(*path(s, 1)) < TINY
 
 
 def node_table(path: Path, first: float, step: float, count: int, bound: Bounds) -> NDArray:
