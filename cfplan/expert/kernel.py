@@ -252,7 +252,7 @@ def _loaded(family: str) -> tuple[Any, Any]:
 
 def _compiled(function: Any, points: int) -> _Bind:
     def bind(reads: list[NDArray], writes: list[NDArray]) -> Callable[[], None]:
-        pointers = [ctypes.byref(ctypes.c_char.from_buffer(array)) for array in (*reads, *writes)]  # holds the arrays
+        pointers = [ctypes.byref(ctypes.c_char.from_buffer(each.data)) for each in (*reads, *writes)]  # holds them
         return partial(function, ctypes.c_long(points), *pointers)
 
     return bind

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,11 +21,12 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.safety.space import Space
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.dense import Sampler, Stretches
+from cfplan.vehicle.dense import Stretches
+from cfplan.vehicle.flatness import Body
 from cfplan.vehicle.trajectory import FullState, Trajectory
 
 TIME_STEP = 1e-3  # s, the most between two samples
-BATCH = 4_000  # samples at a time, about: as many as stay near the processor
+BATCH = 1_000  # samples at a time, about: as many as stay near the processor
 BLOCK = 512  # samples searched for a peak at once
 LEAST_POINTS = 11  # of a piece, its ends included
 WALLS = "distance to the walls"
@@ -118,7 +118,7 @@ class _Quantity:
     unit: str
     sign: int
     row: int
-    # of dense.Sampler
+    # of dense.sample()
     count: int
     # of rows, all of which must keep the same limit
     limit: float
@@ -131,23 +131,15 @@ class _Quantity:
 def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Certificate:
     """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
     stretches, (quantities, table) = _stretches(trajectory), _quantities(trajectory.airframe, limits, space)
-    sampler = Sampler(trajectory.airframe, trajectory.path, trajectory.profile)
-    ends = np.cumsum(stretches.counts)
-    bounds = sorted({0, *np.searchsorted(ends, np.arange(BATCH, ends[-1], BATCH)).tolist(), len(ends)})
-    rows = np.empty((dense.SAMPLED_ROWS, BATCH + int(stretches.counts.max())))
-    values, places = np.full(len(table), -np.inf), np.zeros(len(table))
-    for first, last in pairwise(bounds):
-        batch = Stretches(*(each[first:last] for each in stretches))
-        sampler.rows(batch, rows)
-        if space is not None:
-            _put_distances(rows[dense.POSITION : dense.POSITION + 3, : batch.counts.sum()], space)
-        _raise_peaks(values, places, table, rows, rows[dense.PLACE], batch.counts)
+    walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
+    arrays = dense.arrays_of(trajectory.airframe, trajectory.path, trajectory.profile)
+    values, places, _ = _search(table, walls, BATCH, *arrays, *stretches)
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     peaks = zip(quantities, values.tolist(), when, places.tolist(), where, strict=True)
     return Certificate(
         margins=tuple(_margin(*each) for each in peaks),
         duration=trajectory.duration,
-        samples=int(ends[-1]),
+        samples=int(stretches.counts.sum()),
     )
 
 
@@ -164,7 +156,7 @@ def shares(trajectory: Trajectory, limits: PlanLimits, time: NDArray) -> dict[st
 
 
 def _rows(state: FullState) -> NDArray:
-    """What a Sampler gives, of full states."""
+    """What dense.sample() gives, of full states."""
     rows = np.empty((dense.SAMPLED_ROWS, len(state.s)))
     x, y, z = state.thrust_axis.T
     rows[dense.SPEED] = np.square(state.velocity).sum(axis=1)
@@ -202,14 +194,6 @@ def _quantities(airframe: Airframe, limits: PlanLimits, space: Space | None) -> 
         quantity for quantity in quantities if quantity.row != dense.ANGULAR_ACCELERATION or turning != math.inf
     )
     return limited, np.array([(quantity.row, quantity.count, quantity.sign) for quantity in limited])
-
-
-def _put_distances(position: NDArray, space: Space) -> None:
-    """In place of positions, (3, N), how far from the walls of each axis they are; the least of them counts."""
-    low, high = np.array(space.low)[:, None], np.array(space.high)[:, None]
-    position -= (low + high) / 2
-    np.abs(position, out=position)
-    np.subtract((high - low) / 2, position, out=position)
 
 
 def _plain(value: Any) -> Any:
@@ -272,6 +256,39 @@ def _cut(
     return edges[:-1], edges[1:], interval, piece, counts
 
 
+def _compile(sources: int) -> Callable[..., tuple[NDArray, NDArray, int]]:
+    """The search, which returns `sources` too: a checksum of what it calls, as numba's cache does not look there."""
+
+    @njit(cache=True, error_model="numpy")
+    def search(
+        table: NDArray, walls: NDArray, batch: int, body: Body, coefficients: NDArray, origins: NDArray, nodes: NDArray,
+        left: NDArray, right: NDArray, interval: NDArray, piece: NDArray, counts: NDArray,
+    ) -> tuple[NDArray, NDArray, int]:  # fmt: skip
+        """Peak of each of the table's quantities, and s there; about `batch` samples at a time."""
+        values, places = np.full(len(table), -np.inf), np.zeros(len(table))
+        rows = np.empty((dense.SAMPLED_ROWS, batch + counts.max()))
+        begin = 0
+        while begin < len(counts):
+            end, samples = begin, 0
+            while end < len(counts) and samples < batch:
+                dense.sample(
+                    rows[:, samples : samples + counts[end]], body, coefficients[piece[end]], origins[piece[end]],
+                    nodes[interval[end]], left[end], right[end],
+                )  # fmt: skip
+                samples += counts[end]
+                end += 1
+            for axis in range(walls.shape[1]):  # in place of positions, how far from the walls they are
+                middle, half = (walls[0, axis] + walls[1, axis]) / 2, (walls[1, axis] - walls[0, axis]) / 2
+                position = rows[dense.POSITION + axis]
+                for n in range(samples):
+                    position[n] = half - abs(position[n] - middle)
+            _raise_peaks(values, places, table, rows, rows[dense.PLACE], counts[begin:end])
+            begin = end
+        return values, places, sources
+
+    return search
+
+
 @njit(cache=True)
 def _raise_peaks(values: NDArray, places: NDArray, table: NDArray, rows: NDArray, s: NDArray, counts: NDArray) -> None:
     """Take over the peaks of these samples where they are higher. `table`, (Q, 3): first row, how many, and sign.
@@ -321,3 +338,6 @@ def _bound(before: float, here: float, after: float) -> float:
     sag = 2.0 * here - before - after
     higher = before if before > after else after
     return (here if here > higher else higher) + _ALLOWANCE * (0.0 if sag <= 0.0 else sag)
+
+
+_search = _compile(dense.SOURCES)

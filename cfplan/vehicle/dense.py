@@ -32,7 +32,7 @@ MOTOR_THRUST = 7
 # N, and the three rows behind
 ROWS = 11
 
-# What a Sampler gives besides:
+# What `sample` gives besides:
 POSITION = 11
 # m, and the two rows behind
 PLACE = 14
@@ -105,30 +105,16 @@ def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArra
     return out
 
 
-class Sampler:
-    """Samples of one flight, stretch by stretch; what holds for all of them is made ready once."""
-
-    def __init__(self, airframe: Airframe, path: Path, profile: SpeedProfile) -> None:
-        coefficients = path.coefficients
-        if missing := -coefficients.shape[1] % _BLOCK:
-            coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
-            coefficients.setflags(write=False)  # as a path's are: one type for the compiler
-        self._given = compiled_body(airframe), coefficients, path.origins, profile.table()
-
-    def rows(self, stretches: Stretches, out: NDArray | None = None) -> NDArray:
-        """(SAMPLED_ROWS, N) at the samples of all stretches, one stretch behind the other.
-
-        `out` is where they are written, if given; it may have more columns than are needed.
-        The last sample of a stretch is the last number below its right end, so that it falls on its own side of a
-        break.
-        """
-        if out is None:
-            out = np.empty((SAMPLED_ROWS, int(stretches.counts.sum())))
-        _along(out, *self._given, *stretches)
-        return out
+def arrays_of(airframe: Airframe, path: Path, profile: SpeedProfile) -> tuple[Body, NDArray, NDArray, NDArray]:
+    """What sample() needs of a flight: its body, the path's coefficients and where they count from, the profile."""
+    coefficients = path.coefficients
+    if missing := -coefficients.shape[1] % _BLOCK:
+        coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
+        coefficients.setflags(write=False)  # as a path's are: one type for the compiler
+    return compiled_body(airframe), coefficients, path.origins, profile.table()
 
 
-def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Callable[..., int]]:
+def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
     """The loops, which return `sources`: a checksum of what they call, as numba's cache does not look there."""
 
     @njit(cache=True, error_model="numpy", fastmath=ROUNDING)
@@ -147,34 +133,6 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Call
         return sources
 
     @njit(cache=True, error_model="numpy", fastmath=ROUNDING)
-    def along(
-        out: NDArray, body: Body, coefficients: NDArray, origins: NDArray, nodes: NDArray,
-        left: NDArray, right: NDArray, interval: NDArray, piece: NDArray, counts: NDArray,
-    ) -> int:  # fmt: skip
-        panel, s = np.empty(_SIZE), np.empty(WIDTH)
-        end = 0
-        for k in range(len(counts)):
-            begin, end = end, end + counts[k]
-            last, first_s, width, last_s = counts[k] - 1, left[k], right[k] - left[k], np.nextafter(right[k], -np.inf)
-            node = _node(nodes, interval[k])
-            for done in range(0, counts[k], WIDTH):
-                lanes = min(WIDTH, _whole(counts[k] - done))
-                for n in range(lanes):
-                    s[n] = first_s + (done + n) / last * width if done + n < last else last_s
-                    panel[_X * WIDTH + n] = s[n] - origins[piece[k]]
-                _trace(panel, coefficients[piece[k]], lanes)
-                for n in range(lanes):
-                    panel[_X * WIDTH + n] = s[n] - nodes[interval[k], 0]
-                _flatten_stretch(panel, body, node, lanes)
-                at, count = begin + done, min(WIDTH, counts[k] - done)
-                for row in range(ROWS):
-                    out[row, at : at + count] = panel[(_RESULT + row) * WIDTH : (_RESULT + row) * WIDTH + count]
-                for row in range(3):
-                    out[POSITION + row, at : at + count] = panel[row * WIDTH : row * WIDTH + count]
-                out[PLACE, at : at + count] = s[:count]
-        return sources
-
-    @njit(cache=True, error_model="numpy", fastmath=ROUNDING)
     def states(out: NDArray, body: Body, curves: NDArray, nodes: NDArray, places: NDArray, interval: NDArray) -> int:
         panel = np.empty(_SIZE)
         for start in range(0, len(places), WIDTH):
@@ -190,7 +148,32 @@ def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int], Call
                     out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
         return sources
 
-    return at_points, along, states
+    return at_points, states
+
+
+@register_jitable(fastmath=ROUNDING)
+def sample(
+    out: NDArray, body: Body, curve: NDArray, origin: float, node: NDArray, left: float, right: float
+) -> None:  # fmt: skip
+    """Fill in one stretch's samples, (SAMPLED_ROWS, count), of a piece of the path and an interval of the profile."""
+    panel, s = np.empty(_SIZE), np.empty(WIDTH)
+    last, width, last_s = out.shape[1] - 1, right - left, np.nextafter(right, -np.inf)
+    profile = _node(node)
+    for done in range(0, last + 1, WIDTH):
+        lanes = min(WIDTH, _whole(last + 1 - done))
+        for n in range(lanes):
+            s[n] = left + (done + n) / last * width if done + n < last else last_s
+            panel[_X * WIDTH + n] = s[n] - origin
+        _trace(panel, curve, lanes)
+        for n in range(lanes):
+            panel[_X * WIDTH + n] = s[n] - node[0]
+        _flatten_stretch(panel, body, profile, lanes)
+        count = min(WIDTH, last + 1 - done)
+        for row in range(ROWS):
+            out[row, done : done + count] = panel[(_RESULT + row) * WIDTH : (_RESULT + row) * WIDTH + count]
+        for row in range(3):
+            out[POSITION + row, done : done + count] = panel[row * WIDTH : row * WIDTH + count]
+        out[PLACE, done : done + count] = s[:count]
 
 
 @register_jitable(fastmath=ROUNDING)
@@ -270,9 +253,9 @@ def _flat_at(panel: NDArray, body: Body, node: _Node, n: int) -> tuple[Flat, flo
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
-def _node(nodes: NDArray, k: int) -> _Node:
-    """The profile where interval k begins."""
-    return nodes[k, 1], nodes[k, 2], nodes[k, 3], nodes[k, 4], nodes[k, 5], nodes[k, 6], nodes[k, 7]
+def _node(node: NDArray) -> _Node:
+    """The profile where an interval begins, from its row of the profile's table."""
+    return node[1], node[2], node[3], node[4], node[5], node[6], node[7]
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
@@ -363,4 +346,6 @@ def _squared(vector: tuple[float, float, float]) -> float:
 
 
 _CALLED = [FilePath(__file__).with_name(name).read_bytes() for name in ("flatness.py", "trigonometry.py")]
-_at_points, _along, _states = _compile(zlib.crc32(b"".join(_CALLED)))
+SOURCES = zlib.crc32(b"".join([*_CALLED, FilePath(__file__).read_bytes()]))
+# a checksum of what compiled samples come from, for those that compile this in; numba's cache does not look there
+_at_points, _states = _compile(zlib.crc32(b"".join(_CALLED)))

@@ -15,9 +15,9 @@ from cfplan.safety.certificate import _raise_peaks, _stretches, certify
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
+from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.airframes import AIRFRAMES
-from cfplan.vehicle.dense import PLACE, Sampler
 from cfplan.vehicle.flatness import flat_state
 from cfplan.vehicle.trajectory import Trajectory, state_at
 
@@ -168,7 +168,11 @@ def test_one_value_that_is_not_finite_fails(wrong):
 
 def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval(trajectory):
     stretches = _stretches(trajectory)
-    s = Sampler(trajectory.airframe, trajectory.path, trajectory.profile).rows(stretches)[PLACE]
+    body, coefficients, origins, nodes = dense.arrays_of(AIRFRAME, trajectory.path, trajectory.profile)
+    sampled = [np.empty((dense.SAMPLED_ROWS, count)) for count in stretches.counts]
+    for rows, left, right, interval, piece, _ in zip(sampled, *stretches, strict=True):
+        dense.sample(rows, body, coefficients[piece], origins[piece], nodes[interval], left, right)
+    s = np.concatenate(sampled, axis=1)[dense.PLACE]
     assert np.diff(trajectory.time_at(s)).max() <= 1.001e-3
     assert np.bincount(np.repeat(stretches.interval, stretches.counts)).min() >= 10
     assert len(stretches.counts) >= len(np.union1d(trajectory.profile.s, trajectory.path.breaks)) - 1
