@@ -5,7 +5,7 @@ Times are the processor's: planning is one thread, and a ratio of its times hold
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path as File
 from typing import Any
 
@@ -127,21 +127,28 @@ def long_paths(
     if paths < 1 or repeats < 1 or not lengths or not min(lengths) > 0 or not np.isfinite(max(lengths)):
         raise InputError("long paths need a length above 0 m, one path of it and one repeat at least", where="lengths")
     find_box(box)
-    chosen, seeds, done, interrupted = find_limit_set(limits), range(first_seed, first_seed + paths), [], False
+    chosen, seeds = find_limit_set(limits), range(first_seed, first_seed + paths)
+    total, made, interrupted = len(lengths) * paths * repeats, 0, False
+    done: list[list[Walk]] = []
     try:
         _planned(path_of_length(lengths[0], box, first_seed), chosen)  # loads and compiles
-        for number, length in enumerate(lengths):
+        for length in lengths:
             walks = []
             for seed in seeds:
-                walks.append(_walk(path_of_length(length, box, seed), seed, chosen, repeats))
-                progress(number * paths + len(walks), len(lengths) * paths)
-            done.append(tuple(walks))
+                walks.append(_walk(path_of_length(length, box, seed), seed, chosen))
+                progress(made := made + 1, total)
+            done.append(walks)
+        for _ in range(repeats - 1):  # by turns, so that a computer that changes its pace does so for all lengths
+            for length, walks in zip(lengths, done, strict=True):
+                for k, seed in enumerate(seeds):
+                    walks[k] = _repeated(walks[k], path_of_length(length, box, seed), chosen)
+                    progress(made := made + 1, total)
     except KeyboardInterrupt:
         interrupted = True
-    return LongPaths(command, this_machine(), box, limits, interrupted, tuple(done))
+    return LongPaths(command, this_machine(), box, limits, interrupted, tuple(tuple(walks) for walks in done))
 
 
-def _walk(path: Path, seed: int, chosen: LimitSet, repeats: int) -> Walk:
+def _walk(path: Path, seed: int, chosen: LimitSet) -> Walk:
     nodes = default_nodes(path, "learned")
     values: dict[str, Any] = {"seed": seed, "length": path.length, "nodes": nodes, "reason": "", "share": np.nan}
     values |= dict.fromkeys(("worst_share", "flight", "expert_flight", "kept", "peak"), np.nan)
@@ -150,10 +157,9 @@ def _walk(path: Path, seed: int, chosen: LimitSet, repeats: int) -> Walk:
         path.check()
         _forget_peak()
         before = _memory("VmRSS")
-        found, seconds = _planned(path, chosen)
+        found, values["seconds"] = _planned(path, chosen)
         values |= {"kept": _memory("VmRSS") - before, "peak": _memory("VmHWM") - before}
-        runs = [seconds] + [_planned(path, chosen)[1] for _ in range(repeats - 1)]
-        values |= {"seconds": min(runs, key=sum), "share": found.share, "flight": found.trajectory.duration}
+        values |= {"share": found.share, "flight": found.trajectory.duration}
         values["worst_share"] = found.certificate.worst.share
         expert = plan_reduced(path, chosen.airframe, chosen.limits, nodes=nodes, windows=False)
         if expert.profile is not None:
@@ -163,6 +169,11 @@ def _walk(path: Path, seed: int, chosen: LimitSet, repeats: int) -> Walk:
     except CfplanError as error:
         values["reason"] = str(error)
     return Walk(**values)
+
+
+def _repeated(walk: Walk, path: Path, chosen: LimitSet) -> Walk:
+    """With the shorter of its time and that of planning again."""
+    return walk if walk.reason else replace(walk, seconds=min(walk.seconds, _planned(path, chosen)[1], key=sum))
 
 
 def _planned(path: Path, chosen: LimitSet) -> tuple[Repaired, tuple[float, float, float]]:

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from cfplan.expert.spline_profile import spline_profile
 from cfplan.expert.yaw_track import YawTrack
-from cfplan.learning.smooth import Begin, smoothed
+from cfplan.learning.smooth import Begin, smoothed, track_through
+from cfplan.vehicle.profile import BoundaryState
 
 SETTLED = np.array([2.0, 2.05, 2.12])
 
@@ -69,3 +71,19 @@ def test_a_profile_is_the_spline_of_its_coefficients(make_profile):
     found, expected = spline_profile(u, 3.0, YawTrack(zeros, zeros, zeros[1:])), make_profile(3.0, u)
     for name in ("s", "h", "dh", "ddh", "dddh"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-8)
+
+
+@pytest.mark.parametrize("nodes", [10, 64, 100])
+def test_yaw_is_smoothed_as_scipy_does_and_keeps_the_states_it_is_given(nodes):
+    yaw = np.random.default_rng(nodes).normal(size=nodes + 1).cumsum()
+    track = track_through(yaw, 0.2, None, None)
+    smooth = gaussian_filter1d(yaw, 3.0, mode="nearest")
+    middles = (smooth[1:] + smooth[:-1]) / 2
+    np.testing.assert_allclose(track.yaw[1:-1], (middles[1:] + middles[:-1]) / 2, atol=1e-12)
+    np.testing.assert_allclose(track.dyaw[1:-1], np.diff(middles) / 0.2, atol=1e-12)
+    start, end = BoundaryState(1.0, 0.0, 0.0, 0.3, 0.2), BoundaryState(1.0, 0.0, 0.0, -0.4, -0.7)
+    held = track_through(yaw, 0.2, start, end)
+    assert (held.yaw[0], held.dyaw[0], held.yaw[-1], held.dyaw[-1]) == pytest.approx((0.3, 0.2, -0.4, -0.7))
+    # a parabola in each interval, continuous with its slope
+    np.testing.assert_allclose(held.yaw[:-1] + 0.2 * held.dyaw[:-1] + 0.02 * held.ddyaw, held.yaw[1:], atol=1e-12)
+    np.testing.assert_allclose(held.dyaw[:-1] + 0.2 * held.ddyaw, held.dyaw[1:], atol=1e-12)
