@@ -117,7 +117,7 @@ def _as_shares(at: NDArray, limits: PlanLimits) -> NDArray:
     """(COLUMNS, N) the optimiser's rows, and the squared speed, of dense rows, (dense.ROWS, N)."""
     middle = 0.5 * (limits.motor_thrust_max + limits.motor_thrust_min)
     half = 0.5 * (limits.motor_thrust_max - limits.motor_thrust_min)
-    scales = np.array([
+    scales = np.array([  # column by column
         limits.acceleration**2, limits.angular_velocity**2, 1.0 - math.cos(limits.tilt), limits.specific_thrust_min,
         limits.angular_acceleration**2, half, half, half, half, limits.speed**2,
     ])  # fmt: skip

@@ -13,7 +13,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 PULLS = ("stiffness", "multiplier", "wall", "missing")
-# of each constraint: Σ of its slack; y; the slope that a barrier of 1 has there; and Σ times what it is off its slack
+# of each constraint, by row: Σ of its slack; y; the slope of a barrier of 1 there; Σ times what it is off its slack
 FAR = 1e20
 COMPLEMENTARY = 1e10
 # how far a multiplier may be from what the barrier makes of its slack, as a factor
