@@ -1,41 +1,106 @@
-"""Packages import those above them in the design's list, never those below."""
+"""Packages import those above them in the design's list, rooms of a package likewise, and each by its face alone."""
 
 import ast
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 LAYERS = [
-    "geometry", "vehicle", "safety", "expert", "learning", "planning", "flight", "simulation", "recording", "studies",
-    "cli",
+    "files", "geometry", "vehicle", "safety", "planners", "learning", "planning", "flight", "simulation",
+    "preparation", "recording", "studies", "cli",
 ]  # fmt: skip
+# Modules and rooms of a package, in order: each may import those before it. Modules not named stand together.
+MODULES = "its other modules"
+ROOMS = {
+    "planners": [MODULES, "solver", "expert", "baselines"],
+    "flight": [MODULES, "setpoints", "radio", "mocap", "pilot"],
+    "simulation": ["timed_fault", "dynamics", "virtual_crazyflie", "virtual_vicon", "lab", MODULES],
+    "recording": ["importers", MODULES, "rerun", "report", "mavlink"],
+}
 PACKAGE = Path(__file__).parent.parent / "cfplan"
+FILES = sorted(PACKAGE.rglob("*.py"))
 
 
-def imported_layers(file: Path) -> set[str]:
-    """The cfplan packages that a file imports, anywhere in it."""
-    names: list[str] = []
+def imports(file: Path) -> Iterator[tuple[str, ...]]:
+    """What a file imports of cfplan, anywhere in it: the parts of each module's name, without the first."""
     for node in ast.walk(ast.parse(file.read_text())):
+        names: list[str] = []
         if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
+            names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{file}: relative imports hide what is imported"
-            names += [f"{node.module}.{alias.name}" for alias in node.names]
-    parts = [name.split(".") for name in names if name.startswith("cfplan.")]
-    return {part[1] for part in parts if part[1] in LAYERS}
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        for name in names:
+            first, *parts = name.split(".")
+            if first == "cfplan":
+                while parts and not (
+                    PACKAGE.joinpath(*parts).is_dir() or PACKAGE.joinpath(*parts).with_suffix(".py").exists()
+                ):
+                    parts.pop()
+                yield tuple(parts)
+
+
+def room_of(parts: tuple[str, ...]) -> tuple[str, ...]:
+    """The innermost package in which a module lies."""
+    return parts if PACKAGE.joinpath(*parts).is_dir() else parts[:-1]
+
+
+def face(room: tuple[str, ...]) -> set[str]:
+    """What a room's __init__.py says that others may import."""
+    for node in ast.parse(PACKAGE.joinpath(*room, "__init__.py").read_text()).body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+            return set(ast.literal_eval(node.value))
+    return set()
+
+
+def place(package: str, member: str) -> int:
+    order = ROOMS[package]
+    return order.index(member if member in order else MODULES)
 
 
 @pytest.mark.parametrize("layer", LAYERS)
 def test_a_package_imports_only_those_above_it(layer):
     allowed = set(LAYERS[: LAYERS.index(layer) + 1])
     for file in (PACKAGE / layer).rglob("*.py"):
-        assert imported_layers(file) <= allowed, f"{file} reaches downwards"
+        layers = {parts[0] for parts in imports(file) if parts and parts[0] in LAYERS}
+        assert layers <= allowed, f"{file} reaches downwards"
+
+
+@pytest.mark.parametrize("package", ROOMS)
+def test_a_room_imports_only_those_above_it(package):
+    for file in (PACKAGE / package).rglob("*.py"):
+        inside = file.relative_to(PACKAGE / package).with_suffix("").parts
+        if inside == ("__init__",):
+            continue
+        for parts in imports(file):
+            if len(parts) > 1 and parts[0] == package and parts[1] != inside[0]:
+                assert place(package, parts[1]) <= place(package, inside[0]), f"{file} reaches down to {parts[1]}"
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_a_file_imports_other_rooms_by_their_face(file):
+    own = file.relative_to(PACKAGE).parent.parts
+    for parts in imports(file):
+        for depth in range(1, len(parts)):
+            room, name = parts[:depth], parts[depth]
+            if own[:depth] != room:
+                assert name in face(room), f"{file} imports {'.'.join(parts)}, which {'.'.join(room)} does not offer"
+
+
+def test_every_face_names_what_there_is():
+    for init in PACKAGE.rglob("__init__.py"):
+        if init.parent == PACKAGE:
+            continue
+        for name in face(init.parent.relative_to(PACKAGE).parts):
+            assert (init.parent / name).is_dir() or (init.parent / f"{name}.py").exists() or name in init.read_text()
 
 
 def test_every_package_is_in_the_list():
-    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == set(LAYERS)
+    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} <= set(LAYERS)
 
 
 def test_shared_modules_import_no_layer():
     for file in PACKAGE.glob("*.py"):
-        assert imported_layers(file) == set(), f"{file} belongs to a layer"
+        layers = {parts[0] for parts in imports(file) if parts and parts[0] in LAYERS}
+        assert layers == set(), f"{file} belongs to a layer"

@@ -12,7 +12,7 @@ from cfplan.cli.vehicle import SIMULATED
 from cfplan.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
-    from cfplan.flight.mission import Mission
+    from cfplan.flight.pilot.mission import Mission
 
 FIRST_SPEED = 0.3  # share at which a path should be flown first
 
@@ -38,8 +38,8 @@ def what_it_does(name: str, mission: "Mission", uri: str) -> str:
     """Time, speed, fence, how to end it, and where it ends if nobody can."""
     import numpy as np
 
-    from cfplan.flight.packets import decode
-    from cfplan.simulation.orphan import orphaned
+    from cfplan.flight.setpoints.packets import decode
+    from cfplan.simulation.link_loss import orphaned
 
     speed = float(np.linalg.norm(decode(mission.payloads).velocity, axis=1).max())
     space = mission.limits.space

@@ -84,10 +84,10 @@ def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **wha
         TimeRemainingColumn,
     )
 
-    from cfplan.expert.limit_sets import LIMIT_SETS
     from cfplan.geometry.yaw import YawMode
     from cfplan.learning.dataset import make_dataset
     from cfplan.learning.dataset_spec import DatasetSpec, Relabel
+    from cfplan.safety.limit_sets import LIMIT_SETS
 
     if what["limits"] not in LIMIT_SETS:
         raise InputError(f"no limit set {what['limits']!r}", where="--limits", hint=f"one of {', '.join(LIMIT_SETS)}")

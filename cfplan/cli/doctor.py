@@ -70,8 +70,8 @@ def _optional(name: str) -> dict[str, str]:
 
 def _expert() -> dict[str, str]:
     """How the expert's functions are evaluated here; compiles them if that was never done."""
-    from cfplan.expert.compiled import Backend, compiler
-    from cfplan.expert.kernel import backend
+    from cfplan.planners.expert.compiled import Backend, compiler
+    from cfplan.planners.expert.kernel import backend
 
     used = backend()
     if used is Backend.COMPILED:
@@ -82,9 +82,9 @@ def _expert() -> dict[str, str]:
 
 def _priority() -> dict[str, str]:
     """Whether setpoints are on time although other programs run."""
-    from cfplan.flight.pace import STREAM_PRIORITY, may_go_first
+    from cfplan.flight.real_time import STREAM_PRIORITY, may_use_fifo_scheduling
 
-    if may_go_first():
+    if may_use_fifo_scheduling():
         return _check("priority", f"SCHED_FIFO, {STREAM_PRIORITY}")
     hint = f"setpoints wait for other programs; `rtprio {STREAM_PRIORITY}` in /etc/security/limits.d permits more"
     return _check("priority", "ordinary", "optional", hint)
@@ -92,7 +92,7 @@ def _priority() -> dict[str, str]:
 
 def _radio() -> dict[str, str]:
     """Whether a Crazyradio is plugged in and may be used."""
-    from cfplan.flight.dongle import check_radio, find_radios
+    from cfplan.flight.radio.crazyradio import check_radio, find_radios
 
     try:
         check_radio("radio://0")

@@ -19,7 +19,7 @@ from cfplan.cli.watchers import check_watchers, watchers
 from cfplan.errors import CfplanError, ExitCode
 
 if TYPE_CHECKING:
-    from cfplan.flight.outcome import FlightOutcome
+    from cfplan.flight.pilot.outcome import FlightOutcome
     from cfplan.flight.telemetry import Telemetry
     from cfplan.recording.header import RecordHeader
 
@@ -85,10 +85,10 @@ def fly(
     encoded = certify_bytes(flight, steps)
     rehearsed = rehearse(flight, encoded, steps)
 
-    from cfplan.flight.mission import mission_of
-    from cfplan.flight.process import fly as fly_mission
-    from cfplan.flight.stop_certificate import certify_stops
-    from cfplan.planning.files import save_plan
+    from cfplan.flight.pilot.mission import mission_of
+    from cfplan.flight.pilot.process import fly as fly_mission
+    from cfplan.flight.setpoints.stop_certificate import certify_stops
+    from cfplan.planning.plan_file import save_plan
     from cfplan.recording.reader import read_record
     from cfplan.recording.summary import summarise
     from cfplan.recording.writer import RecordWriter, new_record_folder, write_summary

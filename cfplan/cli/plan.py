@@ -34,7 +34,7 @@ def plan(
     steps = Steps(as_json=as_json)
     flight = obtain_plan(path_file, PlanOptions(safety_file, planner, nodes, speed_share), steps)
     if output is not None:
-        from cfplan.planning.files import save_plan
+        from cfplan.planning.plan_file import save_plan
 
         with steps.step("save") as said:
             if output.exists() and not force:

@@ -9,7 +9,7 @@ from cfplan.cli.output import Steps
 from cfplan.errors import InputError
 
 if TYPE_CHECKING:
-    from cfplan.flight.encoding import EncodedFlight
+    from cfplan.flight.setpoints.encoding import EncodedFlight
     from cfplan.planning.plan import Plan
     from cfplan.safety.limits import Limits
     from cfplan.simulation.dry_run import DryRun
@@ -73,8 +73,8 @@ def obtain_plan(path_or_plan: Path, options: PlanOptions, steps: Steps) -> Plann
             said.append(f"{plan.trajectory.duration:.2f} s, {plan.planner}, read from {path_or_plan}")
         return PlannedFlight(path_or_plan.stem, plan, limits)
 
-    from cfplan.expert.convex import lower_bound
     from cfplan.geometry.path_file import load_path_file
+    from cfplan.planners.baselines.convex import lower_bound
     from cfplan.planning.plan import plan as make_plan
     from cfplan.safety.space import check_space
 
@@ -107,7 +107,7 @@ def _read_plan(file: Path, limits: "Limits") -> "Plan":
     """What was planned under other limits must keep today's; what was planned for another vehicle cannot."""
     from dataclasses import replace
 
-    from cfplan.planning.files import load_plan
+    from cfplan.planning.plan_file import load_plan
     from cfplan.safety.certificate import certify
 
     plan = load_plan(file)
@@ -123,7 +123,7 @@ def _read_plan(file: Path, limits: "Limits") -> "Plan":
 def certify_bytes(flight: PlannedFlight, steps: Steps) -> "EncodedFlight":
     """Show the certificate's worst share, encode the flight, and check what the bytes say."""
     from cfplan.errors import NotCertifiedError
-    from cfplan.flight.encoding import encode_checked
+    from cfplan.flight.setpoints.encoding import encode_checked
 
     plan, certificate = flight.plan, flight.plan.certificate
     with steps.step("certificate") as said:
@@ -147,7 +147,7 @@ def rehearse(flight: PlannedFlight, encoded: "EncodedFlight", steps: Steps) -> "
     Raises NotCertifiedError where the dry run fails.
     """
     from cfplan.simulation.dry_run import dry_run
-    from cfplan.simulation.orphan import orphaned
+    from cfplan.simulation.link_loss import orphaned
 
     with steps.step("dry run") as said:
         result = dry_run(encoded, flight.plan.trajectory, flight.limits.airframe, flight.limits.flight)

@@ -104,7 +104,7 @@ def _size(file: Path) -> str:
 
 def _replay_record(place: Path, files: Files, steps: Steps) -> dict[str, Any]:
     from cfplan.recording.reader import read_record
-    from cfplan.recording.rerun_view import picture, show, write_rrd
+    from cfplan.recording.rerun.record_view import picture, show, write_rrd
     from cfplan.recording.summary import summarise
 
     with steps.step("read") as said:
@@ -124,7 +124,7 @@ def _replay_trials(
     files: Files,
     steps: Steps,
 ) -> dict[str, Any]:
-    from cfplan.recording.overlay_view import picture_overlay, show_overlay, write_overlay
+    from cfplan.recording.rerun.overlay_view import picture_overlay, show_overlay, write_overlay
 
     reference = _reference(plan_file, steps) if plan_file is not None else None
     trials: list[Trial] = []
@@ -141,7 +141,7 @@ def _reference(plan_file: Path, steps: Steps) -> "Reference":
     from cfplan.recording.overlay import reference_of
 
     if plan_file.suffix == PLAN_SUFFIX:  # as it was planned, whatever today's limits say
-        from cfplan.planning.files import load_plan
+        from cfplan.planning.plan_file import load_plan
 
         with steps.step("plan") as said:
             trajectory = load_plan(plan_file).trajectory

@@ -30,8 +30,8 @@ def report(records: tuple[Path, ...], output: Path | None, force: bool, as_json:
 
     With --json the numbers are printed, and a page is written only where -o names one.
     """
-    from cfplan.recording.report import flight_to_dict, read_flight
-    from cfplan.recording.report_page import write_page
+    from cfplan.recording.report.page import write_page
+    from cfplan.recording.report.report import flight_to_dict, read_flight
 
     steps = Steps(as_json=as_json)
     flights = []

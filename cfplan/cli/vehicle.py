@@ -9,7 +9,7 @@ from cfplan.errors import InputError
 
 if TYPE_CHECKING:
     from cfplan.cli.output import Steps
-    from cfplan.flight.poses import PoseSource
+    from cfplan.flight.mocap.poses import PoseSource
     from cfplan.safety.limits import Limits, PoseLimits
 
 SIMULATED = "sim://"
@@ -19,7 +19,7 @@ VIRTUAL_VICON = "lab"  # as the computer in a URI of motion capture
 def check_uris(uri: str, mocap_uri: str | None) -> None:
     """Raises InputError where one is wrong, or a vehicle has no source of poses; looks for nothing yet."""
     from cfplan.flight.mocap.uri import EXAMPLE, parse_uri
-    from cfplan.flight.vehicle_uri import check_vehicle_uri
+    from cfplan.flight.radio.uri import check_vehicle_uri
 
     check_vehicle_uri(uri)
     if mocap_uri is not None:
@@ -35,9 +35,9 @@ def look_at_hardware(uri: str, mocap_uri: str | None, limits: "PoseLimits", step
 
     Raises a CfplanError, within 5 s. Says where the body is, which a person can check with a glance.
     """
-    from cfplan.flight.dongle import check_radio
-    from cfplan.flight.mission import yaw_of
     from cfplan.flight.mocap.source import pose_source
+    from cfplan.flight.pilot.mission import yaw_of
+    from cfplan.flight.radio.crazyradio import check_radio
 
     if uri.startswith("radio://"):
         with steps.step("radio") as said:
@@ -73,10 +73,10 @@ def vehicle(uri: str, mocap_uri: str | None, limits: "Limits") -> "Iterator[tupl
     if not uri.startswith(SIMULATED):
         yield [], pose_source(str(mocap), limits.pose)
         return
-    from cfplan.simulation.lab import start_lab
-    from cfplan.simulation.room import RoomPoseSource, RoomSettings
-    from cfplan.simulation.sim_driver import SimDriver, lab_number
-    from cfplan.simulation.virtual_cameras import ViconSettings
+    from cfplan.simulation.lab.lab import start_lab
+    from cfplan.simulation.lab.room import RoomPoseSource, RoomSettings
+    from cfplan.simulation.lab.sim_driver import SimDriver, lab_number
+    from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 
     number = lab_number(uri)
     if mocap is None:

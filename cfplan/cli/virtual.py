@@ -11,9 +11,9 @@ from cfplan.cli import options
 from cfplan.errors import LinkError
 
 if TYPE_CHECKING:
-    from cfplan.recording.live import LiveView
+    from cfplan.recording.rerun.live import LiveView
     from cfplan.safety.limits import Limits
-    from cfplan.simulation.lab import Truth
+    from cfplan.simulation.lab.lab import Truth
 
 _LOOK = 0.05  # s
 
@@ -36,8 +36,8 @@ Examples:
 def virtual(port: int, seconds: float | None, live: bool, safety_file: Path | None) -> None:
     """Serve the virtual Crazyflie over UDP, with poses on board as from a positioning deck."""
     from cfplan.safety.limits import load_limits
-    from cfplan.simulation.lab import start_lab
-    from cfplan.simulation.room import RoomSettings
+    from cfplan.simulation.lab.lab import start_lab
+    from cfplan.simulation.lab.room import RoomSettings
 
     limits = load_limits(options.find_safety_file(safety_file, Path.cwd() / "here"))
     end = time.monotonic() + seconds if seconds is not None else float("inf")
@@ -80,7 +80,7 @@ def _open_view(limits: "Limits") -> "LiveView":
     import numpy as np
 
     from cfplan.recording.header import header_under
-    from cfplan.recording.live import open_live
+    from cfplan.recording.rerun.live import open_live
     from cfplan.recording.writer import wall_time_at_zero
 
     header = header_under(

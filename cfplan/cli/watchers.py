@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cfplan.flight.keys import Order
+    from cfplan.flight.pilot.keys import Order
     from cfplan.flight.telemetry import Telemetry
     from cfplan.recording.header import RecordHeader
-    from cfplan.recording.live import LiveView
-    from cfplan.recording.mavlink import GroundStation
+    from cfplan.recording.mavlink.bridge import GroundStation
+    from cfplan.recording.rerun.live import LiveView
 
 TLOG_FILE = "telemetry.tlog"
 
@@ -40,11 +40,11 @@ class Watching:
 def check_watchers(*, live: bool, mavlink: str | None) -> None:
     """Raises InputError, before anything is planned, where a watcher cannot be had."""
     if live:
-        from cfplan.recording.viewer import require_screen
+        from cfplan.recording.rerun.viewer import require_screen
 
         require_screen("leave out --live; `cfplan replay` shows the record afterwards")
     if mavlink is not None:
-        from cfplan.recording.mavlink import check_place
+        from cfplan.recording.mavlink.bridge import check_place
 
         check_place(mavlink)
 
@@ -55,11 +55,11 @@ def watchers(header: "RecordHeader", folder: Path, *, live: bool, mavlink: str |
     with contextlib.ExitStack() as stack:
         view = station = None
         if live:
-            from cfplan.recording.live import open_live
+            from cfplan.recording.rerun.live import open_live
 
             view = stack.enter_context(open_live(header, folder))
         if mavlink is not None:
-            from cfplan.recording.mavlink import GroundStation, parse_place
+            from cfplan.recording.mavlink.bridge import GroundStation, parse_place
 
             station = stack.enter_context(GroundStation(parse_place(mavlink), folder / TLOG_FILE))
         yield Watching(view, station)

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from cfplan.errors import InputError
+from cfplan.files.text import read_table
+from cfplan.files.yaml_with_places import Places, read_yaml_with_places
 from cfplan.geometry.min_snap import CLOSEST, CLOSEST_DENSE, check_points, min_snap, smooth_through
 from cfplan.geometry.path import Path, rotation_about_z
 from cfplan.geometry.polynomial_csv import read_polynomials
-from cfplan.geometry.text_source import read_table
-from cfplan.geometry.yaml_source import Places, read_yaml_with_places
 from cfplan.geometry.yaw import YawMode
 
 _FEW = 8

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
+from cfplan.files.text import read_table
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import end_values
 from cfplan.geometry.rest import mended, with_rest_ends
-from cfplan.geometry.text_source import read_table
 
 ROW = "duration, x^0 to x^7, y^0 to y^7, z^0 to z^7, yaw^0 to yaw^7"
 _COLUMNS = 1 + 4 * 8

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from cfplan.expert.solution import Status
 from cfplan.learning.dataset import read_dataset, read_timing
+from cfplan.planners.solution import Status
 
 PERCENTILES = (0, 10, 50, 90, 99, 100)
 DISTRIBUTIONS = {

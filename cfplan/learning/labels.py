@@ -8,14 +8,14 @@ import numpy as np
 import pyarrow as pa
 
 from cfplan.errors import CfplanError
-from cfplan.expert.limit_sets import LIMIT_SETS
-from cfplan.expert.reduced import plan_reduced
-from cfplan.expert.solution import Solution, Status
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import perturbed, random_waypoints
 from cfplan.learning.dataset_spec import DatasetSpec, Relabel
+from cfplan.planners.expert.expert import plan_reduced
+from cfplan.planners.solution import Solution, Status
 from cfplan.safety.certificate import certify
+from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.vehicle.trajectory import Trajectory

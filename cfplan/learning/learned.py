@@ -14,10 +14,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from cfplan.errors import InputError
-from cfplan.expert.preconditions import broken_by, check_arguments, unsolvable
-from cfplan.expert.solution import Solution, Status
-from cfplan.expert.spline_profile import spline_profile
-from cfplan.expert.yaw_track import YawTrack, fixed_yaw, tangent_yaw
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.features import (
@@ -37,9 +33,13 @@ from cfplan.learning.inference import Network
 from cfplan.learning.model_files import Model, find_model
 from cfplan.learning.smooth import Begin, smoothed, track_through
 from cfplan.learning.windows import chain, kept
+from cfplan.planners.solution import Solution, Status
+from cfplan.safety.feasibility import broken_by, check_arguments, unsolvable
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.profile_spline import spline_profile
+from cfplan.vehicle.yaw_spline import YawTrack, fixed_yaw, tangent_yaw
 
 LEAST_NODES = 10
 LEAD = 3.0

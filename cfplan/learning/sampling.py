@@ -14,8 +14,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
-from cfplan.expert.limit_sets import LIMIT_SETS
-from cfplan.expert.solution import Status
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import perturbed
 from cfplan.learning.dataset import read_dataset
@@ -32,6 +30,8 @@ from cfplan.learning.features import (
     fill_nodes,
     told,
 )
+from cfplan.planners.solution import Status
+from cfplan.safety.limit_sets import LIMIT_SETS
 
 LEAST_CERTIFIED = 0.97
 # share of its speed at which a label must be certified to be learned from

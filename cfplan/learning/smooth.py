@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cfplan.expert.yaw_track import YawTrack
 from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.yaw_spline import YawTrack
 
 DURATION = 0.07
 # s, over which answers are smoothed

@@ -20,7 +20,6 @@ from torch.nn.parallel import DistributedDataParallel
 
 from cfplan import __version__
 from cfplan.errors import InputError
-from cfplan.expert.limit_sets import LIMIT_SETS
 from cfplan.learning import features, inference
 from cfplan.learning.checkpoints import Epoch, resume, save_checkpoint
 from cfplan.learning.learned import predict
@@ -31,6 +30,7 @@ from cfplan.learning.processes import processes
 from cfplan.learning.sampling import Labels, Material, draw, read_material, split
 from cfplan.learning.smooth import travel_time
 from cfplan.learning.windows import WINDOW
+from cfplan.safety.limit_sets import LIMIT_SETS
 
 CURVES = "curves.png"
 CHUNK = 4096

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
-from cfplan.expert.convex import lower_bound
-from cfplan.expert.solution import Solution
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.model_files import find_model
-from cfplan.planning.certified import Plan
+from cfplan.planners.baselines.convex import lower_bound
+from cfplan.planners.solution import Solution
+from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO, find_planner
 from cfplan.planning.repair import Repaired, repair, slow
 from cfplan.safety.limits import Limits

@@ -5,17 +5,17 @@ from importlib import import_module
 from types import MappingProxyType
 
 from cfplan.errors import InputError
-from cfplan.expert.solution import Planner
+from cfplan.planners.solution import Planner
 
 AUTO = "auto"
 # no planner: the fastest of some, see plan()
 PLANNERS = MappingProxyType(
     {
         "learned": "cfplan.learning.learned:plan_learned",
-        "expert": "cfplan.expert.reduced:plan_reduced",
-        "toppquad": "cfplan.expert.toppquad:plan_toppquad",
-        "convex": "cfplan.expert.convex:plan_convex",
-        "minsnap": "cfplan.expert.min_snap_baseline:plan_min_snap",
+        "expert": "cfplan.planners.expert.expert:plan_reduced",
+        "toppquad": "cfplan.planners.baselines.toppquad:plan_toppquad",
+        "convex": "cfplan.planners.baselines.convex:plan_convex",
+        "minsnap": "cfplan.planners.baselines.min_snap:plan_min_snap",
     }
 )
 

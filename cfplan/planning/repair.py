@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cfplan.expert.between import surely_exceeds
-from cfplan.expert.refined import refine
 from cfplan.geometry.path import Path
+from cfplan.planners.expert.intersample import surely_exceeds
+from cfplan.planners.expert.refine import refine
 from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import Slowed, slow_until_certified

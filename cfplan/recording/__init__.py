@@ -1,0 +1,3 @@
+"""Records of flights: written as they happen, read back, summarised."""
+
+__all__ = ["header", "importers", "mavlink", "overlay", "reader", "record", "report", "rerun", "summary", "writer"]

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.geometry.yaml_source import Places, read_yaml_with_places
+from cfplan.files.yaml_with_places import Places, read_yaml_with_places
 from cfplan.safety.limits import (
     BatteryLimits,
     FirmwareSettings,

@@ -14,12 +14,12 @@ from scipy.ndimage import minimum_filter1d
 from scipy.spatial import cKDTree
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.encoding import EncodedFlight
-from cfplan.flight.packets import decode
+from cfplan.flight.setpoints.encoding import EncodedFlight
+from cfplan.flight.setpoints.packets import decode
 from cfplan.safety.limits import FlightLimits
-from cfplan.simulation.body import TIME_STEP, hovering
-from cfplan.simulation.closed_loop import PERFECT, ClosedLoop, EstimateErrors, fly_setpoints
-from cfplan.simulation.mellinger import FULL_COMMAND, gains_for
+from cfplan.simulation.dynamics.body import TIME_STEP, hovering
+from cfplan.simulation.dynamics.closed_loop import PERFECT, ClosedLoop, EstimateErrors, fly_setpoints
+from cfplan.simulation.dynamics.mellinger import FULL_COMMAND, gains_for
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import InputError
-from cfplan.expert.limit_sets import BOXES, LIMIT_SETS, LimitSet
 from cfplan.geometry.yaw import YawMode
+from cfplan.safety.limit_sets import BOXES, LIMIT_SETS, LimitSet
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.trials import (
     BAD_PATH,

@@ -4,15 +4,15 @@ from dataclasses import dataclass, field
 from math import pi
 from typing import Any
 
-from cfplan.flight.keys import Order
-from cfplan.flight.outcome import Rung
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase
-from cfplan.simulation.lab import Fault
-from cfplan.simulation.radio import RadioFault, RadioFaultKind
-from cfplan.simulation.virtual_cameras import ViconSettings
+from cfplan.simulation.lab.lab import Fault
+from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from cfplan.simulation.virtual_vicon_faults import FaultKind, ViconFault
+from cfplan.simulation.virtual_vicon.cameras import ViconSettings
+from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 
 FULL_SPEED = 1.5  # s after the stream began: the path's cruise
 

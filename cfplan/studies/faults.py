@@ -1,6 +1,6 @@
 """The fault table: what the pilot makes of each fault, by the truth of the virtual lab.
 
-Flown in the stepped lab (`cfplan.simulation.stepped_lab`): the pilot, the packets, the pose sorting, the virtual
+Flown in the stepped lab (`cfplan.simulation.lab.stepped_lab`): the pilot, the packets, the pose sorting, the virtual
 Crazyflie and the virtual cameras are those of a flight in real time; processes and sockets are not there.
 """
 
@@ -15,18 +15,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cfplan.errors import CfplanError, ExitCode
-from cfplan.flight.keys import Order
-from cfplan.flight.mission import Mission
-from cfplan.flight.outcome import FlightOutcome, Rung
-from cfplan.flight.packets import decode
-from cfplan.flight.pilot import Pilot
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import FlightOutcome, Rung
+from cfplan.flight.pilot.pilot import Pilot
+from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry, Triple
 from cfplan.recording.header import RecordHeader, header_under
 from cfplan.recording.reader import read_record
 from cfplan.recording.writer import RecordWriter
-from cfplan.simulation.lab import Truth
-from cfplan.simulation.stepped_lab import SteppedLab
-from cfplan.simulation.stepped_link import SteppedPoses, connect
+from cfplan.simulation.lab.lab import Truth
+from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.studies.fault_scenarios import SCENARIOS, Scenario
 from cfplan.studies.machine import Machine, this_machine

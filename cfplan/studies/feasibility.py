@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cfplan.errors import InputError
-from cfplan.expert.limit_sets import BOXES, LIMIT_SETS
 from cfplan.geometry.yaw import YawMode
+from cfplan.safety.limit_sets import BOXES, LIMIT_SETS
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.trials import (
     BAD_PATH,

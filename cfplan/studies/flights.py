@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import CfplanError, ExitCode
-from cfplan.expert.convex import lower_bound
-from cfplan.flight.encoding import RATE, EncodedFlight
-from cfplan.flight.packets import encode
+from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
+from cfplan.flight.setpoints.packets import encode
 from cfplan.geometry.path_file import load_path_file
+from cfplan.planners.baselines.convex import lower_bound
 from cfplan.simulation.dry_run import dry_run
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.missions import PlannedMission, planned_mission

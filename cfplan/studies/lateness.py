@@ -19,12 +19,12 @@ import numpy as np
 import rerun as rr
 
 from cfplan.errors import ExitCode, InputError
-from cfplan.flight.encoding import RATE
-from cfplan.flight.mission import Mission
-from cfplan.flight.pace import may_go_first
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.real_time import may_use_fifo_scheduling
+from cfplan.flight.setpoints.encoding import RATE
 from cfplan.recording.header import RecordHeader
-from cfplan.recording.live import LiveView, live_blueprint
-from cfplan.recording.viewer import APPLICATION, free_port, lay_out, viewer_program
+from cfplan.recording.rerun.live import LiveView, live_blueprint
+from cfplan.recording.rerun.viewer import APPLICATION, free_port, lay_out, viewer_program
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.missions import planned_mission
 from cfplan.studies.real_time import Conditions, fly_in_real_time
@@ -121,7 +121,7 @@ def lateness_study(
         for step, priority in enumerate((FIRST, ORDINARY)):
             if priority == ORDINARY:
                 give_up_priority()
-            elif not may_go_first():
+            elif not may_use_fifo_scheduling():
                 rows.append(Measured("stream", priority, "not permitted here"))
                 continue
             progress(2 * step, 4)

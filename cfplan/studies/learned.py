@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import CfplanError, InputError, NotCertifiedError
-from cfplan.expert.convex import plan_convex
-from cfplan.expert.limit_sets import BOXES, LIMIT_SETS, LimitSet
-from cfplan.expert.reduced import plan_reduced
-from cfplan.flight.encoding import encode_checked
+from cfplan.flight.setpoints.encoding import encode_checked
 from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
+from cfplan.planners.baselines.convex import plan_convex
+from cfplan.planners.expert.expert import plan_reduced
 from cfplan.planning.repair import repair, slow
 from cfplan.safety.certificate import certify
+from cfplan.safety.limit_sets import BOXES, LIMIT_SETS, LimitSet
 from cfplan.safety.limits import FlightLimits, Ladder, PlanLimits
 from cfplan.simulation.dry_run import dry_run
 from cfplan.studies.machine import Machine, this_machine

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.expert.limit_sets import LimitSet
-from cfplan.expert.reduced import plan_reduced
-from cfplan.flight.encoding import encode_checked
+from cfplan.flight.setpoints.encoding import encode_checked
 from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
+from cfplan.planners.expert.expert import plan_reduced
 from cfplan.planning.plan import default_nodes
 from cfplan.planning.repair import Repaired, repair
+from cfplan.safety.limit_sets import LimitSet
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.scaling import path_of_length
 from cfplan.studies.trials import find_box, find_limit_set

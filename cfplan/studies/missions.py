@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.encoding import HOLD, EncodedFlight, encode_checked
-from cfplan.flight.mission import Mission, mission_of
+from cfplan.flight.pilot.mission import Mission, mission_of
+from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, encode_checked
 from cfplan.geometry.path_file import load_path_file
 from cfplan.planning.plan import Plan, plan
 from cfplan.safety.limits import load_limits

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from cfplan.flight.mission import Mission
-from cfplan.flight.outcome import Rung
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase
-from cfplan.simulation.lab import Fault
-from cfplan.simulation.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.lab.lab import Fault
+from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from cfplan.simulation.virtual_vicon_faults import FaultKind, ViconFault
+from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.studies.fault_scenarios import Scenario
 from cfplan.studies.faults import FaultFlight, fly_stepped, judge
 from cfplan.studies.machine import Machine, this_machine

@@ -9,22 +9,22 @@ from pathlib import Path
 
 from cfplan import __version__
 from cfplan.errors import CfplanError, ExitCode, InputError
-from cfplan.flight.mission import Mission
+from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.mocap.source import pose_source
-from cfplan.flight.outcome import FlightOutcome
-from cfplan.flight.packets import decode
-from cfplan.flight.poses import PoseSource
-from cfplan.flight.process import fly
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import FlightOutcome
+from cfplan.flight.pilot.process import fly
+from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent, Telemetry
 from cfplan.recording.header import FlightBounds, RecordHeader
-from cfplan.recording.live import LiveView
+from cfplan.recording.rerun.live import LiveView
 from cfplan.recording.writer import RecordWriter, wall_time_at_zero
-from cfplan.simulation.lab import Lab, Truth, start_lab
-from cfplan.simulation.radio import RadioFault, RadioFaultKind
-from cfplan.simulation.room import RoomPoseSource, RoomSettings
-from cfplan.simulation.sim_driver import SimDriver
-from cfplan.simulation.virtual_cameras import ViconSettings
+from cfplan.simulation.lab.lab import Lab, Truth, start_lab
+from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.lab.room import RoomPoseSource, RoomSettings
+from cfplan.simulation.lab.sim_driver import SimDriver
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 
 LATENESS_CHECK = "this computer's lateness"
 RETRIES = 2  # after refusals for lateness alone

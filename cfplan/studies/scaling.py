@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import InputError
-from cfplan.expert.solution import Planner
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.geometry.yaw import YawMode
+from cfplan.planners.solution import Planner
 from cfplan.planning.planners import find_planner
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.trials import find_box, find_limit_set, quantiles

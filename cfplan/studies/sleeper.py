@@ -10,7 +10,8 @@ from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from cfplan.flight.pace import Pace, go_first, wake_promptly
+from cfplan.flight.pilot.deadlines import Pace
+from cfplan.flight.real_time import shorten_time_slice, use_fifo_scheduling
 
 _WATCH, _LATE, _QUEUED, _END = "watch", "late", "queued", None
 
@@ -57,8 +58,8 @@ class Sleeper:
 def _sleep(connection: Connection, rate: float, first: bool) -> None:
     """The sleeper's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever started this
-    if not (first and go_first()):
-        wake_promptly()
+    if not (first and use_fifo_scheduling()):
+        shorten_time_slice()
     noted: dict[str, list[tuple[float, float]]] = {_LATE: [], _QUEUED: []}
     watched: Path | None = None
     connection.send(None)

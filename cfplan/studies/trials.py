@@ -8,16 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.expert.convex import lower_bound
-from cfplan.expert.limit_sets import BOXES, LIMIT_SETS, LimitSet
-from cfplan.expert.solution import Planner, Status
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.geometry.yaw import YawMode
+from cfplan.planners.baselines.convex import lower_bound
+from cfplan.planners.solution import Planner, Status
 from cfplan.planning.planners import find_planner
 from cfplan.planning.repair import Repaired, repair, slow
 from cfplan.safety.certificate import certify
+from cfplan.safety.limit_sets import BOXES, LIMIT_SETS, LimitSet
 from cfplan.vehicle.trajectory import Trajectory
 
 WAYPOINTS = (3, 6)

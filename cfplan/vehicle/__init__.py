@@ -1,0 +1,15 @@
+"""The vehicle: airframes, the flatness map, speed profiles, yaw, timing and trajectories."""
+
+__all__ = [
+    "airframe",
+    "airframes",
+    "dense",
+    "flatness",
+    "profile",
+    "profile_spline",
+    "sampled_yaw",
+    "timing",
+    "trajectory",
+    "trigonometry",
+    "yaw_spline",
+]

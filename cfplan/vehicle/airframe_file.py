@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from cfplan.errors import InputError
-from cfplan.geometry.yaml_source import read_yaml_with_places
+from cfplan.files.yaml_with_places import read_yaml_with_places
 from cfplan.vehicle.airframe import Airframe
 
 Inertia = Annotated[float, Field(gt=0.0, le=1.0)]

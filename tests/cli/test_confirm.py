@@ -9,9 +9,9 @@ import pytest
 
 from cfplan.cli import confirm
 from cfplan.errors import InputError
-from cfplan.flight.brake import encode_stops
-from cfplan.flight.mission import Mission
-from cfplan.flight.packets import FullStateSetpoints, encode
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
+from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.safety.limits import load_limits
 
 RADIO = "radio://0/80/2M"

@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import common
 
 from cfplan.recording.importers.table import read_log
-from cfplan.recording.mavlink import messages_in
+from cfplan.recording.mavlink.bridge import messages_in
 
 REPOSITORY = Path(__file__).parents[2]
 COMMAND = (sys.executable, "-c", "from cfplan.cli import main; main()")

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from cfplan.flight.brake import encode_stops
-from cfplan.flight.keys import Order
-from cfplan.flight.link import GO_TO, LAND, TAKE_OFF
-from cfplan.flight.mission import Mission
-from cfplan.flight.packets import FullStateSetpoints, decode, encode
-from cfplan.flight.pilot import Pilot
-from cfplan.flight.poses import Pose
+from cfplan.flight.mocap.poses import Pose
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.pilot import Pilot
+from cfplan.flight.radio.link import GO_TO, LAND, TAKE_OFF
+from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
+from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Estimate, Event, Phase, PhaseEntered, Telemetry, VehicleStatus
 from cfplan.safety.limits import (
     BatteryLimits,

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cfplan.flight.brake import encode_stops
-from cfplan.flight.mission import Mission
-from cfplan.flight.outcome import FlightOutcome
-from cfplan.flight.packets import FullStateSetpoints, encode
-from cfplan.flight.process import fly
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import FlightOutcome
+from cfplan.flight.pilot.process import fly
+from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
+from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, Telemetry
 from cfplan.safety.limits import GroundManoeuvres, Limits, load_limits
-from cfplan.simulation.lab import Lab, Truth, start_lab
-from cfplan.simulation.room import RoomPoseSource
-from cfplan.simulation.sim_driver import SimDriver
+from cfplan.simulation.lab.lab import Lab, Truth, start_lab
+from cfplan.simulation.lab.room import RoomPoseSource
+from cfplan.simulation.lab.sim_driver import SimDriver
 
 SAFETY_FILE = Path(__file__).parents[2] / "safety.yaml"
 

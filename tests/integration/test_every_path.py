@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from cfplan.errors import ExitCode
-from cfplan.flight.encoding import RATE, check_bytes, encode_trajectory
-from cfplan.flight.mission import mission_of
-from cfplan.flight.outcome import Rung
-from cfplan.flight.process import fly
+from cfplan.flight.pilot.mission import mission_of
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.pilot.process import fly
+from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.telemetry import SetpointSent
 from cfplan.geometry.path_file import load_path_file
 from cfplan.planning.plan import plan
 from cfplan.safety.limits import load_limits
 from cfplan.simulation.dry_run import dry_run
-from cfplan.simulation.lab import start_lab
-from cfplan.simulation.radio import RadioFault, RadioFaultKind
-from cfplan.simulation.room import RoomPoseSource, RoomSettings
-from cfplan.simulation.sim_driver import SimDriver
+from cfplan.simulation.lab.lab import start_lab
+from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.lab.room import RoomPoseSource, RoomSettings
+from cfplan.simulation.lab.sim_driver import SimDriver
 
 REPOSITORY = Path(__file__).parents[2]
 FLIGHTS = sorted((REPOSITORY / "flights").glob("*.yaml"))

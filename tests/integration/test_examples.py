@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.simulation.lab import start_lab
-from cfplan.simulation.room import RoomSettings
+from cfplan.simulation.lab.lab import start_lab
+from cfplan.simulation.lab.room import RoomSettings
 from cfplan.vehicle.airframes import AIRFRAMES
 
 EXAMPLES = Path(cflib.__file__).parents[1] / "examples"

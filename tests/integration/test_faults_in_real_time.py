@@ -13,15 +13,15 @@ import pytest
 
 from cfplan.errors import ExitCode
 from cfplan.flight.mocap.source import pose_source
-from cfplan.flight.outcome import Rung
-from cfplan.flight.process import fly
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import Event, SetpointSent
-from cfplan.simulation.lab import Lab, start_lab
-from cfplan.simulation.radio import RadioFault, RadioFaultKind
-from cfplan.simulation.room import RoomSettings
-from cfplan.simulation.sim_driver import SimDriver
-from cfplan.simulation.virtual_cameras import ViconSettings
-from cfplan.simulation.virtual_vicon_faults import FaultKind, ViconFault
+from cfplan.simulation.lab.lab import Lab, start_lab
+from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.lab.room import RoomSettings
+from cfplan.simulation.lab.sim_driver import SimDriver
+from cfplan.simulation.virtual_vicon.cameras import ViconSettings
+from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.studies.missions import plan_mission
 
 REPOSITORY = Path(__file__).parents[2]

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from cfplan.errors import ExitCode, LinkError
-from cfplan.flight.outcome import Rung
-from cfplan.flight.packets import decode
-from cfplan.flight.process import fly
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.pilot.process import fly
+from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Estimate, Phase, PoseReceived, SetpointSent, Telemetry, VehicleStatus
-from cfplan.simulation.lab import start_lab
-from cfplan.simulation.room import RoomPoseSource
-from cfplan.simulation.sim_driver import SimDriver
+from cfplan.simulation.lab.lab import start_lab
+from cfplan.simulation.lab.room import RoomPoseSource
+from cfplan.simulation.lab.sim_driver import SimDriver
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 
 pytestmark = pytest.mark.integration
@@ -140,10 +140,10 @@ def test_a_listener_that_fails_lands_the_vehicle_and_is_heard(lab, fly_in):
 
 _MAIN = """
 import pickle, sys
-from cfplan.flight.process import fly
+from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import SetpointSent
-from cfplan.simulation.room import RoomPoseSource
-from cfplan.simulation.sim_driver import SimDriver
+from cfplan.simulation.lab.room import RoomPoseSource
+from cfplan.simulation.lab.sim_driver import SimDriver
 
 def show(message):
     if isinstance(message, SetpointSent) and message.index == 100:

@@ -16,15 +16,15 @@ from mavsdk.plugins.action import Action, ActionError, ActionResult
 from mavsdk.plugins.telemetry import Telemetry as StationTelemetry
 
 from cfplan.errors import ExitCode
-from cfplan.flight.mission import Mission
-from cfplan.flight.outcome import FlightOutcome, Rung
-from cfplan.flight.process import fly
-from cfplan.flight.supervisor import ARMED
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import FlightOutcome, Rung
+from cfplan.flight.pilot.process import fly
+from cfplan.flight.radio.supervisor_bits import ARMED
 from cfplan.flight.telemetry import Estimate, Phase, PhaseEntered, SetpointSent, Telemetry, VehicleStatus
-from cfplan.recording.mavlink import GroundStation, Place
-from cfplan.simulation.lab import Lab, start_lab
-from cfplan.simulation.room import RoomPoseSource
-from cfplan.simulation.sim_driver import SimDriver
+from cfplan.recording.mavlink.bridge import GroundStation, Place
+from cfplan.simulation.lab.lab import Lab, start_lab
+from cfplan.simulation.lab.room import RoomPoseSource
+from cfplan.simulation.lab.sim_driver import SimDriver
 
 pytestmark = pytest.mark.integration
 SCRIPTS = Path(sys.executable).parent

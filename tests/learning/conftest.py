@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from cfplan.expert.limit_sets import LIMIT_SETS
-from cfplan.expert.min_snap_baseline import plan_min_snap
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import features, labels
 from cfplan.learning.dataset import make_dataset
 from cfplan.learning.dataset_spec import DatasetSpec
 from cfplan.learning.inference import shapes
 from cfplan.learning.model_files import Card, load_model, save_model
+from cfplan.planners.baselines.min_snap import plan_min_snap
+from cfplan.safety.limit_sets import LIMIT_SETS
 
 HARDWARE = LIMIT_SETS["hardware"]
 TINY = DatasetSpec(

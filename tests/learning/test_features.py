@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from cfplan.expert.limit_sets import LIMIT_SETS
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.learning.features import (
@@ -22,6 +21,7 @@ from cfplan.learning.features import (
     window_inputs,
 )
 from cfplan.learning.sampling import draw, read_material
+from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.vehicle.profile import BoundaryState
 
 CHOSEN = LIMIT_SETS["hardware"]

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.expert.limit_sets import LIMIT_SETS
-from cfplan.expert.solution import Status
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import learned
 from cfplan.learning.features import REFERENCE, bounds, start_logs, told
 from cfplan.learning.learned import plan_learned, predict
 from cfplan.learning.windows import chain, kept
+from cfplan.planners.solution import Status
+from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
 

@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cfplan.errors import InputError
-from cfplan.expert.limit_sets import LIMIT_SETS
 from cfplan.learning.features import INPUTS
 from cfplan.learning.inference import NETWORKS
 from cfplan.learning.model_files import (
@@ -23,6 +22,7 @@ from cfplan.learning.model_files import (
     models_folder,
     save_model,
 )
+from cfplan.safety.limit_sets import LIMIT_SETS
 
 HARDWARE, SIMULATION = LIMIT_SETS["hardware"], LIMIT_SETS["simulation"]
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from cfplan.expert.spline_profile import spline_profile
-from cfplan.expert.yaw_track import YawTrack
 from cfplan.learning.smooth import Begin, smoothed, track_through
 from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.profile_spline import spline_profile
+from cfplan.vehicle.yaw_spline import YawTrack
 
 SETTLED = np.array([2.0, 2.05, 2.12])
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from cfplan.errors import CfplanError, InfeasibleError, InputError
-from cfplan.expert import refined
-from cfplan.expert.solution import Solution, Status
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
+from cfplan.planners.expert import refine as refined
+from cfplan.planners.solution import Solution, Status
 from cfplan.planning.plan import FEWEST_NODES, LAST_RESORTS, MOST_NODES, default_nodes, plan
 from cfplan.planning.planners import PLANNERS, find_planner
 from cfplan.safety.certificate import certify

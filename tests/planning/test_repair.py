@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cfplan.expert.limit_sets import LIMIT_SETS
-from cfplan.expert.reduced import plan_reduced
-from cfplan.expert.refined import refine
-from cfplan.expert.solution import Solution, Status
 from cfplan.learning.learned import plan_learned
+from cfplan.planners.expert.expert import plan_reduced
+from cfplan.planners.expert.refine import refine
+from cfplan.planners.solution import Solution, Status
 from cfplan.planning import repair as repairing
 from cfplan.planning.repair import repair
 from cfplan.safety.certificate import certify
+from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.studies.trials import random_path
 from cfplan.vehicle.trajectory import Trajectory
 

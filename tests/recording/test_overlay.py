@@ -20,13 +20,13 @@ from rerun.experimental import ViewerClient
 from cfplan.cli import cfplan
 from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
-from cfplan.planning.files import save_plan
 from cfplan.planning.plan import plan
-from cfplan.recording import layout
+from cfplan.planning.plan_file import save_plan
 from cfplan.recording.importers.mocap_log import Subject
 from cfplan.recording.overlay import Reference, align, extent, trial_of_record, trial_of_subject
-from cfplan.recording.overlay_view import DASH, dashes, references, stretches, write_overlay
 from cfplan.recording.reader import is_record
+from cfplan.recording.rerun import layout
+from cfplan.recording.rerun.overlay_view import DASH, dashes, references, stretches, write_overlay
 from cfplan.recording.summary import summarise
 from cfplan.safety.limits import load_limits
 

@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from cfplan.cli import cfplan
 from cfplan.errors import InputError
-from cfplan.recording.rerun_view import write_rrd
+from cfplan.recording.rerun.record_view import write_rrd
 
 
 def refused(*words):

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.encoding import check_bytes, encode_trajectory
-from cfplan.flight.packets import encode
+from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
+from cfplan.flight.setpoints.packets import encode
 from cfplan.geometry.min_snap import min_snap
 from cfplan.safety.limits import FlightLimits, Ladder, PlanLimits
 from cfplan.simulation.dry_run import SETTLING, dry_run, stress

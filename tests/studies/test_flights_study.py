@@ -8,10 +8,10 @@ import pytest
 
 from cfplan.cli import main
 from cfplan.errors import ExitCode, InputError, LinkError
-from cfplan.flight.outcome import Check, Deviation, FlightOutcome, Rung
-from cfplan.flight.pace import Lateness
+from cfplan.flight.pilot.deadlines import Lateness
+from cfplan.flight.pilot.outcome import Check, Deviation, FlightOutcome, Rung
 from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent
-from cfplan.simulation.lab import Truth
+from cfplan.simulation.lab.lab import Truth
 from cfplan.studies import flights, real_time
 from cfplan.studies.flights import fly_each
 from cfplan.studies.real_time import LATENESS_CHECK, RETRIES, Conditions

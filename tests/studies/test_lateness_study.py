@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from cfplan.errors import ExitCode, InputError
-from cfplan.flight.outcome import Deviation, FlightOutcome, Rung
-from cfplan.flight.pace import Lateness
+from cfplan.flight.pilot.deadlines import Lateness
+from cfplan.flight.pilot.outcome import Deviation, FlightOutcome, Rung
 from cfplan.flight.telemetry import SetpointSent
 from cfplan.studies import lateness
 from cfplan.studies.lateness import FIRST, ORDINARY, Measured, lateness_study
@@ -27,7 +27,7 @@ import subprocess, sys
 from cfplan.studies.lateness import give_up_priority
 give_up_priority()
 sys.exit(subprocess.run([sys.executable, "-c",
-    "import sys; from cfplan.flight.pace import may_go_first; sys.exit(may_go_first())"]).returncode)
+    "import sys; from cfplan.flight import real_time; sys.exit(real_time.may_use_fifo_scheduling())"]).returncode)
 """
 
 
@@ -56,7 +56,7 @@ def study(monkeypatch):
     monkeypatch.setattr(lateness, "fly_in_real_time", lambda *_, **__: flights.pop(0)())
 
     def run(*ends, permitted=True):
-        monkeypatch.setattr(lateness, "may_go_first", lambda: permitted)
+        monkeypatch.setattr(lateness, "may_use_fifo_scheduling", lambda: permitted)
         flights.extend(ends)
         result = lateness_study(REPOSITORY / "flights" / "line.yaml", REPOSITORY / "safety.yaml", 0.1)
         assert given_up == [True]

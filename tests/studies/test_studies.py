@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.expert.solution import Solution, Status
+from cfplan.planners.solution import Solution, Status
 from cfplan.planning import planners
 from cfplan.studies import feasibility, scaling, trials
 from cfplan.studies.bench import bench

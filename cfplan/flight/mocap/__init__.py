@@ -1,1 +1,3 @@
-"""Poses from a motion capture system: `source.pose_source` for a flight, `feed.Feed` for whoever wants every body."""
+"""Poses from motion capture: sources, the Vicon DataStream, and the gates that poses pass."""
+
+__all__ = ["datastream", "frames", "pose_gate", "pose_predictor", "poses", "source", "survey", "uri"]

@@ -18,7 +18,7 @@ from cfplan.flight.mocap.datastream_client import DataStreamClient
 from cfplan.flight.mocap.frames import Body, Driver, Frame, Scene, Stage
 from cfplan.flight.mocap.sdk import SdkDriver
 from cfplan.flight.mocap.uri import MocapUri, parse_uri
-from cfplan.flight.pace import stay_in_memory
+from cfplan.flight.real_time import lock_memory
 
 HEAD = struct.Struct("<I?")  # bytes of the message behind it, and whether it is a frame
 CONNECT_ALARM = 2.5  # s to resolve the name, connect, and get the first frame's promise
@@ -155,7 +155,7 @@ def main() -> None:
         uri = parse_uri(text, subject_needed=False)
         if uri.system == "vicon":
             _come_first()
-        stay_in_memory()
+        lock_memory()
         run(uri, outlet, again=again == "again")
     except BrokenPipeError:
         return

@@ -13,7 +13,7 @@ from cfplan.errors import CfplanError, LinkError
 from cfplan.flight.mocap.child import CONNECT_ALARM, FRAME_ALARM, Message, decoded
 from cfplan.flight.mocap.frames import Stage
 from cfplan.flight.mocap.uri import MocapUri
-from cfplan.flight.pace import go_with_all
+from cfplan.flight.real_time import use_ordinary_scheduling
 
 _CHUNK = 1 << 16  # bytes
 _LOOK = 0.05  # s between looks at the child
@@ -112,7 +112,7 @@ class Feed:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,  # the vendors' libraries chat
             )
-            go_with_all(process.pid)  # it is not the stream; what may go first asks for it itself
+            use_ordinary_scheduling(process.pid)  # it is not the stream; what may go first asks for it itself
         except BaseException:
             os.close(reading)
             raise

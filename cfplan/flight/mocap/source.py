@@ -8,9 +8,9 @@ from cfplan.errors import CfplanError, InputError, LinkError
 from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Frame, Scene
-from cfplan.flight.mocap.sorting import Sorter, Verdict
+from cfplan.flight.mocap.pose_classifier import Sorter, Verdict
+from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn, parse_uri
-from cfplan.flight.poses import Pose
 from cfplan.flight.telemetry import Quaternion
 from cfplan.safety.limits import PoseLimits
 

@@ -11,7 +11,7 @@ from cfplan.errors import CfplanError, LinkError
 from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Body, Frame, Scene
-from cfplan.flight.mocap.sorting import Sorter, Verdict
+from cfplan.flight.mocap.pose_classifier import Sorter, Verdict
 from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn
 from cfplan.flight.telemetry import Triple
 

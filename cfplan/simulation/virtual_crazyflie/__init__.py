@@ -1,1 +1,3 @@
-"""A Crazyflie that is not there: the firmware's behaviour on the wire, around a simulated body."""
+"""A simulated Crazyflie that speaks CRTP to an unmodified cflib."""
+
+__all__ = ["faults", "settings", "stabilizer", "supervisor", "vehicle", "wire"]

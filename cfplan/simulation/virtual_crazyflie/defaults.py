@@ -2,8 +2,8 @@
 
 from dataclasses import fields
 
-from cfplan.simulation.estimator import Prior
-from cfplan.simulation.mellinger import MellingerGains
+from cfplan.simulation.dynamics.kalman import Prior
+from cfplan.simulation.dynamics.mellinger import MellingerGains
 from cfplan.simulation.virtual_crazyflie.pid import default_gains, default_limits
 
 PID, MELLINGER = 1, 2

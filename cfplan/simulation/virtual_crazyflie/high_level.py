@@ -14,7 +14,7 @@ from struct import error, unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.simulation.mellinger import ON_BOARD
+from cfplan.simulation.dynamics.mellinger import ON_BOARD
 from cfplan.simulation.virtual_crazyflie.setpoints import (
     ACCELERATION,
     BODY_RATE,

@@ -5,7 +5,7 @@ from struct import iter_unpack, unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.packets import decompress_quaternion
+from cfplan.flight.setpoints.packets import decompress_quaternion
 
 _POSITION, _GENERIC, _PACKED_POSITIONS = range(3)
 _EMERGENCY_STOP, _KEEP_ALIVE, _POSE, _PACKED_POSES = 3, 4, 8, 9

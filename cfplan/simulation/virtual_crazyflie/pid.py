@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cfplan.simulation.mellinger import (
+from cfplan.simulation.dynamics.mellinger import (
     ABSOLUTE,
     DISABLE,
     FULL_COMMAND,

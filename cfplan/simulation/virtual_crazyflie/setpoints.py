@@ -7,8 +7,8 @@ from struct import calcsize, unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, decode
-from cfplan.simulation.mellinger import (
+from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, decode
+from cfplan.simulation.dynamics.mellinger import (
     ABSOLUTE,
     DISABLE,
     FULL_STATE,

@@ -9,9 +9,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cfplan.simulation.body import ALL_WELL, FLOOR, STILL_AIR, TIME_STEP, at_rest, pack_body, rotation, step_body
-from cfplan.simulation.estimator import Filter, estimate, new_filter, reset, step_filter
-from cfplan.simulation.mellinger import (
+from cfplan.simulation.dynamics.body import (
+    ALL_WELL,
+    FLOOR,
+    STILL_AIR,
+    TIME_STEP,
+    at_rest,
+    pack_body,
+    rotation,
+    step_body,
+)
+from cfplan.simulation.dynamics.kalman import Filter, estimate, new_filter, reset, step_filter
+from cfplan.simulation.dynamics.mellinger import (
     DISABLE,
     FULL_COMMAND,
     MEMORY_SIZE,

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cfplan.simulation.body import MASS, THRUST_MAX
-from cfplan.simulation.mellinger import euler_yaw
+from cfplan.simulation.dynamics.body import MASS, THRUST_MAX
+from cfplan.simulation.dynamics.mellinger import euler_yaw
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.commander import Commander, Priority
 from cfplan.simulation.virtual_crazyflie.defaults import (
@@ -28,7 +28,7 @@ from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaul
 from cfplan.simulation.virtual_crazyflie.high_level import Goal, HighLevelCommander, Planner
 from cfplan.simulation.virtual_crazyflie.localization import Localization
 from cfplan.simulation.virtual_crazyflie.log_blocks import DATA_CHANNEL, LogBlocks
-from cfplan.simulation.virtual_crazyflie.measures import getters
+from cfplan.simulation.virtual_crazyflie.log_variables import getters
 from cfplan.simulation.virtual_crazyflie.parameters import Parameters
 from cfplan.simulation.virtual_crazyflie.services import Memories, answer_link, answer_platform
 from cfplan.simulation.virtual_crazyflie.setpoints import AttitudeSetpoints, FirmwareAssert, Setpoint, decode_setpoint

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from cfplan.simulation.room import MotionCapture, RoomSettings
+from cfplan.simulation.lab.room import MotionCapture, RoomSettings
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.supervisor import State

@@ -1,0 +1,169 @@
+"""What ends a flight early: every trigger of the abort ladder in one place, looked at a hundred times a second."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from cfplan.errors import ExitCode
+from cfplan.flight.mocap.poses import Pose
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.radio.supervisor_bits import FAULTS
+from cfplan.flight.telemetry import Estimate, Triple, VehicleStatus
+from cfplan.safety.limits import Ladder, Limits
+
+LATEST_SETPOINT = 0.25  # s; the vehicle gives up following after 0.5 s
+OLDEST_LOG = 0.5  # s without the vehicle's log
+LINK_GONE = 10.0  # s without it, after which the link counts as lost; until then the vehicle may be hovering
+DISAGREEMENT_FACTOR = 5.0  # in the air estimate and pose may be apart by so many times what preflight allows
+
+
+@dataclass(frozen=True, slots=True)
+class Trip:
+    """A reason to leave the plan, and how."""
+
+    rung: Rung
+    exit_code: ExitCode
+    text: str
+
+
+@dataclass(slots=True)
+class Seen:
+    """What the pilot knows at one moment."""
+
+    now: float
+    # s
+    order: Order | None = None
+    main_gone: bool = False
+    link_lost: str = ""
+    pose: Pose | None = None
+    # the last good one
+    pose_fault: str = ""
+    # why none has come since
+    wanted: Triple | None = None
+    # m, where the vehicle should have been when the pose was taken; None where no setpoint says so
+    estimate: Estimate | None = None
+    status: VehicleStatus | None = None
+    late: float = 0.0
+    # s, by which the last setpoint missed its deadline
+
+
+class Watch:
+    """Finds the gravest reason to leave the plan. Keeps the battery's and the motion's short history."""
+
+    def __init__(self, limits: Limits):
+        self._limits = limits
+        self._voltage: float | None = None
+        self._voltage_time = 0.0
+        self._since: dict[str, float] = {}
+
+    def ordered(self, seen: Seen) -> Trip | None:
+        """What the operator wants, or what became of him; holds on the ground too."""
+        if seen.order is Order.CUT:
+            return Trip(Rung.CUT, ExitCode.ENDED_BY_PILOT, "the operator cut the motors")
+        if seen.order is Order.LAND:
+            return Trip(Rung.LAND, ExitCode.ENDED_BY_PILOT, "the operator ended the flight")
+        if seen.main_gone:
+            return Trip(Rung.LAND, ExitCode.ENDED_BY_SAFETY, "the main process is gone")
+        return None
+
+    def gravest(self, seen: Seen) -> Trip | None:
+        """The gravest trip of all that holds in the air."""
+        trips = [trip for trip in self._trips(seen) if trip.rung]
+        ordered = self.ordered(seen)
+        if ordered is not None:
+            trips.insert(0, ordered)
+        return max(trips, key=lambda trip: trip.rung, default=None)
+
+    def _trips(self, seen: Seen) -> Iterator[Trip]:
+        yield from self._pose(seen)
+        yield from self._vehicle(seen)
+        yield from self._motion(seen)
+        if seen.late > LATEST_SETPOINT:
+            yield _safety(Rung.BRAKE, f"a setpoint was {seen.late:.2f} s late")
+
+    def _pose(self, seen: Seen) -> Iterator[Trip]:
+        limits = self._limits.pose
+        if seen.pose is None:
+            yield _safety(Rung.LAND, "there is no pose")
+            return
+        age = seen.now - seen.pose.time
+        if age > limits.age_brake:
+            rung = Rung.LAND if age > limits.age_land else Rung.BRAKE
+            why = f" ({seen.pose_fault})" if seen.pose_fault else ""
+            yield _safety(rung, f"the last good pose is {age:.2f} s old{why}")
+
+    def _vehicle(self, seen: Seen) -> Iterator[Trip]:
+        if seen.estimate is None or seen.status is None:
+            return
+        silent = seen.now - max(seen.estimate.time, seen.status.time)
+        if silent > OLDEST_LOG:
+            yield _safety(Rung.LAND, f"the vehicle's log has been silent for {silent:.1f} s")
+        for bit, fault in FAULTS.items():
+            if seen.status.supervisor & bit:
+                yield _safety(Rung.CUT, f"the vehicle {fault}")
+        voltage = self._loaded_voltage(seen.status)
+        if voltage < self._limits.battery.under_load:
+            yield _safety(Rung.LAND, f"the battery is down to {voltage:.2f} V")
+
+    def _loaded_voltage(self, status: VehicleStatus) -> float:
+        """V, averaged with a time constant of under_load_seconds."""
+        if self._voltage is None:
+            self._voltage = status.battery_voltage
+        elapsed = max(status.time - self._voltage_time, 0.0) if self._voltage_time else 0.0
+        self._voltage_time = status.time
+        share = 1.0 - math.exp(-elapsed / self._limits.battery.under_load_seconds)
+        self._voltage += share * (status.battery_voltage - self._voltage)
+        return self._voltage
+
+    def _motion(self, seen: Seen) -> Iterator[Trip]:
+        limits = self._limits.flight
+        if seen.pose is not None:
+            beyond = self._beyond_fence(seen.pose.position)
+            yield _rung(limits.fence, beyond, f"{beyond:.2f} m beyond the fence")
+            if seen.wanted is not None:
+                deviation = math.dist(seen.pose.position, seen.wanted)
+                yield _rung(limits.deviation, deviation, f"{deviation:.2f} m from the setpoint")
+        if seen.estimate is None or seen.status is None:
+            return
+        newest = self._limits.pose.age_warning
+        if seen.pose is not None and seen.now - min(seen.pose.time, seen.estimate.time) <= newest:
+            apart = math.dist(seen.pose.position, seen.estimate.position)
+            if apart > DISAGREEMENT_FACTOR * self._limits.pose.agreement:
+                yield _safety(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")
+        for name, ladder, vector, unit in (
+            ("speed", limits.speed, seen.estimate.velocity, "m/s"),
+            ("acceleration", limits.acceleration, seen.estimate.acceleration, "m/s²"),
+            ("body rate", limits.angular_velocity, seen.status.body_rate, "rad/s"),
+        ):
+            value = math.hypot(*vector)
+            yield self._lasting(name, seen.now, _rung(ladder, value, f"a {name} of {value:.1f} {unit}"))
+
+    def _beyond_fence(self, position: Triple) -> float:
+        """m beyond the space less its margin; the floor does not count."""
+        space = self._limits.space
+        (x, y, z), low, high, margin = position, space.low, space.high, space.margin
+        return margin + max(low[0] - x, x - high[0], low[1] - y, y - high[1], z - high[2])
+
+    def _lasting(self, name: str, now: float, trip: Trip) -> Trip:
+        """The trip if it has lasted; a single noisy value is no reason."""
+        if not trip.rung:
+            self._since.pop(name, None)
+            return trip
+        since = self._since.setdefault(name, now)
+        return trip if now - since >= self._limits.flight.patience else Trip(Rung.NONE, trip.exit_code, trip.text)
+
+
+def _safety(rung: Rung, text: str) -> Trip:
+    return Trip(rung, ExitCode.ENDED_BY_SAFETY, text)
+
+
+def _rung(ladder: Ladder, value: float, text: str) -> Trip:
+    """The rung of a measured value; what is not a number says that the measurement cannot be trusted: land."""
+    if math.isnan(value):
+        return _safety(Rung.LAND, text)
+    if value > ladder.cut:
+        return _safety(Rung.CUT, text)
+    if value > ladder.land:
+        return _safety(Rung.LAND, text)
+    return _safety(Rung.BRAKE if value > ladder.brake else Rung.NONE, text)

@@ -1,0 +1,63 @@
+"""Deadlines at a fixed rate that do not drift, and how well they were met."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Lateness:
+    """How long after their deadlines setpoints were handed to the link."""
+
+    p50: float
+    # s
+    p99: float
+    # s
+    max: float
+    # s
+    count: int
+    skipped: int
+    # deadlines that passed altogether; the clock chose a later setpoint instead
+
+    @classmethod
+    def of(cls, late: Sequence[float], skipped: int) -> "Lateness":
+        values = np.array(late) if late else np.zeros(1)
+        p50, p99 = np.percentile(values, [50, 99])
+        return cls(float(p50), float(p99), float(values.max()), len(late), skipped)
+
+
+class Pace:
+    """Absolute deadlines: the next one is where it was always going to be, however late this one was."""
+
+    def __init__(
+        self,
+        rate: float,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ):
+        self._period, self._clock, self._sleep = 1.0 / rate, clock, sleep
+        self._first, self._count = clock(), 0
+        self.skipped = 0
+
+    @property
+    def upcoming(self) -> float:
+        """s, the next deadline that is still to come."""
+        passed = math.floor((self._clock() - self._first) / self._period)
+        return self._first + (max(self._count, passed) + 1) * self._period
+
+    def wait(self) -> float:
+        """Sleep until the next deadline that is still to come; its time."""
+        self._count += 1
+        due = self._first + self._count * self._period
+        now = self._clock()
+        if now - due > self._period:
+            missed = int((now - due) / self._period)
+            self.skipped += missed
+            self._count += missed
+            due += missed * self._period
+        if due > now:
+            self._sleep(due - now)
+        return due

@@ -1,0 +1,106 @@
+"""Everything that the pilot needs to know, fixed before the vehicle is armed."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
+from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.flight.telemetry import Triple
+from cfplan.safety.limits import Limits
+
+# How far the vehicle's filter trusts poses: what Crazyswarm2 flies with. The large one cures yaw trouble.
+EXTERNAL_POSITION_STD = 1e-3  # m
+EXTERNAL_ATTITUDE_STD = 5e-2  # rad
+_SHORTEST = 1.5  # s, of any manoeuvre of the on-board commander
+
+
+@dataclass(frozen=True, slots=True)
+class Mission:
+    """One certified flight, encoded."""
+
+    payloads: NDArray
+    # (N, 29) uint8, the setpoints from rest to rest
+    stops: NDArray
+    # (N, M, 29) uint8, a way to stop from each setpoint, as brake.encode_stops gives it
+    limits: Limits
+    lead: float = 0.0
+    # s by which each setpoint is ahead of the trajectory at its time
+    hold_time: float = 1.0
+    # s that the vehicle hovers behind the last setpoint before it is handed back
+    rate: float = RATE
+    # Hz
+
+    @property
+    def start(self) -> tuple[Triple, float]:
+        """Position, m, and yaw, rad, of the first setpoint as the vehicle decodes it."""
+        return _place(self.payloads[:1])
+
+    @property
+    def end(self) -> tuple[Triple, float]:
+        """Position, m, and yaw, rad, of the last setpoint as the vehicle decodes it."""
+        return _place(self.payloads[-1:])
+
+    @property
+    def motion_ends(self) -> float:
+        """s from the first setpoint to the first of those that only hover at the end."""
+        moving = np.flatnonzero(np.any(decode(self.payloads).velocity != 0.0, axis=1))
+        return float(moving[-1] + 1) / self.rate if len(moving) else 0.0
+
+    @property
+    def duration(self) -> float:
+        """s from the first setpoint to the last."""
+        return (len(self.payloads) - 1) / self.rate
+
+    @property
+    def take_off_height(self) -> float:
+        """m above the origin"""
+        return self.limits.ground.take_off_height
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What is set on the vehicle and read back before the feed of poses begins."""
+        return {
+            "stabilizer.estimator": self.limits.firmware.estimator,
+            "stabilizer.controller": self.limits.firmware.controller,
+            "ctrlMel.mass": self.limits.airframe.mass,
+            "ctrlMel.massThrust": self.limits.airframe.command_per_thrust,
+            "locSrv.extPosStdDev": EXTERNAL_POSITION_STD,
+            "locSrv.extQuatStdDev": EXTERNAL_ATTITUDE_STD,
+        }
+
+    @property
+    def parameters_if_known(self) -> dict[str, float]:
+        """What is set where the vehicle has it, which is from firmware 2026.04 on: rotor drag over mass, 1/s.
+
+        A filter that does not know of drag takes the tilt that holds against it for acceleration: at 2 m/s its
+        attitude is 4° off. Along the thrust axis it measures what drag does.
+        """
+        drag = self.limits.airframe.drag[0] / self.limits.airframe.mass
+        return {"kalman.dragB_x": drag, "kalman.dragB_y": drag}
+
+
+def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0) -> Mission:
+    """The mission that flies these setpoints; stops are made for each of them."""
+    return Mission(encoded.payloads, encode_stops(encoded.payloads, RATE), limits, encoded.lead, hold_time)
+
+
+def manoeuvre_time(distance: float, mean_speed: float) -> float:
+    """s that the on-board commander is given for a distance, m."""
+    return max(_SHORTEST, distance / mean_speed)
+
+
+def yaw_of(quaternion: tuple[float, float, float, float]) -> float:
+    """rad, the heading of the body's x axis."""
+    x, y, z, w = quaternion
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _place(payload: NDArray) -> tuple[Triple, float]:
+    state = decode(payload)
+    x, y, z = state.position[0].tolist()
+    qx, qy, qz, qw = state.quaternion[0].tolist()
+    return (x, y, z), yaw_of((qx, qy, qz, qw))

@@ -1,0 +1,89 @@
+"""How a flight went."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from cfplan.errors import ExitCode
+from cfplan.flight.pilot.deadlines import Lateness
+from cfplan.flight.telemetry import Phase, Triple
+
+
+class Rung(IntEnum):
+    """The rungs of the abort ladder, the gravest last."""
+
+    NONE = 0
+    BRAKE = 1  # along the planned path to a hover, then land
+    LAND = 2  # the same stop, then land at once, where it is
+    CUT = 3  # motors off, wherever it is
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One line of the preflight table."""
+
+    name: str
+    value: str
+    threshold: str
+    passed: bool
+    hint: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """Distance of the measured position from the setpoint of the same moment, over the stream."""
+
+    max: float
+    # m
+    rms: float
+    # m
+    time_of_max: float
+    # s from the first setpoint
+    count: int
+    # poses that were compared
+
+    @classmethod
+    def of(cls, samples: Sequence[tuple[float, float]]) -> "Deviation":
+        """From (s from the first setpoint, m), in any order."""
+        if not samples:
+            return cls(0.0, 0.0, 0.0, 0)
+        time, worst = max(samples, key=lambda sample: sample[1])
+        rms = math.sqrt(sum(distance**2 for _, distance in samples) / len(samples))
+        return cls(worst, rms, time, len(samples))
+
+
+def settle_time(samples: Sequence[tuple[float, float]], within: float) -> float:
+    """s after the end of the motion from which the vehicle stays `within` m; `samples` are (s after it, m), ascending.
+
+    inf where it does not.
+    """
+    last_outside = max((index for index, (_, distance) in enumerate(samples) if distance > within), default=-1)
+    return samples[last_outside + 1][0] if last_outside + 1 < len(samples) else math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class FlightOutcome:
+    """What the pilot reports when the vehicle is down, or was never armed."""
+
+    exit_code: ExitCode
+    reason: str
+    # one line
+    rung: Rung
+    # how far down the abort ladder it went
+    checks: tuple[Check, ...]
+    # the preflight table, as far as it came
+    phases: tuple[tuple[Phase, float], ...]
+    # each phase entered, with its time on the clock of time.monotonic()
+    first_setpoint: float
+    # s on the same clock; 0 where none was sent
+    flown: float
+    # s, from the first setpoint to the last that moved
+    lateness: Lateness
+    deviation: Deviation
+    settled_after: float
+    # s after the last moving setpoint; inf where it did not settle, or was not asked to
+    end_position: Triple
+    # m, where it was last seen
+    telemetry_dropped: int = 0
+    # messages that found the main process too slow

@@ -1,0 +1,200 @@
+"""The pilot in a process of its own, and the main process's side of it."""
+
+import contextlib
+import gc
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+
+from cfplan.errors import CfplanError, LinkError
+from cfplan.flight.mocap.poses import PoseSource
+from cfplan.flight.pilot.keys import Keyboard, Order
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import FlightOutcome
+from cfplan.flight.pilot.pilot import Pilot
+from cfplan.flight.pilot.reporter import Reporter
+from cfplan.flight.radio.connection import connect
+from cfplan.flight.real_time import STREAM_PRIORITY, lock_memory, shorten_time_slice, use_fifo_scheduling
+from cfplan.flight.telemetry import Telemetry
+
+_SWITCH_INTERVAL = 0.0001  # s; the stream gets the interpreter back after at most this
+_THREAD_PRIORITY = STREAM_PRIORITY // 2
+_POLL = 0.05  # s
+_LANDING = 60.0  # s that a pilot without a main process has to come down
+
+
+def fly(
+    mission: Mission,
+    *,
+    uri: str,
+    pose_source: PoseSource,
+    drivers: Sequence[type] = (),
+    on_telemetry: Callable[[Telemetry], None] = lambda _: None,
+    more_orders: Callable[[], Sequence[Order]] = tuple,
+) -> FlightOutcome:
+    """Fly a mission and come back when the vehicle is down. Call from the main thread, so that Ctrl-C lands.
+
+    `pose_source` and `drivers` (cflib link drivers tried before cflib's own) go to the pilot's process by pickle.
+    `on_telemetry` gets every message, in order; what it raises is raised here after the vehicle has landed.
+    `more_orders` tells what was ordered otherwise than by key or signal since it was last asked; it must not wait.
+    Raises LinkError where the vehicle cannot be reached or the pilot's process dies, and what the pose source raises.
+    """
+    context = multiprocessing.get_context("spawn")
+    telemetry, telemetry_end = context.Pipe(duplex=False)
+    orders_end, orders = context.Pipe(duplex=False)
+    process = context.Process(
+        target=_run, args=(mission, uri, tuple(drivers), pose_source, telemetry_end, orders_end), name="pilot"
+    )
+    with Keyboard() as keyboard, telemetry, orders:
+        with _signals_ignored():
+            process.start()
+        telemetry_end.close()
+        orders_end.close()
+        try:
+            return _attend(process, telemetry, orders, keyboard, on_telemetry, more_orders)
+        finally:
+            orders.close()  # where this end fails, the pilot notices and lands
+            telemetry.close()
+            process.join(_LANDING)
+            if process.is_alive():
+                process.kill()
+
+
+def _attend(
+    process: BaseProcess,
+    telemetry: Connection,
+    orders: Connection,
+    keyboard: Keyboard,
+    on_telemetry: Callable[[Telemetry], None],
+    more_orders: Callable[[], Sequence[Order]],
+) -> FlightOutcome:
+    """Pass telemetry one way and orders the other until the pilot's last message."""
+    failure: BaseException | None = None
+    watched: list[Connection | int] = [telemetry]
+    if keyboard.descriptor is not None:
+        watched.append(keyboard.descriptor)
+    while True:
+        ready = wait(watched, _POLL)
+        for order in (*keyboard.orders(), *more_orders()):
+            _send(orders, order)
+        if telemetry not in ready:
+            continue
+        try:
+            message = telemetry.recv()
+        except (EOFError, OSError):
+            process.join(5.0)
+            raise LinkError(
+                f"the pilot's process died (exit code {process.exitcode})",
+                hint="the vehicle levels out after 0.5 s without setpoints and stops its motors after 2 s",
+            ) from failure
+        if isinstance(message, list):
+            if failure is None:
+                try:
+                    for each in message:
+                        on_telemetry(each)
+                except BaseException as error:  # whatever breaks here must not break the flight
+                    failure = error
+                    _send(orders, Order.LAND)
+            continue
+        if failure is not None:
+            raise failure
+        if isinstance(message, CfplanError):
+            raise message
+        return message
+
+
+def _send(orders: Connection, order: Order) -> None:
+    with contextlib.suppress(OSError):  # a pilot that is gone is noticed by its telemetry
+        orders.send(order)
+
+
+@contextlib.contextmanager
+def _signals_ignored():
+    """A process started meanwhile never sees a Ctrl-C, not even before it runs its first line."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP, signal.SIGTSTP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+class Orders:
+    """What the main process tells the pilot, read by a thread; `gone` when there is no main process any more."""
+
+    def __init__(self, connection: Connection):
+        self._connection = connection
+        self.worst: Order | None = None
+        self.gone = False
+        threading.Thread(target=self._run, name="orders", daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            while True:
+                self.give(self._connection.recv())
+        except (EOFError, OSError):
+            self.gone = True
+
+    def give(self, order: Order) -> None:
+        self.worst = max(order, self.worst or order)
+
+
+def _run(
+    mission: Mission,
+    uri: str,
+    drivers: tuple[type, ...],
+    pose_source: PoseSource,
+    telemetry: Connection,
+    orders_connection: Connection,
+) -> None:
+    """The pilot's process, from its first line to its last."""
+    with contextlib.suppress(OSError):
+        os.setsid()  # the terminal's signals are the main process's affair
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
+        signal.signal(number, signal.SIG_IGN)
+    orders, report = Orders(orders_connection), Reporter(telemetry)
+    signal.signal(signal.SIGTERM, lambda *_: orders.give(Order.LAND))
+    logging.getLogger("cflib").setLevel(logging.CRITICAL)  # what matters is reported as telemetry
+    warnings.filterwarnings("ignore", module="cflib")
+    sys.setswitchinterval(_SWITCH_INTERVAL)
+    last: FlightOutcome | CfplanError
+    try:
+        pilot = Pilot(
+            mission,
+            connect=lambda waiting: connect(uri, report, drivers, waiting=waiting),
+            source=pose_source,
+            report=report,
+            orders=orders,
+            enter_real_time=_enter_real_time,
+        )
+        last = pilot.fly()
+    except CfplanError as error:
+        last = error
+    except Exception as error:  # on the ground; in the air the pilot lands first
+        last = CfplanError(f"fault in the pilot: {error!r}", where=uri, hint="nothing was armed; please report this")
+    report.close(last)
+    os._exit(0)  # cflib leaves threads behind that never end
+
+
+def _enter_real_time() -> None:
+    """Nothing but the flight from here on: no collection of garbage, and first in the queue for the processor."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    with contextlib.suppress(OSError):
+        # The other threads too: one that is kept from the processor while it holds the interpreter keeps the stream
+        # waiting as well.
+        for thread in map(int, os.listdir("/proc/self/task")):
+            if not use_fifo_scheduling(_THREAD_PRIORITY, thread):
+                shorten_time_slice(thread)
+    use_fifo_scheduling()
+    lock_memory()

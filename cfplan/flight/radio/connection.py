@@ -1,0 +1,159 @@
+"""Connecting to a Crazyflie, within bounds of time, and refusing with a hint what cannot be reached."""
+
+import contextlib
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from cfplan.errors import LinkError
+from cfplan.flight.radio.crazyradio import usb_hint
+from cfplan.flight.radio.link import Link
+from cfplan.flight.radio.radio_lock import claim
+from cfplan.flight.radio.uri import EXAMPLES
+from cfplan.flight.telemetry import Telemetry
+
+FIRST_ANSWER = 4.0  # s, from opening the link to the first packet
+WHOLE_CONNECTION = 30.0  # s, to the last parameter, over a lossy radio without a cache
+PATIENCE = 0.005  # s that a packet in flight waits for a radio that is busy; then the next, fresher one counts
+_RETRIES = 5000  # transmissions that may fail in a row, some 10 s: a vehicle that hovers alone is worth waiting for
+
+
+def connect(
+    uri: str,
+    report: Callable[[Telemetry], None],
+    drivers: Sequence[type] = (),
+    *,
+    waiting: Callable[[], None] = lambda: None,
+) -> Link:
+    """Connect, and take the vehicle out of whatever an earlier connection left it in.
+
+    `drivers` are cflib link drivers tried before cflib's own. `waiting` is called while nothing happens, and may raise.
+    Raises LinkError, within 5 s where nothing answers.
+    """
+    from cflib import crtp
+    from cflib.crazyflie import Crazyflie
+    from cflib.crtp.radiodriver import set_retries_before_disconnect
+
+    if not crtp.CLASSES:
+        crtp.init_drivers()
+    for driver in reversed(drivers):
+        if driver not in crtp.CLASSES:
+            crtp.CLASSES.insert(0, driver)
+
+    claimed = claim(uri)
+    set_retries_before_disconnect(_RETRIES)
+    answered, complete, failed = threading.Event(), threading.Event(), threading.Event()
+    reasons: list[str] = []
+
+    def fail(_: str, reason: str = "the link was closed") -> None:
+        reasons.append(reason)
+        failed.set()
+
+    crazyflie = Crazyflie(rw_cache=_table_cache())
+    crazyflie.link_established.add_callback(lambda _: answered.set())
+    crazyflie.fully_connected.add_callback(lambda _: complete.set())
+    crazyflie.connection_failed.add_callback(fail)
+    crazyflie.disconnected.callbacks.insert(0, fail)  # before cflib's own, one of which may never return
+
+    def open_link() -> None:
+        crazyflie.open_link(uri)
+        if crazyflie.link is not None:
+            crazyflie.link = _Serialized(crazyflie.link)
+
+    threading.Thread(target=open_link, daemon=True).start()
+    try:
+        _wait(answered, failed, FIRST_ANSWER, waiting)
+        if not failed.is_set() and not answered.is_set():
+            raise LinkError("nothing answers", where=uri, hint=_hint(uri, ""))
+        _wait(complete, failed, WHOLE_CONNECTION, waiting)
+        if failed.is_set():
+            reason = reasons[0].splitlines()[0].removeprefix("Couldn't load link driver: ")
+            raise LinkError(f"cannot connect: {reason}", where=uri, hint=_hint(uri, reason))
+        if not complete.is_set():
+            raise LinkError("the vehicle answers, but its tables do not come through", where=uri,
+                            hint="move closer, or choose a freer channel")  # fmt: skip
+    except BaseException:
+        if claimed is not None:
+            claimed.close()
+        threading.Thread(target=crazyflie.close_link, daemon=True).start()
+        raise
+
+    link = Link(crazyflie, uri, report)
+    link.claim = claimed
+
+    def note_loss(_: str, reason: str = "the link was closed") -> None:
+        link.lost = link.lost or reason
+
+    crazyflie.disconnected.callbacks.insert(0, note_loss)
+    crazyflie.connection_lost.add_callback(note_loss)
+    link.release_priority()
+    link.ask_firmware()
+    return link
+
+
+def _wait(done: threading.Event, failed: threading.Event, patience: float, waiting: Callable[[], None]) -> None:
+    end = time.monotonic() + patience
+    while not (done.is_set() or failed.is_set()) and time.monotonic() < end:
+        waiting()
+        done.wait(0.02)
+
+
+def _hint(uri: str, reason: str) -> str:
+    if "No driver" in reason or "malformed" in reason:
+        return f"a URI looks like {EXAMPLES}"
+    if by_usb := usb_hint(None, reason):
+        return by_usb
+    if uri.startswith("radio://") and ("dongle" in reason.lower() or "backend" in reason.lower()):
+        return "plug a Crazyradio in; `cfplan doctor` shows what is found"
+    if uri.startswith("radio://"):
+        return "is the Crazyflie on, and are channel, rate and address right?"
+    if uri.startswith("usb://"):
+        return "is the Crazyflie on and on a cable? `lsusb` must list it"
+    return "is the other end running?"
+
+
+def _table_cache() -> str | None:
+    """Where cflib keeps the vehicle's tables between connections; None where nothing can be written."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "cfplan" / "tables"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return str(folder) if os.access(folder, os.W_OK) else None
+
+
+class _Serialized:
+    """A link driver that sends for one thread at a time, and in flight gives a packet up rather than wait for long.
+
+    cflib's radio driver has a queue of one and waits for 2 s where the radio is dead. A setpoint or a pose that waited
+    so long would be taken for a fresh one.
+    """
+
+    def __init__(self, driver: Any):
+        self._driver, self._lock = driver, threading.Lock()
+        self.needs_resending = driver.needs_resending
+
+    def send_packet(self, packet: Any) -> None:
+        """For cflib itself."""
+        if self._lock.acquire(timeout=0.1):
+            try:
+                self._driver.send_packet(packet)
+            finally:
+                self._lock.release()
+
+    def send_soon(self, packet: Any) -> None:
+        """For what is out of date in a moment."""
+        waiting = getattr(self._driver, "out_queue", None)
+        if isinstance(waiting, queue.Queue):
+            with contextlib.suppress(queue.Full):
+                waiting.put(packet, timeout=PATIENCE)
+        else:
+            self.send_packet(packet)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._driver, name)

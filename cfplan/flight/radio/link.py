@@ -1,0 +1,258 @@
+"""The connection to one Crazyflie: cflib for what it does well, and bounded waits where it would wait for ever.
+
+cflib connects, fetches the tables and carries parameters and logs. What is sent in flight goes straight to the link
+driver: cflib's own sending holds a lock while a dying link joins the thread that waits for it.
+"""
+
+import math
+import struct
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from cfplan.errors import LinkError
+from cfplan.flight.setpoints.packets import decompress_quaternion
+from cfplan.flight.telemetry import Estimate, Telemetry, Triple, VehicleStatus
+from cfplan.vehicle.airframe import GRAVITY
+
+HIGH_LEVEL_PORT, GENERIC_PORT, LOCALIZATION_PORT, SUPERVISOR_PORT, PLATFORM_PORT = 8, 7, 6, 9, 13
+TAKE_OFF, LAND, STOP, GO_TO = 7, 8, 3, 12  # commands of the on-board commander
+EXTERNAL_POSE = 8
+
+_MILLI = 1e-3
+_CLOCK_DRIFT = 5e-4  # by which the vehicle's clock may differ
+_STAMPS_WRAP = (1 << 24) * _MILLI  # s
+_ESTIMATE = [f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az")]
+ESTIMATE_LOG = ([(name, "int16_t") for name in _ESTIMATE] + [("stateEstimateZ.quat", "uint32_t")], 10)
+STATUS_LOG = (
+    [(f"stateEstimateZ.{name}", "int16_t") for name in ("rateRoll", "ratePitch", "rateYaw")]
+    + [(f"motor.m{motor}", "uint16_t") for motor in (1, 2, 3, 4)]
+    + [("pm.vbatMV", "uint16_t"), ("supervisor.info", "uint16_t")],
+    20,
+)
+VARIANCE_LOG = ([(f"kalman.var{axis}", "float") for axis in "XYZ"], 10)
+
+
+class Link:
+    """A connected Crazyflie. Made by `connection.connect`."""
+
+    def __init__(
+        self,
+        crazyflie: Any,
+        uri: str,
+        report: Callable[[Telemetry], None],
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._crazyflie, self.uri, self._report, self._clock = crazyflie, uri, report, clock
+        self.lost = ""
+        # why the link is gone; empty while it stands
+        self.estimate: Estimate | None = None
+        self.status: VehicleStatus | None = None
+        self.position_variance: Triple | None = None
+        # m² along x, y, z
+        self.replies: dict[int, int] = {}
+        # command of the on-board commander: the code that it answered, 0 for done
+        self.firmware = ""
+        self.claim: Any = None
+        # keeps others from the radio until it is closed
+        self._variance_block: Any = None
+        self._log_zero, self._log_heard = math.inf, 0.0
+        # s, when the vehicle's clock of ms was zero, as the quickest messages have it; the last message
+        crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
+        crazyflie.add_port_callback(PLATFORM_PORT, self._on_platform)
+
+    @property
+    def protocol(self) -> int:
+        return int(self._crazyflie.platform.get_protocol_version())
+
+    @property
+    def round_trip(self) -> float:
+        """s, 95th percentile of the last echoes; 0 before the first."""
+        return float(self._crazyflie.link_statistics.latency.latency) * _MILLI
+
+    # What is sent in flight: never waits.
+
+    def _send(self, port: int, channel: int, data: bytes) -> None:
+        self.send(packet(port, channel, data))
+
+    def send(self, prepared: Any) -> None:
+        """Send a packet made by `packet`. A link that is gone takes it silently: watch `lost`."""
+        driver = self._crazyflie.link
+        if driver is not None:
+            driver.send_soon(prepared)
+
+    def send_pose(self, position: Sequence[float], quaternion: Sequence[float]) -> None:
+        self._send(LOCALIZATION_PORT, 1, struct.pack("<B7f", EXTERNAL_POSE, *position, *quaternion))
+
+    def release_priority(self) -> None:
+        """Give the vehicle back to its on-board commander."""
+        self._send(GENERIC_PORT, 1, struct.pack("<BI", 0, 0))
+
+    def take_off(self, height: float, duration: float) -> None:
+        """Straight up to `height`, m above the origin, keeping yaw."""
+        self._command(TAKE_OFF, struct.pack("<Bff?f", 0, height, 0.0, True, duration))
+
+    def land(self, height: float, duration: float) -> None:
+        """Straight down to `height`, keeping yaw; motors off at the end."""
+        self._command(LAND, struct.pack("<Bff?f", 0, height, 0.0, True, duration))
+
+    def go_to(self, position: Sequence[float], yaw: float, duration: float) -> None:
+        self._command(GO_TO, struct.pack("<BBB5f", 0, False, False, *position, yaw, duration))
+
+    def stop_motors(self) -> None:
+        """End what the on-board commander does; motors off."""
+        self._command(STOP, b"\0")
+
+    def stop_setpoint(self) -> None:
+        """Motors off until another setpoint comes."""
+        self._send(GENERIC_PORT, 0, b"\0")
+
+    def _command(self, command: int, arguments: bytes) -> None:
+        self.replies.pop(command, None)
+        self._send(HIGH_LEVEL_PORT, 0, bytes([command]) + arguments)
+
+    def arm(self, do_arm: bool) -> None:
+        if self.protocol >= 12:
+            self._send(SUPERVISOR_PORT, 1, bytes([1, do_arm]))
+        else:
+            self._send(PLATFORM_PORT, 0, bytes([1, do_arm]))
+
+    def emergency_stop(self) -> None:
+        """Motors off at once, wherever it is; the vehicle must be restarted after it."""
+        if self.protocol >= 12:
+            self._send(SUPERVISOR_PORT, 1, b"\x03")
+        else:
+            self._send(LOCALIZATION_PORT, 1, b"\x03")
+
+    def keep_alive(self) -> None:
+        """A sign of life for the vehicle's emergency-stop watchdog, which the first one starts for good."""
+        if self.protocol >= 12:
+            self._send(SUPERVISOR_PORT, 1, b"\x04")
+        else:
+            self._send(LOCALIZATION_PORT, 1, b"\x04")
+
+    # What waits for an answer: for the ground only.
+
+    def has_parameter(self, name: str) -> bool:
+        return self._crazyflie.param.toc.get_element_by_complete_name(name) is not None
+
+    def set_parameter(self, name: str, value: float, patience: float = 2.0) -> float:
+        """Write, then read what the vehicle has. Raises LinkError where it has no such parameter or does not answer."""
+        group, _, short = name.partition(".")
+        values: list[float] = []
+        answered = threading.Event()
+
+        def note(_: str, text: str) -> None:
+            values.append(float(text))
+            if len(values) == 2:  # the first answers the writing, the second the reading
+                answered.set()
+
+        self._crazyflie.param.add_update_callback(group, short, note)
+        try:
+            self._crazyflie.param.set_value(name, value)
+            self._crazyflie.param.request_param_update(name)
+            if not answered.wait(patience):
+                raise LinkError(f"no answer to setting {name}", where=self.uri, hint="check the radio link")
+        except (KeyError, AttributeError) as error:
+            raise LinkError(
+                f"the vehicle has no parameter {name} that can be set", where=self.uri, hint="update its firmware"
+            ) from error
+        finally:
+            self._crazyflie.param.remove_update_callback(group, short, note)
+        return values[-1]
+
+    def start_logs(self) -> None:
+        """From here on `estimate`, `status` and `position_variance` are kept, and the first two reported."""
+        self._log("estimate", ESTIMATE_LOG, self._on_estimate)
+        self._log("status", STATUS_LOG, self._on_status)
+        self._variance_block = self._log("variance", VARIANCE_LOG, self._on_variance)
+
+    def stop_variance_log(self) -> None:
+        if self._variance_block is not None:
+            self._variance_block.stop()
+
+    def _log(self, name: str, variables: tuple[list[tuple[str, str]], int], note: Callable[..., None]) -> Any:
+        from cflib.crazyflie.log import LogConfig
+
+        names, period_ms = variables
+        block = LogConfig(name, period_ms)
+        for variable, kind in names:
+            block.add_variable(variable, kind)
+        block.data_received_cb.add_callback(note)
+        try:
+            self._crazyflie.log.add_config(block)
+        except KeyError as error:
+            raise LinkError(f"{error.args[0]}", where=self.uri, hint="update the vehicle's firmware") from error
+        block.start()
+        return block
+
+    def ask_firmware(self) -> None:
+        """`firmware` is set when the answer comes, where the vehicle gives one."""
+        self._send(PLATFORM_PORT, 1, b"\x01")
+
+    def close(self) -> None:
+        """Close the link. On the ground only: it sends a zero setpoint, which stops the motors."""
+        closing = threading.Thread(target=self._crazyflie.close_link, daemon=True)
+        closing.start()
+        closing.join(timeout=2.0)
+        if self.claim is not None:
+            self.claim.close()
+
+    # What comes in: these run in cflib's thread and must be quick.
+
+    def _when(self, stamp_ms: int) -> float:
+        """When the vehicle wrote a message, as the quickest ones tell; a radio that was dead delivers old ones."""
+        now = self._clock()
+        zero = now - stamp_ms * _MILLI
+        if abs(zero - self._log_zero) > _STAMPS_WRAP / 2:  # the first, or the vehicle's 24 bits began anew
+            self._log_zero = zero
+        self._log_zero = min(self._log_zero + _CLOCK_DRIFT * (now - self._log_heard), zero)
+        self._log_heard = now
+        return self._log_zero + stamp_ms * _MILLI
+
+    def _on_estimate(self, stamp_ms: int, data: dict[str, int], _: Any) -> None:
+        x, y, z, vx, vy, vz, ax, ay, az = (data[name] * _MILLI for name in _ESTIMATE)
+        q = decompress_quaternion(np.array([data["stateEstimateZ.quat"]], dtype=np.uint32))[0]
+        self.estimate = Estimate(
+            time=self._when(stamp_ms),
+            position=(x, y, z),
+            velocity=(vx, vy, vz),
+            acceleration=(ax, ay, az - GRAVITY),  # the log counts gravity in
+            quaternion=(float(q[0]), float(q[1]), float(q[2]), float(q[3])),
+        )
+        self._report(self.estimate)
+
+    def _on_status(self, stamp_ms: int, data: dict[str, int], _: Any) -> None:
+        roll, pitch, yaw = (data[f"stateEstimateZ.{name}"] * _MILLI for name in ("rateRoll", "ratePitch", "rateYaw"))
+        self.status = VehicleStatus(
+            time=self._when(stamp_ms),
+            body_rate=(roll, -pitch, yaw),  # the log's pitch rate is nose up
+            motor=(data["motor.m1"], data["motor.m2"], data["motor.m3"], data["motor.m4"]),
+            battery_voltage=data["pm.vbatMV"] * _MILLI,
+            supervisor=data["supervisor.info"],
+        )
+        self._report(self.status)
+
+    def _on_variance(self, _: int, data: dict[str, float], __: Any) -> None:
+        self.position_variance = data["kalman.varX"], data["kalman.varY"], data["kalman.varZ"]
+
+    def _on_reply(self, packet: Any) -> None:
+        if len(packet.data) >= 4:
+            self.replies[packet.data[0]] = packet.data[3]
+
+    def _on_platform(self, packet: Any) -> None:
+        if packet.channel == 1 and len(packet.data) > 1 and packet.data[0] == 1:
+            self.firmware = bytes(packet.data[1:]).split(b"\0")[0].decode("ascii", "replace")
+
+
+def packet(port: int, channel: int, data: bytes) -> Any:
+    """A CRTP packet that `Link.send` takes."""
+    from cflib.crtp.crtpstack import CRTPPacket
+
+    made = CRTPPacket()
+    made.set_header(port, channel)
+    made.data = bytearray(data)
+    return made

@@ -1,0 +1,89 @@
+"""Stops along the path, encoded before take-off for every moment of the flight.
+
+From the setpoint that is due, the clock of the trajectory runs slower and slower until it stands: the vehicle brakes
+on the path itself, where it was certified to be, and ends level at rest. With r the rate of that clock,
+
+    v = r v₀,   a = r² a₀ + ṙ v₀,   attitude from a + g and heading,   body rates from the turn between attitudes.
+
+r falls as a smoothstep, so the braking deceleration is at most 1.5 v₀ / duration.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude
+from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
+from cfplan.vehicle.airframe import GRAVITY
+
+DURATION = 0.8  # s, from full speed to rest: 3.75 m/s² from 2 m/s on top of the turn's own
+_GRAVITY = np.array([0.0, 0.0, GRAVITY])
+
+
+def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION, rows: NDArray | None = None) -> NDArray:
+    """(N, M, 29) uint8: stop i begins with setpoint i's place and ends in hover; M setpoints at `rate`.
+
+    Where `rows` are given, those of these setpoints alone.
+    """
+    reference = decode(payloads)
+    begin = np.arange(len(payloads)) if rows is None else rows
+    steps = round(duration * rate)
+    share = np.arange(steps + 1) / steps
+    clock_rate = 1.0 - share**2 * (3.0 - 2.0 * share)
+    slowing = -6.0 * share * (1.0 - share) / duration
+    elapsed = duration * rate * (share - share**3 + share**4 / 2.0)  # in setpoints; the integral of clock_rate
+    place = np.minimum(begin[:, None] + elapsed, len(payloads) - 1.0)
+    row = np.minimum(place.astype(int), max(len(payloads) - 2, 0))
+    between = (place - row)[..., None]
+
+    def at(values: NDArray) -> NDArray:
+        after = values[np.minimum(row + 1, len(values) - 1)]
+        return values[row] + between * (after - values[row])
+
+    velocity = at(reference.velocity)
+    acceleration = clock_rate[:, None] ** 2 * at(reference.acceleration) + slowing[:, None] * velocity
+    turn = at(np.unwrap(_heading(reference.quaternion))[:, None])[..., 0].reshape(-1)
+    zero = np.zeros_like(turn)
+    headed = np.stack([zero, zero, np.sin(turn / 2), np.cos(turn / 2)], axis=1)
+    made = controller_attitude(acceleration.reshape(-1, 3) + _GRAVITY, headed)
+    attitude = Rotation.from_matrix(made).as_quat()
+    shape = (len(begin), steps + 1)
+    body_rate = _ahead(_turn_rates(attitude.reshape(*shape, 4), rate), RATE_LEAD * rate)
+    body_rate[:, -1] = 0.0  # the vehicle may be left with the last setpoint
+    return encode(
+        FullStateSetpoints(
+            position=at(reference.position).reshape(-1, 3),
+            velocity=(clock_rate[:, None] * velocity).reshape(-1, 3),
+            acceleration=acceleration.reshape(-1, 3),
+            quaternion=command_quaternion(attitude),
+            body_rate=body_rate.reshape(-1, 3),
+        )
+    ).reshape(*shape, -1)
+
+
+def _heading(quaternion: NDArray) -> NDArray:
+    """(N,) rad, all that the controller takes from quaternions (N, 4)."""
+    x, y, z, w = quaternion.T
+    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _ahead(values: NDArray, by: float) -> NDArray:
+    """(..., M, 3) rows from `by` rows later on; the last holds."""
+    place = np.minimum(np.arange(values.shape[-2]) + by, values.shape[-2] - 1.0)
+    row = place.astype(int)
+    after = np.minimum(row + 1, values.shape[-2] - 1)
+    return values[..., row, :] + (place - row)[:, None] * (values[..., after, :] - values[..., row, :])
+
+
+def _turn_rates(quaternion: NDArray, rate: float) -> NDArray:
+    """(..., M, 3) rad/s in body axes: the turn from the attitude before to the one after, over the time between."""
+    before = np.concatenate([quaternion[..., :1, :], quaternion[..., :-1, :]], axis=-2)
+    after = np.concatenate([quaternion[..., 1:, :], quaternion[..., -1:, :]], axis=-2)
+    periods = np.full(quaternion.shape[-2], 2.0)
+    periods[[0, -1]] = 1.0
+    v0, w0, v1, w1 = before[..., :3], before[..., 3:], after[..., :3], after[..., 3:]
+    vector = w0 * v1 - w1 * v0 - np.cross(v0, v1)
+    scalar = w0 * w1 + np.sum(v0 * v1, axis=-1, keepdims=True)
+    sine = np.linalg.norm(vector, axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, np.abs(scalar)) * np.sign(np.where(scalar == 0.0, 1.0, scalar))
+    return vector / np.maximum(sine, 1e-12) * angle * rate / periods[:, None]

@@ -1,0 +1,178 @@
+"""The best possible time with speed, acceleration and collective thrust alone, and a planner that goes for it.
+
+Without attitude the problem is convex in b = (ds/dt)² by arc length and is solved by reachability analysis
+(copp-py). From outside its polygons and its steps only ever allow more than a flight may do, so its time is a lower
+bound; from inside it gives a profile that is made smooth enough to fly. Motors and body rates are not asked: where the
+acceleration jumps the profile breaks them, and is as slow after repair as that costs.
+"""
+
+import time
+from typing import Any
+
+import copp_py
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import InfeasibleError
+from cfplan.geometry.path import Path
+from cfplan.geometry.yaw import YawMode
+from cfplan.planners.baselines.convex_profile import smooth_profile, window
+from cfplan.planners.baselines.convex_rows import Rows, inner_rows, outer_rows
+from cfplan.planners.baselines.convex_stations import Stations, stations
+from cfplan.planners.baselines.selection import least_slowed
+from cfplan.planners.solution import Solution, Status
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.sampled_yaw import yaw_along
+
+BOUND_SPACING, BOUND_TURN = 0.005, 0.004
+# m and rad between stations: what discretisation costs the bound falls with both, to 0.3 % of time at 2 m/s
+PLAN_SPACING, PLAN_TURN = 0.03, 0.03
+# coarser, as what the planner makes of it is certified and not proven
+WINDOW_SHARES = (0.25, 0.5, 1.0)
+# of the width at which a jump of acceleration takes the whole of a limit; wider rounds tight corners off too much
+BOUNDARY_SLACK = 1.01
+# on b where a segment hands over: what is on a limit from inside may be over the polygon's
+Boundary = tuple[float | None, float | None]
+# m²/s² at the start and the end of the path, None where it is free
+
+
+def lower_bound(
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    *,
+    start: BoundaryState | None = None,
+    end: BoundaryState | None = None,
+) -> float:
+    """s: no motion along the path within speed, acceleration and collective thrust takes less.
+
+    What is proven: a feasible motion sampled at the stations meets every row (`outer_rows`), so at each station it is
+    no faster than the reachable set's top; between two stations it cannot exceed what full acceleration from both
+    gives. Curvature and slope are bounded over each interval by their extremes at its samples, not by interval
+    arithmetic.
+
+    Raises:
+        InfeasibleError: not even these limits can be met.
+    """
+    at = stations(path, spacing=BOUND_SPACING, turn=BOUND_TURN)
+    top = _outer_top(at, airframe, limits, _boundary(path, start, end))
+    return float(np.sum(_least_times(at, top, limits)))
+
+
+def _outer_top(at: Stations, airframe: Airframe, limits: PlanLimits, boundary: Boundary) -> NDArray:
+    """(M,) m²/s²: b is no greater at the stations. The second pass knows from the first how fast drag can be met."""
+    fastest = np.full(len(at.length), limits.speed)
+    top = _reachable_top(at, outer_rows(at, airframe, limits, fastest), boundary)
+    return _reachable_top(at, outer_rows(at, airframe, limits, _fastest(at, top, limits)), boundary)
+
+
+def _fastest(at: Stations, top: NDArray, limits: PlanLimits) -> NDArray:
+    """(M,) m/s: no faster anywhere in the two intervals beside each station."""
+    spacing = np.diff(at.length)
+    inside = np.maximum(top[:-1], top[1:]) + 2 * limits.acceleration * spacing
+    around = np.maximum(np.append(inside, inside[-1]), np.insert(inside, 0, inside[0]))
+    return np.minimum(np.sqrt(around), limits.speed)
+
+
+def plan_convex(
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    *,
+    nodes: int = 100,
+    yaw: YawMode = YawMode.FIXED,
+    yaw_angle: float = 0.0,
+    start: BoundaryState | None = None,
+    end: BoundaryState | None = None,
+) -> Solution:
+    """The convex problem from inside, made smooth. Of a boundary state only h is met, and only roughly."""
+    begun = time.perf_counter()
+    boundary = _boundary(path, start, end)
+    at = stations(path, spacing=PLAN_SPACING, turn=PLAN_TURN)
+    fastest = np.full(len(at.length), limits.speed)
+    try:
+        speeds = _solved(at, inner_rows(at, airframe, limits, fastest), boundary)
+    except InfeasibleError as error:
+        return Solution(Status.INFEASIBLE, None, str(error))
+    along = yaw_along(path, yaw, yaw_angle)
+    width = window(airframe, limits)
+    profiles = (smooth_profile(path, at, speeds, share * width, nodes, along) for share in WINDOW_SHARES)
+    profile = least_slowed(path, profiles, airframe, limits)
+    stats: dict[str, float | int | str] = {
+        "solver": "copp-py",
+        "solve_seconds": time.perf_counter() - begun,
+        "point_mass_time": float(np.sum(2 * np.diff(at.length) / (np.sqrt(speeds[1:]) + np.sqrt(speeds[:-1])))),
+    }
+    if profile is None:
+        return Solution(Status.NOT_CONVERGED, None, "no smoothing of the solution stays above h = 0", stats)
+    return Solution(Status.SOLVED, profile, stats=stats)
+
+
+def _boundary(path: Path, start: BoundaryState | None, end: BoundaryState | None) -> Boundary:
+    """b at the path's ends: 0 at a rest end, None where it is free."""
+    values = []
+    for s, state in ((0.0, start), (path.end, end)):
+        square = float(np.sum(path(np.array([s]), 1) ** 2))
+        values.append(0.0 if square == 0.0 else None if state is None else state.h * square)
+    return values[0], values[1]
+
+
+def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
+    ceiling, most, ends = rows.ceiling.copy(), rows.most.copy(), []
+    for index, beside, value in ((0, 1, boundary[0]), (-1, -2, boundary[1])):
+        if value is None:  # free: let b jump in the interval at that end, which only ever allows more
+            most[[index, beside]] = 1e6
+            value = ceiling[index]
+        elif value > ceiling[index] * BOUNDARY_SLACK:
+            raise InfeasibleError(
+                f"a boundary state of {value**0.5:.3f} m/s is faster than the limits allow there, "
+                f"{ceiling[index] ** 0.5:.3f} m/s"
+            )
+        ceiling[index] = max(value, 1e-9)  # the library wants it positive
+        ends.append(float(value))
+    constraints = copp_py.constraints.Constraints(3, capacity=len(at.length))
+    constraints.append_s(at.length)
+    constraints.add_constraint_1st(ceiling[:, None], 0)
+    constraints.add_constraint_2nd(rows.first, rows.second, most, 0)
+    reachability: Any = copp_py.solver.topp2_ra  # its stub forgets to export Problem
+    return reachability.Problem(constraints, idx_s_interval=(0, len(at.length) - 1), a_boundary=(ends[0], ends[1]))
+
+
+def _reachable_top(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
+    try:
+        return copp_py.solver.reach_set2.bidirectional(_problem(at, rows, boundary)).a_max
+    except copp_py.core.CoppError as error:
+        raise InfeasibleError(
+            "no motion along the path meets the limits of speed, acceleration and collective thrust",
+            hint="loosen the limits or start slower",
+        ) from error
+
+
+def _solved(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
+    try:
+        return copp_py.solver.topp2_ra.solve(_problem(at, rows, boundary))
+    except copp_py.core.CoppError as error:
+        raise InfeasibleError(f"the convex problem has no solution: {error}") from error
+
+
+def _least_times(at: Stations, top: NDArray, limits: PlanLimits) -> NDArray:
+    """(M-1,) s: the least time of each interval with b at most `top` at its ends and |b'| at most 2 a_max inside."""
+    spacing = np.diff(at.length)
+    left, right = top[:-1], top[1:]
+    gain = 2 * limits.acceleration
+    meet = np.clip(0.5 * ((right - left) / gain + spacing), 0.0, spacing)
+    with np.errstate(divide="ignore"):
+        low = np.maximum(at.curvature_low[:-1], at.curvature_low[1:])
+        # low bounds curvature over both intervals beside a station, so either one bounds it over this one
+        cap = np.minimum(limits.speed**2, np.where(low > 0, limits.acceleration / low, np.inf))
+    return _rush(left, meet, gain, cap) + _rush(right, spacing - meet, gain, cap)
+
+
+def _rush(b: NDArray, distance: NDArray, gain: float, cap: NDArray) -> NDArray:
+    """s to cover a distance when b grows by `gain` a metre until it reaches `cap`."""
+    cap = np.maximum(cap, b)
+    rising = np.minimum(distance, (cap - b) / gain)
+    peak = np.sqrt(b + gain * rising)
+    return 2 * (peak - np.sqrt(b)) / gain + (distance - rising) / np.maximum(np.sqrt(cap), 1e-9)

@@ -1,0 +1,71 @@
+"""From the convex problem's bang-bang speed to a profile that a vehicle can follow.
+
+The time law of the distance flown, l(t), is averaged over a triangular window in time. That keeps its speed limit,
+bounds jerk and snap where acceleration jumps, and from rest makes l grow as t⁴: just what a finite h does at a rest
+end of a path, where l grows as s⁴.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.geometry.path import Path
+from cfplan.planners.baselines.convex_stations import Stations
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.profile_spline import profile_through
+
+SAMPLES_PER_INTERVAL = 8
+TIME_STEPS_PER_WINDOW = 200
+H_STIFFNESS = 1e-4
+
+
+def window(airframe: Airframe, limits: PlanLimits) -> float:
+    """s: half the width of the window that turns a jump from one acceleration to its opposite into a fair motion.
+
+    Over w a jump of 2a makes a jerk of 2a/w and a snap of at most 4a/w², and g times the thrust axis's first and second
+    derivative are about that: to be met by body rate, and by the torque that motors have to spare in hover.
+    """
+    spare = min(limits.motor_thrust_max - airframe.hover_thrust, airframe.hover_thrust - limits.motor_thrust_min)
+    turning = min(4 * airframe.arm * max(spare, 1e-3) / max(airframe.inertia[:2]), limits.angular_acceleration)
+    most = min(limits.acceleration, 4 * limits.motor_thrust_max / airframe.mass)
+    rate, acceleration = GRAVITY * limits.angular_velocity, GRAVITY * turning
+    return max(2 * most / rate, (4 * most / acceleration) ** 0.5)
+
+
+def smooth_profile(
+    path: Path, at: Stations, b: NDArray, half_width: float, nodes: int, yaw: Callable[[NDArray], NDArray]
+) -> SpeedProfile:
+    """The profile over `nodes` intervals of the speeds √b at the stations, averaged over ± half_width s."""
+    length, speed = _averaged(at.length, b, half_width)
+    grid = np.linspace(0.0, path.end, nodes + 1)
+    samples = grid[-1] * (np.arange(SAMPLES_PER_INTERVAL * nodes) + 0.5) / (SAMPLES_PER_INTERVAL * nodes)
+    total = at.length[-1]
+    here = np.interp(samples, at.s, _graded(at.length, total))
+    rate = np.interp(here, _graded(length, total), np.cbrt(speed)) ** 3
+    h = np.square(rate / np.linalg.norm(path(samples, 1), axis=1))
+    return profile_through(grid, samples, h, yaw(samples), h_stiffness=H_STIFFNESS)
+
+
+def _averaged(length: NDArray, b: NDArray, half_width: float) -> tuple[NDArray, NDArray]:
+    """Distance, m, and speed, m/s, at close times after averaging speed over the triangular window."""
+    speed = np.sqrt(np.maximum(b, 0.0))
+    duration = np.concatenate([[0.0], np.cumsum(2 * np.diff(length) / (speed[1:] + speed[:-1]))])
+    step = half_width / TIME_STEPS_PER_WINDOW
+    time = np.arange(-TIME_STEPS_PER_WINDOW, int(np.ceil(duration[-1] / step)) + TIME_STEPS_PER_WINDOW + 1) * step
+    law = np.interp(time, duration, speed)  # acceleration is constant between stations: speed is linear in time
+    smooth = np.pad(law, TIME_STEPS_PER_WINDOW - 1, mode="edge")
+    for _ in range(2):  # a box averaged by a box is a triangle
+        total = np.concatenate([[0.0], np.cumsum(smooth)])
+        smooth = (total[TIME_STEPS_PER_WINDOW:] - total[:-TIME_STEPS_PER_WINDOW]) / TIME_STEPS_PER_WINDOW
+    gone = np.concatenate([[0.0], np.cumsum(0.5 * (smooth[1:] + smooth[:-1])) * step])
+    gone -= half_width * speed[0]  # a flight that does not start from rest was on its way before
+    return gone * (length[-1] + half_width * speed[-1]) / gone[-1], smooth
+
+
+def _graded(distance: NDArray, total: float) -> NDArray:
+    """Distance so stretched that a rest end, where it grows as s⁴ and as t⁴, looks linear in s and in t."""
+    half, inside = total / 2, np.clip(distance, 0.0, total)
+    return np.where(inside < half, inside**0.25, 2 * half**0.25 - (total - inside) ** 0.25)

@@ -1,0 +1,54 @@
+"""The plain baseline: the min-snap path at its own nominal timing, scaled as a whole until it is certified."""
+
+import time
+
+import numpy as np
+
+from cfplan.errors import InfeasibleError, NotCertifiedError
+from cfplan.geometry.path import Path
+from cfplan.geometry.yaw import YawMode
+from cfplan.planners.solution import Solution, Status
+from cfplan.safety.limits import PlanLimits
+from cfplan.safety.slowing import slow_until_certified
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.profile import BoundaryState, SpeedProfile
+from cfplan.vehicle.profile_spline import profile_through
+from cfplan.vehicle.sampled_yaw import yaw_along
+from cfplan.vehicle.trajectory import Trajectory
+
+SAMPLES_PER_UNIT = 200  # of s, where the greatest nominal speed is sought
+
+
+def plan_min_snap(
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    *,
+    nodes: int = 100,
+    yaw: YawMode = YawMode.FIXED,
+    yaw_angle: float = 0.0,
+    start: BoundaryState | None = None,
+    end: BoundaryState | None = None,
+) -> Solution:
+    """h constant, as great as the certificate allows. A boundary state's h would have to be just that one: not met."""
+    begun = time.perf_counter()
+    grid = np.linspace(0.0, path.end, nodes + 1)
+    dense = np.linspace(0.0, path.end, max(1000, int(SAMPLES_PER_UNIT * path.end)))
+    fastest = limits.speed / np.linalg.norm(path(dense, 1), axis=1).max()  # ds/dt that meets the speed limit
+    middles = 0.5 * (grid[1:] + grid[:-1])
+    where = np.sort(np.concatenate([grid, middles]))
+    turning = profile_through(grid, where, np.ones_like(where), yaw_along(path, yaw, yaw_angle)(where))
+    zeros = np.zeros(nodes + 1)
+    profile = SpeedProfile(
+        grid, np.full(nodes + 1, fastest**2), zeros, zeros, zeros[1:], turning.yaw, turning.dyaw, turning.ddyaw
+    )
+    try:
+        slowed = slow_until_certified(Trajectory(path, profile, airframe), limits)
+    except (InfeasibleError, NotCertifiedError) as error:
+        return Solution(Status.INFEASIBLE, None, str(error))
+    stats: dict[str, float | int | str] = {
+        "solver": "scaling",
+        "share": slowed.share,
+        "solve_seconds": time.perf_counter() - begun,
+    }
+    return Solution(Status.SOLVED, slowed.trajectory.profile, stats=stats)

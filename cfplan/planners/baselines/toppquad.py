@@ -1,0 +1,219 @@
+"""TOPPQuad as a planner: the reference that the reduced expert and the learned planner are compared with.
+
+Of the solver's answer only h and yaw at the grid points are kept: attitude, rates and thrusts follow from them through
+flatness, as the paper recovers them, so whatever the solver believed of them does not count.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.geometry.path import Path
+from cfplan.geometry.yaw import YawMode
+from cfplan.planners.baselines.selection import least_slowed
+from cfplan.planners.baselines.toppquad_nlp import H_LEAST, ROWS, STEP_ROWS, VARIABLES, Program, program
+from cfplan.planners.solution import Solution, Status
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.profile_spline import profile_through
+from cfplan.vehicle.sampled_yaw import yaw_along
+
+NODES_LEAST = 8
+MAX_ITERATIONS = 1000
+MAX_SECONDS = 30.0
+# of one attempt
+GUESS_SPEEDS = (1.0, 0.5)
+# ds/dt of the min-snap timing to start from: the paper's, which solved 98 % of its paths, and one for a second attempt
+END_NODES = 2
+END_SHARE = 0.5
+H_STIFFNESSES = (1e-2, 1e-1, 1.0, 10.0, 100.0)
+# of the spline through h: the grid of the paper is too coarse to say how h goes on between its points
+YAW_STIFFNESS = 1e-2
+
+
+def plan_toppquad(
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    *,
+    nodes: int = 100,
+    yaw: YawMode = YawMode.FREE,
+    yaw_angle: float = 0.0,
+    start: BoundaryState | None = None,
+    end: BoundaryState | None = None,
+) -> Solution:
+    """Solve the paper's problem over `nodes` intervals. Free yaw starts in [0, π/2].
+
+    Of a boundary state h and h' are met, and yaw at the start: the problem's states have no more.
+    """
+    if nodes < NODES_LEAST:
+        return Solution(Status.NOT_CONVERGED, None, f"{nodes} intervals are too few, take {NODES_LEAST} at least")
+    begun = time.perf_counter()
+    prepared = program(nodes + 1, airframe, limits.angular_acceleration, MAX_ITERATIONS, MAX_SECONDS)
+    built = time.perf_counter()
+    grid = np.linspace(0.0, path.end, nodes + 1)
+    if start is not None and yaw is YawMode.FREE:
+        yaw_angle = start.yaw
+    angles = yaw_along(path, yaw, yaw_angle)(grid)
+    asked = _bounds(path, grid, airframe, limits, yaw, start, end)
+    held = _bounds(path, grid, airframe, limits, YawMode.FIXED, start, end)
+    guesses = [_guess(path, grid, airframe, angles, _guessed_h(path, grid, limits, speed)) for speed in GUESS_SPEEDS]
+    parameters = _parameters(path, grid, angles)
+
+    attempts = [_solve(prepared, guesses[0], parameters, asked)]
+    if not attempts[-1].solved:
+        # With yaw held the problem is far easier, and what it finds is a good guess, and no wrong answer, for free yaw.
+        attempts.append(_solve(prepared, guesses[1], parameters, held))
+        if attempts[-1].solved and yaw is YawMode.FREE:
+            attempts.append(_solve(prepared, attempts[-1].x, parameters, asked))
+    found = next((attempt for attempt in reversed(attempts) if attempt.solved), attempts[0])
+    solved = time.perf_counter()
+    stats: dict[str, float | int | str] = {
+        "solver": "IPOPT",
+        "build_seconds": built - begun,
+        "solve_seconds": solved - built,
+        "tries": len(attempts),
+        "iterations": sum(attempt.iterations for attempt in attempts),
+        "said": found.said,
+    }
+    if not found.solved:
+        status = Status.INFEASIBLE if "Infeasible" in found.said else Status.NOT_CONVERGED
+        return Solution(status, None, f"IPOPT: {found.said}", stats)
+    if yaw is YawMode.FREE:
+        angles = np.unwrap(2 * np.arctan2(found.x[:, 4], found.x[:, 5]), period=4 * np.pi)
+    profiles = (
+        profile_through(grid, grid, found.x[:, 0], angles, h_stiffness=stiffness, yaw_stiffness=YAW_STIFFNESS)
+        for stiffness in H_STIFFNESSES
+    )
+    profile = least_slowed(path, profiles, airframe, limits)
+    stats["fit_seconds"] = time.perf_counter() - solved
+    if profile is None:
+        return Solution(Status.NOT_CONVERGED, None, "no spline through the solution stays above h = 0", stats)
+    return Solution(Status.SOLVED, profile, stats=stats)
+
+
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    x: NDArray
+    # (N+1, 16)
+    solved: bool
+    said: str
+    # by the solver
+    iterations: int
+
+
+def _solve(prepared: Program, guess: NDArray, parameters: NDArray, bounds: dict[str, NDArray]) -> _Attempt:
+    answer = prepared.solver(x0=guess.ravel(), p=parameters, **bounds)
+    report = prepared.solver.stats()
+    x = np.array(answer["x"]).reshape(prepared.nodes, VARIABLES)
+    return _Attempt(x, bool(report["success"]), str(report["return_status"]), int(report["iter_count"]))
+
+
+def _parameters(path: Path, grid: NDArray, angles: NDArray) -> NDArray:
+    half = angles[:, None] / 2
+    columns = np.concatenate([path(grid, 1), path(grid, 2), np.cos(half), np.sin(half)], axis=1)
+    return np.concatenate([[grid[1] - grid[0]], columns.ravel()])
+
+
+def _bounds(
+    path: Path,
+    grid: NDArray,
+    airframe: Airframe,
+    limits: PlanLimits,
+    yaw: YawMode,
+    start: BoundaryState | None,
+    end: BoundaryState | None,
+) -> dict[str, NDArray]:
+    """lbx, ubx, lbg, ubg."""
+    count = len(grid)
+    low, high = np.full((count, VARIABLES), -np.inf), np.full((count, VARIABLES), np.inf)
+    square = np.maximum(np.sum(path(grid, 1) ** 2, axis=1), 1e-12)
+    low[:, 0], high[:, 0] = H_LEAST, np.maximum(limits.speed**2 / square, 2 * H_LEAST)
+    high[:, 0] = np.minimum(high[:, 0], _end_caps(path, grid, airframe, limits))
+    low[:, 12:16] = limits.motor_thrust_min / airframe.hover_thrust
+    high[:, 12:16] = limits.motor_thrust_max / airframe.hover_thrust
+
+    rows_low, rows_high = np.zeros((count, ROWS)), np.zeros((count, ROWS))
+    rows_low[:, 6:], rows_high[:, 6:] = -np.inf, np.inf
+    rows_high[:, 6], rows_high[:, 7] = limits.acceleration**2, limits.angular_velocity**2
+    rows_high[:, 12] = 1.0
+    rows_low[:, 8], rows_low[:, 9] = np.cos(limits.tilt), limits.specific_thrust_min
+    if yaw is not YawMode.FREE:
+        rows_low[:, 10] = rows_high[:, 10] = 0.0
+    elif start is not None:
+        rows_low[0, 10] = rows_high[0, 10] = 0.0
+    else:
+        low[0, 4], low[0, 5], rows_low[0, 11] = 0.0, 0.0, 0.0  # z ≥ 0, w ≥ 0 and z ≤ w: yaw in [0, π/2]
+    for index, state in ((0, start), (-1, end)):
+        if state is not None:
+            low[index, :2] = high[index, :2] = (state.h, state.dh)
+    steps = np.zeros((count - 1) * STEP_ROWS)
+    return {
+        "lbx": low.ravel(),
+        "ubx": high.ravel(),
+        "lbg": np.concatenate([rows_low.ravel(), steps, [1.0]]),
+        "ubg": np.concatenate([rows_high.ravel(), steps, [1.0]]),
+    }
+
+
+def _end_caps(path: Path, grid: NDArray, airframe: Airframe, limits: PlanLimits) -> NDArray:
+    """(N+1,) most h at the END_NODES grid points at each end, no bound elsewhere.
+
+    Between the last two grid points of a rest end γ'' grows from nothing, so the equations at the points alone let h
+    grow without bound there. At constant h the thrust axis turns at h^(3/2) |γ'''| / g and its rate grows by
+    h² |γ''''| / g: these stay within the body rate and within a share of what motors can give beside hover.
+    """
+    caps = np.full(len(grid), np.inf)
+    spare = min(limits.motor_thrust_max - airframe.hover_thrust, airframe.hover_thrust - limits.motor_thrust_min)
+    turning = END_SHARE * min(
+        4 * airframe.arm * max(spare, 1e-3) / max(airframe.inertia[:2]), limits.angular_acceleration
+    )
+    for ends in (range(END_NODES), range(len(grid) - END_NODES, len(grid))):
+        near = np.linspace(grid[max(ends[0] - 1, 0)], grid[min(ends[-1] + 1, len(grid) - 1)], 8 * END_NODES)
+        third, fourth = (float(np.linalg.norm(path(near, order), axis=1).max()) for order in (3, 4))
+        rate = (GRAVITY * limits.angular_velocity / max(third, 1e-9)) ** (2 / 3)
+        caps[ends] = min(rate, (GRAVITY * turning / max(fourth, 1e-9)) ** 0.5)
+    return caps
+
+
+def _guessed_h(path: Path, grid: NDArray, limits: PlanLimits, speed: float) -> float:
+    """h of the min-snap timing at that speed, or less where it would break the speed limit."""
+    fastest = float(np.linalg.norm(path(grid, 1), axis=1).max())
+    return min(speed, speed * limits.speed / max(fastest, 1e-9)) ** 2
+
+
+def _guess(path: Path, grid: NDArray, airframe: Airframe, angles: NDArray, h: float) -> NDArray:
+    """(N+1, 16): the min-snap timing h = const, its attitude, and rates by inverting Eq. 23."""
+    step = grid[1] - grid[0]
+    force = h * path(grid, 2) + np.array([0.0, 0.0, GRAVITY])
+    specific = np.linalg.norm(force, axis=1)
+    q = _hopf(force / specific[:, None], angles)
+    turn = _relative(q[:-1], q[1:])
+    omega = np.zeros((len(grid), 3))
+    omega[:-1] = 2 * turn[:, :3] / (step * turn[:, 3:])
+    omega[-1] = omega[-2]
+    alpha = np.zeros_like(omega)
+    alpha[:-1] = np.diff(omega, axis=0) / step
+    inertia = np.array(airframe.inertia)
+    torque = h * (inertia * alpha + np.cross(omega, inertia * omega))
+    wrench = np.concatenate([airframe.mass * specific[:, None], torque], axis=1)
+    thrusts = np.linalg.solve(airframe.mixing, wrench.T).T / airframe.hover_thrust
+    return np.concatenate([np.full((len(grid), 1), h), np.zeros((len(grid), 1)), q, omega, alpha, thrusts], axis=1)
+
+
+def _relative(before: NDArray, after: NDArray) -> NDArray:
+    """(N, 4) x y z w: before⁻¹ ⊗ after."""
+    v, w = -before[:, :3], before[:, 3:]
+    vector = w * after[:, :3] + after[:, 3:] * v + np.cross(v, after[:, :3])
+    return np.concatenate([vector, w * after[:, 3:] - np.sum(v * after[:, :3], axis=1, keepdims=True)], axis=1)
+
+
+def _hopf(axis: NDArray, yaw: NDArray) -> NDArray:
+    """(N, 4) x y z w: the least turn from the vertical to `axis`, (N, 3) unit, after a turn by yaw, (N,)."""
+    a, b, c = axis.T
+    cos, sin = np.cos(yaw / 2), np.sin(yaw / 2)
+    norm = np.sqrt(2.0 * (1.0 + c))
+    return np.stack([(a * sin - b * cos) / norm, (a * cos + b * sin) / norm, sin * norm / 2, cos * norm / 2], axis=-1)

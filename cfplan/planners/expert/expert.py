@@ -1,0 +1,108 @@
+"""The expert: the fastest profile that keeps every limit, by the reduced formulation.
+
+State (h, h', h'', ψ, ψ') and control (h''', ψ''), constant in each interval, so the dynamics are linear and exact
+and everything physical follows point by point through the flatness map (DESIGN section 4). Minimised is the time of
+flight, by Gauss quadrature, with small penalties on angular acceleration, yaw rate and roughness. Limits hold at both
+ends of every interval, where the controls jump, and at points inside.
+
+Between those points a limit can still be exceeded by a percent or so. The solution is looked at densely; where it
+exceeds a limit, that limit is lowered by as much in that interval alone, and the problem solved again from there,
+which takes a few iterations and costs about a hundredth of a percent in time.
+
+Where the path rests (γ' = γ'' = γ''' = 0) h has no bearing on motion and hardly any on its first derivatives: left
+alone, an optimiser lets it run away or stop short. There h stays constant over the first, or last, interval.
+"""
+
+import math
+import time
+
+from numpy.typing import NDArray
+
+from cfplan.geometry.path import Path
+from cfplan.geometry.yaw import YawMode
+from cfplan.planners.expert.compiled import Backend
+from cfplan.planners.expert.kernel import backend as backend_in_use
+from cfplan.planners.expert.point_constraints import Penalties
+from cfplan.planners.expert.problem import Ends, pose, profile_of
+from cfplan.planners.expert.program import Shape, layout_of
+from cfplan.planners.expert.solvers import interior_point, ipopt
+from cfplan.planners.expert.tightening import Kept, Task, flaw, kept_between
+from cfplan.planners.expert.windows import by_windows
+from cfplan.planners.solution import Solution, Status
+from cfplan.safety.feasibility import broken_by, check_arguments, unsolvable
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.yaw_spline import fixed_yaw, tangent_yaw
+
+WINDOW = (96, 24)
+# intervals that a window keeps, and how much further it looks: longer windows take more steps
+
+
+def plan_reduced(
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    *,
+    nodes: int = 100,
+    yaw: YawMode = YawMode.FIXED,
+    yaw_angle: float = 0.0,
+    start: BoundaryState | None = None,
+    end: BoundaryState | None = None,
+    penalties: Penalties | None = None,
+    windows: bool = True,
+    backend: Backend | None = None,
+) -> Solution:
+    """Plan over `nodes` intervals uniform in s; see Planner.
+
+    Yaw is that of the Hopf fibration. FIXED holds `yaw_angle`, TANGENT follows the horizontal direction of flight;
+    both are laid out before the speed (see yaw_track), which then respects what turning takes. FREE leaves yaw to the
+    optimiser, from a first yaw between `yaw_angle` and a quarter turn more, as the paper has it. A start or end state
+    brings its own yaw in every mode. Long paths are taken window by window, unless `windows` is False. `backend` is for
+    tests: left out, compiled code where there is a compiler.
+
+    Raises:
+        InputError: arguments that are not numbers, or fewer nodes than the path needs.
+    """
+    check_arguments(path, nodes, yaw_angle, start, end)
+    began = time.perf_counter()
+    if reason := unsolvable(airframe, limits):
+        return Solution(Status.INFEASIBLE, None, reason)
+    for name, boundary, s in (("start", start, 0.0), ("end", end, path.end)):
+        if boundary and (reason := broken_by(boundary, path, s, airframe, limits)):
+            return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
+
+    track = (tangent_yaw if yaw is YawMode.TANGENT else fixed_yaw)(path, nodes, yaw_angle, start, end)
+    shape = Shape(nodes, yaw is YawMode.FREE, turning_limited=limits.angular_acceleration < math.inf)
+    whole = Task(path, airframe, limits, Ends(start, end), track, layout_of(shape), backend)
+    failures: list[str] = []
+    solvers: set[str] = set()
+
+    def search(task: Task, _near: NDArray) -> Kept | str:
+        problem = pose(
+            task.layout, task.path, airframe, limits, task.track, yaw_angle, task.ends, penalties or Penalties()
+        )
+        reasons: list[str] = []
+        for solve in (interior_point, ipopt):
+            attempt = solve(problem, backend)
+            reason = flaw(attempt, problem, task)
+            if not reason:
+                failures.extend(reasons)
+                solvers.add(attempt.solver)
+                return kept_between(attempt, problem, task)
+            reasons.append(f"{attempt.solver}: {reason}")
+        return "; ".join(reasons)
+
+    joined = by_windows(whole, WINDOW if windows else (nodes, 0), search)
+    if isinstance(joined, str):
+        return Solution(Status.NOT_CONVERGED, None, joined)
+    stats: dict[str, float | int | str] = {
+        "solve_seconds": time.perf_counter() - began,
+        "iterations": joined.iterations,
+        "rounds": joined.rounds,
+        "windows": 1 + len(joined.joints),
+        "solver": " and ".join(sorted(solvers)),
+        "backend": str(backend or backend_in_use()),
+    }
+    profile = profile_of(joined.table, limits.speed**2, track, path.end)
+    return Solution(Status.SOLVED, profile, "; ".join(failures), stats, joined.joints)

@@ -1,0 +1,172 @@
+"""Plans as Parquet files: samples for any reader, and in the metadata what is needed to certify the plan again.
+
+Path and profile are kept exactly (JSON writes every float so that it is read back the same), so a plan that was loaded
+is the plan that was saved. What a file says of its own certificate is for readers; loading certifies anew.
+"""
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+import cfplan
+from cfplan.errors import CfplanError, InputError
+from cfplan.geometry.path import Path
+from cfplan.planning.plan_result import Plan
+from cfplan.safety.certificate import certify
+from cfplan.safety.limits import Limits
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.trajectory import FullState, Trajectory
+
+FORMAT = 2
+RATE = 100  # Hz, of the samples
+_KEY = b"cfplan"
+_AXES = ("x", "y", "z", "w")
+_HINT = "make it again with `cfplan plan`"
+
+
+def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | None = None) -> None:
+    """Write the plan; the file appears whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    import pyarrow
+    import pyarrow.parquet
+
+    metadata = {
+        "format": FORMAT,
+        "version": cfplan.__version__,
+        "planner": plan.planner,
+        "nodes": plan.nodes,
+        "slowed": plan.slowed,
+        "speed_share": plan.speed_share,
+        "seconds": plan.seconds,
+        "notes": list(plan.notes),
+        "lower_bound": plan.lower_bound,
+        "joints": list(plan.joints),
+        "provenance": dict(provenance or {}),
+        "certificate": plan.certificate.to_dict(),
+        "airframe": asdict(plan.airframe),
+        "limits": asdict(plan.limits),
+        "path": {"breaks": plan.path.breaks.tolist(), "coefficients": plan.path.coefficients.tolist()},
+        "profile": {f.name: getattr(plan.profile, f.name).tolist() for f in fields(SpeedProfile)},
+    }
+    table = pyarrow.table(_columns(plan.trajectory))
+    table = table.replace_schema_metadata({_KEY: json.dumps(metadata).encode()})
+    target = FilePath(file)
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        os.close(handle)
+        try:
+            pyarrow.parquet.write_table(table, name, compression="zstd")
+            os.chmod(name, 0o644)
+            os.replace(name, target)
+        except BaseException:
+            os.unlink(name)
+            raise
+    except OSError as error:
+        raise InputError(
+            f"cannot be written: {error.strerror or error}", where=str(target), hint="name another file with -o"
+        ) from None
+
+
+def load_plan(file: FilePath | str) -> Plan:
+    """The plan that was saved, certified anew.
+
+    Raises:
+        InputError: not there, truncated, not a plan, of another format, or at odds with itself.
+    """
+    import pyarrow
+    import pyarrow.parquet
+
+    where = str(file)
+    try:
+        table = pyarrow.parquet.read_table(file)
+    except FileNotFoundError:
+        raise InputError("no such file", where=where, hint="make it with `cfplan plan PATH -o FILE`") from None
+    except (OSError, pyarrow.ArrowException) as error:
+        raise InputError(f"not a plan, or cut off: {_one_line(error)}", where=where, hint=_HINT) from None
+    try:
+        metadata = json.loads((table.schema.metadata or {})[_KEY])
+        if metadata["format"] != FORMAT:
+            raise InputError(f"a plan of format {metadata['format']}, not {FORMAT}", where=where, hint=_HINT)
+        plan = _rebuilt(metadata)
+    except KeyError as error:
+        raise InputError(f"not a plan of cfplan: {error} is missing", where=where, hint=_HINT) from None
+    except CfplanError as error:
+        raise InputError(error.what, where=where, hint=error.hint or _HINT) from None
+    except (ValidationError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        raise InputError(f"not a sound plan: {_one_line(error)}", where=where, hint=_HINT) from None
+    _check_samples(plan, table, where)
+    return plan
+
+
+def _rebuilt(metadata: dict[str, Any]) -> Plan:
+    airframe = TypeAdapter(Airframe).validate_python(metadata["airframe"])
+    limits = TypeAdapter(Limits).validate_python(metadata["limits"])
+    path = Path(np.array(metadata["path"]["breaks"]), np.array(metadata["path"]["coefficients"]))
+    profile = SpeedProfile(**{f.name: np.array(metadata["profile"][f.name], dtype=float) for f in fields(SpeedProfile)})
+    trajectory = Trajectory(path, profile, airframe)
+    joints = tuple(map(float, metadata.get("joints", ())))  # older files tell of none
+    if not all(0.0 < joint < path.end for joint in joints):
+        raise ValueError("a joint lies outside the path")
+    return Plan(
+        path=path,
+        airframe=airframe,
+        limits=limits,
+        trajectory=trajectory,
+        certificate=certify(trajectory, limits.plan, limits.space),
+        planner=str(metadata["planner"]),
+        nodes=int(metadata["nodes"]),
+        slowed=float(metadata["slowed"]),
+        speed_share=float(metadata["speed_share"]),
+        seconds=float(metadata["seconds"]),
+        notes=tuple(map(str, metadata["notes"])),
+        lower_bound=None if metadata["lower_bound"] is None else float(metadata["lower_bound"]),
+        joints=joints,
+    )
+
+
+def _times(trajectory: Trajectory) -> np.ndarray:
+    return np.append(np.arange(np.ceil(trajectory.duration * RATE)) / RATE, trajectory.duration)
+
+
+def _columns(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """One column a number, vectors by their components."""
+    state = trajectory.at(_times(trajectory))
+    columns = {}
+    for field in fields(FullState):
+        values = np.ascontiguousarray(getattr(state, field.name).T)
+        if values.ndim == 1:
+            columns[field.name] = values
+        else:
+            labels = _AXES if field.name != "motor_thrust" else ("1", "2", "3", "4")
+            columns |= {f"{field.name}_{label}": row for label, row in zip(labels, values, strict=False)}
+    return columns
+
+
+def _check_samples(plan: Plan, table: Any, where: str) -> None:
+    """The samples must be those of the plan, so that a reader of either sees the same flight."""
+    if table.num_rows != len(_times(plan.trajectory)):
+        raise InputError("its samples are not those of its plan", where=where, hint=_HINT)
+    columns = _columns(plan.trajectory)
+    if set(table.column_names) != set(columns):
+        raise InputError("its columns are not those of a plan", where=where, hint=_HINT)
+    for name, expected in columns.items():
+        found = table[name].to_numpy()
+        scale = 1.0 + float(np.max(np.abs(expected)))
+        if found.dtype.kind != "f" or not np.all(np.abs(found - expected) <= 1e-6 * scale):
+            raise InputError(f"its samples of {name} are not those of its plan", where=where, hint=_HINT)
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text if len(text) <= 160 else f"{text[:157]}..."

@@ -1,0 +1,3 @@
+"""A flight told to MAVLink ground stations, and their commands."""
+
+__all__ = ["bridge"]

@@ -1,0 +1,64 @@
+"""What a ground station may command: to stop. Everything else is refused, and every command is answered.
+
+MAVLink is not authenticated, so nothing is obeyed that arms or moves the vehicle; a stop only makes things safer,
+whoever sends it.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from cfplan.flight.pilot.keys import Order
+
+# MAV_CMD
+_RETURN, _LAND, _TAKE_OFF, _GUIDED = 20, 21, 22, 92
+_SET_MODE, _REPOSITION, _TERMINATE = 176, 192, 185
+_MOTOR_TEST, _REBOOT, _MISSION, _ARM = 209, 246, 300, 400
+_REQUEST_MESSAGE, _REQUEST_VERSION = 512, 520
+_REFUSED = (_RETURN, _TAKE_OFF, _GUIDED, _SET_MODE, _REPOSITION, _MOTOR_TEST, _REBOOT, _MISSION)
+FORCE = 21196  # by which a disarming is meant in the air too
+AUTOPILOT_VERSION = 148  # the one message that can be asked for
+
+
+class Result(IntEnum):
+    """MAV_RESULT"""
+
+    ACCEPTED = 0
+    DENIED = 2
+    UNSUPPORTED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """To one command."""
+
+    result: Result
+    order: Order | None = None
+    # for the pilot
+    says: str = ""
+    # what is told to all ground stations
+    message: int | None = None
+    # that was asked for
+
+
+def answer(command: int, parameters: tuple[float, ...]) -> Answer:
+    """To MAV_CMD `command` with its first two parameters, which may be anything, NaN too."""
+    first, second = parameters[:2]
+    if command == _LAND:
+        return Answer(Result.ACCEPTED, Order.LAND, "landing, as the ground station commands")
+    if command == _TERMINATE and first > 0.5:
+        return Answer(Result.ACCEPTED, Order.CUT, "motors off: flight termination")
+    if command == _ARM and first == 0 and second == FORCE:
+        return Answer(Result.ACCEPTED, Order.CUT, "motors off: forced disarm")
+    if command in (_TERMINATE, _ARM, *_REFUSED):
+        return Answer(Result.DENIED, says=f"refused: command {command}; ground stations may only stop a flight")
+    if command == _REQUEST_VERSION or (command == _REQUEST_MESSAGE and first == AUTOPILOT_VERSION):
+        return Answer(Result.ACCEPTED, message=AUTOPILOT_VERSION)
+    return Answer(Result.UNSUPPORTED)
+
+
+def command_of(message: Any) -> tuple[int, tuple[float, float]] | None:
+    """The command in a COMMAND_LONG or COMMAND_INT; None for other messages."""
+    if message.get_type() not in ("COMMAND_LONG", "COMMAND_INT"):
+        return None
+    return int(message.command), (float(message.param1), float(message.param2))

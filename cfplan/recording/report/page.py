@@ -1,0 +1,190 @@
+"""The report as one HTML page that needs nothing else: tables, charts, events, certificate, provenance."""
+
+import html
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cfplan.errors import InputError
+from cfplan.recording.overlay import Trial, trial_of_record
+from cfplan.recording.plots import FLOWN, Colour, finite_limits, plots
+from cfplan.recording.report.charts import Curve, place_chart, time_chart
+from cfplan.recording.report.report import Flight, rows
+from cfplan.recording.rerun.overlay_view import COLOURS, references
+from cfplan.recording.summary import reference_span
+
+_PATH: Colour = (120, 120, 120)
+_SIDES = (("From the side", 1, 2), ("From the front", 0, 2))
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 2em auto; padding: 0 1em; }
+h1 { font-size: 1.6em; } h2 { font-size: 1.25em; margin-top: 2.2em; border-bottom: 1px solid #ddd; }
+h3 { font-size: 1.05em; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .25em .9em .25em 0; text-align: left; border-bottom: 1px solid #eee; vertical-align: top; }
+td.n, th.n { text-align: right; } .note { background: #fff6e0; padding: .4em .8em; border-left: 4px solid #e69f00; }
+.fail, .error { color: #b02020; font-weight: 600; } .warning { color: #9a6700; }
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(440px, 1fr)); gap: 1em 1.5em; }
+.charts svg { width: 100%; height: auto; } .scroll { overflow-x: auto; } footer { color: #777; margin-top: 3em; }
+@media print { body { max-width: none; margin: 0; } .charts svg, table { break-inside: avoid; } }
+"""
+
+
+def page(flights: Sequence[Flight]) -> str:
+    """The whole page; of several flights a comparison first."""
+    title = flights[0].record.header.name if len(flights) == 1 else f"{len(flights)} flights"
+    parts = [f"<h1>{html.escape(title)}</h1>", _summary(flights)]
+    if len(flights) > 1:
+        parts.append(_comparison(flights))
+    parts += [_flight(flight) for flight in flights]
+    versions = sorted({flight.record.header.version for flight in flights})
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">"
+        '<meta name="viewport" content="width=device-width">'
+        f"<title>{html.escape(title)}: flight report</title><style>{_STYLE}</style></head><body>"
+        f"{''.join(parts)}<footer>cfplan {html.escape(', '.join(versions))}</footer></body></html>\n"
+    )
+
+
+def write_page(flights: Sequence[Flight], file: Path, *, overwrite: bool = False) -> None:
+    """Write the page; whole or not at all. Raises InputError where the file cannot be."""
+    if file.exists() and not overwrite:
+        raise InputError("there is a file already", where=str(file), hint="name another with -o, or add --force")
+    content = page(flights)
+    unfinished = ""
+    try:
+        handle, unfinished = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(content)
+        os.chmod(unfinished, 0o644)
+        os.replace(unfinished, file)
+    except OSError as error:
+        if unfinished:
+            Path(unfinished).unlink(missing_ok=True)
+        raise InputError(
+            f"cannot be written ({error.strerror or error})", where=str(file), hint="name another place with -o"
+        ) from error
+
+
+def _summary(flights: Sequence[Flight]) -> str:
+    """One row a number, one column a flight."""
+    columns = [rows(flight) for flight in flights]
+    head = "" if len(flights) == 1 else "".join(f'<th class="n">{html.escape(f.name)}</th>' for f in flights)
+    body = [
+        f"<tr><td>{html.escape(label)}</td>"
+        + "".join(f'<td class="n">{html.escape(column[index][1])}</td>' for column in columns)
+        + "</tr>"
+        for index, (label, _) in enumerate(columns[0])
+    ]
+    heading = f"<tr><th></th>{head}</tr>" if head else ""
+    return f'<div class="scroll"><table>{heading}{"".join(body)}</table></div>'
+
+
+def _comparison(flights: Sequence[Flight]) -> str:
+    trials = [trial_of_record(flight.record, flight.name) for flight in flights]
+    over = [_along(trial) for trial in trials]
+    charts = _views(trials)
+    for title, values in (
+        ("Deviation in time, m", [trial.deviation for trial in trials]),
+        ("Speed, m/s", [trial.speed for trial in trials]),
+    ):
+        curves = [
+            Curve(trial.name, trial.time[rows_], value[rows_], COLOURS[index % len(COLOURS)])
+            for index, (trial, value, rows_) in enumerate(zip(trials, values, over, strict=True))
+        ]
+        charts.append(time_chart(f"{title}, from the begin of the path", curves))
+    return f'<h2>Side by side</h2><div class="charts">{"".join(charts)}</div>'
+
+
+def _along(trial: Trial) -> np.ndarray:
+    """The rows while the path was flown; all where there was none."""
+    if trial.reference is None or len(trial.reference.time) == 0:
+        return np.arange(len(trial.time))
+    return np.flatnonzero((trial.time >= 0) & (trial.time <= trial.reference.time[-1]))
+
+
+def _views(trials: Sequence[Trial]) -> list[str]:
+    """From above, and beside it from two sides."""
+    sides = "".join(_places(trials, name, across, up) for name, across, up in _SIDES)
+    return [_places(trials, "From above", 0, 1), f"<div>{sides}</div>"]
+
+
+def _places(trials: Sequence[Trial], title: str, across: int, up: int) -> str:
+    curves = [
+        Curve(f"{reference.name} (reference)", reference.position[:, across], reference.position[:, up], _PATH, True)
+        for reference in references(trials)
+    ]
+    for index, trial in enumerate(trials):
+        colour = COLOURS[index % len(COLOURS)] if len(trials) > 1 else FLOWN
+        rows_ = _along(trial)
+        label = trial.name if len(trials) > 1 else "flown"
+        curves.append(Curve(label, trial.position[rows_, across], trial.position[rows_, up], colour))
+    return place_chart(title, curves, ("xyz"[across], "xyz"[up]))
+
+
+def _flight(flight: Flight) -> str:
+    record = flight.record
+    begin, end = (moment - record.start for moment in reference_span(record))
+    band = (begin, end) if np.isfinite(begin) else None
+    trial = trial_of_record(record, flight.name)
+    charts = _views([trial])
+    for plot in plots(record):
+        curves = [
+            Curve(
+                label,
+                line.time - record.start,
+                line.values.reshape(len(line.time), len(line.labels))[:, column],
+                colour,
+            )
+            for line in plot.lines
+            for column, (label, colour) in enumerate(zip(line.labels, line.colours, strict=True))
+        ]
+        charts.append(time_chart(plot.title, curves, limits=finite_limits(plot), band=band))
+    notes = "".join(f'<p class="note">{html.escape(note)}</p>' for note in flight.notes)
+    return (
+        f"<h2>{html.escape(flight.name)}</h2>{notes}"
+        f'<div class="charts">{"".join(charts)}</div>'
+        f"{_events(flight)}{_certificate(flight)}{_provenance(flight)}"
+    )
+
+
+def _events(flight: Flight) -> str:
+    record = flight.record
+    said = [
+        (time, str(level), str(text))
+        for time, level, text in zip(record.events.time, record.events.level, record.events.text, strict=True)
+    ]
+    said += [(time, "phase", str(phase)) for time, phase in zip(record.phases.time, record.phases.phase, strict=True)]
+    if not said:
+        return "<h3>Events</h3><p>None were recorded.</p>"
+    lines = [
+        f'<tr class="{html.escape(level)}"><td class="n">{time - record.start:.2f} s</td><td>{html.escape(level)}</td>'
+        f"<td>{html.escape(text)}</td></tr>"
+        for time, level, text in sorted(said, key=lambda entry: entry[0])
+    ]
+    return f"<h3>Events</h3><table>{''.join(lines)}</table>"
+
+
+def _certificate(flight: Flight) -> str:
+    if flight.certificate is None:
+        return ""
+    heads = ("limit", "worst", "allowed", "share", "at", "where")
+    head = "".join(f'<th class="n">{name}</th>' if index else f"<th>{name}</th>" for index, name in enumerate(heads))
+    lines = [
+        f'<tr class="{"" if margin.passed else "fail"}">'
+        + "".join(f"<td{' class=n' if index else ''}>{html.escape(cell)}</td>" for index, cell in enumerate(row))
+        + "</tr>"
+        for margin, row in zip(flight.certificate.margins, flight.certificate.rows(), strict=True)
+    ]
+    verdict = "passed" if flight.certificate.passed else '<span class="fail">failed</span>'
+    return (
+        f"<h3>Certificate of the plan: {verdict}</h3><p>{flight.certificate.samples} samples along the flight.</p>"
+        f'<div class="scroll"><table><tr>{head}</tr>{"".join(lines)}</table></div>'
+    )
+
+
+def _provenance(flight: Flight) -> str:
+    lines = [f"<tr><td>{html.escape(what)}</td><td>{html.escape(value)}</td></tr>" for what, value in flight.provenance]
+    return f"<h3>Where it comes from</h3><table>{''.join(lines)}</table>"

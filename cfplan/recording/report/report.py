@@ -1,0 +1,150 @@
+"""What is reported of a flight: its numbers, its certificate, its events, and where it all came from."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from cfplan.errors import CfplanError
+from cfplan.planning.plan_file import load_plan
+from cfplan.recording.reader import read_record
+from cfplan.recording.record import PLAN_FILE, Record
+from cfplan.recording.summary import FlightSummary, summarise
+from cfplan.safety.certificate import Certificate
+
+UNKNOWN = "–"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flight:
+    """One record with all that is derived from it."""
+
+    name: str
+    # of its folder
+    record: Record
+    summary: FlightSummary
+    shares: Mapping[str, float]
+    # of the limit, of each peak; NaN where there is no such limit
+    certificate: Certificate | None
+    # of its plan; None where the record has none that can be read
+    provenance: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...]
+    # what is missing, one sentence each
+
+
+def read_flight(place: Path) -> Flight:
+    """A record, with the plan that lies beside it. Raises InputError where it is no record."""
+    record = read_record(place)
+    summary, header = summarise(record), record.header
+    notes = ["The record ends early: what follows its last whole chunk is lost."] if record.truncated else []
+    certificate, plan_rows = None, []
+    plan_file = record.folder / PLAN_FILE
+    if plan_file.is_file():
+        try:
+            plan = load_plan(plan_file)
+            certificate = plan.certificate
+            plan_rows = [
+                ("planner", plan.planner),
+                ("grid", f"{plan.nodes} intervals"),
+                ("planning", f"{plan.seconds:.2f} s"),
+                ("share of the planner's speed", f"{plan.slowed:.4g}"),
+                ("share of the speed asked for", f"{plan.speed_share:.4g}"),
+                *(("note", note) for note in plan.notes),
+            ]
+        except CfplanError as error:
+            notes.append(f"Its plan cannot be read: {error.what}.")
+    else:
+        notes.append("There is no plan beside it, so no certificate either.")
+    return Flight(
+        name=record.folder.resolve().name,
+        record=record,
+        summary=summary,
+        shares={
+            "peak_speed": summary.peak_speed / header.bounds.speed,
+            "peak_acceleration": summary.peak_acceleration / header.bounds.acceleration,
+            "peak_body_rate": summary.peak_body_rate / header.bounds.body_rate,
+            "max_deviation": summary.max_deviation / header.bounds.deviation,
+        },
+        certificate=certificate,
+        provenance=(*_provenance(record), *plan_rows),
+        notes=tuple(notes),
+    )
+
+
+def _provenance(record: Record) -> list[tuple[str, str]]:
+    header = record.header
+    begun = datetime.fromtimestamp(header.wall_time_at_zero + record.start, UTC)
+    return [
+        ("begun", f"{begun:%Y-%m-%d %H:%M:%S} UTC"),
+        ("path", header.name),
+        ("vehicle", header.vehicle.name),
+        ("reached by", header.uri),
+        ("cfplan", header.version),
+        *((key, value) for key, value in header.provenance.items() if key != "planner"),
+    ]
+
+
+def outcome(flight: Flight) -> str:
+    """How it ended, as the pilot said."""
+    said = flight.record.summary.get("outcome")
+    return str(said.get("reason") or UNKNOWN) if isinstance(said, Mapping) else UNKNOWN
+
+
+def rows(flight: Flight) -> list[tuple[str, str]]:
+    """The summary table: what it is, and its value as people read it."""
+    s = flight.summary
+    return [
+        ("travel time, planned", _number(s.travel_time_planned, "s", 2)),
+        ("travel time, flown", _number(s.travel_time_flown, "s", 2)),
+        ("settling", _number(s.settling, "s", 2)),
+        ("deviation in time, max", _number(100 * s.max_deviation, "cm", 1)),
+        ("deviation in time, rms", _number(100 * s.rms_deviation, "cm", 1)),
+        ("deviation from the path, max", _number(100 * s.max_deviation_to_path, "cm", 1)),
+        ("deviation from the path, rms", _number(100 * s.rms_deviation_to_path, "cm", 1)),
+        ("peak speed", _peak(flight, "peak_speed", "m/s")),
+        ("peak acceleration", _peak(flight, "peak_acceleration", "m/s²")),
+        ("peak body rate", _peak(flight, "peak_body_rate", "rad/s")),
+        ("lateness of setpoints, p99", _number(1e3 * s.lateness_p99, "ms", 2)),
+        ("lateness of setpoints, worst", _number(1e3 * s.lateness_max, "ms", 2)),
+        ("pose dropouts", str(s.pose_dropouts)),
+        ("longest pose gap", _number(1e3 * s.longest_pose_gap, "ms", 0)),
+        ("battery", f"{_number(s.battery_start, 'V', 2)} → {_number(s.battery_end, 'V', 2)}"),
+        ("certificate", _verdict(flight.certificate)),
+        ("ended", outcome(flight)),
+    ]
+
+
+def _number(value: float, unit: str, digits: int) -> str:
+    return f"{value:.{digits}f} {unit}" if math.isfinite(value) else UNKNOWN
+
+
+def _peak(flight: Flight, name: str, unit: str) -> str:
+    value, share = getattr(flight.summary, name), flight.shares[name]
+    return _number(value, unit, 2) + (f" ({100 * share:.0f} % of the limit)" if math.isfinite(share) else "")
+
+
+def _verdict(certificate: Certificate | None) -> str:
+    if certificate is None:
+        return UNKNOWN
+    worst = certificate.worst
+    return f"{'passed' if certificate.passed else 'FAILED'}, {worst.name} {100 * worst.share:.1f} %"
+
+
+def flight_to_dict(flight: Flight) -> dict[str, Any]:
+    """For JSON: all numbers in SI."""
+    record = flight.record
+    events = zip(record.events.time - record.start, record.events.level, record.events.text, strict=True)
+    return {
+        "name": flight.name,
+        "folder": str(record.folder),
+        "path": record.header.name,
+        **flight.summary.to_json(),
+        "shares": {name: share if math.isfinite(share) else None for name, share in flight.shares.items()},
+        "outcome": record.summary.get("outcome"),
+        "certificate": None if flight.certificate is None else flight.certificate.to_dict(),
+        "events": [{"time": float(time), "level": str(level), "text": str(text)} for time, level, text in events],
+        "provenance": [{"what": what, "value": value} for what, value in flight.provenance],
+        "notes": list(flight.notes),
+    }

@@ -1,0 +1,143 @@
+"""The flight in rerun while it goes on, from what the main process is told of it; the pilot's process never sees this.
+
+Messages are only put into a queue; a thread sends what has gathered as columns, ten times a second. The viewer is a
+process of its own at a low priority: the setpoints come first.
+"""
+
+import contextlib
+import subprocess
+import threading
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from cfplan.flight.telemetry import PoseReceived, SetpointSent, Telemetry, VehicleStatus
+from cfplan.recording.header import RecordHeader
+from cfplan.recording.plots import FLOWN, WANTED, plots
+from cfplan.recording.record import Record
+from cfplan.recording.rerun import layout
+from cfplan.recording.rerun.plan_view import log_plan
+from cfplan.recording.rerun.record_view import (
+    TRACK_RADIUS,
+    log_columns,
+    log_limits,
+    log_outline,
+    log_room,
+    log_styles,
+    log_tail,
+)
+from cfplan.recording.rerun.viewer import APPLICATION, free_port, lay_out, require_screen, viewer_program
+from cfplan.recording.topics import TOPICS, columns_of
+
+PERIOD = 0.1  # s between batches
+CAPACITY = 50_000  # messages that wait at most; more are left out of the view, never of the record
+_CARRIED = (SetpointSent, PoseReceived, VehicleStatus)
+# of which the last of a batch begins the next, so that lines have no gaps
+_GOODBYE = 3.0  # s
+
+
+def open_live(header: RecordHeader, folder: Path) -> "LiveView":
+    """A live view in a viewer's window, of a flight whose plan lies in the record's folder.
+
+    Raises InputError where there is no screen.
+    """
+    require_screen("leave out --live; `cfplan replay` shows the record afterwards")
+    port = free_port()
+    subprocess.Popen(
+        [
+            "nice", "-n", "10", str(viewer_program()), "--port", str(port), "--bind", "127.0.0.1",
+            "--hide-welcome-screen",
+        ],
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    stream = rr.RecordingStream(APPLICATION)
+    stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
+    lay_out(stream, live_blueprint(header))
+    return LiveView(stream, header, folder)
+
+
+def live_blueprint(header: RecordHeader) -> rrb.Blueprint:
+    """The same as of a replay, but the time follows."""
+    return layout.blueprint(header, play_state="following")
+
+
+class LiveView:
+    """Sends a flight to a stream while it is entered; `show` takes a message and returns at once."""
+
+    def __init__(self, stream: rr.RecordingStream, header: RecordHeader, folder: Path = Path()):
+        self._stream, self._header, self._folder = stream, header, folder
+        self._waiting: deque[Telemetry] = deque(maxlen=CAPACITY)
+        self._start: float | None = None
+        # s, of the first message: 0 on the timeline
+        self._carried: dict[type, Telemetry] = {}
+        self._drawn: set[str] = set()
+        # the outlines that stand already
+        self.failure = ""
+        # why the view ends early, one line
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="live view", daemon=True)
+
+    def __enter__(self) -> "LiveView":
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.set()
+        self._thread.join(_GOODBYE)
+
+    def show(self, message: Telemetry) -> None:
+        """Take a message."""
+        self._waiting.append(message)
+
+    def _run(self) -> None:
+        try:
+            empty = _part(self._header, [])
+            self._stream.send_recording_name(self._header.name)
+            log_room(self._stream, self._header)
+            log_styles(self._stream, plots(empty))
+            log_plan(self._stream, replace(empty, folder=self._folder))
+            while not self._ending.wait(PERIOD):
+                self._send()
+            self._send()
+            self._stream.flush(timeout_sec=_GOODBYE / 2)
+        except Exception as error:  # a viewer that was closed must not be heard of in the flight
+            self.failure = f"the live view ended: {error}"
+        with contextlib.suppress(Exception):
+            self._stream.disconnect()
+
+    def _send(self) -> None:
+        fresh: list[Telemetry] = []
+        while self._waiting:
+            fresh.append(self._waiting.popleft())
+        if not fresh:
+            return
+        ends = [max(message.time for message in fresh)]
+        if self._start is None:
+            self._start = min(message.time for message in fresh)
+            ends.insert(0, self._start)
+        part = _part(self._header, [*self._carried.values(), *fresh])
+        self._carried |= {type(message): message for message in fresh if isinstance(message, _CARRIED)}
+        shown = plots(part)
+        log_columns(self._stream, part, shown, self._start)
+        log_limits(self._stream, shown, [end - self._start for end in ends])
+        poses = part.poses
+        log_tail(self._stream, layout.FLOWN, poses.time - self._start, poses.position, FLOWN, TRACK_RADIUS)
+        for entity, times, colour in ((layout.BODY, poses.time, FLOWN), (layout.GHOST, part.setpoints.due, WANTED)):
+            if len(times) and entity not in self._drawn:
+                self._drawn.add(entity)
+                log_outline(self._stream, entity, self._header.vehicle.arm, times[:1] - self._start, colour)
+
+
+def _part(header: RecordHeader, messages: list[Telemetry]) -> Record:
+    """Some messages of a flight, as if they were all of it."""
+    streams = {
+        topic.stream: columns_of(topic, [message for message in messages if type(message) is topic.message])
+        for topic in TOPICS
+    }
+    return Record(folder=Path(), header=header, summary={}, truncated=False, **streams)

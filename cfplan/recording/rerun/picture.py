@@ -1,0 +1,144 @@
+"""Pictures of the rerun view, made without a screen: rerun's own viewer on whatever Vulkan driver there is."""
+
+import contextlib
+import os
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import rerun.blueprint as rrb
+
+from cfplan.errors import InputError
+from cfplan.recording.rerun.layout import TIMELINE
+from cfplan.recording.rerun.viewer import Draw, free_port, refuse_existing, save, viewer_program, whole_file
+
+SIZE = (1920, 1080)  # points, of the window that is never shown
+_STARTS_WITHIN = 30.0  # s
+_LOADS_WITHIN = 60.0  # s
+_SETTLES = 5.0  # s until plots have found their ranges and the viewer no longer says hello
+_NO_DRIVER_WORDS = ("No graphics adapter", "Failed to get render context", "Vulkan")
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One view of the window."""
+
+    name: str
+    reports: tuple[str, ...]
+    # what could not be drawn
+    identity: str
+
+
+def write_png(
+    file: Path, blueprint: rrb.Blueprint, draw: Draw, moment: float, *, overwrite: bool = False
+) -> tuple[str, ...]:
+    """Write the whole view as it stands at a moment, s on the timeline, and tell what the viewer complains of.
+
+    Raises InputError where the file cannot be written or where there is nothing to draw with.
+    """
+    refuse_existing(file, overwrite=overwrite)
+    with tempfile.TemporaryDirectory(prefix="cfplan-") as folder:
+        recording = Path(folder) / "view.rrd"
+        save(recording, blueprint, draw)
+        with HeadlessViewer.opened(recording) as viewer:
+            viewer.go_to(moment)
+            picture = viewer.picture()
+            complaints = viewer.complaints()
+    with whole_file(file) as unfinished:
+        unfinished.write_bytes(picture)
+    return complaints
+
+
+class HeadlessViewer:
+    """A viewer without a window."""
+
+    def __init__(self, client: Any):
+        self._client = client
+
+    @classmethod
+    @contextlib.contextmanager
+    def opened(cls, recording: Path, size: tuple[int, int] = SIZE) -> "Iterator[HeadlessViewer]":
+        """With a recording loaded. Raises InputError where there is no driver, or where it does not load."""
+        port = free_port()
+        with tempfile.TemporaryDirectory(prefix="cfplan-") as folder, (Path(folder) / "said").open("wb+") as said:
+            process = subprocess.Popen(
+                [
+                    viewer_program(), "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1", "--port", str(port),
+                    "--window-size", f"{size[0]}x{size[1]}",
+                ],
+                env={"XDG_RUNTIME_DIR": folder, **os.environ, "RERUN_ANALYTICS": "false"},
+                stdin=subprocess.DEVNULL, stdout=said, stderr=said,
+            )  # fmt: skip
+            try:
+                viewer = cls(_client(port, process))
+                viewer._open(recording)
+                yield viewer
+            except ConnectionError:
+                raise _explained(process, Path(said.name)) from None
+            finally:
+                process.kill()
+                process.wait()
+
+    def _open(self, recording: Path) -> None:
+        self._client.open(str(recording))
+        end = time.monotonic() + _LOADS_WITHIN
+        while self._client.get_state().loading:
+            if time.monotonic() > end:
+                raise InputError("the viewer does not come to an end of loading it", where=str(recording))
+            time.sleep(0.1)
+
+    def go_to(self, moment: float) -> None:
+        """Set the time cursor, s."""
+        self._client.set_time(TIMELINE, duration=moment)
+        time.sleep(_SETTLES)
+
+    def views(self) -> tuple[View, ...]:
+        """All that the window holds, those behind others in tabs too."""
+        return tuple(
+            View(view.name or "", tuple(str(report) for report in view.reports), str(view.view_id))
+            for view in self._client.get_state().views
+        )
+
+    def picture(self, view: View | None = None) -> bytes:
+        """A PNG of one view, or of the whole window."""
+        return self._client.take_screenshot(view.identity if view is not None else None)
+
+    def complaints(self) -> tuple[str, ...]:
+        """What could not be drawn, and what went wrong at all."""
+        told = [f"{view.name}: {report}" for view in self.views() for report in view.reports]
+        told += [entry.message for entry in self._client.get_logs() if entry.level.upper() == "ERROR"]
+        return tuple(told)
+
+
+def _client(port: int, process: subprocess.Popen) -> Any:
+    """Once the viewer listens. Raises ConnectionError where it does not, or ends instead."""
+    from rerun.experimental import ViewerClient
+
+    end = time.monotonic() + _STARTS_WITHIN
+    while True:
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.get_state()
+            return client
+        except ConnectionError:
+            if process.poll() is not None or time.monotonic() > end:
+                raise
+            time.sleep(0.1)
+
+
+def _explained(process: subprocess.Popen, said: Path) -> InputError:
+    """Why the viewer left: it listens before it knows whether it can draw."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(5.0)
+    text = said.read_text(errors="replace")
+    if any(words in text for words in _NO_DRIVER_WORDS):
+        return InputError(
+            "there is no Vulkan driver to draw with",
+            hint="install a software one (Debian: apt install mesa-vulkan-drivers), or --save and look at it elsewhere",
+        )
+    lines = [line.strip() for line in text.splitlines() if line.strip()] or ["it said nothing"]
+    return InputError(f"the viewer ended: {lines[-1][:200]}", hint="--save writes what it should have shown")

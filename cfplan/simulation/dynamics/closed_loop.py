@@ -1,0 +1,195 @@
+"""Setpoints, controller and body in one compiled loop: what the vehicle does with the bytes that it is sent.
+
+At each millisecond, in this order: the newest setpoint that has arrived; every second time the controller, on the
+estimate as it is now; the body. So the firmware's recorded flights were made.
+"""
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from cfplan.flight.setpoints.packets import FullStateSetpoints
+from cfplan.simulation.dynamics.body import (
+    ALL_WELL,
+    BODY_RATE,
+    MOTORS,
+    POSITION,
+    QUATERNION,
+    STATE_SIZE,
+    STILL_AIR,
+    THRUST_MAX,
+    TIME_STEP,
+    VELOCITY,
+    pack_body,
+    step_body,
+)
+from cfplan.simulation.dynamics.mellinger import (
+    CONTROL_PERIOD,
+    FULL_COMMAND,
+    FULL_STATE,
+    MEMORY_SIZE,
+    SETPOINT_SIZE,
+    MellingerGains,
+    distribute_power,
+    gains_for,
+    step_mellinger,
+)
+from cfplan.vehicle.airframe import Airframe
+
+_STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)
+
+
+@dataclass(frozen=True, slots=True)
+class EstimateErrors:
+    """How what the controller believes differs from the truth; attitude and body rate are believed as they are."""
+
+    latency: float = 0.0
+    # s by which position and velocity are late
+    position_noise: float = 0.0
+    # m, standard deviation, anew each 10 ms
+    velocity_noise: float = 0.0
+    # m/s, likewise
+    seed: int = 0
+
+
+PERFECT = EstimateErrors()
+
+
+@dataclass(frozen=True, slots=True)
+class ClosedLoop:
+    """What the vehicle did, every millisecond from the start to the end."""
+
+    time: NDArray
+    # (N,) s
+    states: NDArray
+    # (N, 17) as in `body`
+    commands: NDArray
+    # (N, 4) what the controller asked of each motor, 16-bit units
+
+    @property
+    def position(self) -> NDArray:
+        """(N, 3) m"""
+        return self.states[:, POSITION]
+
+    @property
+    def velocity(self) -> NDArray:
+        """(N, 3) m/s"""
+        return self.states[:, VELOCITY]
+
+    @property
+    def quaternion(self) -> NDArray:
+        """(N, 4) body→world, x y z w"""
+        return self.states[:, QUATERNION]
+
+    @property
+    def body_rate(self) -> NDArray:
+        """(N, 3) rad/s"""
+        return self.states[:, BODY_RATE]
+
+    @property
+    def motor_thrust(self) -> NDArray:
+        """(N, 4) N"""
+        return self.states[:, MOTORS]
+
+
+def fly_setpoints(
+    setpoints: FullStateSetpoints,
+    times: NDArray,
+    airframe: Airframe,
+    start: NDArray,
+    *,
+    duration: float,
+    gains: MellingerGains | None = None,
+    floor: float = 0.0,
+    delay: float = 0.0,
+    estimate: EstimateErrors = PERFECT,
+    wind: NDArray = STILL_AIR,
+    efficiency: NDArray = ALL_WELL,
+) -> ClosedLoop:
+    """Fly setpoints that arrive at `times` + `delay`, (N,) s, from the state `start`, (17,), for `duration` s.
+
+    Until the first arrives, the controller holds it all the same. `gains` are the airframe's where not given; `wind`
+    (3,) m/s and motor `efficiency` (4,) are constant.
+    """
+    steps = round(duration / TIME_STEP)
+    arrivals = np.round((np.asarray(times) + delay) / TIME_STEP).astype(np.int64)
+    rows = np.zeros((len(times), SETPOINT_SIZE))
+    rows[:, 0:16] = np.hstack(
+        [
+            setpoints.position,
+            setpoints.velocity,
+            setpoints.acceleration,
+            setpoints.quaternion,
+            setpoints.body_rate,
+        ]
+    )
+    random = np.random.default_rng(estimate.seed)
+    noise = np.repeat(random.normal(size=(steps // 10 + 1, 6)), 10, axis=0)
+    noise *= np.repeat([estimate.position_noise, estimate.velocity_noise], 3)
+    states = np.empty((steps + 1, STATE_SIZE))
+    states[0] = start
+    commands = np.empty((steps + 1, 4))
+    _run(
+        states,
+        commands,
+        rows,
+        arrivals,
+        (gains or gains_for(airframe)).pack(),
+        pack_body(airframe, floor=floor),
+        round(estimate.latency / TIME_STEP),
+        noise,
+        np.asarray(wind, dtype=float),
+        np.asarray(efficiency, dtype=float),
+    )
+    return ClosedLoop(np.arange(steps + 1) * TIME_STEP, states, commands)
+
+
+def _compile_loop(sources: int) -> Callable[..., int]:
+    """The loop, which returns `sources`.
+
+    numba's cache compares a function's own file and what it closes over, not the files of the functions that it calls:
+    closing over a checksum of those keeps a changed body from flying as it was when the loop was compiled.
+    """
+
+    @njit(cache=True)
+    def run(
+        states: NDArray,
+        commands: NDArray,
+        setpoints: NDArray,
+        arrivals: NDArray,
+        gains: NDArray,
+        body: NDArray,
+        latency: int,
+        noise: NDArray,
+        wind: NDArray,
+        efficiency: NDArray,
+    ) -> int:
+        memory, control = np.zeros(MEMORY_SIZE), np.zeros(4)
+        motors, thrusts = np.zeros(4), np.zeros(4)
+        believed, state = np.empty(STATE_SIZE), states[0].copy()
+        newest = 0
+        scale = body[THRUST_MAX] / FULL_COMMAND
+        for step in range(len(states)):
+            states[step] = state
+            while newest + 1 < len(arrivals) and arrivals[newest + 1] <= step:
+                newest += 1
+            if step % _STEPS_A_CONTROL == 0:
+                believed[:] = state
+                believed[0:6] = states[max(step - latency, 0), 0:6] + noise[step]
+                step_mellinger(control, memory, gains, setpoints[newest], FULL_STATE, believed)
+                distribute_power(control, motors)
+                thrusts[:] = motors * scale
+            commands[step] = motors
+            step_body(state, thrusts, body, wind, efficiency)
+        return sources
+
+    return run
+
+
+_CALLED = [Path(__file__).with_name(name).read_bytes() for name in ("body.py", "mellinger.py")]
+_run = _compile_loop(zlib.crc32(b"".join(_CALLED)))

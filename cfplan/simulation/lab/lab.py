@@ -1,0 +1,198 @@
+"""A virtual lab in a process of its own: a virtual Crazyflie and a room with motion capture, in real time.
+
+The lab speaks CRTP over UDP on the loopback, one datagram a packet, as cflib's own UDP driver does; the room's poses
+come from the next port. Where it listens stands in the environment, so that child processes find it. It ends with the
+process that started it, however that ends.
+"""
+
+import os
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import CfplanError, LinkError
+from cfplan.simulation.lab.radio import RadioFault
+from cfplan.simulation.lab.room import RoomSettings, lab_variable
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_vicon.faults import ViconFault
+from cfplan.vehicle.airframe import Airframe
+
+TRUTH, LATEST, CLOSE = "truth", "latest", "close"
+Fault = VehicleFault | RadioFault | ViconFault
+_START_TIMEOUT = 180.0  # s; the first start on a machine compiles
+_ANSWER_TIMEOUT = 10.0  # s
+_CLOSE_TIMEOUT = 3.0  # s
+
+# Where each value lies in a row of what the lab records of the truth, 100 rows a second.
+TIME, STATE, MOTORS, OFF_IN_AIR, SUPERVISOR = 0, slice(1, 18), slice(18, 22), 22, 23
+ROW_SIZE = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What really happened: for tests and reports, never for a pilot. One row every 10 ms."""
+
+    time: NDArray
+    # (N,) s on the clock of time.monotonic()
+    position: NDArray
+    # (N, 3) m
+    velocity: NDArray
+    # (N, 3) m/s
+    quaternion: NDArray
+    # (N, 4) body→world x y z w
+    body_rate: NDArray
+    # (N, 3) rad/s
+    motor: NDArray
+    # (N, 4) 16-bit commands
+    off_in_air: NDArray
+    # (N,) ticks of 1 ms, so far, with all motors off well above the floor
+    supervisor: NDArray
+    # (N,) the supervisor's state
+    locked: bool
+    # whether the supervisor was ever locked
+
+    @staticmethod
+    def of(rows: NDArray, locked: bool) -> "Truth":
+        """From the rows as the lab records them."""
+        state = rows[:, STATE]
+        return Truth(
+            time=rows[:, TIME],
+            position=state[:, 0:3],
+            velocity=state[:, 3:6],
+            quaternion=state[:, 6:10],
+            body_rate=state[:, 10:13],
+            motor=rows[:, MOTORS],
+            off_in_air=rows[:, OFF_IN_AIR],
+            supervisor=rows[:, SUPERVISOR].astype(int),
+            locked=locked,
+        )
+
+
+class Lab:
+    """A running lab; a context manager. `start_lab` makes it."""
+
+    def __init__(
+        self,
+        process: subprocess.Popen,
+        connection: Connection,
+        number: int,
+        port: int,
+        mocap_uri: str = "",
+    ):
+        self.number = number
+        self.uri = f"sim://{number}"
+        self.port = port
+        self.mocap_uri = mocap_uri
+        # of the vehicle in the virtual Vicon; "" where the room has none
+        self._process = process
+        self._connection = connection
+        self._address = f"127.0.0.1:{port}"
+        self._hidden = os.environ.get(lab_variable(number))
+        os.environ[lab_variable(number)] = self._address
+
+    @property
+    def process_id(self) -> int:
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        return self._process.poll() is None
+
+    def truth(self) -> Truth:
+        """What really happened so far; for tests and reports. Raises LinkError where the lab has died."""
+        return self._ask(TRUTH)
+
+    def latest(self) -> Truth:
+        """The last row of it."""
+        return self._ask(LATEST)
+
+    def _ask(self, request: str) -> Truth:
+        try:
+            self._connection.send(request)
+            if not self._connection.poll(_ANSWER_TIMEOUT):
+                raise LinkError("the lab does not answer", where=self.uri, hint="is the machine overloaded? Try again")
+            rows, locked = self._connection.recv()
+        except (OSError, EOFError) as why:
+            raise LinkError(
+                "the lab has died", where=self.uri, hint="try again; a first start compiles for up to a minute"
+            ) from why
+        return Truth.of(np.frombuffer(rows).reshape(-1, ROW_SIZE), locked)
+
+    def disturb(self, fault: Fault) -> None:
+        """Let something go wrong with the vehicle, its radio or the virtual Vicon; its start counts from now."""
+        with suppress(OSError):  # the lab has died, which others will notice
+            self._connection.send(fault)
+
+    def close(self) -> None:
+        """End it; may be called twice."""
+        with suppress(OSError):  # closed or dead already
+            self._connection.send(CLOSE)
+        self._connection.close()
+        try:
+            self._process.wait(_CLOSE_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        name = lab_variable(self.number)
+        if os.environ.get(name) == self._address:
+            del os.environ[name]
+            if self._hidden is not None:
+                os.environ[name] = self._hidden
+
+    def __enter__(self) -> "Lab":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def start_lab(
+    airframe: Airframe,
+    *,
+    vehicle: VehicleSettings | None = None,
+    room: RoomSettings | None = None,
+    number: int = 0,
+    port: int = 0,
+) -> Lab:
+    """Start a lab with a vehicle of this airframe as `sim://number`, and as `udp://127.0.0.1:port`; 0 takes a free one.
+
+    Raises LinkError where it does not come up, InputError where the port or the one above it is taken.
+
+    A lab that had that number is hidden until this one is closed. A plain child process rather than one of
+    multiprocessing's, so that it can be started from a daemonic process and from a script without a main guard.
+    """
+    ours, theirs = socket.socketpair()
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "cfplan.simulation.lab.process", str(theirs.fileno())],
+            pass_fds=(theirs.fileno(),),
+            stdin=subprocess.DEVNULL,
+        )
+    connection = Connection(ours.detach())
+    try:
+        connection.send((airframe, vehicle or VehicleSettings(), room or RoomSettings(), port))
+        if not connection.poll(_START_TIMEOUT):
+            raise EOFError
+        answer = connection.recv()
+        if isinstance(answer, CfplanError):
+            raise answer
+        port, vicon_port = answer
+        subject = room.vicon.subject if room is not None and room.vicon is not None else ""
+        mocap_uri = f"vicon://127.0.0.1:{vicon_port}/{subject}" if subject else ""
+        return Lab(process, connection, number, port, mocap_uri)
+    except (OSError, EOFError) as why:
+        process.kill()
+        code = process.wait()
+        raise LinkError(
+            f"the virtual lab did not start (exit {code})", where=f"sim://{number}", hint="run `cfplan doctor`"
+        ) from why

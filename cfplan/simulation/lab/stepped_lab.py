@@ -1,0 +1,145 @@
+"""The virtual lab without real time: vehicle, radio and cameras on a clock that goes on only while a pilot sleeps.
+
+The same virtual Crazyflie, packets, pose sorting and pilot as in a lab of processes, in one thread: every flight can be
+repeated to the last bit, and takes a fraction of its time.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from cfplan.simulation.lab.lab import MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME, Fault, Truth
+from cfplan.simulation.lab.radio import Radio, RadioFault
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
+from cfplan.simulation.virtual_crazyflie.vehicle import COMMANDER_PERIOD, VirtualCrazyflie
+from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
+from cfplan.simulation.virtual_vicon.server import Picture
+from cfplan.vehicle.airframe import Airframe
+
+BEGIN = 1000.0  # s, where the clock starts
+_WARM_UP = 200  # ms
+_RECONNECTS_AFTER = 0.3  # s from when the cameras' connection is possible again
+
+
+class SteppedLab:
+    """`clock` and `sleep` are the pilot's; `heard` takes what comes from the vehicle over the radio."""
+
+    def __init__(
+        self,
+        airframe: Airframe,
+        *,
+        vehicle: VehicleSettings | None = None,
+        cameras: ViconSettings | None = None,
+        seed: int = 0,
+    ):
+        self.vehicle = VirtualCrazyflie(airframe, vehicle)
+        self.vehicle.advance(_WARM_UP)
+        self.vehicle.sent()
+        self.now = BEGIN
+        self.radio = Radio(BEGIN, seed=11 + seed)
+        self.cameras = Cameras(cameras or ViconSettings(seed=7 + seed), BEGIN)
+        self.heard: Callable[[bytes], None] = lambda _: None
+        self._origin = BEGIN - self.vehicle.tick / 1000
+        self._pictures: list[tuple[float, Picture]] = []
+        self._connected_from = BEGIN
+        self._events: list[tuple[float, Callable[[], None]]] = []
+        self._stalled = 0.0
+        self._rows: list[np.ndarray] = []
+
+    # The pilot's clock.
+
+    def clock(self) -> float:
+        return self.now
+
+    def sleep(self, duration: float) -> None:
+        """Let time go by, and more of it where the pilot's computer stands still."""
+        end = self.now + max(duration, 0.0)
+        self._run_until(end)
+        while self._stalled:
+            end, self._stalled = self.now + self._stalled, 0.0
+            self._run_until(end)
+
+    def stall(self, duration: float) -> None:
+        """The pilot's computer stands still for so long, s, from its next sleep on."""
+        self._stalled += duration
+
+    # What others do.
+
+    def at(self, time: float, action: Callable[[], None]) -> None:
+        """Call it when the clock gets there; what it raises comes out of the pilot's sleep."""
+        self._events.append((time, action))
+        self._events.sort(key=lambda event: event[0])
+
+    def disturb(self, fault: Fault) -> None:
+        """Let something go wrong; its start counts from now."""
+        if isinstance(fault, VehicleFault):
+            self.vehicle.inject(fault)
+        elif isinstance(fault, RadioFault):
+            self.radio.inject(fault, self.now)
+        else:
+            self.cameras.inject(fault, self.now)
+
+    def pictures(self) -> list[tuple[float, Picture]]:
+        """What the cameras sent since the last call, each with the time at which it came."""
+        found, self._pictures = self._pictures, []
+        return found
+
+    def truth(self) -> Truth:
+        """What really happened so far."""
+        rows = np.array(self._rows).reshape(-1, ROW_SIZE)
+        return Truth.of(rows, self.vehicle.supervisor.ever_locked)
+
+    def _run_until(self, end: float) -> None:
+        while self._events and self._events[0][0] <= end:
+            time, action = self._events.pop(0)
+            self._advance(time)
+            action()
+        self._advance(end)
+
+    def _advance(self, end: float) -> None:
+        """Vehicle by milliseconds, from one moment at which something happens to the next."""
+        target = int((end - self._origin) * 1000 + 1e-6)
+        while self.vehicle.tick < target:
+            tick = self.vehicle.tick
+            self.now = self._origin + tick / 1000
+            self._exchange()
+            self._look()
+            if tick % COMMANDER_PERIOD == 0:
+                self._note()
+            boundary = tick + COMMANDER_PERIOD - tick % COMMANDER_PERIOD
+            step = 1 if self.radio.busy else max(min(target, boundary, self._next_look()) - tick, 1)
+            self.vehicle.advance(step)
+            for packet in self.vehicle.sent():
+                self.radio.answer(packet)
+        self.now = max(end, self.now)
+        self._exchange()
+
+    def _next_look(self) -> int:
+        return int(np.ceil((self.cameras.next_look - self._origin) * 1000 - 1e-6))
+
+    def _exchange(self) -> None:
+        up, down = self.radio.step(self.now)
+        for packet in up:
+            self.vehicle.receive(packet)
+        for packet in self.vehicle.sent():
+            self.radio.answer(packet)
+        for packet in down:
+            self.heard(packet)
+
+    def _look(self) -> None:
+        if self.now >= self.cameras.next_look - 1e-6:
+            truth = self.vehicle.stabilizer.loop.truth.tolist()
+            self.cameras.look(self.now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]))
+        due = self.cameras.due(self.now)
+        if self.cameras.cut_off(self.now):
+            self._connected_from = self.now + _RECONNECTS_AFTER
+        elif self.now >= self._connected_from:
+            self._pictures += [(self.now, picture) for picture in due]
+
+    def _note(self) -> None:
+        row, loop = np.empty(ROW_SIZE), self.vehicle.stabilizer.loop
+        row[TIME], row[STATE], row[MOTORS] = self.now, loop.truth, loop.motors
+        row[OFF_IN_AIR], row[SUPERVISOR] = loop.counts[OFF_IN_AIR_TICKS], self.vehicle.supervisor.state
+        self._rows.append(row)

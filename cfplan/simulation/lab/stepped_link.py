@@ -1,0 +1,163 @@
+"""The pilot's link and poses in a stepped lab: the pilot's own code on both, and no thread, socket or process."""
+
+import struct
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+from cfplan.errors import LinkError
+from cfplan.flight.mocap.frames import Body, Frame
+from cfplan.flight.mocap.source import MocapSource
+from cfplan.flight.mocap.uri import parse_uri
+from cfplan.flight.radio.connection import PATIENCE
+from cfplan.flight.radio.link import PLATFORM_PORT, Link
+from cfplan.flight.telemetry import Telemetry
+from cfplan.safety.limits import PoseLimits
+from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.simulation.virtual_crazyflie.wire import Port, pack
+
+URI = "stepped://0"
+_STEP = 0.001  # s
+_ASK_AGAIN = 0.1  # s
+_PATIENCE = 3.0  # s for an answer
+_ROUND_TRIP_MS = 2.0
+_READ, _WRITE, _DATA = 1, 2, 2
+_CREATE_BLOCK, _APPEND_BLOCK, _RESET_LOG, _START_BLOCK, _STOP_BLOCK = 6, 7, 5, 8, 4
+_CREATED = 27  # bytes of variables that fit into the first packet
+_LOG_TYPES = {"int16_t": (5, "h"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "float": (7, "f")}
+
+
+class SteppedLink(Link):
+    """Sends and hears as the real one does, by the same functions; waits by letting the lab's time go on."""
+
+    def __init__(self, lab: SteppedLab, report: Callable[[Telemetry], None]):
+        self._lab = lab
+        self._callbacks: dict[int, list[Callable[[Any], None]]] = {}
+        self._blocks: dict[int, tuple[list[str], str, Callable[..., None]]] = {}
+        self._answers: list[tuple[int, int, bytes]] = []
+        self._parameters, self._variables = lab.vehicle.parameters.toc.index(), lab.vehicle.log.toc.index()
+        lab.heard = self._hear
+        endpoint = SimpleNamespace(
+            link=self,
+            platform=SimpleNamespace(get_protocol_version=lambda: lab.vehicle.settings.protocol),
+            link_statistics=SimpleNamespace(latency=SimpleNamespace(latency=_ROUND_TRIP_MS)),
+            add_port_callback=lambda port, note: self._callbacks.setdefault(port, []).append(note),
+        )
+        super().__init__(endpoint, URI, report, clock=lab.clock)
+
+    def send_soon(self, packet: Any) -> None:
+        """As the radio's driver: wait a moment for its queue, then give the packet up."""
+        until = self._lab.now + PATIENCE
+        while self._lab.radio.full and self._lab.now < until:
+            self._lab.sleep(_STEP)
+        self._lab.radio.send(bytes((packet.header,)) + bytes(packet.data))
+
+    def has_parameter(self, name: str) -> bool:
+        return name in self._parameters
+
+    def set_parameter(self, name: str, value: float, patience: float = 2.0) -> float:
+        number = self._parameters.get(name)
+        if number is None:
+            raise LinkError(f"the vehicle has no parameter {name}", where=URI, hint="update its firmware")
+        layout = self._lab.vehicle.parameters.toc.variables[number].format
+        head = struct.pack("<H", number)
+        number_of_kind = value if layout == "<f" else int(value)
+        self._ask(Port.PARAMETERS, _WRITE, head + struct.pack(layout, number_of_kind), head, patience)
+        answer = self._ask(Port.PARAMETERS, _READ, head, head, patience)
+        return float(struct.unpack_from(layout, answer, 3)[0])
+
+    def _log(self, name: str, variables: tuple[list[tuple[str, str]], int], note: Callable[..., None]) -> Any:
+        entries, period = variables
+        block = len(self._blocks)
+        kinds = [_LOG_TYPES[kind] for _, kind in entries]
+        wanted = b"".join(
+            struct.pack("<BH", code, self._variables[entry])
+            for (entry, _), (code, _) in zip(entries, kinds, strict=True)
+        )
+        self._blocks[block] = [entry for entry, _ in entries], "<" + "".join(layout for _, layout in kinds), note
+        first, others = wanted[:_CREATED], wanted[_CREATED:]
+        steps = [(_CREATE_BLOCK, first), (_APPEND_BLOCK, others), (_START_BLOCK, struct.pack("<H", period))]
+        for command, rest in steps:
+            head = bytes((command, block))
+            self._ask(Port.LOG, 1, head + rest, head, _PATIENCE)
+        stop = bytes((_STOP_BLOCK, block))
+        return SimpleNamespace(stop=lambda: self._lab.radio.send(pack(Port.LOG, 1, stop)))
+
+    def start_logs(self) -> None:
+        self._ask(Port.LOG, 1, bytes((_RESET_LOG,)), bytes((_RESET_LOG,)), _PATIENCE)
+        super().start_logs()
+
+    def close(self) -> None:
+        self._lab.heard = lambda _: None
+
+    def _ask(self, port: Port, channel: int, payload: bytes, head: bytes, patience: float) -> bytes:
+        """Send until it is answered. Raises LinkError where it never is."""
+        end = self._lab.now + patience
+        self._answers.clear()
+        while self._lab.now < end:
+            self._lab.radio.send(pack(port, channel, payload))
+            again = self._lab.now + max(_ASK_AGAIN, self._lab.vehicle.settings.parameter_delay)
+            while self._lab.now < min(again, end):
+                self._lab.sleep(_STEP)
+                for came in self._answers:
+                    if came[:2] == (port, channel) and came[2].startswith(head):
+                        return came[2]
+        raise LinkError(f"no answer to {port.name.lower()}", where=URI, hint="check the radio link")
+
+    def _hear(self, datagram: bytes) -> None:
+        port, channel, data = datagram[0] >> 4, datagram[0] & 3, datagram[1:]
+        if port == Port.LOG and channel == _DATA:
+            names, layout, note = self._blocks[data[0]]
+            note(
+                int.from_bytes(data[1:4], "little"),
+                dict(zip(names, struct.unpack(layout, data[4:]), strict=True)),
+                None,
+            )
+            return
+        for callback in self._callbacks.get(port, ()):
+            callback(SimpleNamespace(port=port, channel=channel, data=data))
+        self._answers.append((port, channel, data))
+
+
+def connect(lab: SteppedLab, report: Callable[[Telemetry], None]) -> SteppedLink:
+    """As `cfplan.flight.radio.connection.connect`."""
+    lab.sleep(0.1)
+    link = SteppedLink(lab, report)
+    link.release_priority()
+    link.ask_firmware()
+    end = lab.now + _PATIENCE
+    while not link.firmware and lab.now < end:
+        lab.sleep(_STEP)
+    if not link.firmware:
+        raise LinkError("nothing answers", where=URI, hint=f"port {PLATFORM_PORT} is silent")
+    return link
+
+
+class SteppedPoses(MocapSource):
+    """The pilot's source of poses on the lab's cameras: dated and sorted as they are in the air."""
+
+    def __init__(self, lab: SteppedLab, limits: PoseLimits, subject: str = "cf1"):
+        super().__init__(parse_uri(f"vicon://lab/{subject}", subject_needed=True), limits)
+        self._lab = lab
+
+    def open(self) -> None:
+        self._begin()
+        self._lab.pictures()
+
+    def poses(self) -> list[Any]:
+        found = []
+        for received, picture in self._lab.pictures():
+            bodies, hidden = [], []
+            for shown in picture.bodies:
+                if shown.pose is None:
+                    hidden.append(shown.name)
+                else:
+                    bodies.append(Body(shown.name, *shown.pose))
+            frame = Frame(received, tuple(bodies), tuple(hidden), picture.number, picture.rate, picture.latency)
+            pose = self._sort(frame)
+            if pose is not None:
+                found.append(pose)
+        return found
+
+    def close(self) -> None:
+        pass

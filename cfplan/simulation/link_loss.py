@@ -1,0 +1,161 @@
+"""Where the vehicle goes when its pilot dies, by the firmware's own time-outs.
+
+It holds the last setpoint, then its supervisor levels it out at that height, then it stops the motors. While it levels
+out, the controller goes on with the body rates of that last setpoint, so a vehicle that was about to turn never gets
+quite level and may speed up; where it comes down depends on the moment, and is found by flying it.
+"""
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.packets import decode
+from cfplan.safety.limits import Limits
+from cfplan.simulation.dynamics.body import ALL_WELL, STILL_AIR, THRUST_MAX, TIME_STEP, hovering, pack_body, step_body
+from cfplan.simulation.dynamics.mellinger import (
+    CONTROL_PERIOD,
+    FULL_COMMAND,
+    FULL_STATE,
+    MEMORY_SIZE,
+    SETPOINT_SIZE,
+    distribute_power,
+    gains_for,
+    level_out,
+    step_mellinger,
+)
+
+LEVEL_AFTER, OFF_AFTER = 0.54, 2.04  # s after the last setpoint; the supervisor looks every 40 ms
+OFF_BY_WATCHDOG = 1.0  # s, where the emergency-stop watchdog is awake
+_LONGEST = 4.0  # s until it lies on the floor
+_MOMENTS = 48  # at which the pilot is let die
+_STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)
+
+
+@dataclass(frozen=True, slots=True)
+class Orphaned:
+    """The worst moment for a pilot to die."""
+
+    moment: float
+    # s from the first setpoint
+    distance: float
+    # m, horizontally from the last setpoint to the far corner of what it sweeps
+    beyond: float
+    # m beyond the walls or the ceiling; negative inside
+
+    def __str__(self) -> str:
+        walls = f"{self.beyond:.1f} m beyond the walls" if self.beyond > 0 else "inside the walls"
+        return f"at the worst moment, {self.moment:.1f} s, it comes down {self.distance:.1f} m on, {walls}"
+
+
+def orphaned(payloads: NDArray, limits: Limits, rate: float = RATE) -> Orphaned:
+    """Let the pilot die at moments all along a flight, (N, 29) uint8; that from which it ends farthest out."""
+    moments = np.linspace(0.0, (len(payloads) - 1) / rate, _MOMENTS)
+    places, swept = swept_when_orphaned(payloads, limits, moments, rate)
+    low, high = np.array(limits.space.low), np.array(limits.space.high)
+    low[2] = -np.inf  # it ends on the floor
+    beyond = np.maximum(low - swept[:, 0], swept[:, 1] - high).max(axis=1)
+    away = np.abs(swept[:, :, :2] - places[:, None, :2]).max(axis=1)
+    worst = int(np.argmax(beyond))
+    return Orphaned(float(moments[worst]), float(np.hypot(*away[worst])), float(beyond[worst]))
+
+
+def swept_when_orphaned(
+    payloads: NDArray, limits: Limits, moments: NDArray, rate: float = RATE
+) -> tuple[NDArray, NDArray]:
+    """For each moment, (K,) s and rising: the last setpoint's place, (K, 3), and the box that is swept, (K, 2, 3).
+
+    The vehicle's estimate is taken for perfect, although no pose comes either.
+    """
+    state, airframe = decode(payloads), limits.airframe
+    rows = np.zeros((len(payloads), SETPOINT_SIZE))
+    rows[:, 0:16] = np.hstack([state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate])
+    arrivals = np.round(np.arange(len(payloads)) / (rate * TIME_STEP)).astype(np.int64)
+    steps = np.round(moments / TIME_STEP).astype(np.int64)
+    swept = np.empty((len(steps), 2, 3))
+    x, y, z, w = state.quaternion[0]
+    _run(
+        swept,
+        steps,
+        hovering(airframe, state.position[0], float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))),
+        rows,
+        arrivals,
+        gains_for(airframe).pack(),
+        pack_body(airframe),
+        round(LEVEL_AFTER / TIME_STEP),
+        round((OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER) / TIME_STEP),
+        round(_LONGEST / TIME_STEP),
+    )
+    last = np.maximum(np.searchsorted(arrivals, steps) - 1, 0)
+    return state.position[last], swept
+
+
+def _compile(sources: int) -> Callable[..., int]:
+    """The loop, which returns `sources`: numba's cache notices a change there only if the loop closes over them."""
+
+    @njit(cache=True)
+    def control_and_move(
+        step: int,
+        state: NDArray,
+        memory: NDArray,
+        thrusts: NDArray,
+        gains: NDArray,
+        setpoint: NDArray,
+        mode: NDArray,
+        body: NDArray,
+    ) -> None:
+        if step % _STEPS_A_CONTROL == 0:
+            control, motors = np.zeros(4), np.zeros(4)
+            step_mellinger(control, memory, gains, setpoint, mode, state)
+            distribute_power(control, motors)
+            thrusts[:] = motors * (body[THRUST_MAX] / FULL_COMMAND)
+        step_body(state, thrusts, body, STILL_AIR, ALL_WELL)
+
+    @njit(cache=True)
+    def run(
+        swept: NDArray,
+        moments: NDArray,
+        start: NDArray,
+        setpoints: NDArray,
+        arrivals: NDArray,
+        gains: NDArray,
+        body: NDArray,
+        level_after: int,
+        off_after: int,
+        longest: int,
+    ) -> int:
+        state, memory, thrusts = start.copy(), np.zeros(MEMORY_SIZE), np.zeros(4)
+        newest, step = 0, 0
+        for number in range(len(moments)):
+            while step < moments[number]:
+                while newest + 1 < len(arrivals) and arrivals[newest + 1] <= step:
+                    newest += 1
+                control_and_move(step, state, memory, thrusts, gains, setpoints[newest], FULL_STATE, body)
+                step += 1
+            alone, mode, last = state.copy(), FULL_STATE.copy(), setpoints[newest].copy()
+            its_memory, its_thrusts = memory.copy(), thrusts.copy()
+            swept[number, 0], swept[number, 1] = alone[0:3], alone[0:3]
+            for after in range(longest):
+                if after == level_after:
+                    level_out(last, mode)
+                if after < off_after:
+                    control_and_move(step + after, alone, its_memory, its_thrusts, gains, last, mode, body)
+                else:
+                    its_thrusts[:] = 0.0
+                    step_body(alone, its_thrusts, body, STILL_AIR, ALL_WELL)
+                swept[number, 0] = np.minimum(swept[number, 0], alone[0:3])
+                swept[number, 1] = np.maximum(swept[number, 1], alone[0:3])
+                if after > off_after and alone[2] <= 0.0:
+                    break
+        return sources
+
+    return run
+
+
+_CALLED = [(Path(__file__).parent / "dynamics" / name).read_bytes() for name in ("body.py", "mellinger.py")]
+_run = _compile(zlib.crc32(b"".join(_CALLED)))

@@ -1,0 +1,137 @@
+"""What the log variables that matter are worth, in the firmware's units and signs."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.flight.setpoints.packets import compress_quaternion
+from cfplan.simulation.dynamics.body import rotation
+from cfplan.simulation.virtual_crazyflie.setpoints import PITCH, ROLL, YAW
+from cfplan.vehicle.airframe import GRAVITY
+
+if TYPE_CHECKING:
+    from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
+
+Getter = Callable[[], float]
+
+_AXES = "xyz"
+_LOW_BATTERY_LEVELS = (3.5, 4.18)  # V at 0 and 100 %
+
+
+def _element(array: NDArray, place: int, scale: float = 1.0) -> Getter:
+    return lambda: float(array[place]) * scale
+
+
+def euler(quaternion: NDArray) -> tuple[float, float, float]:
+    """Roll, pitch, yaw in degrees; pitch in the firmware's legacy sign, nose up positive."""
+    x, y, z, w = (float(value) for value in quaternion)
+    roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (x * z - w * y), -1, 1))
+    yaw = np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+    return float(np.degrees(roll)), float(np.degrees(pitch)), float(np.degrees(yaw))
+
+
+def getters(vehicle: "VirtualCrazyflie") -> Mapping[str, Getter]:
+    """A function for each log variable that is alive; the others stay zero."""
+    loop = vehicle.stabilizer.loop
+    belief, kalman = loop.belief, loop.kalman
+    found: dict[str, Getter] = {}
+    for place, axis in enumerate(_AXES):
+        found[f"stateEstimate.{axis}"] = _element(belief, place)
+        found[f"stateEstimate.v{axis}"] = _element(belief, 3 + place)
+        found[f"stateEstimateZ.{axis}"] = _element(belief, place, 1000)
+        found[f"stateEstimateZ.v{axis}"] = _element(belief, 3 + place, 1000)
+        found[f"gyro.{axis}"] = _element(belief, 10 + place, 180 / np.pi)
+        found[f"acc.{axis}"] = _element(loop.acceleration, place, 1 / GRAVITY)
+        found[f"kalman.state{axis.upper()}"] = _element(kalman.state, place)
+        found[f"kalman.stateP{axis.upper()}"] = _element(kalman.state, 3 + place)
+        found[f"kalman.stateD{place}"] = _element(kalman.state, 6 + place)
+        found[f"locSrv.{axis}"] = _element(vehicle.localization.latest, place)
+        found[f"ext_pos.{axis.upper()}"] = _element(vehicle.localization.latest, place)
+    found |= _variances(vehicle) | _attitude(vehicle) | _accelerations(vehicle) | _targets(vehicle)
+    found |= _motors_and_power(vehicle)
+    supervisor = vehicle.supervisor
+    found["supervisor.info"] = vehicle.info
+    found["sys.canfly"] = lambda: supervisor.can_fly
+    found["sys.isFlying"] = lambda: supervisor.is_flying
+    found["sys.isTumbled"] = lambda: supervisor.tumbled
+    found["locSrvZ.tick"] = lambda: vehicle.localization.tick
+    found["radio.isConnected"] = lambda: 1
+    return found
+
+
+def _variances(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
+    covariance = vehicle.stabilizer.loop.kalman.covariance
+    names = ("X", "Y", "Z", "PX", "PY", "PZ", "D0", "D1", "D2")
+    return {f"kalman.var{name}": _element(covariance.diagonal(), place) for place, name in enumerate(names)}
+
+
+def _attitude(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
+    belief = vehicle.stabilizer.loop.belief
+
+    def angle(place: int) -> float:
+        return euler(belief[6:10])[place]
+
+    found: dict[str, Getter] = {}
+    for place, name in enumerate(("roll", "pitch", "yaw")):
+        for group in ("stateEstimate", "stabilizer"):
+            found[f"{group}.{name}"] = partial(angle, place)
+    for place, name in enumerate("xyzw"):
+        found[f"stateEstimate.q{name}"] = _element(belief, 6 + place)
+        found[f"kalman.q{(place + 1) % 4}"] = _element(belief, 6 + place)
+        found[f"locSrv.q{name}"] = _element(vehicle.localization.latest, 3 + place)
+    found["stateEstimateZ.quat"] = lambda: int(compress_quaternion(belief[None, 6:10])[0])
+    # The firmware gives pitch in its legacy sign here too.
+    for place, name, sign in ((10, "Roll", 1), (11, "Pitch", -1), (12, "Yaw", 1)):
+        found[f"stateEstimateZ.rate{name}"] = _element(belief, place, sign * 1000)
+    return found
+
+
+def _accelerations(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
+    """World axes: stateEstimate in g without gravity, stateEstimateZ in mm/s² with it."""
+    loop = vehicle.stabilizer.loop
+
+    def world(axis: int, scale: float, gravity: float) -> float:
+        return float(rotation(loop.belief[6:10])[axis] @ loop.acceleration - gravity) * scale
+
+    found: dict[str, Getter] = {}
+    for place, axis in enumerate(_AXES):
+        found[f"stateEstimate.a{axis}"] = partial(world, place, 1 / GRAVITY, GRAVITY if axis == "z" else 0.0)
+        found[f"stateEstimateZ.a{axis}"] = partial(world, place, 1000.0, 0.0)
+    return found
+
+
+def _targets(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
+    def target(place: int, scale: float = 1.0) -> Getter:
+        return lambda: float(vehicle.setpoint.values[place]) * scale
+
+    def mode(place: int) -> Getter:
+        return lambda: int(vehicle.setpoint.mode[place])
+
+    found: dict[str, Getter] = {}
+    for start, prefix in ((0, ""), (3, "v"), (6, "a")):
+        for place, axis in enumerate(_AXES):
+            found[f"ctrltarget.{prefix}{axis}"] = target(start + place)
+            found[f"ctrltargetZ.{prefix}{axis}"] = target(start + place, 1000)
+    for place, name in ((ROLL, "roll"), (PITCH, "pitch"), (YAW, "yaw")):
+        found[f"ctrltarget.{name}"] = target(place, 180 / np.pi)
+    for place, name in enumerate(("x", "y", "z", "roll", "pitch", "yaw", "quat")):
+        found[f"ctrltarget.mode_{name}"] = mode(place)
+    return found
+
+
+def _motors_and_power(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
+    loop, battery = vehicle.stabilizer.loop, vehicle.battery
+    found: dict[str, Getter] = {f"motor.m{place + 1}": _element(loop.motors, place) for place in range(4)}
+    for place, name in enumerate(("thrust", "roll", "pitch", "yaw")):
+        found[f"controller.cmd_{name}"] = _element(loop.control, place)
+        found[f"ctrlMel.cmd_{name}"] = _element(loop.control, place)
+    found["stabilizer.thrust"] = _element(loop.control, 0)
+    found["pm.vbat"] = lambda: battery.voltage
+    found["pm.vbatMV"] = lambda: battery.voltage * 1000
+    empty, full = _LOW_BATTERY_LEVELS
+    found["pm.batteryLevel"] = lambda: float(np.clip(100 * (battery.voltage - empty) / (full - empty), 0, 100))
+    return found

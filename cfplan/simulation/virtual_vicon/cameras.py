@@ -1,0 +1,137 @@
+"""The cameras of the virtual Vicon: what they make of where the bodies are, and when it leaves.
+
+Nothing in it waits and nothing has a clock of its own: whoever owns it tells it where the vehicle is at each moment of
+`next_look`.
+"""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfplan.errors import InputError
+from cfplan.flight.telemetry import Quaternion, Triple
+from cfplan.simulation.virtual_vicon.faults import FaultKind, Faults, Seen, ViconFault
+from cfplan.simulation.virtual_vicon.server import Picture, Shown
+
+_LEVEL: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ViconSettings:
+    """What the virtual Vicon is like."""
+
+    subject: str = "cf1"
+    # the vehicle's name
+    segment: str = ""
+    # of the vehicle's root segment; "" for the subject's own name
+    others: tuple[tuple[str, Triple], ...] = ()
+    # bodies that stand in the room, and where, m
+    rate: float = 100.0
+    # Hz
+    position_noise: float = 0.001
+    # m, standard deviation of each axis
+    attitude_noise: float = math.radians(0.2)
+    # rad, standard deviation about each axis
+    latency: float = 0.010
+    # s from the moment of a pose to its leaving; also what the server says about itself
+    y_up: bool = False
+    spare: bool = False
+    # what has not changed is not sent again
+    port: int = 0
+    # 0 takes a free one
+    first_frame: int = 1000
+    faults: tuple[ViconFault, ...] = ()
+    # from the server's start
+    seed: int = 7
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "position_noise", "attitude_noise", "latency"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0) or (name == "rate" and not 1 <= value <= 1000):
+                raise InputError(f"{name} {value} of the virtual Vicon makes no sense", hint="rate 1 to 1000 Hz")
+
+
+class Cameras:
+    """See the bodies, and hold each picture back until it is due."""
+
+    def __init__(self, settings: ViconSettings, start: float):
+        # start in s on the clock that every other call is on
+        self._settings, self._start = settings, start
+        self._chance = np.random.default_rng(settings.seed)
+        self._faults = Faults()
+        for fault in settings.faults:
+            self._faults.add(fault, start)
+        self._looks = 0
+        self._last: Picture | None = None
+        self._waiting: deque[tuple[float, Picture]] = deque()
+
+    @property
+    def next_look(self) -> float:
+        """When the cameras look next, s."""
+        return self._start + self._looks / self._settings.rate
+
+    def inject(self, fault: ViconFault, now: float) -> None:
+        """Let something go wrong; its start counts from now."""
+        self._faults.add(fault, now)
+
+    def look(self, time: float, position: Triple, quaternion: Quaternion) -> None:
+        """The vehicle is here; see it."""
+        settings, faults = self._settings, self._faults
+        # Frames that nobody had time to take are counted, and missing.
+        self._looks = max(self._looks, round((time - self._start) * settings.rate)) + 1
+        if self._last is not None and faults.acting(FaultKind.REPEAT, time):
+            self._queue(time, self._last)
+            return
+        truth = {settings.subject: (position, quaternion), **{name: (place, _LEVEL) for name, place in settings.others}}
+        seen = faults.seen(time, {name: self._with_noise(*pose) for name, pose in truth.items()})
+        self._queue(time, self._picture(seen, truth))
+
+    def cut_off(self, now: float) -> bool:
+        """Whether no connection is possible."""
+        return self._faults.acting(FaultKind.CLOSE, now) is not None
+
+    def due(self, now: float) -> list[Picture]:
+        """The pictures that leave by now."""
+        found = []
+        while self._waiting and self._waiting[0][0] <= now:
+            found.append(self._waiting.popleft()[1])
+        return found
+
+    def _queue(self, time: float, picture: Picture) -> None:
+        self._last = picture
+        if self._faults.acting(FaultKind.STALL, time):
+            return
+        delay = self._faults.acting(FaultKind.DELAY, time)
+        due = time + self._settings.latency + (delay.strength if delay else 0.0)
+        if self._waiting:
+            due = max(due, self._waiting[-1][0])  # nothing overtakes in a stream
+        self._waiting.append((due, picture))
+
+    def _picture(self, seen: Mapping[str, Seen], truth: Mapping[str, Seen]) -> Picture:
+        settings = self._settings
+        bodies = tuple(
+            Shown(name, (settings.segment or name) if name == settings.subject else name, seen.get(name))
+            for name in truth
+        )
+        number = settings.first_frame + self._looks - 1
+        return Picture(number, settings.rate, settings.latency, settings.y_up, bodies)
+
+    def _with_noise(self, position: Triple, quaternion: Quaternion) -> Seen:
+        settings = self._settings
+        if not (settings.position_noise or settings.attitude_noise):
+            return position, quaternion
+        off = self._chance.normal(0, settings.position_noise, 3)
+        a, b, c = self._chance.normal(0, settings.attitude_noise / 2, 3)
+        (px, py, pz), (x, y, z, w) = position, quaternion
+        turned = (
+            x + w * a + y * c - z * b,
+            y + w * b - x * c + z * a,
+            z + w * c + x * b - y * a,
+            w - x * a - y * b - z * c,
+        )
+        norm = math.hypot(*turned)
+        qx, qy, qz, qw = (float(value / norm) for value in turned)
+        return (px + float(off[0]), py + float(off[1]), pz + float(off[2])), (qx, qy, qz, qw)

@@ -1,0 +1,140 @@
+"""A virtual Vicon: cameras, their faults, and a DataStream server that Vicon's own client accepts.
+
+Nothing in it waits and nothing has a clock of its own: whoever owns it tells it where the bodies are at each moment of
+`next_look`, and lets it send with `step` every few milliseconds. `serve` does both from a thread.
+"""
+
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from cfplan.errors import InputError
+from cfplan.flight.telemetry import Quaternion
+from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
+from cfplan.simulation.virtual_vicon.faults import Seen, ViconFault
+from cfplan.simulation.virtual_vicon.server import Connection
+
+_HOST = "127.0.0.1"
+_LEVEL: Quaternion = (0.0, 0.0, 0.0, 1.0)
+_STEP = 0.001  # s
+
+
+class VirtualVicon(Cameras):
+    """Cameras and server."""
+
+    def __init__(self, settings: ViconSettings, start: float):
+        # start in s on the clock that every other call is on
+        super().__init__(settings, start)
+        self._connections: list[Connection] = []
+        self._listener: socket.socket | None = None
+        self.port = self._listen(settings.port)
+
+    def step(self, now: float) -> None:
+        """Accept clients, hear them, and send what is due."""
+        if self.cut_off(now):
+            self._stop_listening()
+        elif self._listener is None:
+            self._listen(self.port)
+        self._accept()
+        for connection in self._connections:
+            connection.read()
+        for picture in self.due(now):
+            for connection in self._connections:
+                connection.show(picture)
+        for connection in [each for each in self._connections if not each.alive]:
+            connection.close()
+            self._connections.remove(connection)
+
+    def close(self) -> None:
+        """End; may be called twice."""
+        self._stop_listening()
+
+    # The listening socket.
+
+    def _listen(self, port: int) -> int:
+        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((_HOST, port))
+        except OSError as why:
+            listener.close()
+            raise InputError(
+                f"port {port} cannot be had: {why.strerror}", where="virtual Vicon", hint="port 0 takes a free one"
+            ) from why
+        listener.listen()
+        listener.setblocking(False)
+        self._listener = listener
+        return listener.getsockname()[1]
+
+    def _accept(self) -> None:
+        while self._listener is not None:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return
+            self._connections.append(Connection(client, spare=self._settings.spare))
+
+    def _stop_listening(self) -> None:
+        """No new connections, and the old ones reset."""
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+        for connection in self._connections:
+            connection.close(reset=True)
+        self._connections.clear()
+
+
+@contextmanager
+def serve(
+    settings: ViconSettings | None = None,
+    pose: Callable[[float], Seen] = lambda _: ((0.0, 0.0, 0.0), _LEVEL),
+) -> Iterator["Served"]:
+    """A virtual Vicon in a thread; `pose` gives the vehicle's at a time in s since the start."""
+    served = Served(settings or ViconSettings(), pose)
+    thread = threading.Thread(target=served.run, name="virtual vicon", daemon=True)
+    thread.start()
+    try:
+        yield served
+    finally:
+        served.ended.set()
+        thread.join()
+        served.vicon.close()
+
+
+class Served:
+    """A virtual Vicon that runs in a thread."""
+
+    def __init__(self, settings: ViconSettings, pose: Callable[[float], Seen]):
+        self.start = time.monotonic()
+        self.vicon = VirtualVicon(settings, self.start)
+        self.settings, self._pose = settings, pose
+        self.ended = threading.Event()
+        self._injected: deque[ViconFault] = deque()
+
+    @property
+    def uri(self) -> str:
+        """Of its vehicle."""
+        return self.uri_of(self.settings.subject)
+
+    def uri_of(self, subject: str, system: str = "vicon") -> str:
+        """Of any body, through any client."""
+        return f"{system}://{_HOST}:{self.vicon.port}/{subject}"
+
+    def inject(self, fault: ViconFault) -> None:
+        """Let something go wrong; its start counts from now."""
+        self._injected.append(fault)
+
+    def run(self) -> None:
+        """Until ended."""
+        vicon = self.vicon
+        while not self.ended.wait(_STEP):
+            now = time.monotonic()
+            while self._injected:
+                vicon.inject(self._injected.popleft(), now)
+            while vicon.next_look <= now:
+                at = vicon.next_look
+                vicon.look(at, *self._pose(at - self.start))
+            vicon.step(now)

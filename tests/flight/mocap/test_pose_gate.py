@@ -1,0 +1,54 @@
+"""Poses that must not be forwarded are told from those that must."""
+
+import math
+
+import pytest
+
+from cfplan.flight.mocap.pose_gate import Freshness
+from cfplan.flight.mocap.poses import Pose
+
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+def pose(time, x=0.0, quaternion=LEVEL):
+    return Pose(time, time + 0.01, (x, 0.0, 1.0), quaternion)
+
+
+@pytest.fixture
+def freshness():
+    judge = Freshness(jump=0.1)
+    assert not judge.fault(pose(1.0))
+    return judge
+
+
+def test_a_pose_that_moves_as_a_vehicle_does_is_good(freshness):
+    assert not freshness.fault(pose(1.01, 0.02))
+    assert not freshness.fault(pose(1.02, 0.04))
+
+
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [
+        (pose(1.01, math.nan), "not a number"),
+        (pose(1.01, math.inf), "not a number"),
+        (pose(math.nan), "not a number"),
+        (pose(1.0, 0.01), "not newer"),
+        (pose(0.9, 0.01), "not newer"),
+        (pose(1.01), "frozen"),
+        (pose(1.01, 1.0), "jumped"),
+        (pose(1.01, 0.01, (0.0, 0.0, 1.0, 0.0)), "turned 180"),
+        (pose(1.01, 0.01, (0.0, 0.0, 0.0, 0.0)), "no rotation"),
+    ],
+)
+def test_a_bad_pose_is_named_and_forgotten(freshness, bad, why):
+    assert why in freshness.fault(bad)
+    assert freshness.last == pose(1.0)
+    assert not freshness.fault(pose(1.02, 0.02))
+
+
+def test_the_sign_of_a_quaternion_means_nothing(freshness):
+    assert not freshness.fault(pose(1.01, 0.01, (0.0, 0.0, 0.0, -1.0)))
+
+
+def test_after_a_dropout_a_vehicle_may_have_gone_far(freshness):
+    assert not freshness.fault(pose(1.5, 1.0))

@@ -1,0 +1,143 @@
+"""Each trigger at its threshold, and its rung."""
+
+import math
+
+import pytest
+
+from cfplan.errors import ExitCode
+from cfplan.flight.mocap.poses import Pose
+from cfplan.flight.pilot.abort_monitor import Seen, Watch
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.outcome import Deviation, Rung, settle_time
+from cfplan.flight.telemetry import Estimate, VehicleStatus
+
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+STILL = (0.0, 0.0, 0.0)
+HERE = (0.0, 0.0, 1.0)
+
+
+def seen(now=10.0, place=HERE, age=0.01, velocity=STILL, rate=STILL, voltage=3.9, bits=0, **changes):
+    pose = Pose(now - age, now, place, LEVEL)
+    estimate = Estimate(now, place, velocity, STILL, LEVEL)
+    status = VehicleStatus(now, rate, (0, 0, 0, 0), voltage, bits)
+    return Seen(now, pose=pose, estimate=estimate, status=status, **changes)
+
+
+def rung(watch, what):
+    trip = watch.gravest(what)
+    return trip.rung if trip is not None else Rung.NONE
+
+
+@pytest.fixture
+def watch(limits):
+    return Watch(limits)
+
+
+def test_a_good_flight_gives_no_reason(watch):
+    assert watch.gravest(seen(wanted=HERE)) is None
+
+
+@pytest.mark.parametrize(("age", "expected"), [(0.1, Rung.NONE), (0.2, Rung.BRAKE), (0.6, Rung.LAND)])
+def test_old_poses_brake_and_then_land(watch, age, expected):
+    assert rung(watch, seen(age=age)) is expected
+
+
+@pytest.mark.parametrize(
+    ("off", "expected"), [(0.29, Rung.NONE), (0.31, Rung.BRAKE), (0.61, Rung.LAND), (1.01, Rung.CUT)]
+)
+def test_deviation_climbs_the_ladder(watch, off, expected):
+    assert rung(watch, seen(wanted=(off, 0.0, 1.0))) is expected
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ((2.79, 0.0, 1.0), Rung.NONE),
+        ((2.85, 0.0, 1.0), Rung.BRAKE),
+        ((0.0, -2.95, 1.0), Rung.LAND),
+        ((0.0, 0.0, 2.4), Rung.CUT),
+        ((0.0, 0.0, 0.02), Rung.NONE),
+    ],
+)
+def test_the_fence_has_walls_and_a_ceiling_but_no_floor(watch, place, expected):
+    assert rung(watch, seen(place=place)) is expected
+
+
+def test_a_speed_counts_only_when_it_lasts(watch):
+    fast = (3.5, 0.0, 0.0)
+    assert rung(watch, seen(now=10.0, velocity=fast)) is Rung.NONE
+    assert rung(watch, seen(now=10.05, velocity=fast)) is Rung.NONE
+    assert rung(watch, seen(now=10.11, velocity=fast)) is Rung.BRAKE
+
+
+def test_a_single_noisy_value_is_forgotten(watch):
+    fast = (3.5, 0.0, 0.0)
+    assert rung(watch, seen(now=10.0, velocity=fast)) is Rung.NONE
+    assert rung(watch, seen(now=10.05)) is Rung.NONE
+    assert rung(watch, seen(now=10.14, velocity=fast)) is Rung.NONE
+
+
+def test_a_body_rate_beyond_the_limit_that_lasts_brakes(watch):
+    for now in (10.0, 10.06, 10.12):
+        last = rung(watch, seen(now=now, rate=(0.0, 12.0, 0.0)))
+    assert last is Rung.BRAKE
+
+
+@pytest.mark.parametrize("broken", [{"velocity": (math.nan, 0.0, 0.0)}, {"rate": (0.0, 0.0, math.nan)}])
+def test_a_measurement_that_is_no_number_lands_when_it_lasts(watch, broken):
+    assert rung(watch, seen(now=10.0, **broken)) is Rung.NONE
+    assert rung(watch, seen(now=10.2, **broken)) is Rung.LAND
+
+
+def test_a_voltage_dip_is_averaged_away_and_an_empty_battery_is_not(watch):
+    for step in range(100):
+        assert rung(watch, seen(now=10.0 + step / 100)) is Rung.NONE
+    for step in range(30):
+        assert rung(watch, seen(now=11.0 + step / 100, voltage=3.0)) is Rung.NONE
+    for step in range(300):
+        last = rung(watch, seen(now=11.3 + step / 100, voltage=3.0))
+    assert last is Rung.LAND
+
+
+@pytest.mark.parametrize("bit", [5, 6, 7])
+def test_a_vehicle_that_is_out_of_control_is_cut(watch, bit):
+    assert rung(watch, seen(bits=1 << bit)) is Rung.CUT
+
+
+def test_an_estimate_that_leaves_the_poses_brakes(watch):
+    what = seen()
+    what.estimate = Estimate(10.0, (0.2, 0.0, 1.0), STILL, STILL, LEVEL)
+    assert rung(watch, what) is Rung.BRAKE
+
+
+def test_a_setpoint_far_too_late_brakes(watch):
+    assert rung(watch, seen(late=0.2)) is Rung.NONE
+    assert rung(watch, seen(late=0.3)) is Rung.BRAKE
+
+
+def test_no_pose_at_all_lands(watch):
+    assert rung(watch, Seen(10.0)) is Rung.LAND
+
+
+def test_the_operators_reason_is_told_before_others_of_its_rung(watch):
+    trip = watch.gravest(seen(order=Order.LAND, main_gone=True, age=0.6))
+    assert trip.exit_code is ExitCode.ENDED_BY_PILOT
+
+
+def test_the_gravest_reason_wins(watch):
+    trip = watch.gravest(seen(order=Order.LAND, bits=1 << 6))
+    assert trip.rung is Rung.CUT
+    assert "locked" in trip.text
+
+
+def test_deviation_is_summed_up():
+    deviation = Deviation.of([(0.0, 0.3), (1.0, 0.4), (2.0, 0.0)])
+    assert deviation.max == 0.4
+    assert deviation.time_of_max == 1.0
+    assert deviation.rms == pytest.approx(math.sqrt(0.25 / 3))
+
+
+def test_settled_means_that_it_stays():
+    assert settle_time([(0.1, 0.01), (0.2, 0.05), (0.3, 0.02), (0.4, 0.01)], within=0.03) == 0.3
+    assert settle_time([(0.1, 0.01), (0.2, 0.05)], within=0.03) == math.inf
+    assert settle_time([], within=0.03) == math.inf

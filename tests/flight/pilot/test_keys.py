@@ -1,0 +1,115 @@
+"""Orders from keys and signals, and a terminal that is left as it was found."""
+
+import os
+import pty
+import signal
+import sys
+import termios
+import textwrap
+import time
+
+import pytest
+
+from cfplan.flight.pilot.keys import Keyboard, Order, orders_of
+
+
+@pytest.mark.parametrize(
+    ("keys", "orders"),
+    [
+        (b"", []),
+        (b" ", [Order.LAND]),
+        (b"\x1b", [Order.CUT]),
+        (b"x\n", []),
+        (b"\x1b[A", []),
+        (b"\x1bOP", []),
+        (b"\x1b[1;5C", []),
+        (b" \x1b", [Order.LAND, Order.CUT]),
+        (b"\x1b[A\x1b", [Order.CUT]),
+        (b"\x1b\x1b", [Order.CUT, Order.CUT]),
+    ],
+)
+def test_space_lands_and_esc_cuts_and_arrows_do_neither(keys, orders):
+    assert orders_of(keys) == orders
+
+
+def test_the_first_interrupt_lands_and_the_second_cuts():
+    with Keyboard() as keyboard:
+        assert keyboard.orders() == []
+        os.kill(os.getpid(), signal.SIGINT)
+        assert keyboard.orders() == [Order.LAND]
+        os.kill(os.getpid(), signal.SIGINT)
+        assert keyboard.orders() == [Order.CUT]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_wish_to_end_the_program_lands(number):
+    with Keyboard() as keyboard:
+        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), number)
+        assert keyboard.orders() == [Order.LAND, Order.LAND]
+
+
+def test_signal_handlers_are_given_back_even_after_an_error():
+    before = signal.getsignal(signal.SIGINT)
+
+    def fail_inside():
+        with Keyboard():
+            assert signal.getsignal(signal.SIGINT) is not before
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail_inside()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+_PROGRAM = """
+import sys, termios, time
+from cfplan.flight.pilot.keys import Keyboard
+before = termios.tcgetattr(0)
+try:
+    with Keyboard() as keyboard:
+        print("ready", flush=True)
+        seen = []
+        while len(seen) < 3:
+            seen += keyboard.orders()
+            time.sleep(0.01)
+        print([order.name for order in seen], flush=True)
+        raise ZeroDivisionError
+except ZeroDivisionError:
+    pass
+print("restored" if termios.tcgetattr(0) == before else "changed", flush=True)
+"""
+
+
+def _read_until(descriptor: int, text: str, patience: float = 20.0) -> str:
+    end, got = time.monotonic() + patience, ""
+    while text not in got and time.monotonic() < end:
+        try:
+            got += os.read(descriptor, 1024).decode()
+        except OSError:  # the other end has closed
+            break
+    assert text in got
+    return got
+
+
+def test_keys_of_a_real_terminal_are_read_and_its_mode_comes_back():
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, [sys.executable, "-c", textwrap.dedent(_PROGRAM)])
+    try:
+        _read_until(terminal, "ready")
+        local = termios.tcgetattr(terminal)[3]
+        assert not local & termios.ICANON
+        assert not local & termios.ECHO
+        os.write(terminal, b" ")
+        time.sleep(0.1)
+        os.write(terminal, b"\x1b[A")
+        time.sleep(0.1)
+        os.write(terminal, b"\x03")  # Ctrl-C comes as a signal
+        time.sleep(0.1)
+        os.write(terminal, b"\x1b")
+        said = _read_until(terminal, "restored")
+        assert "['LAND', 'LAND', 'CUT']" in said
+    finally:
+        os.close(terminal)
+        os.waitpid(child, 0)

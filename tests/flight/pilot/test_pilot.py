@@ -1,0 +1,350 @@
+"""The pilot's decisions, on a clock of their own: what it does when, and what it never does."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from cfplan.errors import ExitCode, InputError
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.radio.link import GO_TO, LAND, TAKE_OFF
+from cfplan.flight.telemetry import Phase, PoseReceived, SetpointSent
+
+
+def test_a_flight_goes_through_every_phase_in_order_and_ends_disarmed(world, fly):
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.OK
+    assert world.phases == list(Phase)
+    assert world.calls[0] == "release"
+    assert world.calls[-3:-1] == ["disarm", "close"]
+    assert world.position[2] < 0.05
+    assert world.motors_off_in_the_air == 0.0
+
+
+def test_each_setpoint_is_sent_when_it_is_due(world, mission, fly):
+    outcome = fly()
+    sent = [message for message in world.messages if isinstance(message, SetpointSent)]
+    plan = [message for message in sent if message.time < outcome.first_setpoint + mission.duration + 1e-6]
+    assert [message.index for message in plan] == list(range(len(mission.payloads)))
+    assert outcome.lateness.max < 1e-9
+    assert outcome.lateness.skipped == 0
+
+
+def test_the_command_comes_before_the_priority_is_given_back(world, fly):
+    fly()
+    after_take_off = world.calls[world.calls.index("take off") :]
+    assert after_take_off[:4] == ["take off", "go to", "release", "land"]
+
+
+def test_good_poses_are_forwarded_while_the_stream_runs(world, fly):
+    outcome = fly()
+    during = [place for place in world.forwarded if 0.0 < place[0] - outcome.first_setpoint < 2.0]
+    assert len(during) > 190
+    assert all(later[1] > place[1] for place, later in pairwise(during[20:151]))
+
+
+def test_a_late_tick_carries_the_setpoint_of_its_moment(world, mission, fly):
+    stalls = iter([0.05])
+    honest = world.sleep
+
+    def sleep(duration: float) -> None:
+        honest(duration)
+        if Phase.STREAM in world.phases and world.now > world.stall_at:
+            honest(next(stalls, 0.0))
+
+    world.stall_at = math.inf
+    world.when(Phase.STREAM, 1.0, lambda: setattr(world, "stall_at", world.now))
+    world.sleep = sleep
+    outcome = fly()
+    sent = [message for message in world.messages if isinstance(message, SetpointSent)]
+    assert outcome.exit_code is ExitCode.OK
+    assert outcome.lateness.max == pytest.approx(0.05, abs=0.01)
+    assert outcome.lateness.skipped >= 3
+    for message in sent[:190]:
+        assert message.index == pytest.approx((message.time - outcome.first_setpoint) * 100, abs=0.51)
+
+
+def stop_poses(world):
+    world.poses_stopped = True
+
+
+def freeze_poses(world):
+    world.poses_frozen = True
+
+
+def shift_poses(world):
+    world.pose_shift = (1.0, 0.0, 0.0)
+
+
+def break_poses(world):
+    world.pose_shift = (math.nan, 0.0, 0.0)
+
+
+def blow_away(world):
+    world.push = (0.0, 3.5, 0.0)
+
+
+def drain(world):
+    world.voltage = 2.9
+
+
+def silence(world):
+    world.logs_stopped = True
+
+
+def lock(world):
+    world.extra_bits = 1 << 6
+
+
+def land(world):
+    world.orders.worst = Order.LAND
+
+
+def cut(world):
+    world.orders.worst = Order.CUT
+
+
+def lose_main(world):
+    world.orders.gone = True
+
+
+SAFETY, PILOT = ExitCode.ENDED_BY_SAFETY, ExitCode.ENDED_BY_PILOT
+
+
+@pytest.mark.parametrize(
+    ("fault", "rung", "exit_code", "text"),
+    [
+        (stop_poses, Rung.LAND, SAFETY, "pose is"),
+        (freeze_poses, Rung.LAND, SAFETY, "pose is"),
+        (break_poses, Rung.LAND, SAFETY, "pose is"),
+        (shift_poses, Rung.CUT, SAFETY, "from the setpoint"),
+        (drain, Rung.LAND, SAFETY, "battery"),
+        (silence, Rung.LAND, SAFETY, "silent"),
+        (lock, Rung.CUT, SAFETY, "locked"),
+        (land, Rung.LAND, PILOT, "operator"),
+        (cut, Rung.CUT, PILOT, "operator"),
+        (lose_main, Rung.LAND, SAFETY, "main process"),
+    ],
+)
+@pytest.mark.parametrize("after", [0.5, 1.0])
+def test_a_fault_in_the_stream_takes_its_rung(world, fly, fault, rung, exit_code, text, after):
+    world.when(Phase.STREAM, after, lambda: fault(world))
+    if fault is silence:
+        # The log comes back before the link counts as lost.
+        world.when(Phase.STREAM, after + 1.0, lambda: setattr(world, "logs_stopped", False))
+    outcome = fly()
+    assert outcome.exit_code is exit_code
+    assert outcome.rung is rung
+    assert text in outcome.reason
+    assert world.closed
+    assert not world.armed
+    if rung is Rung.CUT:
+        assert "emergency stop" in world.calls
+    else:
+        assert world.position[2] < 0.05
+        assert world.motors_off_in_the_air == 0.0
+        assert "emergency stop" not in world.calls
+
+
+def test_a_dropout_of_poses_brakes_on_the_path_before_it_lands(world, fly):
+    world.when(Phase.STREAM, 1.0, lambda: setattr(world, "poses_stopped", True))
+    world.when(Phase.STREAM, 1.3, lambda: setattr(world, "poses_stopped", False))
+    outcome = fly()
+    assert outcome.rung is Rung.BRAKE
+    assert abs(world.position[0]) < 1.0
+    assert world.position[1] == pytest.approx(0.0, abs=1e-3)
+    assert world.position[2] < 0.05
+
+
+def test_poses_that_come_back_within_the_limit_change_nothing(world, fly):
+    world.when(Phase.STREAM, 1.0, lambda: setattr(world, "poses_stopped", True))
+    world.when(Phase.STREAM, 1.1, lambda: setattr(world, "poses_stopped", False))
+    assert fly().exit_code is ExitCode.OK
+
+
+def test_no_pose_of_a_frozen_source_is_forwarded(world, fly):
+    world.when(Phase.STREAM, 1.0, lambda: freeze_poses(world))
+    outcome = fly()
+    frozen_from = outcome.first_setpoint + 1.03
+    assert any(isinstance(message, PoseReceived) and message.time > frozen_from for message in world.messages)
+    assert not [place for place in world.forwarded if place[0] > frozen_from]
+
+
+@pytest.mark.parametrize("phase", [Phase.TAKE_OFF, Phase.GO_TO_START, Phase.HOLD, Phase.HAND_BACK, Phase.LAND])
+@pytest.mark.parametrize("after", [0.0, 0.01, 0.02, 0.7])
+def test_the_operator_can_land_at_any_time_in_the_air(world, fly, phase, after):
+    if phase is Phase.TAKE_OFF and after == 0.0:
+        after = 0.005  # before that it is still on the ground
+    world.when(phase, after, lambda: land(world))
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.ENDED_BY_PILOT
+    assert world.position[2] < 0.05
+    assert world.motors_off_in_the_air == 0.0
+    assert not world.armed
+
+
+@pytest.mark.parametrize("phase", [Phase.FEED, Phase.CONVERGE, Phase.PREFLIGHT, Phase.ARM])
+def test_an_order_on_the_ground_ends_it_there(world, fly, phase):
+    world.when(phase, 0.0, lambda: land(world))
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.ENDED_BY_PILOT
+    assert "take off" not in world.calls
+    assert world.closed
+
+
+def test_a_cut_while_landing_is_still_obeyed(world, fly):
+    world.when(Phase.STREAM, 1.0, lambda: land(world))
+    world.when(Phase.LAND, 0.5, lambda: cut(world))
+    outcome = fly()
+    assert outcome.rung is Rung.CUT
+    assert "emergency stop" in world.calls
+
+
+def test_an_order_to_arm_or_disarm_that_the_radio_swallows_is_sent_again(world, fly):
+    world.arms_lost = 1
+    world.when(Phase.LAND, 0.0, lambda: setattr(world, "arms_lost", 1))
+    assert fly().exit_code is ExitCode.OK
+    assert world.calls.count("arm") == 2
+    assert world.calls.count("disarm") == 2
+    assert not world.armed
+
+
+def test_a_cut_is_sent_until_the_vehicle_says_that_it_is_locked(world, fly):
+    world.cuts_lost = 20
+    world.when(Phase.STREAM, 1.0, lambda: cut(world))
+    outcome = fly()
+    assert outcome.rung is Rung.CUT
+    assert world.calls.count("emergency stop") > 20
+    assert world.stopped
+    assert "does not say" not in world.said
+
+
+def test_a_cut_that_never_arrives_is_said(world, fly):
+    world.cuts_lost = 10_000
+    world.when(Phase.STREAM, 1.0, lambda: cut(world))
+    assert fly().rung is Rung.CUT
+    assert "the vehicle does not say that its motors were cut" in world.said
+
+
+def test_a_tracked_body_that_is_another_one_keeps_the_vehicle_on_the_floor(world, fly):
+    world.other_body = True
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.PREFLIGHT
+    assert "stays on the floor" in outcome.reason
+    assert "swapped" in outcome.reason
+    assert world.position[2] < 0.2
+    assert "stop setpoint" in world.calls
+    assert "emergency stop" not in world.calls
+    assert not world.armed
+    assert world.closed
+
+
+@pytest.mark.parametrize("phase", [Phase.TAKE_OFF, Phase.STREAM, Phase.LAND])
+def test_a_lost_link_is_reported_and_nothing_is_closed_in_the_air(world, fly, phase):
+    world.when(phase, 0.5, lambda: setattr(world, "lost", "too many packets lost"))
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.LINK_LOST
+    assert "too many packets lost" in outcome.reason
+    assert not [call for call in world.calls if call in ("disarm", "emergency stop")]
+
+
+def test_a_failed_check_leaves_the_vehicle_disarmed(world, fly):
+    world.voltage = 3.7
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.PREFLIGHT
+    assert "battery at rest: 3.70 V" in outcome.reason
+    assert "arm" not in world.calls
+    assert world.closed
+    assert [check.name for check in outcome.checks if not check.passed] == ["battery at rest"]
+
+
+def test_a_parameter_that_the_vehicle_changes_back_fails_preflight(world, fly):
+    world.stubborn["stabilizer.controller"] = 1
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.PREFLIGHT
+    assert "stabilizer.controller is 1, not 2" in outcome.reason
+
+
+def test_the_vehicle_is_told_of_its_drag_where_it_has_a_place_for_it(world, fly):
+    fly()
+    assert world.parameters["kalman.dragB_x"] > 0.1
+
+
+def test_older_firmware_flies_without_it_and_that_is_said(world, fly):
+    world.unknown = ("kalman.dragB_x", "kalman.dragB_y")
+    assert fly().exit_code is ExitCode.OK
+    assert "kalman.dragB_x" not in world.parameters
+    assert "no kalman.dragB_x" in world.said
+
+
+def test_a_refused_take_off_ends_on_the_ground(world, fly):
+    world.refuses[TAKE_OFF] = 16
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.PREFLIGHT
+    assert "refuses to take off" in outcome.reason
+    assert world.calls[-3:-1] == ["disarm", "close"]
+
+
+def test_a_vehicle_whose_commander_refuses_to_land_is_brought_down_by_setpoints(world, fly):
+    world.refuses[LAND] = 16
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.OK
+    assert outcome.rung is Rung.NONE
+    assert world.position[2] < 0.05
+    assert world.motors_off_in_the_air == 0.0
+    assert "stop setpoint" in world.calls
+    assert "emergency stop" not in world.calls
+
+
+def test_a_refused_hand_over_leaves_the_stream_flying_and_lands_by_it(world, fly):
+    def refuse():
+        world.refuses.update({GO_TO: 16, LAND: 16})
+
+    world.when(Phase.HOLD, 0.1, refuse)
+    outcome = fly()
+    assert outcome.rung is Rung.NONE
+    assert "does not take over" in world.said
+    assert world.position[2] < 0.05
+    assert world.motors_off_in_the_air == 0.0
+
+
+def test_a_source_without_poses_is_an_error_with_a_hint(world, fly):
+    world.poses_stopped = True
+    with pytest.raises(InputError, match="no pose comes") as caught:
+        fly()
+    assert caught.value.hint
+    assert world.closed
+
+
+def test_a_fault_of_the_program_itself_lands(world, fly):
+    def fault():
+        raise ZeroDivisionError("invented")
+
+    world.when(Phase.STREAM, 1.0, fault)
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.ENDED_BY_SAFETY
+    assert "invented" in outcome.reason
+    assert world.position[2] < 0.05
+
+
+def test_leaving_the_room_beyond_the_last_line_cuts(world, fly):
+    world.when(Phase.GO_TO_START, 0.5, lambda: blow_away(world))
+    outcome = fly()
+    assert outcome.rung is Rung.CUT
+    assert "fence" in outcome.reason
+
+
+def test_the_watchdog_of_the_vehicle_sleeps_unless_it_is_asked_for(world, fly):
+    fly()
+    assert not world.signs_of_life
+
+
+def test_the_watchdog_gets_ten_signs_of_life_a_second_from_take_off_to_landing(world, mission, fly):
+    watched = replace(mission.limits.firmware, watchdog=True)
+    outcome = fly(firmware=watched)
+    phases = dict(outcome.phases)
+    assert min(world.signs_of_life) < phases[Phase.TAKE_OFF] + 0.5
+    assert max(b - a for a, b in pairwise(world.signs_of_life)) < 0.15
+    assert max(world.signs_of_life) < phases[Phase.DISARM]

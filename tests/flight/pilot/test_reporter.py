@@ -1,0 +1,94 @@
+"""Telemetry gets out when it can and never holds the pilot up."""
+
+import multiprocessing
+import time
+
+import pytest
+
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.process import Orders
+from cfplan.flight.pilot.reporter import Reporter
+from cfplan.flight.telemetry import Event, Level
+
+
+def event(number: int) -> Event:
+    return Event(float(number), Level.INFO, "x" * 100)
+
+
+def wait_for(condition, patience=5.0):
+    end = time.monotonic() + patience
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)
+    assert condition()
+
+
+@pytest.fixture
+def pipe():
+    reader, writer = multiprocessing.Pipe(duplex=False)
+    yield reader, writer
+    reader.close()
+    writer.close()
+
+
+def received(reader):
+    messages, last = [], None
+    while last is None:
+        part = reader.recv()
+        if isinstance(part, list):
+            messages += part
+        else:
+            last = part
+    return messages, last
+
+
+def test_every_message_arrives_in_order_and_the_last_word_is_last(pipe):
+    reader, writer = pipe
+    report = Reporter(writer)
+    for number in range(200):
+        report(event(number))
+    report.close("done")
+    messages, last = received(reader)
+    assert messages == [event(number) for number in range(200)]
+    assert last == "done"
+    assert report.dropped == 0
+
+
+def test_a_reader_that_is_stuck_costs_the_oldest_messages_and_no_time(pipe):
+    reader, writer = pipe
+    report = Reporter(writer, capacity=500)
+    for number in range(1000):  # fills the pipe, in which the sending thread then sticks
+        report(event(number))
+        time.sleep(0.0005)
+    for number in range(1000, 6000):
+        report(event(number))
+    assert report.dropped >= 4000
+    messages = []
+    while not messages or messages[-1] != event(5999):
+        messages += reader.recv()
+    assert messages[-500:] == [event(number) for number in range(5500, 6000)]
+
+
+def test_a_reader_that_is_gone_is_no_error(pipe):
+    reader, writer = pipe
+    report = Reporter(writer)
+    reader.close()
+    for number in range(100):
+        report(event(number))
+    report.close("done")
+
+
+def test_the_gravest_order_stays(pipe):
+    reader, writer = pipe
+    orders = Orders(reader)
+    for order in (Order.LAND, Order.CUT, Order.LAND):
+        writer.send(order)
+    wait_for(lambda: orders.worst is Order.CUT)
+    assert not orders.gone
+
+
+def test_a_main_process_that_ends_is_noticed(pipe):
+    reader, writer = pipe
+    orders = Orders(reader)
+    writer.close()
+    wait_for(lambda: orders.gone)
+    assert orders.worst is None

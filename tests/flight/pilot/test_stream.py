@@ -1,0 +1,75 @@
+"""Setpoints sampled by the clock, and the deadlines they are sent at."""
+
+import numpy as np
+import pytest
+
+from cfplan.flight.pilot.deadlines import Lateness, Pace
+from cfplan.flight.pilot.stream import Stream
+from cfplan.flight.setpoints.packets import decode
+
+
+class Clock:
+    """Moves when it is slept on, and late by whatever is wished."""
+
+    def __init__(self):
+        self.now, self.oversleep = 10.0, 0.0
+
+    def __call__(self):
+        return self.now
+
+    def sleep(self, duration):
+        self.now += duration + self.oversleep
+
+
+@pytest.fixture
+def payloads(mission):
+    return mission.payloads
+
+
+def test_the_setpoint_is_that_of_the_moment(payloads):
+    stream = Stream(payloads, 100.0, start=50.0)
+    assert stream.index(49.0) == 0
+    assert stream.index(50.0) == 0
+    assert stream.index(51.004) == 100
+    assert stream.index(51.006) == 101
+    assert stream.index(99.0) == len(payloads) - 1
+
+
+def test_the_packet_carries_the_payload_to_the_generic_commander(payloads):
+    stream = Stream(payloads, 100.0)
+    assert stream.packets[7].get_header() == 0x7C
+    assert bytes(stream.packets[7].data) == payloads[7].tobytes()
+
+
+def test_the_reference_between_setpoints_is_between_them(payloads):
+    stream = Stream(payloads, 100.0, start=50.0)
+    places = decode(payloads).position
+    assert stream.position(51.0) == pytest.approx(places[100])
+    assert stream.position(51.005) == pytest.approx((places[100] + places[101]) / 2)
+    assert stream.position(49.0) == pytest.approx(places[0])
+    assert stream.position(60.0) == pytest.approx(places[-1])
+
+
+def test_deadlines_do_not_drift_when_every_sleep_is_long():
+    clock = Clock()
+    pace = Pace(100.0, clock, clock.sleep)
+    clock.oversleep = 0.002
+    due = [pace.wait() for _ in range(500)]
+    assert due == pytest.approx(10.0 + np.arange(1, 501) / 100.0)
+    assert pace.skipped == 0
+
+
+def test_a_stall_skips_deadlines_and_keeps_the_schedule():
+    clock = Clock()
+    pace = Pace(100.0, clock, clock.sleep)
+    pace.wait()
+    clock.now += 0.2
+    due = pace.wait()
+    assert due <= clock.now
+    assert clock.now - due < 0.0101
+    assert (due - 10.0) * 100.0 == pytest.approx(round((due - 10.0) * 100.0))
+    assert pace.skipped in (18, 19)
+
+
+def test_lateness_of_nothing_is_zero():
+    assert Lateness.of([], 0) == Lateness(0.0, 0.0, 0.0, 0, 0)

@@ -1,0 +1,241 @@
+"""A trajectory as bytes: they say what was planned, and nothing else passes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cfplan.errors import NotCertifiedError
+from cfplan.flight.setpoints.encoding import (
+    RATE_LEAD,
+    THRUST_LEAD,
+    check_bytes,
+    command_quaternion,
+    controller_attitude,
+    encode_checked,
+    encode_trajectory,
+    setpoints_at,
+)
+from cfplan.flight.setpoints.packets import decode, encode
+from cfplan.geometry.min_snap import min_snap
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.airframes import AIRFRAMES
+from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.trajectory import Trajectory
+
+AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
+LIMITS = PlanLimits(
+    speed=2.0, acceleration=5.0, angular_velocity=8.0, tilt=np.radians(30), motor_thrust_min=0.0,
+    motor_thrust_max=0.12, specific_thrust_min=4.905,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trajectory() -> Trajectory:
+    """A slalom at constant h, near 2 m/s, that turns by a radian on the way."""
+    path = min_snap([[0, 0, 1], [1, 0.6, 1.2], [2, -0.6, 0.9], [3, 0.6, 1.1], [4, 0, 1]])
+    s, step = np.linspace(0, path.end, 61, retstep=True)
+    ddyaw = np.repeat([4.0, -4.0], 30) / path.end**2
+    dyaw = np.append(0.0, np.cumsum(ddyaw) * step)
+    yaw = np.append(0.0, np.cumsum((dyaw[:-1] + dyaw[1:]) / 2 * step))
+    h, none = np.full(61, 0.9), np.zeros(61)
+    profile = SpeedProfile(s, h, none, none, none[:-1], yaw, dyaw, ddyaw)
+    return Trajectory(path, profile, AIRFRAME)
+
+
+@pytest.fixture(scope="module")
+def encoded(trajectory):
+    return encode_trajectory(trajectory)
+
+
+def test_a_setpoint_is_due_every_ten_milliseconds_until_well_after_the_end(encoded, trajectory):
+    assert np.diff(encoded.times) == pytest.approx(0.01)
+    assert encoded.times[0] == 0.0
+    assert trajectory.duration + 0.5 <= encoded.duration <= trajectory.duration + 0.53
+    assert encoded.payloads.shape == (len(encoded.times), 29)
+
+
+def test_it_begins_and_ends_in_hover(encoded, trajectory):
+    told = encoded.decoded
+    assert told.position[0] == pytest.approx(trajectory.path(0.0), abs=5e-4)
+    assert told.velocity[0] == pytest.approx(0.0)
+    after = encoded.times >= trajectory.duration
+    for values in (told.velocity, told.acceleration, told.body_rate):
+        assert np.all(values[after] == 0.0)
+    assert told.position[after] == pytest.approx(
+        np.tile(trajectory.path(trajectory.path.end), (sum(after), 1)), abs=5e-4
+    )
+
+
+def test_the_acceleration_field_makes_up_for_drag(trajectory):
+    """Newton's second law: mass times planned acceleration is thrust, weight and drag together."""
+    encoded = encode_trajectory(trajectory, thrust_lead=0.0)
+    states = trajectory.at(encoded.times)
+    turn = Rotation.from_quat(states.quaternion)
+    air = turn.inv().apply(states.velocity)
+    drag = -turn.apply(air * [AIRFRAME.drag[0], AIRFRAME.drag[0], AIRFRAME.drag[1]])
+    thrust = AIRFRAME.mass * (encoded.decoded.acceleration + np.array([0, 0, GRAVITY]))
+    weight = AIRFRAME.mass * np.array([0, 0, -GRAVITY])
+    assert (thrust + weight + drag) / AIRFRAME.mass == pytest.approx(states.acceleration, abs=1e-3)
+    assert np.linalg.norm(drag, axis=1).max() / AIRFRAME.mass > 0.5
+
+
+def test_body_rates_are_sent_ahead(encoded, trajectory):
+    later = trajectory.at(encoded.times + RATE_LEAD).body_rate
+    assert encoded.decoded.body_rate == pytest.approx(later, abs=0.6e-3)
+
+
+def test_thrust_is_sent_ahead_and_its_direction_is_not(encoded, trajectory):
+    force = encoded.decoded.acceleration + np.array([0, 0, GRAVITY])
+    thrust = np.linalg.norm(force, axis=1)
+    assert thrust == pytest.approx(trajectory.at(encoded.times + THRUST_LEAD).specific_thrust, abs=1e-3)
+    assert force / thrust[:, None] == pytest.approx(trajectory.at(encoded.times).thrust_axis, abs=2e-4)
+
+
+def attitudes(tilt_max: float, count: int = 5000):
+    random = np.random.default_rng(5)
+    tilt, direction, yaw = tilt_max * random.random(count), *random.uniform(-np.pi, np.pi, (2, count))
+    axis = np.stack([np.sin(tilt) * np.cos(direction), np.sin(tilt) * np.sin(direction), np.cos(tilt)], axis=1)
+    turn = np.stack([-np.sin(direction), np.cos(direction), 0 * yaw], axis=1) * tilt[:, None]  # the least to the axis
+    return axis, (Rotation.from_rotvec(turn) * Rotation.from_euler("z", yaw[:, None])).as_quat()
+
+
+def angles(frames, quaternions):
+    """rad between rotation matrices and quaternions."""
+    return (Rotation.from_matrix(frames).inv() * Rotation.from_quat(quaternions)).magnitude()
+
+
+def test_the_controller_arrives_at_the_planned_attitude_from_what_is_sent():
+    axis, planned = attitudes(np.radians(60))
+    sent = command_quaternion(planned)
+    assert Rotation.from_quat(sent).apply([0, 0, 1]) == pytest.approx(axis, abs=1e-12)
+    assert angles(controller_attitude(axis, sent), planned) == pytest.approx(0.0, abs=1e-7)
+
+
+def test_sending_the_planned_attitude_itself_would_turn_the_vehicle_by_degrees():
+    axis, planned = attitudes(np.radians(30))
+    off = angles(controller_attitude(axis, planned), planned)
+    assert 8.0 < np.degrees(off.max()) < 8.5
+
+
+def test_its_own_bytes_pass(encoded, trajectory):
+    check_bytes(encoded, trajectory, LIMITS)
+
+
+def test_bytes_checked_as_they_are_made_are_the_same(encoded, trajectory):
+    checked = encode_checked(trajectory, LIMITS)
+    np.testing.assert_array_equal(checked.payloads, encoded.payloads)
+    np.testing.assert_array_equal(checked.times, encoded.times)
+    assert (checked.lead, checked.rate_lead, checked.thrust_lead) == (
+        encoded.lead, encoded.rate_lead, encoded.thrust_lead,
+    )  # fmt: skip
+    check_bytes(checked, trajectory, LIMITS)
+
+
+def test_bytes_that_would_not_pass_are_not_made(trajectory):
+    with pytest.raises(NotCertifiedError, match="speed"):
+        encode_checked(trajectory, replace(LIMITS, speed=1.5))
+
+
+def test_bytes_that_do_not_say_what_was_meant_are_not_made(trajectory, monkeypatch):
+    def forged(setpoints, first):
+        payloads = encode(setpoints, first)
+        payloads[40, 3] ^= 0x40
+        return payloads
+
+    monkeypatch.setattr("cfplan.flight.setpoints.encoding.encode", forged)
+    with pytest.raises(NotCertifiedError, match="position") as caught:
+        encode_checked(trajectory, LIMITS)
+    assert caught.value.where == "setpoint 40"
+
+
+def test_a_long_flight_is_encoded_and_checked_by_parts_alike(encoded, trajectory, monkeypatch):
+    monkeypatch.setattr("cfplan.flight.setpoints.encoding._BATCH", 100)
+    np.testing.assert_array_equal(encode_trajectory(trajectory).payloads, encoded.payloads)
+    np.testing.assert_array_equal(encode_checked(trajectory, LIMITS).payloads, encoded.payloads)
+    check_bytes(encoded, trajectory, LIMITS)
+    payloads = encoded.payloads.copy()
+    payloads[250, 3] ^= 0x40
+    with pytest.raises(NotCertifiedError) as caught:
+        check_bytes(replace(encoded, payloads=payloads), trajectory, LIMITS)
+    assert caught.value.where == "setpoint 250"
+
+
+@pytest.mark.parametrize("lead", [0.0, 0.01])
+@pytest.mark.parametrize("rate", [50.0, 100.0, 200.0])
+def test_bytes_pass_at_other_rates_and_leads(trajectory, lead, rate):
+    check_bytes(encode_trajectory(trajectory, rate=rate, lead=lead, hold=0.1), trajectory, LIMITS)
+
+
+@pytest.mark.parametrize("byte", range(29))
+def test_a_flipped_bit_in_any_byte_of_a_packet_is_found(encoded, trajectory, byte):
+    payloads = encoded.payloads.copy()
+    row = len(payloads) // 2
+    payloads[row, byte] ^= 0x40
+    with pytest.raises(NotCertifiedError) as caught:
+        check_bytes(replace(encoded, payloads=payloads), trajectory, LIMITS)
+    assert caught.value.where == f"setpoint {row}"
+
+
+@pytest.mark.parametrize("name", ["position", "velocity", "acceleration", "body_rate"])
+def test_a_field_off_by_a_thousandth_is_found(encoded, trajectory, name):
+    told = decode(encoded.payloads)
+    getattr(told, name)[40, 2] += 0.001
+    changed = replace(encoded, payloads=encode(told))
+    with pytest.raises(NotCertifiedError, match=name) as caught:
+        check_bytes(changed, trajectory, LIMITS)
+    assert caught.value.where == "setpoint 40"
+
+
+def test_an_attitude_off_by_a_degree_of_yaw_is_found(encoded, trajectory):
+    told = decode(encoded.payloads)
+    told.quaternion[40] = (
+        Rotation.from_euler("z", 1, degrees=True) * Rotation.from_quat(told.quaternion[40])
+    ).as_quat()
+    with pytest.raises(NotCertifiedError, match="quaternion"):
+        check_bytes(replace(encoded, payloads=encode(told)), trajectory, LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("speed", 1.5, "speed"), ("acceleration", 2.0, "acceleration"), ("angular_velocity", 0.5, "angular velocity"),
+        ("tilt", np.radians(15), "tilt"), ("specific_thrust_min", 9.8, "specific thrust"),
+    ],
+)  # fmt: skip
+def test_bytes_beyond_a_limit_are_refused(encoded, trajectory, field, value, said):
+    with pytest.raises(NotCertifiedError, match=said) as caught:
+        check_bytes(encoded, trajectory, replace(LIMITS, **{field: value}))
+    assert caught.value.where.startswith("setpoint ")
+
+
+def test_a_stream_that_does_not_end_in_hover_is_refused(encoded, trajectory):
+    cut = replace(encoded, times=encoded.times[:-60], payloads=encoded.payloads[:-60])
+    with pytest.raises(NotCertifiedError, match="hover"):
+        check_bytes(cut, trajectory, LIMITS)
+
+
+def test_bytes_of_another_shape_are_refused(encoded, trajectory):
+    for payloads in (encoded.payloads[:, :-1], encoded.payloads[:-1], encoded.payloads[:0]):
+        with pytest.raises(NotCertifiedError, match="shape"):
+            check_bytes(replace(encoded, payloads=payloads), trajectory, LIMITS)
+
+
+def test_a_path_out_of_the_packets_range_is_refused_with_the_setpoint():
+    path = min_snap([[0, 0, 1], [40, 0, 1]])
+    ones = np.ones(11)
+    profile = SpeedProfile(
+        np.linspace(0, path.end, 11), ones, 0 * ones, 0 * ones, 0 * ones[:-1], 0 * ones, 0 * ones, 0 * ones[:-1]
+    )
+    with pytest.raises(NotCertifiedError, match="position") as caught:
+        encode_trajectory(Trajectory(path, profile, AIRFRAME))
+    row = int(caught.value.where.split()[1])
+    assert setpoints_at(Trajectory(path, profile, AIRFRAME), np.array([row / 100])).position[0, 0] > 32.767
+
+
+@pytest.mark.parametrize("bad", [{"rate": 0.0}, {"hold": -1.0}, {"lead": np.nan}, {"rate": np.nan}])
+def test_sampling_that_makes_no_sense_is_refused(trajectory, bad):
+    with pytest.raises(NotCertifiedError):
+        encode_trajectory(trajectory, **bad)

@@ -1,0 +1,92 @@
+"""Refining: what is nearly right becomes the expert's, window by window on long paths."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.random_paths import random_waypoints
+from cfplan.planners.expert import refine as refined
+from cfplan.planners.expert.expert import plan_reduced
+from cfplan.planners.expert.refine import WINDOW, refine
+from cfplan.planners.expert.windows import windows_of
+from cfplan.planners.solution import Status
+from cfplan.safety.certificate import certify
+from cfplan.safety.limit_sets import LIMIT_SETS
+from cfplan.vehicle.profile_spline import h_coefficients, spline_profile, yaw_of
+from cfplan.vehicle.trajectory import Trajectory
+
+BOX = np.array([[-2.0, -4.0, 0.0], [2.5, 4.0, 2.0]])
+
+
+def planned(limit_set: str, seed: int, nodes: int = 100, waypoints: tuple[int, int] = (3, 6)):
+    """(path, limit set, the expert's profile)."""
+    chosen = LIMIT_SETS[limit_set]
+    path = min_snap(random_waypoints(seed, BOX, waypoints))
+    return path, chosen, plan_reduced(path, chosen.airframe, chosen.limits, nodes=nodes, windows=False).profile
+
+
+def disturbed(profile, end, size, seed=0):
+    """The profile with its speed changed by up to that share, smoothly, from place to place."""
+    random = np.random.default_rng(seed)
+    coefficients = h_coefficients(profile)
+    waves = sum(random.normal() * np.sin(np.linspace(0, k * np.pi, len(coefficients))) for k in range(2, 9))
+    return spline_profile(coefficients * (1 + size * waves / np.abs(waves).max()) ** 2, end, yaw_of(profile))
+
+
+@pytest.mark.parametrize("limit_set", ["hardware", "simulation"])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_profile_near_the_experts_becomes_as_fast_and_certified_in_fewer_steps(limit_set, seed):
+    path, chosen, expert = planned(limit_set, seed)
+    near = disturbed(expert, path.end, 0.03, seed)
+    assert not certify(Trajectory(path, near, chosen.airframe), chosen.limits).passed
+    solution = refine(path, near, chosen.airframe, chosen.limits)
+    assert solution.status is Status.SOLVED
+    refined = Trajectory(path, solution.profile, chosen.airframe)
+    assert certify(refined, chosen.limits).passed
+    assert refined.duration == pytest.approx(Trajectory(path, expert, chosen.airframe).duration, rel=5e-3)
+    from_afar = plan_reduced(path, chosen.airframe, chosen.limits, nodes=100)
+    assert solution.stats["iterations"] < from_afar.stats["iterations"]
+
+
+def test_windows_cover_a_path_and_each_looks_ahead():
+    kept, ahead = WINDOW
+    for nodes in (1, 100, kept + ahead, kept + ahead + 1, 1000):
+        windows = windows_of(nodes, kept, ahead)
+        assert windows[0][0] == 0
+        assert windows[-1][1] == nodes
+        for (_, ends), (begins, _) in itertools.pairwise(windows):
+            assert ends - begins == ahead
+
+
+def test_a_long_path_by_windows_is_as_fast_as_by_the_whole_and_continuous_at_joints(monkeypatch):
+    monkeypatch.setattr(refined, "WINDOW", (96, 32))
+    path, chosen, expert = planned("hardware", 5, nodes=320, waypoints=(9, 9))
+    solution = refine(path, disturbed(expert, path.end, 0.02), chosen.airframe, chosen.limits)
+    assert solution.stats["windows"] == 3
+    flown = Trajectory(path, solution.profile, chosen.airframe)  # refuses jumps of h, h', h'' and yaw
+    assert certify(flown, chosen.limits).passed
+    assert flown.duration == pytest.approx(Trajectory(path, expert, chosen.airframe).duration, rel=5e-3)
+
+
+def test_boundary_states_are_kept():
+    path, chosen, expert = planned("hardware", 4)
+    first, last = 30, 80
+    part = path.part(expert.s[first], expert.s[last])
+    start, end = expert.boundary(first), expert.boundary(last)
+    cut = spline_profile(h_coefficients(expert)[first : last + 3] * 0.98**2, part.end, yaw_of(expert).part(first, last))
+    profile = refine(part, cut, chosen.airframe, chosen.limits, start=start, end=end).profile
+    for state, found in ((start, profile.boundary(0)), (end, profile.boundary(-1))):
+        assert (found.h, found.dh, found.ddh) == pytest.approx((state.h, state.dh, state.ddh), rel=1e-6, abs=1e-6)
+
+
+def test_what_cannot_be_refined_has_a_reason():
+    path, chosen, expert = planned("hardware", 2)
+    rough = np.random.default_rng(3).uniform(0.01, 400.0, len(expert.s) + 2)
+    solution = refine(path, spline_profile(rough, path.end, yaw_of(expert)), chosen.airframe, chosen.limits)
+    if solution.profile is None:
+        assert solution.status is Status.NOT_CONVERGED
+        assert "refining s = " in solution.reason
+    else:
+        assert np.isfinite(solution.profile.h).all()

@@ -1,0 +1,153 @@
+"""The interior point method on problems whose answers others know."""
+
+from dataclasses import replace
+
+import casadi
+import numpy as np
+import pytest
+from scipy.linalg import solveh_banded
+
+from cfplan.planners.solver import banded, barrier
+from cfplan.planners.solver.barrier import bounds_of
+from cfplan.planners.solver.interior_point import Search, minimise
+
+
+class Valley:
+    """Rosenbrock's function of a chain, with x_k x_(k+1) and x_k between bounds."""
+
+    rows = 2
+
+    def __init__(self, size, lower, upper, least=-np.inf):
+        self.size = size
+        m = 2 * size
+        low, high = np.full(m, -np.inf), np.full(m, np.inf)
+        low[: size - 1], high[: size - 1] = lower, upper  # the last product is of nobody
+        low[size:] = least
+        self.bounds = bounds_of(low, high)
+        self.g, self.pulls = np.zeros(m), np.zeros((4, m))
+        self.gradients, self.matrix = np.zeros((4, size)), np.zeros((size, 2))
+
+    def cost(self, x):
+        return sum(100 * (x[k + 1] - x[k] ** 2) ** 2 + (1 - x[k]) ** 2 for k in range(self.size - 1))
+
+    def values(self, v):
+        self.v = v.copy()
+        self.g[:] = np.concatenate([v[:-1] * v[1:], [0.0], v])
+        return self.cost(v)
+
+    def jacobian(self):
+        x, rows = self.v, np.zeros((2 * self.size, self.size))
+        k = np.arange(self.size - 1)
+        rows[k, k], rows[k, k + 1] = x[1:], x[:-1]
+        rows[self.size :] = np.eye(self.size)
+        return rows
+
+    def expand(self):
+        x, (stiffness, multipliers, *_) = self.v, self.pulls
+        self.gradients[0] = 0.0
+        self.gradients[0, :-1] = -400 * x[:-1] * (x[1:] - x[:-1] ** 2) - 2 * (1 - x[:-1])
+        self.gradients[0, 1:] += 200 * (x[1:] - x[:-1] ** 2)
+        self.gradients[1:] = self.pulls[1:] @ self.jacobian()
+        whole = np.zeros((self.size, self.size))
+        k = np.arange(self.size - 1)
+        whole[k, k] = -400 * x[1:] + 1200 * x[:-1] ** 2 + 2
+        whole[k + 1, k + 1] += 200
+        whole[k + 1, k] = whole[k, k + 1] = -400 * x[:-1] + multipliers[: self.size - 1]
+        whole += self.jacobian().T @ (stiffness[:, None] * self.jacobian())
+        self.matrix[:, 0], self.matrix[1:, 1] = np.diag(whole), np.diag(whole, -1)
+
+    def along(self, dv):
+        return self.jacobian() @ dv
+
+
+EXACTLY = Search(last_barrier=1e-9, gradient=1e-7, feasibility=1e-9, iterations=300)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "least"), [(-np.inf, np.inf, -np.inf), (-np.inf, 0.5, -np.inf), (0.1, 0.3, 0.2), (2.0, 9.0, 0.0)]
+)
+def test_it_ends_where_another_solver_does(lower, upper, least):
+    start = np.linspace(0.5, 1.5, 8)
+    ended = minimise(Valley(8, lower, upper, least), start, EXACTLY)
+    assert ended.solved, ended.words
+    x = casadi.SX.sym("x", 8)
+    problem = {"x": x, "f": Valley(8, lower, upper).cost(x), "g": x[:-1] * x[1:]}
+    options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10}}
+    best = casadi.nlpsol("ipopt", "ipopt", problem, options)(x0=start, lbg=lower, ubg=upper, lbx=least)
+    np.testing.assert_allclose(ended.v, np.array(best["x"]).ravel(), atol=2e-5)
+
+
+def test_a_search_that_takes_whole_steps_at_their_word_saves_looking_and_ends_as_near():
+    class Looks(Valley):
+        count = 0
+
+        def expand(self):
+            super().expand()
+            self.count += 1
+
+    start = np.linspace(0.5, 1.5, 8)
+    near = Search(barrier=1e-3, last_barrier=1e-3, gradient=1e-3, feasibility=1e-3, iterations=300)
+    first, second = Looks(8, -np.inf, 0.5), Looks(8, -np.inf, 0.5)
+    looked = minimise(first, start, near)
+    believed = minimise(second, start, replace(near, left_by_step=1e-3))
+    assert looked.solved
+    assert believed.solved
+    assert second.count < first.count
+    np.testing.assert_allclose(believed.v, looked.v, atol=5e-3)
+
+
+@pytest.mark.parametrize("size", [1, 15, 16, 17, 50])
+def test_the_worst_of_all_slacks_counts_wherever_it_is(size):
+    rng = np.random.default_rng(size)
+    lower, upper = np.where(rng.random(size) < 0.3, -np.inf, -1.0), np.where(rng.random(size) < 0.3, np.inf, 1.0)
+    bounds = bounds_of(lower, upper)
+    for worst in range(size):
+        g, along = rng.uniform(-0.9, 0.9, (2, size))
+        state, step = np.stack([rng.uniform(-0.9, 0.9, size), *rng.uniform(0.1, 1.0, (2, size))]), np.empty((3, size))
+        along[worst] *= 50.0
+        s, low, high = state[0], state[1] * bounds[2], state[2] * bounds[3]
+        state[1], state[2] = low, high
+        active = np.isfinite(lower) | np.isfinite(upper)
+        below, above = np.where(bounds[2], s - lower, 1.0), np.where(bounds[3], upper - s, 1.0)
+        off = max((bounds[2] * abs(low * below - 0.01)).max(), (bounds[3] * abs(high * above - 0.01)).max())
+        assert barrier.errors(g, bounds, state, 0.01) == pytest.approx(((active * abs(g - s)).max(), off))
+        d = active * (g - s + along)
+        dlow, dhigh = bounds[2] * ((0.01 - low * d) / below - low), bounds[3] * ((0.01 + high * d) / above - high)
+        most = max((-bounds[2] * d / below).max(), (bounds[3] * d / above).max())
+        dual = max((-dlow / (low + 1e-300)).max(), (-dhigh / (high + 1e-300)).max())
+        _, share, share_dual = barrier.steps(g, along, bounds, state, 0.01, 0.99, step)
+        assert share == pytest.approx(min(1.0, 0.99 / max(most, 1e-30)))
+        assert share_dual == pytest.approx(min(1.0, 0.99 / max(dual, 1e-30)))
+        np.testing.assert_allclose(step, [d, dlow, dhigh], rtol=1e-9, atol=1e-9)
+
+
+def test_bounds_that_contradict_each_other_are_not_called_solved():
+    ended = minimise(Valley(8, 4.0, 5.0, -np.inf), np.linspace(0.5, 1.5, 8), Search(iterations=3))
+    assert not ended.solved
+    ended = minimise(Valley(2, 4.0, 3.9, -np.inf), np.ones(2), Search())
+    assert not ended.solved
+
+
+def test_what_is_not_a_number_is_told():
+    ended = minimise(Valley(8, 0.0, 1.0), np.full(8, np.nan), Search())
+    assert not ended.solved
+    assert "not a number" in ended.words
+
+
+@pytest.mark.parametrize("width", [1, 2, 5, 9])
+def test_banded_matrices_are_factored_as_lapack_does(width):
+    rng = np.random.default_rng(width)
+    size = 30
+    matrix = rng.normal(size=(size, width))
+    matrix[:, 0] = 4.0 * width
+    x = rng.normal(size=size)
+    bands = np.zeros((width, size))
+    for d in range(width):
+        bands[d, : size - d] = matrix[d:, d]
+    bands[0] += 0.5
+    expected = solveh_banded(bands, x, lower=True)
+    factor = np.empty_like(matrix)
+    assert banded.factorise(matrix, 0.5, factor)
+    banded.solve(factor, x)
+    np.testing.assert_allclose(x, expected, rtol=1e-10)
+    assert not banded.factorise(matrix, -4.0 * width, factor)

@@ -1,0 +1,389 @@
+"""The lab as a process, and unmodified cflib on it: real sockets, real clocks."""
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+
+import cflib.crtp
+import numpy as np
+import pytest
+from cflib.crazyflie import Crazyflie
+from cflib.crazyflie.log import LogConfig
+from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
+from cflib.crazyflie.syncLogger import SyncLogger
+from cflib.crtp.crtpstack import CRTPPort
+from cflib.positioning.motion_commander import MotionCommander
+
+from cfplan.errors import InputError, LinkError
+from cfplan.simulation.lab.lab import start_lab
+from cfplan.simulation.lab.room import RoomPoseSource, RoomSettings, lab_address
+from cfplan.simulation.lab.sim_driver import SimDriver, register_sim_driver
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.vehicle.airframes import AIRFRAMES
+
+pytestmark = pytest.mark.integration
+AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
+
+
+@pytest.fixture(scope="module")
+def lab():
+    """One lab for all that leave it whole."""
+    register_sim_driver()
+    with start_lab(AIRFRAME, vehicle=VehicleSettings(position=(0.5, -0.3, 0.0))) as running:
+        yield running
+
+
+@pytest.fixture
+def doomed():
+    """A lab for those that do not."""
+    register_sim_driver()
+    with start_lab(AIRFRAME, number=5) as running:
+        yield running
+
+
+@pytest.fixture
+def link(lab):
+    with SyncCrazyflie(lab.uri, cf=Crazyflie()) as sync:
+        sync.wait_for_params()
+        yield sync.cf
+
+
+def until(condition, seconds=5.0):
+    """Wait for something; whether it came."""
+    give_up = time.monotonic() + seconds
+    while time.monotonic() < give_up:
+        if condition():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def read_back(cf, name, value):
+    """Set a parameter and wait for the vehicle to say that it has it."""
+    cf.param.set_value(name, value)
+    assert until(lambda: abs(float(cf.param.get_value(name)) - value) <= 1e-6 * max(1.0, abs(value)))
+
+
+class PoseFeed(threading.Thread):
+    """What a pilot does with poses, in short."""
+
+    def __init__(self, cf):
+        super().__init__(daemon=True)
+        self.cf, self.source, self.stop = cf, RoomPoseSource(), threading.Event()
+        self.source.open()
+        self.start_position = self.source.poses()[-1].position
+        self.latest = None
+
+    def run(self):
+        while not self.stop.wait(0.004):
+            for pose in self.source.poses():
+                self.latest = pose
+                self.cf.loc.send_extpose(pose.position, pose.quaternion)
+        self.source.close()
+
+
+def prepare(cf, feed):
+    cf.commander.send_notify_setpoint_stop()
+    for name, value in (
+        ("stabilizer.controller", 2),
+        ("stabilizer.estimator", 2),
+        ("ctrlMel.mass", AIRFRAME.mass),
+        ("locSrv.extPosStdDev", 0.003),
+        ("locSrv.extQuatStdDev", 0.01),
+        ("kalman.dragB_x", AIRFRAME.drag[0] / AIRFRAME.mass),
+        ("kalman.dragB_y", AIRFRAME.drag[0] / AIRFRAME.mass),
+    ):
+        read_back(cf, name, value)
+    feed.start()
+    for axis, value in zip("XYZ", feed.start_position, strict=True):
+        cf.param.set_value(f"kalman.initial{axis}", value)
+    cf.param.set_value("kalman.resetEstimation", 1)
+    time.sleep(0.7)
+
+
+def test_cflib_connects_and_sees_tables_parameters_and_supervisor(link):
+    assert len([name for group in link.log.toc.toc.values() for name in group]) > 550
+    assert len([name for group in link.param.toc.toc.values() for name in group]) > 300
+    assert link.platform.get_protocol_version() == 12
+    assert link.param.is_updated
+    assert link.param.get_value("stabilizer.estimator") == "1"
+    assert link.supervisor.can_fly
+    assert link.supervisor.is_armed
+    assert not link.supervisor.is_flying
+
+
+def test_parameters_are_set_and_read_back_and_have_defaults(link):
+    read_back(link, "ctrlMel.mass", 0.031)
+    answers = []
+    link.param.get_default_value("ctrlMel.mass", lambda name, value: answers.append((name, value)))
+    assert until(lambda: answers)
+    assert answers[0][1] == pytest.approx(0.029)
+    states = []
+    link.param.persistent_store("ctrlMel.mass", lambda name, done: states.append(done))
+    assert until(lambda: states)
+    link.param.persistent_get_state("ctrlMel.mass", lambda name, state: states.append(state))
+    assert until(lambda: len(states) == 2)
+    assert states[1].is_stored
+    assert states[1].stored_value == pytest.approx(0.031)
+
+
+def test_log_blocks_come_at_100_hz_by_the_vehicles_clock(link):
+    blocks, stamps = [], {"one": [], "two": []}
+    for name, variables in (
+        ("one", ["stateEstimateZ.x", "stateEstimateZ.quat", "stateEstimateZ.vz", "pm.vbatMV", "supervisor.info"]),
+        ("two", ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "kalman.varX", "locSrvZ.tick"]),
+    ):
+        block = LogConfig(name, 10)
+        for variable in variables:
+            block.add_variable(variable)
+        link.log.add_config(block)
+        block.data_received_cb.add_callback(lambda stamp, data, which: stamps[which.name].append(stamp))
+        block.start()
+        blocks.append(block)
+    time.sleep(2.0)
+    for block in blocks:
+        block.stop()
+    for values in stamps.values():
+        assert len(values) > 180
+        assert set(np.diff(values)) == {10}
+
+
+def test_a_synchronous_logger_reads_values(link):
+    block = LogConfig("battery", 50)
+    block.add_variable("pm.vbat", "float")
+    with SyncLogger(link, block) as logger:
+        _, data, _ = next(iter(logger))
+    assert 3.9 < data["pm.vbat"] < 4.3
+
+
+def test_a_whole_flight_take_off_go_to_stream_hand_back_land(lab, link):
+    codes = []
+    link.add_port_callback(CRTPPort.SETPOINT_HL, lambda packet: codes.append(packet.data[3]))
+    feed = PoseFeed(link)
+    prepare(link, feed)
+    commander, planner = link.commander, link.high_level_commander
+
+    started = time.monotonic()
+    planner.takeoff(0.8, 1.5, yaw=None)
+    time.sleep(2.0)
+    planner.go_to(0.0, 0.0, 1.0, 0.0, 1.5)
+    time.sleep(2.0)
+    begun = time.monotonic()
+    radius, rate = 0.4, 1.5
+    for step in range(300):
+        time.sleep(max(0.0, begun + step * 0.01 - time.monotonic()))
+        angle = rate * max(0.0, (time.monotonic() - begun))
+        ramp = min(angle / 3.0, 1.0)
+        place = [radius * ramp * np.sin(angle), 0.0, 1.0]
+        commander.send_full_state_setpoint(place, [0, 0, 0], [0, 0, 0], [0, 0, 0, 1], 0, 0, 0)
+    x, y, z = feed.latest.position
+    planner.go_to(x, y, z, 0.0, 1.0)
+    commander.send_notify_setpoint_stop()
+    time.sleep(1.2)
+    planner.land(0.0, 1.5, yaw=None)
+    assert until(lambda: not link.supervisor.is_flying, 8.0)
+
+    truth = lab.truth()
+    feed.stop.set()
+    feed.join()
+    assert codes == [0, 0, 0, 0]
+    begun_at = np.searchsorted(truth.time, started)
+    assert truth.position[-1, 2] == 0.0
+    assert truth.position[begun_at:, 2].max() == pytest.approx(1.0, abs=0.1)
+    assert np.abs(truth.position[begun_at:, 0]).max() < 0.8
+    assert truth.off_in_air[-1] == truth.off_in_air[begun_at]
+    assert not truth.locked
+    assert np.allclose(np.diff(truth.time[begun_at:]), 0.01, atol=1e-6)
+
+
+def test_motion_commander_flies_with_the_default_controller(lab, link):
+    """The firmware's PID and its velocity setpoints, as cflib's own examples use them."""
+    read_back(link, "stabilizer.controller", 1)
+    feed = PoseFeed(link)
+    read_back(link, "stabilizer.estimator", 2)
+    feed.start()
+    for axis, value in zip("XYZ", feed.start_position, strict=True):
+        link.param.set_value(f"kalman.initial{axis}", value)
+    link.param.set_value("kalman.resetEstimation", 1)
+    time.sleep(0.7)
+    with MotionCommander(link, default_height=0.5) as motion:
+        motion.forward(0.4)
+        motion.left(0.3)
+        time.sleep(0.3)
+        place = feed.latest.position
+    feed.stop.set()
+    feed.join()
+    x, y, _ = feed.start_position
+    assert place == pytest.approx((x + 0.4, y + 0.3, 0.5), abs=0.2)
+    assert until(lambda: lab.truth().position[-1, 2] == 0.0)
+
+
+def test_the_link_closes_at_once_and_opens_again(lab):
+    for _ in range(2):
+        with SyncCrazyflie(lab.uri, cf=Crazyflie()) as sync:
+            sync.wait_for_params()
+            begun = time.monotonic()
+        assert time.monotonic() - begun < 0.5
+
+
+def test_a_lab_that_dies_is_a_lost_connection(doomed):
+    lost = threading.Event()
+    cf = Crazyflie()
+    cf.connection_lost.add_callback(lambda uri, why: lost.set())
+    connected = threading.Event()
+    cf.connected.add_callback(lambda uri: connected.set())
+    cf.open_link(doomed.uri)
+    assert connected.wait(10)
+    os.kill(doomed.process_id, signal.SIGKILL)
+    assert lost.wait(4)
+    cf.close_link()
+    with pytest.raises(LinkError):
+        doomed.truth()
+
+
+def test_a_lab_that_hangs_is_a_lost_connection(doomed):
+    lost = threading.Event()
+    cf = Crazyflie()
+    cf.connection_lost.add_callback(lambda uri, why: lost.set())
+    connected = threading.Event()
+    cf.connected.add_callback(lambda uri: connected.set())
+    cf.open_link(doomed.uri)
+    assert connected.wait(10)
+    os.kill(doomed.process_id, signal.SIGSTOP)
+    try:
+        assert lost.wait(5)
+    finally:
+        os.kill(doomed.process_id, signal.SIGCONT)
+        cf.close_link()
+
+
+def refusal(uri):
+    """Why cflib could not open the link."""
+    reasons = []
+    cf = Crazyflie()
+    cf.connection_failed.add_callback(lambda link_uri, why: reasons.append(why))
+    cf.open_link(uri)
+    assert reasons
+    return reasons[0]
+
+
+def test_links_that_cannot_be_say_why(monkeypatch):
+    register_sim_driver()
+    monkeypatch.setenv("CFPLAN_SIM_7", "127.0.0.1:9")
+    assert "no vehicle answers" in refusal("sim://7")
+    monkeypatch.setenv("CFPLAN_SIM_7", "nonsense")
+    assert "host:port" in refusal("sim://7")
+    assert "no such virtual vehicle" in refusal("sim://one")
+
+
+def test_the_driver_is_registered_once_and_finds_the_lab(lab):
+    register_sim_driver()
+    assert cflib.crtp.CLASSES.count(SimDriver) == 1
+    assert ["sim://0", "virtual Crazyflie"] in SimDriver().scan_interface()
+
+
+def test_a_link_without_a_lab_brings_its_own(monkeypatch):
+    register_sim_driver()
+    monkeypatch.delenv("CFPLAN_SIM_3", raising=False)
+    with SyncCrazyflie("sim://3", cf=Crazyflie()) as sync:
+        own = sync.cf.link._own_lab
+        assert own.alive
+        assert sync.cf.log.toc is not None
+    assert not own.alive
+    assert "CFPLAN_SIM_3" not in os.environ
+
+
+def test_poses_are_late_noisy_and_at_the_rate_that_was_set():
+    room = RoomSettings(rate=100, latency=0.03, position_noise=0.002)
+    with start_lab(AIRFRAME, vehicle=VehicleSettings(position=(1.0, 2.0, 0.0)), room=room, number=4):
+        source = pickle.loads(pickle.dumps(RoomPoseSource(number=4)))
+        source.open()
+        poses = []
+        end = time.monotonic() + 2.0
+        while time.monotonic() < end:
+            time.sleep(0.002)
+            poses += source.poses()
+        source.close()
+        source.close()
+    times = np.array([pose.time for pose in poses])
+    places = np.array([pose.position for pose in poses])
+    assert np.allclose(np.diff(times), 0.01, atol=1e-6)
+    assert np.median([pose.received - pose.time for pose in poses]) == pytest.approx(0.032, abs=0.01)
+    assert places.mean(axis=0) == pytest.approx([1.0, 2.0, 0.0], abs=1e-3)
+    assert places.std(axis=0) == pytest.approx([0.002] * 3, rel=0.3)
+
+
+def test_a_child_process_finds_the_room(lab):
+    program = textwrap.dedent(
+        """
+        import time
+        from cfplan.simulation.lab.room import RoomPoseSource
+        source = RoomPoseSource()
+        source.open()
+        time.sleep(0.2)
+        print(len(source.poses()))
+        """
+    )
+    child = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
+    assert int(child.stdout) > 10
+
+
+def test_a_second_lab_of_a_number_hides_the_first_until_it_closes(lab):
+    with start_lab(AIRFRAME) as second:
+        assert lab_address(0) == ("127.0.0.1", second.port)
+        second.close()
+    assert lab_address(0) == ("127.0.0.1", lab.port)
+
+
+def test_without_a_lab_there_are_no_poses(monkeypatch):
+    with pytest.raises(LinkError, match="no simulated room"):
+        RoomPoseSource(number=9).open()
+    monkeypatch.setenv("CFPLAN_SIM_9", "somewhere")
+    with pytest.raises(InputError):
+        RoomPoseSource(number=9).open()
+
+
+@pytest.mark.parametrize("settings", [{"rate": 0.0}, {"rate": np.nan}, {"latency": -1.0}, {"position_noise": np.inf}])
+def test_a_room_that_makes_no_sense_is_refused(settings):
+    with pytest.raises(InputError):
+        RoomSettings(**settings)
+
+
+def process_runs(number):
+    return subprocess.run(["ps", "-o", "stat=", "-p", str(number)], capture_output=True, text=True).stdout[:1] not in (
+        "",
+        "Z",
+    )
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM, None])
+def test_the_lab_ends_with_the_process_that_started_it(end):
+    program = textwrap.dedent(
+        """
+        import time
+        from cfplan.simulation.lab.lab import start_lab
+        from cfplan.vehicle.airframes import AIRFRAMES
+        lab = start_lab(AIRFRAMES["crazyflie-2.1+"])
+        print(lab.process_id, flush=True)
+        time.sleep({0})
+        """
+    ).format(0 if end is None else 60)
+    parent = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    number = int(parent.stdout.readline())
+    if end is not None:
+        assert process_runs(number)
+        parent.send_signal(end)
+    parent.wait()
+    parent.stdout.close()
+    assert until(lambda: not process_runs(number), 3.0)
+
+
+def test_ctrl_c_is_not_the_labs_to_obey(lab):
+    os.kill(lab.process_id, signal.SIGINT)
+    time.sleep(0.3)
+    assert lab.alive
