@@ -3,7 +3,7 @@
 A window's answers are joined to the three coefficients that are settled already, or to a rest, and smoothed by the
 least sum of squared changes and squared third differences of log √u. What the second weigh depends on how long an
 interval takes: motion is smoothed over the same time whatever the grid. Where the path rests, four coefficients are
-equal, so that h stays constant over the first or last interval (see expert/reduced.py).
+equal, so that h stays constant over the first or last interval (see planners/expert/expert.py).
 """
 
 from enum import IntEnum

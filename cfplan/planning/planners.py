@@ -12,7 +12,7 @@ AUTO = "auto"
 PLANNERS = MappingProxyType(
     {
         "learned": "cfplan.learning.learned:plan_learned",
-        "expert": "cfplan.planners.expert.expert:plan_reduced",
+        "expert": "cfplan.planners.expert.expert:plan_expert",
         "toppquad": "cfplan.planners.baselines.toppquad:plan_toppquad",
         "convex": "cfplan.planners.baselines.convex:plan_convex",
         "minsnap": "cfplan.planners.baselines.min_snap:plan_min_snap",

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cfplan.geometry.path import Path
-from cfplan.planners.expert.intersample import surely_exceeds
+from cfplan.planners.expert.intersample import violates_at_nodes
 from cfplan.planners.expert.refine import refine
 from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import PlanLimits
@@ -76,7 +76,7 @@ def repair(
         NotCertifiedError: the profile is not finite, not smooth, or h is not positive.
     """
     before = duration_of(profile)
-    if not surely_exceeds(path, profile, airframe, limits):
+    if not violates_at_nodes(path, profile, airframe, limits):
         trajectory = Trajectory(path, profile, airframe)
         certificate = certify(trajectory, limits, space)
         if certificate.passed:

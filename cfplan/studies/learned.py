@@ -16,7 +16,7 @@ from cfplan.flight.setpoints.encoding import encode_checked
 from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.baselines.convex import plan_convex
-from cfplan.planners.expert.expert import plan_reduced
+from cfplan.planners.expert.expert import plan_expert
 from cfplan.planning.repair import repair, slow
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import BOXES, LIMIT_SETS, LimitSet
@@ -231,7 +231,7 @@ def _fly(path: Path, box: str, seed: int, chosen: LimitSet) -> Flight:
     values |= {"box": box, "limits": chosen.name, "seed": seed, "length": path.length}
     try:
         path.check()
-        expert = plan_reduced(path, airframe, limits, nodes=NODES)
+        expert = plan_expert(path, airframe, limits, nodes=NODES)
         if expert.profile is None:
             return Flight(**values | {"reason": f"expert: {expert.reason or expert.status}"})
         mended = repair(path, expert.profile, airframe, limits)

@@ -15,7 +15,7 @@ from cfplan.errors import CfplanError, InputError
 from cfplan.flight.setpoints.encoding import encode_checked
 from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
-from cfplan.planners.expert.expert import plan_reduced
+from cfplan.planners.expert.expert import plan_expert
 from cfplan.planning.plan import default_nodes
 from cfplan.planning.repair import Repaired, repair
 from cfplan.safety.limit_sets import LimitSet
@@ -161,7 +161,7 @@ def _walk(path: Path, seed: int, chosen: LimitSet) -> Walk:
         values |= {"kept": _memory("VmRSS") - before, "peak": _memory("VmHWM") - before}
         values |= {"share": found.share, "flight": found.trajectory.duration}
         values["worst_share"] = found.certificate.worst.share
-        expert = plan_reduced(path, chosen.airframe, chosen.limits, nodes=nodes, windows=False)
+        expert = plan_expert(path, chosen.airframe, chosen.limits, nodes=nodes, windows=False)
         if expert.profile is not None:
             values["expert_flight"] = Trajectory(path, expert.profile, chosen.airframe).duration
     except InputError:

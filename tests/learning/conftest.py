@@ -23,7 +23,7 @@ def tiny(tmp_path_factory):
     """A folder with sixteen labelled paths."""
     folder = tmp_path_factory.mktemp("tiny")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(labels, "plan_reduced", plan_min_snap)
+        patch.setattr(labels, "plan_expert", plan_min_snap)
         make_dataset(folder, TINY)
     return folder
 

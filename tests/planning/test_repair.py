@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cfplan.learning.learned import plan_learned
-from cfplan.planners.expert.expert import plan_reduced
+from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.expert.refine import refine
 from cfplan.planners.solution import Solution, Status
 from cfplan.planning import repair as repairing
@@ -21,7 +21,7 @@ HARDWARE = LIMIT_SETS["hardware"]
 
 def test_a_profile_that_passes_stays_as_it_is():
     path = random_path(1, "10x10x10")
-    profile = plan_reduced(path, HARDWARE.airframe, HARDWARE.limits).profile.slowed(0.9)
+    profile = plan_expert(path, HARDWARE.airframe, HARDWARE.limits).profile.slowed(0.9)
     repaired = repair(path, profile, HARDWARE.airframe, HARDWARE.limits)
     assert repaired.trajectory.profile is profile
     assert repaired.describe() == ""
@@ -65,7 +65,7 @@ def test_what_cannot_be_refined_is_slowed_and_says_why(monkeypatch):
 
 def test_limits_that_the_profile_never_knew_are_kept_too():
     path = random_path(5, "10x10x10")
-    profile = plan_reduced(path, HARDWARE.airframe, HARDWARE.limits).profile
+    profile = plan_expert(path, HARDWARE.airframe, HARDWARE.limits).profile
     tighter = replace(HARDWARE.limits, speed=1.2, tilt=np.radians(20))
     repaired = repair(path, profile, HARDWARE.airframe, tighter)
     assert certify(repaired.trajectory, tighter).passed

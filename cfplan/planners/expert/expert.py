@@ -39,7 +39,7 @@ WINDOW = (96, 24)
 # intervals that a window keeps, and how much further it looks: longer windows take more steps
 
 
-def plan_reduced(
+def plan_expert(
     path: Path,
     airframe: Airframe,
     limits: PlanLimits,

@@ -99,7 +99,7 @@ class DensePath:
         return _as_shares(highest, limits), _as_shares(lowest, limits)
 
 
-def surely_exceeds(path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> bool:
+def violates_at_nodes(path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> bool:
     """Whether a limit is exceeded at a node; where not, the certificate has the word."""
     first, nodes = profile.s[:-1], np.arange(len(profile.s) - 1)
     at = dense.dense_rows(airframe, path.derivatives(first)[1:], profile, np.zeros(len(first)), nodes)

@@ -8,7 +8,7 @@ import pytest
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.planners.expert import refine as refined
-from cfplan.planners.expert.expert import plan_reduced
+from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.expert.refine import WINDOW, refine
 from cfplan.planners.expert.windows import windows_of
 from cfplan.planners.solution import Status
@@ -24,7 +24,7 @@ def planned(limit_set: str, seed: int, nodes: int = 100, waypoints: tuple[int, i
     """(path, limit set, the expert's profile)."""
     chosen = LIMIT_SETS[limit_set]
     path = min_snap(random_waypoints(seed, BOX, waypoints))
-    return path, chosen, plan_reduced(path, chosen.airframe, chosen.limits, nodes=nodes, windows=False).profile
+    return path, chosen, plan_expert(path, chosen.airframe, chosen.limits, nodes=nodes, windows=False).profile
 
 
 def disturbed(profile, end, size, seed=0):
@@ -46,7 +46,7 @@ def test_a_profile_near_the_experts_becomes_as_fast_and_certified_in_fewer_steps
     refined = Trajectory(path, solution.profile, chosen.airframe)
     assert certify(refined, chosen.limits).passed
     assert refined.duration == pytest.approx(Trajectory(path, expert, chosen.airframe).duration, rel=5e-3)
-    from_afar = plan_reduced(path, chosen.airframe, chosen.limits, nodes=100)
+    from_afar = plan_expert(path, chosen.airframe, chosen.limits, nodes=100)
     assert solution.stats["iterations"] < from_afar.stats["iterations"]
 
 
