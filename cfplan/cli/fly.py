@@ -75,7 +75,7 @@ def fly(
     as_json: bool,
 ) -> int:
     """Fly along PATH: plan, certify, rehearse, then take off, stream the flight, land, and keep a record."""
-    from cfplan.safety.limits import load_limits
+    from cfplan.safety.limits_file import load_limits
 
     steps = Steps(as_json=as_json)
     check_uris(uri, mocap_uri)

@@ -61,7 +61,7 @@ def obtain_plan(path_or_plan: Path, options: PlanOptions, steps: Steps) -> Plann
 
     Raises what loading, planning and certifying raise; a certificate that fails is not an error here.
     """
-    from cfplan.safety.limits import load_limits
+    from cfplan.safety.limits_file import load_limits
 
     with steps.step("limits") as said:
         safety_file = find_safety_file(options.safety_file, path_or_plan)

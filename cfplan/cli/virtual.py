@@ -35,7 +35,7 @@ Examples:
 @click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="Its vehicle is served.")
 def virtual(port: int, seconds: float | None, live: bool, safety_file: Path | None) -> None:
     """Serve the virtual Crazyflie over UDP, with poses on board as from a positioning deck."""
-    from cfplan.safety.limits import load_limits
+    from cfplan.safety.limits_file import load_limits
     from cfplan.simulation.lab.lab import start_lab
     from cfplan.simulation.lab.room import RoomSettings
 

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import Airframe
@@ -138,15 +137,3 @@ class Limits:
     ground: GroundManoeuvres
     lateness: float = 0.005
     # s, by which this computer may miss its deadlines before take-off, 99th percentile
-
-
-def load_limits(file: Path | str) -> Limits:
-    """safety.yaml, strictly validated and with its vehicle found.
-
-    Raises:
-        InputError: unknown keys, limits that are not positive, that contradict each other, that make hovering
-            impossible or that allow more than the vehicle can do; with `file:line:column`.
-    """
-    from cfplan.safety.limits_file import read_limits  # pydantic takes its time to import
-
-    return read_limits(file)

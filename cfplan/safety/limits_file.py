@@ -124,8 +124,13 @@ def _made(kind: type[Kind], section: _Section, **others: Any) -> Kind:
     return kind(**{**values, **ladders, **others})
 
 
-def read_limits(file: Path | str) -> Limits:
-    """See load_limits."""
+def load_limits(file: Path | str) -> Limits:
+    """Read safety.yaml, strictly validated, and find its vehicle.
+
+    Raises:
+        InputError: unknown keys, limits that are not positive, that contradict each other, that make hovering
+            impossible or that allow more than the vehicle can do; with `file:line:column`.
+    """
     content, places = read_yaml_with_places(file, _SafetyFile)
     _check_order(content, places)
     airframe = _vehicle(content.vehicle, Path(file).parent, places)

@@ -8,7 +8,7 @@ from cfplan.flight.pilot.mission import Mission, mission_of
 from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, encode_checked
 from cfplan.geometry.path_file import load_path_file
 from cfplan.planning.plan import Plan, plan
-from cfplan.safety.limits import load_limits
+from cfplan.safety.limits_file import load_limits
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from cfplan.errors import InputError
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
 from cfplan.flight.setpoints.stops import encode_stops
-from cfplan.safety.limits import load_limits
+from cfplan.safety.limits_file import load_limits
 
 RADIO = "radio://0/80/2M"
 REPOSITORY = Path(__file__).parents[2]

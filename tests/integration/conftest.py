@@ -13,7 +13,8 @@ from cfplan.flight.pilot.process import fly
 from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, Telemetry
-from cfplan.safety.limits import GroundManoeuvres, Limits, load_limits
+from cfplan.safety.limits import GroundManoeuvres, Limits
+from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.lab import Lab, Truth, start_lab
 from cfplan.simulation.lab.room import RoomPoseSource
 from cfplan.simulation.lab.sim_driver import SimDriver

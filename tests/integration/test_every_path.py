@@ -13,7 +13,7 @@ from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajector
 from cfplan.flight.telemetry import SetpointSent
 from cfplan.geometry.path_file import load_path_file
 from cfplan.planning.plan import plan
-from cfplan.safety.limits import load_limits
+from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.lab.lab import start_lab
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from cfplan.geometry.min_snap import min_snap
-from cfplan.safety.limits import load_limits
+from cfplan.safety.limits_file import load_limits
 
 
 @pytest.fixture(scope="session")

@@ -28,7 +28,7 @@ from cfplan.recording.reader import is_record
 from cfplan.recording.rerun import layout
 from cfplan.recording.rerun.overlay_view import DASH, dashes, references, stretches, write_overlay
 from cfplan.recording.summary import summarise
-from cfplan.safety.limits import load_limits
+from cfplan.safety.limits_file import load_limits
 
 DURATION = 8.0
 VULKAN = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]

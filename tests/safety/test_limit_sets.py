@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from cfplan.safety.limit_sets import LIMIT_SETS
-from cfplan.safety.limits import load_limits
+from cfplan.safety.limits_file import load_limits
 
 
 def test_the_hardware_set_is_what_the_projects_safety_file_allows():

@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.safety.limits import Ladder, load_limits
+from cfplan.safety.limits import Ladder
+from cfplan.safety.limits_file import load_limits
 from cfplan.vehicle.airframes import AIRFRAMES
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"

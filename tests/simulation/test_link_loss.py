@@ -8,7 +8,7 @@ import pytest
 
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
-from cfplan.safety.limits import load_limits
+from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.link_loss import orphaned, swept_when_orphaned
 from cfplan.studies.fault_scenarios import SCENARIOS
 from cfplan.studies.faults import fly_stepped

@@ -26,7 +26,7 @@ from cfplan.recording.report.page import page, write_page
 from cfplan.recording.report.report import flight_to_dict, read_flight, rows
 from cfplan.recording.summary import reference_span, summarise
 from cfplan.recording.writer import RecordWriter, write_summary
-from cfplan.safety.limits import load_limits
+from cfplan.safety.limits_file import load_limits
 
 CHROMIUM = shutil.which("chromium")
 

@@ -27,7 +27,7 @@ from cfplan.recording.rerun.picture import SIZE, HeadlessViewer
 from cfplan.recording.rerun.plan_view import ACTIVE, FREE, active_limits
 from cfplan.recording.rerun.record_view import HOVER_ARROW, floor_lines, picture, show, vehicle_outline, write_rrd
 from cfplan.recording.writer import RecordWriter
-from cfplan.safety.limits import load_limits
+from cfplan.safety.limits_file import load_limits
 
 RERUN = Path(rerun_cli.__file__).with_name("rerun")
 VULKAN = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]

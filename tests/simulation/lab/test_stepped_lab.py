@@ -6,7 +6,7 @@ import pytest
 
 from cfplan.errors import LinkError
 from cfplan.flight.telemetry import Estimate, VehicleStatus
-from cfplan.safety.limits import load_limits
+from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import BEGIN, SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
