@@ -10,7 +10,7 @@ from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from cfplan.flight.pilot.deadlines import Pace
+from cfplan.flight.pilot.deadlines import Deadlines
 from cfplan.flight.real_time import shorten_time_slice, use_fifo_scheduling
 
 _WATCH, _LATE, _QUEUED, _END = "watch", "late", "queued", None
@@ -63,10 +63,10 @@ def _sleep(connection: Connection, rate: float, first: bool) -> None:
     noted: dict[str, list[tuple[float, float]]] = {_LATE: [], _QUEUED: []}
     watched: Path | None = None
     connection.send(None)
-    pace = Pace(rate)
+    deadlines = Deadlines(rate)
     gc.freeze()
     while True:
-        due = pace.wait()
+        due = deadlines.wait()
         noted[_LATE].append((due, time.monotonic() - due))
         if watched is not None:
             with contextlib.suppress(OSError):  # it has ended

@@ -15,7 +15,7 @@ from contextlib import suppress
 
 from cfplan.errors import CfplanError, InputError, LinkError
 from cfplan.flight.mocap.datastream_client import DataStreamClient
-from cfplan.flight.mocap.frames import Body, Driver, Frame, Scene, Stage
+from cfplan.flight.mocap.frames import Driver, Frame, Scene, Stage, TrackedBody
 from cfplan.flight.mocap.sdk import SdkDriver
 from cfplan.flight.mocap.uri import MocapUri, parse_uri
 from cfplan.flight.real_time import lock_memory
@@ -52,7 +52,7 @@ def decoded(buffer: bytearray) -> list[Message]:
         del buffer[:end]
         if is_frame:
             received, bodies, *rest = marshal.loads(data)
-            found.append(Frame(received, tuple(Body(*body) for body in bodies), *rest))
+            found.append(Frame(received, tuple(TrackedBody(*body) for body in bodies), *rest))
         else:
             found.append(pickle.loads(data))
     return found

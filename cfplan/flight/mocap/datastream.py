@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-from cfplan.flight.mocap.frames import Body, Frame, Scene, Subject
+from cfplan.flight.mocap.frames import Frame, Scene, Subject, TrackedBody
 from cfplan.flight.telemetry import Quaternion
 
 OBJECTS = 0x1A2B0001
@@ -217,13 +217,13 @@ def _as_subject(known: _Known) -> Subject:
     return Subject(known.name, tuple([known.segments[known.tracked], *others] if known.segments else ()))
 
 
-def _body(name: str, pose: tuple[float, ...], y_up: bool, quality: float) -> Body:
+def _body(name: str, pose: tuple[float, ...], y_up: bool, quality: float) -> TrackedBody:
     """Millimetres to metres, a matrix to a quaternion, and z up."""
     x, y, z = (value / 1000 for value in pose[:3])
     qx, qy, qz, qw = _quaternion(pose[3:])
     if y_up:  # x stays, y up becomes z up: a turn by 90° about x, of the world and of the body's own axes
-        return Body(name, (x, -z, y), (qx, -qz, qy, qw), quality)
-    return Body(name, (x, y, z), (qx, qy, qz, qw), quality)
+        return TrackedBody(name, (x, -z, y), (qx, -qz, qy, qw), quality)
+    return TrackedBody(name, (x, y, z), (qx, qy, qz, qw), quality)
 
 
 def _quaternion(matrix: tuple[float, ...]) -> Quaternion:

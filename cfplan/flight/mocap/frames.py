@@ -8,7 +8,7 @@ from cfplan.flight.telemetry import Quaternion, Triple
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class TrackedBody:
     """A body that was seen in a frame."""
 
     name: str
@@ -26,7 +26,7 @@ class Frame:
 
     received: float
     # s on the clock of time.monotonic(), when it reached this computer
-    bodies: tuple[Body, ...]
+    bodies: tuple[TrackedBody, ...]
     # those that were seen
     hidden: tuple[str, ...] = ()
     # those that the system knows and did not see

@@ -9,7 +9,7 @@ import math
 from collections import Counter, deque
 from enum import StrEnum
 
-from cfplan.flight.mocap.frames import Body
+from cfplan.flight.mocap.frames import TrackedBody
 from cfplan.flight.telemetry import Quaternion, Triple
 
 _ACCELERATION = 20.0  # m/s² by which the motion may have changed since; twice what a flight may do
@@ -35,16 +35,16 @@ class Verdict(StrEnum):
     BROKEN = "not a pose"  # not a number, or no rotation
 
 
-class Sorter:
+class PoseClassifier:
     """Sorts the poses of one body, in the order of their time."""
 
     def __init__(self, jump: float):
         # jump in m, of a pose from where the last ones led
         self._jump = jump
-        self._good: deque[tuple[float, Body]] = deque()
-        self._last: Body | None = None
+        self._good: deque[tuple[float, TrackedBody]] = deque()
+        self._last: TrackedBody | None = None
         self._number: int | None = None
-        self._other: tuple[float, Body] | None = None
+        self._other: tuple[float, TrackedBody] | None = None
         self._other_since = 0.0
         self._other_verdict = Verdict.JUMPED
         self.counts: Counter[Verdict] = Counter()
@@ -52,7 +52,7 @@ class Sorter:
         # as the vehicle itself believes it: its gyroscopes tell a vehicle that turned, while it was not seen, from a
         # pattern that was turned over
 
-    def sort(self, time: float, body: Body | None, number: int | None = None) -> Verdict:
+    def classify(self, time: float, body: TrackedBody | None, number: int | None = None) -> Verdict:
         """What this pose is. Only a good one may be used."""
         verdict = self._verdict(time, body, number)
         self.counts[verdict] += 1
@@ -65,7 +65,7 @@ class Sorter:
                 self._good.popleft()
         return verdict
 
-    def _verdict(self, time: float, body: Body | None, number: int | None) -> Verdict:
+    def _verdict(self, time: float, body: TrackedBody | None, number: int | None) -> Verdict:
         if number is not None and number == self._number:
             return Verdict.REPEATED
         if body is None or not any(body.position):  # some systems send a hidden body as all zeros
@@ -82,7 +82,7 @@ class Sorter:
             return Verdict.REPEATED
         return self._against_track(time, body)
 
-    def _against_track(self, time: float, body: Body) -> Verdict:
+    def _against_track(self, time: float, body: TrackedBody) -> Verdict:
         last_time, last = self._good[-1]
         elapsed = time - last_time
         off = math.dist(body.position, self._expected(time))
@@ -118,7 +118,7 @@ class Sorter:
         x, y, z = (b + (b - a) * share for a, b in zip(first.position, last.position, strict=True))
         return x, y, z
 
-    def _goes_on(self, time: float, body: Body) -> bool:
+    def _goes_on(self, time: float, body: TrackedBody) -> bool:
         """Whether a pose belongs to the other track."""
         assert self._other is not None
         other_time, other = self._other
@@ -131,7 +131,7 @@ class Sorter:
         self._good.clear()
 
 
-def _same(a: Body, b: Body) -> bool:
+def _same(a: TrackedBody, b: TrackedBody) -> bool:
     return a.position == b.position and a.quaternion == b.quaternion
 
 

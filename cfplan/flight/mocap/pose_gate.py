@@ -9,7 +9,7 @@ _TURN = 0.5  # rad that the attitude may turn between poses, over what it turns 
 _FASTEST_TURN = 25.0  # rad/s
 
 
-class Freshness:
+class PoseGate:
     """Tells good poses from repeated, frozen, jumping and broken ones."""
 
     def __init__(self, jump: float):

@@ -15,7 +15,7 @@ FARTHEST = 0.05  # s that it is trusted beyond the last pose
 _FEWEST = 4
 
 
-class Forecast:
+class PosePredictor:
     """Position a little later than the last pose."""
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from cfplan.errors import InputError, LinkError
 from cfplan.flight.mocap.datastream_client import DataStreamClient, open_connection
-from cfplan.flight.mocap.frames import Body, Frame, Scene
+from cfplan.flight.mocap.frames import Frame, Scene, TrackedBody
 from cfplan.flight.mocap.uri import MocapUri
 
 if TYPE_CHECKING:
@@ -105,11 +105,11 @@ class SdkDriver:
             client.close()
 
 
-def _body(name: str, body: "motioncapture.RigidBody") -> Body:
+def _body(name: str, body: "motioncapture.RigidBody") -> TrackedBody:
     x, y, z = (float(value) for value in body.position)
     turn = body.rotation
     quaternion = (float(turn.x), float(turn.y), float(turn.z), float(turn.w))
     norm = math.sqrt(math.fsum(value * value for value in quaternion))  # single precision leaves it a little off 1
     if abs(norm - 1.0) < 1e-3:
         quaternion = (turn.x / norm, turn.y / norm, turn.z / norm, turn.w / norm)
-    return Body(name, (x, y, z), quaternion)
+    return TrackedBody(name, (x, y, z), quaternion)

@@ -8,7 +8,7 @@ from cfplan.errors import CfplanError, InputError, LinkError
 from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Frame, Scene
-from cfplan.flight.mocap.pose_classifier import Sorter, Verdict
+from cfplan.flight.mocap.pose_classifier import PoseClassifier, Verdict
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn, parse_uri
 from cfplan.flight.telemetry import Quaternion
@@ -40,7 +40,7 @@ class MocapSource:
         self._begin()
 
     def _begin(self) -> None:
-        self._sorter = Sorter(self._limits.jump)
+        self._classifier = PoseClassifier(self._limits.jump)
         self._clock = FrameClock(self._limits.latency)
         self._scene: Scene | None = None
         self._next = -math.inf
@@ -49,12 +49,12 @@ class MocapSource:
 
     def tell_attitude(self, attitude: Quaternion) -> None:
         """What the vehicle believes."""
-        self._sorter.attitude = attitude
+        self._classifier.attitude = attitude
 
     @property
     def counts(self) -> "Counter[Verdict]":
         """How many poses were what."""
-        return self._sorter.counts
+        return self._classifier.counts
 
     @property
     def sees_delays(self) -> bool:
@@ -117,17 +117,17 @@ class MocapSource:
             elif isinstance(message, Scene):
                 self._scene = message
             elif isinstance(message, Frame):
-                pose = self._sort(message)
+                pose = self._classify(message)
                 if pose is not None:
                     found.append(pose)
         if error is not None:
             raise error
         return found
 
-    def _sort(self, frame: Frame) -> Pose | None:
+    def _classify(self, frame: Frame) -> Pose | None:
         body = next(iter(frame.bodies), None)
         taken = self._clock.taken(frame.received, frame.number, frame.rate, frame.latency)
-        verdict = self._sorter.sort(taken, body, frame.number)
+        verdict = self._classifier.classify(taken, body, frame.number)
         if verdict is not Verdict.GOOD or body is None:
             self.fault = str(verdict)
             return None

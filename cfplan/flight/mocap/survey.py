@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from cfplan.errors import CfplanError, LinkError
 from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
-from cfplan.flight.mocap.frames import Body, Frame, Scene
-from cfplan.flight.mocap.pose_classifier import Sorter, Verdict
+from cfplan.flight.mocap.frames import Frame, Scene, TrackedBody
+from cfplan.flight.mocap.pose_classifier import PoseClassifier, Verdict
 from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn
 from cfplan.flight.telemetry import Triple
 
@@ -92,8 +92,8 @@ class Surveyor:
         self._missing = 0
         self._last: Frame | None = None
         self._clock = FrameClock(0.0)
-        self._sorters: dict[str, Sorter] = {}
-        self._bodies: dict[str, Body] = {}
+        self._classifiers: dict[str, PoseClassifier] = {}
+        self._bodies: dict[str, TrackedBody] = {}
         self.scene: Scene | None = None
 
     @property
@@ -113,7 +113,7 @@ class Surveyor:
         seen = {body.name: body for body in frame.bodies}
         self._bodies |= seen
         for name in [*seen, *frame.hidden]:
-            self._sorters.setdefault(name, Sorter(_JUMP)).sort(taken, seen.get(name), frame.number)
+            self._classifiers.setdefault(name, PoseClassifier(_JUMP)).classify(taken, seen.get(name), frame.number)
 
     def report(self) -> Survey:
         """What was seen so far."""
@@ -140,12 +140,12 @@ class Surveyor:
 
     def _names(self) -> list[str]:
         known = [subject.name for subject in self.scene.subjects] if self.scene else []
-        return known + sorted(self._sorters.keys() - set(known))
+        return known + sorted(self._classifiers.keys() - set(known))
 
     def _body(self, name: str) -> BodyReport:
         subjects = self.scene.subjects if self.scene else ()
         segments = next((subject.segments for subject in subjects if subject.name == name), ())
-        counts: Counter[Verdict] = self._sorters[name].counts if name in self._sorters else Counter()
+        counts: Counter[Verdict] = self._classifiers[name].counts if name in self._classifiers else Counter()
         body = self._bodies.get(name)
         x, y, z, w = body.quaternion if body else (math.nan,) * 4
         return BodyReport(

@@ -19,7 +19,7 @@ DISAGREEMENT_FACTOR = 5.0  # in the air estimate and pose may be apart by so man
 
 
 @dataclass(frozen=True, slots=True)
-class Trip:
+class Abort:
     """A reason to leave the plan, and how."""
 
     rung: Rung
@@ -28,7 +28,7 @@ class Trip:
 
 
 @dataclass(slots=True)
-class Seen:
+class Observation:
     """What the pilot knows at one moment."""
 
     now: float
@@ -48,7 +48,7 @@ class Seen:
     # s, by which the last setpoint missed its deadline
 
 
-class Watch:
+class AbortMonitor:
     """Finds the gravest reason to leave the plan. Keeps the battery's and the motion's short history."""
 
     def __init__(self, limits: Limits):
@@ -57,52 +57,52 @@ class Watch:
         self._voltage_time = 0.0
         self._since: dict[str, float] = {}
 
-    def ordered(self, seen: Seen) -> Trip | None:
+    def ordered(self, observation: Observation) -> Abort | None:
         """What the operator wants, or what became of him; holds on the ground too."""
-        if seen.order is Order.CUT:
-            return Trip(Rung.CUT, ExitCode.ENDED_BY_PILOT, "the operator cut the motors")
-        if seen.order is Order.LAND:
-            return Trip(Rung.LAND, ExitCode.ENDED_BY_PILOT, "the operator ended the flight")
-        if seen.main_gone:
-            return Trip(Rung.LAND, ExitCode.ENDED_BY_SAFETY, "the main process is gone")
+        if observation.order is Order.CUT:
+            return Abort(Rung.CUT, ExitCode.ENDED_BY_PILOT, "the operator cut the motors")
+        if observation.order is Order.LAND:
+            return Abort(Rung.LAND, ExitCode.ENDED_BY_PILOT, "the operator ended the flight")
+        if observation.main_gone:
+            return Abort(Rung.LAND, ExitCode.ENDED_BY_SAFETY, "the main process is gone")
         return None
 
-    def gravest(self, seen: Seen) -> Trip | None:
-        """The gravest trip of all that holds in the air."""
-        trips = [trip for trip in self._trips(seen) if trip.rung]
-        ordered = self.ordered(seen)
+    def gravest(self, observation: Observation) -> Abort | None:
+        """The gravest abort of all that holds in the air."""
+        aborts = [abort for abort in self._aborts(observation) if abort.rung]
+        ordered = self.ordered(observation)
         if ordered is not None:
-            trips.insert(0, ordered)
-        return max(trips, key=lambda trip: trip.rung, default=None)
+            aborts.insert(0, ordered)
+        return max(aborts, key=lambda abort: abort.rung, default=None)
 
-    def _trips(self, seen: Seen) -> Iterator[Trip]:
-        yield from self._pose(seen)
-        yield from self._vehicle(seen)
-        yield from self._motion(seen)
-        if seen.late > LATEST_SETPOINT:
-            yield _safety(Rung.BRAKE, f"a setpoint was {seen.late:.2f} s late")
+    def _aborts(self, observation: Observation) -> Iterator[Abort]:
+        yield from self._pose(observation)
+        yield from self._vehicle(observation)
+        yield from self._motion(observation)
+        if observation.late > LATEST_SETPOINT:
+            yield _safety(Rung.BRAKE, f"a setpoint was {observation.late:.2f} s late")
 
-    def _pose(self, seen: Seen) -> Iterator[Trip]:
+    def _pose(self, observation: Observation) -> Iterator[Abort]:
         limits = self._limits.pose
-        if seen.pose is None:
+        if observation.pose is None:
             yield _safety(Rung.LAND, "there is no pose")
             return
-        age = seen.now - seen.pose.time
+        age = observation.now - observation.pose.time
         if age > limits.age_brake:
             rung = Rung.LAND if age > limits.age_land else Rung.BRAKE
-            why = f" ({seen.pose_fault})" if seen.pose_fault else ""
+            why = f" ({observation.pose_fault})" if observation.pose_fault else ""
             yield _safety(rung, f"the last good pose is {age:.2f} s old{why}")
 
-    def _vehicle(self, seen: Seen) -> Iterator[Trip]:
-        if seen.estimate is None or seen.status is None:
+    def _vehicle(self, observation: Observation) -> Iterator[Abort]:
+        if observation.estimate is None or observation.status is None:
             return
-        silent = seen.now - max(seen.estimate.time, seen.status.time)
+        silent = observation.now - max(observation.estimate.time, observation.status.time)
         if silent > OLDEST_LOG:
             yield _safety(Rung.LAND, f"the vehicle's log has been silent for {silent:.1f} s")
         for bit, fault in FAULTS.items():
-            if seen.status.supervisor & bit:
+            if observation.status.supervisor & bit:
                 yield _safety(Rung.CUT, f"the vehicle {fault}")
-        voltage = self._loaded_voltage(seen.status)
+        voltage = self._loaded_voltage(observation.status)
         if voltage < self._limits.battery.under_load:
             yield _safety(Rung.LAND, f"the battery is down to {voltage:.2f} V")
 
@@ -116,28 +116,31 @@ class Watch:
         self._voltage += share * (status.battery_voltage - self._voltage)
         return self._voltage
 
-    def _motion(self, seen: Seen) -> Iterator[Trip]:
+    def _motion(self, observation: Observation) -> Iterator[Abort]:
         limits = self._limits.flight
-        if seen.pose is not None:
-            beyond = self._beyond_fence(seen.pose.position)
+        if observation.pose is not None:
+            beyond = self._beyond_fence(observation.pose.position)
             yield _rung(limits.fence, beyond, f"{beyond:.2f} m beyond the fence")
-            if seen.wanted is not None:
-                deviation = math.dist(seen.pose.position, seen.wanted)
+            if observation.wanted is not None:
+                deviation = math.dist(observation.pose.position, observation.wanted)
                 yield _rung(limits.deviation, deviation, f"{deviation:.2f} m from the setpoint")
-        if seen.estimate is None or seen.status is None:
+        if observation.estimate is None or observation.status is None:
             return
         newest = self._limits.pose.age_warning
-        if seen.pose is not None and seen.now - min(seen.pose.time, seen.estimate.time) <= newest:
-            apart = math.dist(seen.pose.position, seen.estimate.position)
+        if (
+            observation.pose is not None
+            and observation.now - min(observation.pose.time, observation.estimate.time) <= newest
+        ):
+            apart = math.dist(observation.pose.position, observation.estimate.position)
             if apart > DISAGREEMENT_FACTOR * self._limits.pose.agreement:
                 yield _safety(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")
         for name, ladder, vector, unit in (
-            ("speed", limits.speed, seen.estimate.velocity, "m/s"),
-            ("acceleration", limits.acceleration, seen.estimate.acceleration, "m/s²"),
-            ("body rate", limits.angular_velocity, seen.status.body_rate, "rad/s"),
+            ("speed", limits.speed, observation.estimate.velocity, "m/s"),
+            ("acceleration", limits.acceleration, observation.estimate.acceleration, "m/s²"),
+            ("body rate", limits.angular_velocity, observation.status.body_rate, "rad/s"),
         ):
             value = math.hypot(*vector)
-            yield self._lasting(name, seen.now, _rung(ladder, value, f"a {name} of {value:.1f} {unit}"))
+            yield self._lasting(name, observation.now, _rung(ladder, value, f"a {name} of {value:.1f} {unit}"))
 
     def _beyond_fence(self, position: Triple) -> float:
         """m beyond the space less its margin; the floor does not count."""
@@ -145,20 +148,20 @@ class Watch:
         (x, y, z), low, high, margin = position, space.low, space.high, space.margin
         return margin + max(low[0] - x, x - high[0], low[1] - y, y - high[1], z - high[2])
 
-    def _lasting(self, name: str, now: float, trip: Trip) -> Trip:
-        """The trip if it has lasted; a single noisy value is no reason."""
-        if not trip.rung:
+    def _lasting(self, name: str, now: float, abort: Abort) -> Abort:
+        """The abort if it has lasted; a single noisy value is no reason."""
+        if not abort.rung:
             self._since.pop(name, None)
-            return trip
+            return abort
         since = self._since.setdefault(name, now)
-        return trip if now - since >= self._limits.flight.patience else Trip(Rung.NONE, trip.exit_code, trip.text)
+        return abort if now - since >= self._limits.flight.patience else Abort(Rung.NONE, abort.exit_code, abort.text)
 
 
-def _safety(rung: Rung, text: str) -> Trip:
-    return Trip(rung, ExitCode.ENDED_BY_SAFETY, text)
+def _safety(rung: Rung, text: str) -> Abort:
+    return Abort(rung, ExitCode.ENDED_BY_SAFETY, text)
 
 
-def _rung(ladder: Ladder, value: float, text: str) -> Trip:
+def _rung(ladder: Ladder, value: float, text: str) -> Abort:
     """The rung of a measured value; what is not a number says that the measurement cannot be trusted: land."""
     if math.isnan(value):
         return _safety(Rung.LAND, text)

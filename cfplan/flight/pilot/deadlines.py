@@ -29,7 +29,7 @@ class Lateness:
         return cls(float(p50), float(p99), float(values.max()), len(late), skipped)
 
 
-class Pace:
+class Deadlines:
     """Absolute deadlines: the next one is where it was always going to be, however late this one was."""
 
     def __init__(

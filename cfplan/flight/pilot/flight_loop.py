@@ -2,7 +2,7 @@
 
 Everything happens in ticks at the rate of the setpoints. A tick waits for its deadline, sends what is due, forwards
 the newest good pose, and looks at what could end the flight; so whatever the pilot waits for, poses flow and the watch
-is kept. A reason to leave the plan arrives as `Tripped`, out of any wait.
+is kept. A reason to leave the plan arrives as `AbortRaised`, out of any wait.
 """
 
 import math
@@ -11,11 +11,11 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
-from cfplan.flight.mocap.pose_gate import Freshness
-from cfplan.flight.mocap.pose_predictor import Forecast
+from cfplan.flight.mocap.pose_gate import PoseGate
+from cfplan.flight.mocap.pose_predictor import PosePredictor
 from cfplan.flight.mocap.poses import Pose, PoseSource
-from cfplan.flight.pilot.abort_monitor import LINK_GONE, Seen, Trip, Watch
-from cfplan.flight.pilot.deadlines import Pace
+from cfplan.flight.pilot.abort_monitor import LINK_GONE, Abort, AbortMonitor, Observation
+from cfplan.flight.pilot.deadlines import Deadlines
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Check, Rung
@@ -28,26 +28,26 @@ TRIES = 3
 _SIGN_OF_LIFE = 0.1  # s between those for the vehicle's watchdog, which waits for 1 s
 
 
-class OrdersFrom(Protocol):
+class OrderSource(Protocol):
     """Where the operator's orders come from."""
 
     worst: Order | None
     gone: bool
 
 
-class Tripped(Exception):
+class AbortRaised(Exception):
     """There is a reason to leave the plan."""
 
-    def __init__(self, trip: Trip):
-        self.trip = trip
-        super().__init__(trip.text)
+    def __init__(self, abort: Abort):
+        self.abort = abort
+        super().__init__(abort.text)
 
 
 class LinkLost(Exception):
     """Nothing more can be sent."""
 
 
-class Cockpit:
+class FlightLoop:
     """The link, the poses and the watch of one flight, ticking."""
 
     def __init__(
@@ -55,27 +55,27 @@ class Cockpit:
         mission: Mission,
         source: PoseSource,
         report: Callable[[Telemetry], None],
-        orders: OrdersFrom,
+        orders: OrderSource,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
         self.mission, self.limits, self.source = mission, mission.limits, source
         self.report, self.now = report, clock
         self._orders, self._sleep = orders, sleep
-        self._watch = Watch(mission.limits)
-        self._freshness, self._forecast = Freshness(mission.limits.pose.jump), Forecast()
+        self._monitor = AbortMonitor(mission.limits)
+        self._pose_gate, self._predictor = PoseGate(mission.limits.pose.jump), PosePredictor()
         self.plan = Stream(mission.payloads, mission.rate, stop_from=mission.stops.__getitem__)
         self.stream: Stream | None = None
         # what each tick sends; None while the on-board commander flies
-        self.muted = False
+        self.sending_paused = False
         # sends nothing for a moment
         self.link: Link
         self.connected = self.feeding = self.airborne = False
         self.floor = 0.0
         # m, height of the tracked body before take-off
         self.rung = Rung.NONE
-        # a trip of this rung or a lesser one changes nothing
-        self.pace: Pace
+        # an abort of this rung or a lesser one changes nothing
+        self.deadlines: Deadlines
         self.phases: list[tuple[Phase, float]] = []
         self.checks: tuple[Check, ...] = ()
         self.pose_fault = ""
@@ -94,10 +94,10 @@ class Cockpit:
 
     def tick(self) -> float:
         """One deadline: the setpoint, then the pose, then the look-out. The time after it, s."""
-        due = self.pace.wait()
+        due = self.deadlines.wait()
         now = self.now()
         stream = self.stream
-        if stream is not None and not self.muted:
+        if stream is not None and not self.sending_paused:
             index = stream.index(now)
             self.link.send(stream.packets[index])
             if self.plan.start:
@@ -119,21 +119,21 @@ class Cockpit:
             self.source.tell_attitude(estimate.quaternion)
         for pose in self.source.poses():
             self.report(PoseReceived(pose.time, pose.received, pose.position, pose.quaternion))
-            fault = self._freshness.fault(pose)
+            fault = self._pose_gate.fault(pose)
             if fault != self.pose_fault:
                 self.pose_fault = fault
                 self.say(Level.WARNING, f"pose: {fault}" if fault else "pose: good again")
             if not fault:
                 newest = pose
                 self.recent.append(pose)
-                self._forecast.add(pose)
+                self._predictor.add(pose)
                 self._note_deviation(pose)
         if self.source.fault != self._source_fault:
             self._source_fault = self.source.fault
             self.say(Level.WARNING, f"motion capture: {self._source_fault or 'good again'}")
         now = self.now()
         if newest is not None and now - newest.time < self.limits.pose.age_brake:
-            self.link.send_pose(self._forecast.position(now), newest.quaternion)
+            self.link.send_pose(self._predictor.position(now), newest.quaternion)
         while len(self.recent) > 1 and self.recent[0].time < self.recent[-1].time - 1.0:
             self.recent.popleft()
 
@@ -148,8 +148,8 @@ class Cockpit:
         link = self.link
         if link.lost or (self.airborne and link.estimate is not None and now - link.estimate.time > LINK_GONE):
             raise LinkLost
-        pose, stream = self._freshness.last, self.stream
-        seen = Seen(
+        pose, stream = self._pose_gate.last, self.stream
+        observation = Observation(
             now=now,
             order=self._orders.worst,
             main_gone=self._orders.gone,
@@ -160,19 +160,19 @@ class Cockpit:
             status=link.status,
             late=late if stream is not None else 0.0,
         )
-        trip = self._watch.gravest(seen) if self.airborne else self._watch.ordered(seen)
-        if trip is not None and trip.rung > self.rung:
-            raise Tripped(trip)
+        abort = self._monitor.gravest(observation) if self.airborne else self._monitor.ordered(observation)
+        if abort is not None and abort.rung > self.rung:
+            raise AbortRaised(abort)
 
     def look_at_orders(self) -> None:
         """What a tick does before there is a link."""
-        trip = self._watch.ordered(Seen(self.now(), self._orders.worst, self._orders.gone))
-        if trip is not None:
-            raise Tripped(trip)
+        abort = self._monitor.ordered(Observation(self.now(), self._orders.worst, self._orders.gone))
+        if abort is not None:
+            raise AbortRaised(abort)
 
-    def restart_pace(self) -> None:
+    def restart_deadlines(self) -> None:
         """Deadlines from now on; those that something slow on the ground has missed do not count."""
-        self.pace = Pace(self.mission.rate, self.now, self._sleep)
+        self.deadlines = Deadlines(self.mission.rate, self.now, self._sleep)
 
     def until(self, done: Callable[[], bool], patience: float) -> bool:
         """Tick until it is done; whether it was, in time."""
@@ -194,7 +194,7 @@ class Cockpit:
         return None
 
     def pose(self) -> Pose:
-        pose = self._freshness.last
+        pose = self._pose_gate.last
         assert pose is not None  # nothing asks before the feed has begun
         return pose
 

@@ -1,4 +1,4 @@
-"""The table of checks between the ground and the air: each a small function with a value, a threshold and a verdict."""
+"""Preflight: the table of checks before arming, each a small function with a value, a threshold and a verdict."""
 
 import math
 import re
@@ -21,7 +21,7 @@ LARGEST_ROUND_TRIP = 0.05  # s
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class PreflightSnapshot:
     """What is known of the vehicle before it is armed."""
 
     mission: Mission
@@ -50,39 +50,39 @@ class Ground:
     # the stream has the processor ahead of ordinary programs, which the system must permit
 
 
-def run_checks(ground: Ground) -> tuple[Check, ...]:
+def run_checks(snapshot: PreflightSnapshot) -> tuple[Check, ...]:
     """Every check, in the order of the table."""
-    return tuple(check(ground) for check in CHECKS)
+    return tuple(check(snapshot) for check in CHECKS)
 
 
-def check_protocol(ground: Ground) -> Check:
+def check_protocol(snapshot: PreflightSnapshot) -> Check:
     return Check(
-        "radio protocol", str(ground.protocol), f"≥ {OLDEST_PROTOCOL}", ground.protocol >= OLDEST_PROTOCOL,
+        "radio protocol", str(snapshot.protocol), f"≥ {OLDEST_PROTOCOL}", snapshot.protocol >= OLDEST_PROTOCOL,
         "update the vehicle's firmware",
     )  # fmt: skip
 
 
-def check_firmware(ground: Ground) -> Check:
-    oldest = ground.mission.limits.firmware.oldest
-    found = tuple(int(part) for part in re.findall(r"\d+", ground.firmware)[: max(3, len(oldest))])
+def check_firmware(snapshot: PreflightSnapshot) -> Check:
+    oldest = snapshot.mission.limits.firmware.oldest
+    found = tuple(int(part) for part in re.findall(r"\d+", snapshot.firmware)[: max(3, len(oldest))])
     return Check(
-        "firmware", ground.firmware or "unknown", "≥ " + ".".join(map(str, oldest)), bool(found) and found >= oldest,
+        "firmware", snapshot.firmware or "unknown", "≥ " + ".".join(map(str, oldest)), bool(found) and found >= oldest,
         "update the vehicle's firmware: older filters go wrong with yaw beyond 90°",
     )  # fmt: skip
 
 
-def check_round_trip(ground: Ground) -> Check:
+def check_round_trip(snapshot: PreflightSnapshot) -> Check:
     return Check(
-        "link round trip", f"{ground.round_trip * 1e3:.1f} ms", f"≤ {LARGEST_ROUND_TRIP * 1e3:.0f} ms",
-        0.0 < ground.round_trip <= LARGEST_ROUND_TRIP, "move closer, or choose a freer channel",
+        "link round trip", f"{snapshot.round_trip * 1e3:.1f} ms", f"≤ {LARGEST_ROUND_TRIP * 1e3:.0f} ms",
+        0.0 < snapshot.round_trip <= LARGEST_ROUND_TRIP, "move closer, or choose a freer channel",
     )  # fmt: skip
 
 
-def check_supervisor(ground: Ground) -> Check:
-    faults = [text for bit, text in FAULTS.items() if ground.status.supervisor & bit]
-    if ground.status.supervisor & FLYING:
+def check_supervisor(snapshot: PreflightSnapshot) -> Check:
+    faults = [text for bit, text in FAULTS.items() if snapshot.status.supervisor & bit]
+    if snapshot.status.supervisor & FLYING:
         faults.append("flying already")
-    if not faults and not ground.could_fly:
+    if not faults and not snapshot.could_fly:
         faults.append("cannot fly")
     return Check(
         "supervisor", ", ".join(faults) or "can fly", "can fly", not faults,
@@ -90,59 +90,59 @@ def check_supervisor(ground: Ground) -> Check:
     )  # fmt: skip
 
 
-def check_battery(ground: Ground) -> Check:
-    least = ground.mission.limits.battery.at_rest
-    voltage = ground.status.battery_voltage
+def check_battery(snapshot: PreflightSnapshot) -> Check:
+    least = snapshot.mission.limits.battery.at_rest
+    voltage = snapshot.status.battery_voltage
     return Check("battery at rest", f"{voltage:.2f} V", f"≥ {least:.2f} V", voltage >= least, "charge the battery")
 
 
-def check_endurance(ground: Ground) -> Check:
-    longest = ground.mission.limits.battery.endurance
-    flight = ground.mission.duration + ground.mission.hold_time
+def check_endurance(snapshot: PreflightSnapshot) -> Check:
+    longest = snapshot.mission.limits.battery.endurance
+    flight = snapshot.mission.duration + snapshot.mission.hold_time
     return Check("flight time", f"{flight:.1f} s", f"≤ {longest:.0f} s", flight <= longest, "plan a shorter path")
 
 
-def check_parameters(ground: Ground) -> Check:
+def check_parameters(snapshot: PreflightSnapshot) -> Check:
     wrong = [
-        f"{name} is {ground.read_back.get(name, math.nan):g}, not {wanted:g}"
-        for name, wanted in ground.wanted.items()
-        if not math.isclose(ground.read_back.get(name, math.nan), wanted, rel_tol=1e-6)
+        f"{name} is {snapshot.read_back.get(name, math.nan):g}, not {wanted:g}"
+        for name, wanted in snapshot.wanted.items()
+        if not math.isclose(snapshot.read_back.get(name, math.nan), wanted, rel_tol=1e-6)
     ]
     return Check(
-        "parameters read back", "; ".join(wrong) or f"{len(ground.wanted)} as set", "as set", not wrong,
+        "parameters read back", "; ".join(wrong) or f"{len(snapshot.wanted)} as set", "as set", not wrong,
         "restart the vehicle",
     )  # fmt: skip
 
 
-def check_pose_rate(ground: Ground) -> Check:
-    least = ground.mission.limits.pose.rate_min
-    first, last = ground.poses[0].time, ground.poses[-1].time
-    rate = (len(ground.poses) - 1) / (last - first) if last > first else 0.0
+def check_pose_rate(snapshot: PreflightSnapshot) -> Check:
+    least = snapshot.mission.limits.pose.rate_min
+    first, last = snapshot.poses[0].time, snapshot.poses[-1].time
+    rate = (len(snapshot.poses) - 1) / (last - first) if last > first else 0.0
     return Check(
         "pose rate", f"{rate:.0f} Hz", f"≥ {least:.0f} Hz", rate >= least, "are all markers seen, is the body tracked?"
     )
 
 
-def check_pose_age(ground: Ground) -> Check:
-    most = ground.mission.limits.pose.age_warning
+def check_pose_age(snapshot: PreflightSnapshot) -> Check:
+    most = snapshot.mission.limits.pose.age_warning
     return Check(
-        "pose age", f"{ground.pose_age * 1e3:.0f} ms", f"≤ {most * 1e3:.0f} ms", ground.pose_age <= most,
+        "pose age", f"{snapshot.pose_age * 1e3:.0f} ms", f"≤ {most * 1e3:.0f} ms", snapshot.pose_age <= most,
         "look at the network between motion capture and this computer",
     )  # fmt: skip
 
 
-def check_agreement(ground: Ground) -> Check:
-    most = ground.mission.limits.pose.agreement
-    distance = math.dist(ground.estimate.position, ground.poses[-1].position)
+def check_agreement(snapshot: PreflightSnapshot) -> Check:
+    most = snapshot.mission.limits.pose.agreement
+    distance = math.dist(snapshot.estimate.position, snapshot.poses[-1].position)
     return Check(
         "estimate against pose", f"{distance * 1e3:.0f} mm", f"≤ {most * 1e3:.0f} mm", distance <= most,
         "is the tracked body this vehicle, and are poses in metres with z up?",
     )  # fmt: skip
 
 
-def check_yaw_agreement(ground: Ground) -> Check:
-    most = ground.mission.limits.pose.yaw_agreement
-    apart = yaw_of(ground.estimate.quaternion) - yaw_of(ground.poses[-1].quaternion)
+def check_yaw_agreement(snapshot: PreflightSnapshot) -> Check:
+    most = snapshot.mission.limits.pose.yaw_agreement
+    apart = yaw_of(snapshot.estimate.quaternion) - yaw_of(snapshot.poses[-1].quaternion)
     apart = abs(math.remainder(apart, math.tau))
     return Check(
         "yaw against pose", f"{math.degrees(apart):.1f}°", f"≤ {math.degrees(most):.1f}°", apart <= most,
@@ -150,18 +150,18 @@ def check_yaw_agreement(ground: Ground) -> Check:
     )  # fmt: skip
 
 
-def check_variance(ground: Ground) -> Check:
-    worst = max(ground.variance)
+def check_variance(snapshot: PreflightSnapshot) -> Check:
+    worst = max(snapshot.variance)
     return Check(
         "estimator deviation", f"{math.sqrt(max(worst, 0.0)) * 1e3:.0f} mm",
         f"≤ {math.sqrt(LARGEST_VARIANCE) * 1e3:.0f} mm", worst <= LARGEST_VARIANCE, "let the vehicle stand still",
     )  # fmt: skip
 
 
-def check_start_place(ground: Ground) -> Check:
+def check_start_place(snapshot: PreflightSnapshot) -> Check:
     """The column above the vehicle, up to the take-off height, must be inside the space."""
-    space, (x, y, _) = ground.mission.limits.space, ground.poses[-1].position
-    beyond = space.beyond((x, y, ground.mission.take_off_height))
+    space, (x, y, _) = snapshot.mission.limits.space, snapshot.poses[-1].position
+    beyond = space.beyond((x, y, snapshot.mission.take_off_height))
     worst = float(np.max(beyond))
     return Check(
         "place of take-off", f"({x:.2f}, {y:.2f}) m, {-worst:.2f} m inside", "inside the space less its margin",
@@ -169,11 +169,11 @@ def check_start_place(ground: Ground) -> Check:
     )  # fmt: skip
 
 
-def check_plan_inside(ground: Ground) -> Check:
+def check_plan_inside(snapshot: PreflightSnapshot) -> Check:
     """Each setpoint and each stop; all of them on the path or within rounding of it."""
-    space = ground.mission.limits.space
-    planned = decode(ground.mission.payloads).position
-    stops = decode(ground.mission.stops.reshape(-1, ground.mission.stops.shape[-1])).position
+    space = snapshot.mission.limits.space
+    planned = decode(snapshot.mission.payloads).position
+    stops = decode(snapshot.mission.stops.reshape(-1, snapshot.mission.stops.shape[-1])).position
     worst = max(float(np.max(space.beyond(planned))), float(np.max(space.beyond(stops))))
     return Check(
         "plan and stops in the space", f"{-worst:.3f} m inside", "inside the space less its margin",
@@ -181,18 +181,18 @@ def check_plan_inside(ground: Ground) -> Check:
     )  # fmt: skip
 
 
-def check_waking(ground: Ground) -> Check:
-    most = ground.mission.limits.lateness
-    how = "by SCHED_FIFO" if ground.uses_fifo_scheduling else "without SCHED_FIFO"
+def check_waking(snapshot: PreflightSnapshot) -> Check:
+    most = snapshot.mission.limits.lateness
+    how = "by SCHED_FIFO" if snapshot.uses_fifo_scheduling else "without SCHED_FIFO"
     return Check(
-        "this computer's lateness", f"p99 {ground.waking.p99 * 1e3:.1f} ms {how}", f"≤ {most * 1e3:.0f} ms",
-        ground.waking.p99 <= most,
+        "this computer's lateness", f"p99 {snapshot.waking.p99 * 1e3:.1f} ms {how}", f"≤ {most * 1e3:.0f} ms",
+        snapshot.waking.p99 <= most,
         "close what else runs on this computer"
-        + ("" if ground.uses_fifo_scheduling else "; see `cfplan doctor` on priority"),
+        + ("" if snapshot.uses_fifo_scheduling else "; see `cfplan doctor` on priority"),
     )  # fmt: skip
 
 
-CHECKS: tuple[Callable[[Ground], Check], ...] = (
+CHECKS: tuple[Callable[[PreflightSnapshot], Check], ...] = (
     check_protocol,
     check_firmware,
     check_round_trip,

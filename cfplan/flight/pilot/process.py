@@ -128,7 +128,7 @@ def _signals_ignored():
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
-class Orders:
+class OrderReceiver:
     """What the main process tells the pilot, read by a thread; `gone` when there is no main process any more."""
 
     def __init__(self, connection: Connection):
@@ -161,7 +161,7 @@ def _run(
         os.setsid()  # the terminal's signals are the main process's affair
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
         signal.signal(number, signal.SIG_IGN)
-    orders, report = Orders(orders_connection), Reporter(telemetry)
+    orders, report = OrderReceiver(orders_connection), Reporter(telemetry)
     signal.signal(signal.SIGTERM, lambda *_: orders.give(Order.LAND))
     logging.getLogger("cflib").setLevel(logging.CRITICAL)  # what matters is reported as telemetry
     warnings.filterwarnings("ignore", module="cflib")

@@ -12,7 +12,7 @@ from typing import Any
 from cfplan.errors import LinkError
 from cfplan.flight.radio.crazyradio import usb_hint
 from cfplan.flight.radio.link import Link
-from cfplan.flight.radio.radio_lock import claim
+from cfplan.flight.radio.radio_lock import lock_radio
 from cfplan.flight.radio.uri import EXAMPLES
 from cfplan.flight.telemetry import Telemetry
 
@@ -44,7 +44,7 @@ def connect(
         if driver not in crtp.CLASSES:
             crtp.CLASSES.insert(0, driver)
 
-    claimed = claim(uri)
+    lock = lock_radio(uri)
     set_retries_before_disconnect(_RETRIES)
     answered, complete, failed = threading.Event(), threading.Event(), threading.Event()
     reasons: list[str] = []
@@ -77,13 +77,13 @@ def connect(
             raise LinkError("the vehicle answers, but its tables do not come through", where=uri,
                             hint="move closer, or choose a freer channel")  # fmt: skip
     except BaseException:
-        if claimed is not None:
-            claimed.close()
+        if lock is not None:
+            lock.close()
         threading.Thread(target=crazyflie.close_link, daemon=True).start()
         raise
 
     link = Link(crazyflie, uri, report)
-    link.claim = claimed
+    link.radio_lock = lock
 
     def note_loss(_: str, reason: str = "the link was closed") -> None:
         link.lost = link.lost or reason

@@ -56,7 +56,7 @@ class Link:
         self.replies: dict[int, int] = {}
         # command of the on-board commander: the code that it answered, 0 for done
         self.firmware = ""
-        self.claim: Any = None
+        self.radio_lock: Any = None
         # keeps others from the radio until it is closed
         self._variance_block: Any = None
         self._log_zero, self._log_heard = math.inf, 0.0
@@ -198,8 +198,8 @@ class Link:
         closing = threading.Thread(target=self._crazyflie.close_link, daemon=True)
         closing.start()
         closing.join(timeout=2.0)
-        if self.claim is not None:
-            self.claim.close()
+        if self.radio_lock is not None:
+            self.radio_lock.close()
 
     # What comes in: these run in cflib's thread and must be quick.
 

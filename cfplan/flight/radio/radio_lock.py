@@ -11,10 +11,10 @@ from cfplan.errors import LinkError
 _EXCLUSIVE = ("radio://", "usb://", "udp://")
 
 
-def claim(uri: str) -> IO[str] | None:
+def lock_radio(uri: str) -> IO[str] | None:
     """Keep others away until it is closed or this process ends. Raises LinkError where another is there already.
 
-    None for a vehicle that nothing else can reach, or where no claim can be written.
+    None for a vehicle that nothing else can reach, or where no lock can be written.
     """
     if not uri.startswith(_EXCLUSIVE):
         return None

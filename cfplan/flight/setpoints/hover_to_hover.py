@@ -13,7 +13,9 @@ from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
 from cfplan.flight.telemetry import Triple
 
 
-def encode_transfer(begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float, rate: float) -> NDArray:
+def encode_hover_to_hover(
+    begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float, rate: float
+) -> NDArray:
     """(N, 29) uint8 at `rate`, Hz: straight from `begin` to `end`, m, in `duration`, s, turning the shorter way."""
     share = np.linspace(0.0, 1.0, max(round(duration * rate), 1) + 1)
     along = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)

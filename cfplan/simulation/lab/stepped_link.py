@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from cfplan.errors import LinkError
-from cfplan.flight.mocap.frames import Body, Frame
+from cfplan.flight.mocap.frames import Frame, TrackedBody
 from cfplan.flight.mocap.source import MocapSource
 from cfplan.flight.mocap.uri import parse_uri
 from cfplan.flight.radio.connection import PATIENCE
@@ -152,9 +152,9 @@ class SteppedPoses(MocapSource):
                 if shown.pose is None:
                     hidden.append(shown.name)
                 else:
-                    bodies.append(Body(shown.name, *shown.pose))
+                    bodies.append(TrackedBody(shown.name, *shown.pose))
             frame = Frame(received, tuple(bodies), tuple(hidden), picture.number, picture.rate, picture.latency)
-            pose = self._sort(frame)
+            pose = self._classify(frame)
             if pose is not None:
                 found.append(pose)
         return found

@@ -41,7 +41,7 @@ _UPPER = np.linalg.inv(
 _ORDERS = np.arange(8)
 
 
-class Planner(Enum):
+class PlannerState(Enum):
     """What the planner does."""
 
     IDLE = auto()
@@ -120,7 +120,7 @@ class HighLevelCommander:
     """Carries out commands one at a time; from idle a curve starts `where` the vehicle believes that it is."""
 
     def __init__(self, memory: bytearray, where: Callable[[], Goal]):
-        self.state = Planner.IDLE
+        self.state = PlannerState.IDLE
         self._where = where
         self._memory = memory
         self._pieces: list[_Piece] = []
@@ -131,7 +131,7 @@ class HighLevelCommander:
 
     def stop(self) -> None:
         """Go idle at once."""
-        self.state = Planner.IDLE
+        self.state = PlannerState.IDLE
 
     def finished(self, time: float) -> bool:
         """Whether the last curve has been flown to its end."""
@@ -139,9 +139,9 @@ class HighLevelCommander:
 
     def setpoint(self, time: float) -> Setpoint:
         """What to do now, asked every 10 ms."""
-        if self.state is Planner.LANDING and self.finished(time):
-            self.state = Planner.IDLE
-        if self.state is Planner.IDLE:
+        if self.state is PlannerState.LANDING and self.finished(time):
+            self.state = PlannerState.IDLE
+        if self.state is PlannerState.IDLE:
             return Setpoint()
         with np.errstate(all="ignore"):  # what a client sends may be no number
             goal = self._goal(time)
@@ -192,7 +192,7 @@ class HighLevelCommander:
         return group == 0 or bool(group & self._group_mask)
 
     def _move(self, command: int, data: bytes, time: float) -> int:
-        if self.state is Planner.IDLE:
+        if self.state is PlannerState.IDLE:
             self._last = self._where()
         if command in (_TAKE_OFF, _LAND):
             _, height, duration = unpack("<Bff", data)
@@ -213,14 +213,14 @@ class HighLevelCommander:
         return self._start(number, relative, relative_yaw, backwards, scale, time)
 
     def _climb(self, landing: bool, height: float, yaw: float, duration: float, time: float) -> int:
-        if self.state is Planner.LANDING if landing else self.state is not Planner.IDLE:
+        if self.state is PlannerState.LANDING if landing else self.state is not PlannerState.IDLE:
             return _PLANNER_BUSY
         target = self._last.position.copy()
         target[2] = height
         return self._fly(_at_rest(self._last.position), target, yaw, duration, time, landing=landing)
 
     def _go_to(self, relative: bool, linear: bool, place: NDArray, duration: float, time: float) -> int:
-        here = self._last if self.state is Planner.IDLE else self._goal(time)
+        here = self._last if self.state is PlannerState.IDLE else self._goal(time)
         target = place + here.position if relative else place.copy()
         if linear:
             distance = target - here.position
@@ -229,7 +229,7 @@ class HighLevelCommander:
             still = np.zeros(4)
             here = Goal(here.position, steady, still, still)
             end = Goal(here.position + distance, steady, still, still)
-            return self._begin_at(septic(max(duration, 1e-3), here, end), time, Planner.FLYING)
+            return self._begin_at(septic(max(duration, 1e-3), here, end), time, PlannerState.FLYING)
         return self._fly(here, target, target[3], duration, time, landing=False)
 
     def _fly(self, here: Goal, target: NDArray, yaw: float, duration: float, time: float, *, landing: bool) -> int:
@@ -238,9 +238,9 @@ class HighLevelCommander:
         end = target.copy()
         end[3] = start[3] + _wrapped(yaw - start[3])
         curve = septic(max(duration, 1e-3), Goal(start, here.velocity, here.acceleration, here.jerk), _at_rest(end))
-        return self._begin_at(curve, time, Planner.LANDING if landing else Planner.FLYING)
+        return self._begin_at(curve, time, PlannerState.LANDING if landing else PlannerState.FLYING)
 
-    def _begin_at(self, curve: _Piece, time: float, state: Planner) -> int:
+    def _begin_at(self, curve: _Piece, time: float, state: PlannerState) -> int:
         self._pieces, self._begin, self.state = [curve], time, state
         return 0
 
@@ -266,7 +266,7 @@ class HighLevelCommander:
             shift = self._last.position - pieces[0].coefficients[0]
             shift[3] = _wrapped(shift[3]) if relative_yaw else 0.0
             pieces = [piece.moved(shift) for piece in pieces]
-        self._pieces, self._begin, self.state = pieces, time, Planner.FLYING
+        self._pieces, self._begin, self.state = pieces, time, PlannerState.FLYING
         return 0
 
 

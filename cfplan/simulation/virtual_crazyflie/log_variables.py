@@ -34,7 +34,7 @@ def euler(quaternion: NDArray) -> tuple[float, float, float]:
     return float(np.degrees(roll)), float(np.degrees(pitch)), float(np.degrees(yaw))
 
 
-def getters(vehicle: "VirtualCrazyflie") -> Mapping[str, Getter]:
+def log_variables(vehicle: "VirtualCrazyflie") -> Mapping[str, Getter]:
     """A function for each log variable that is alive; the others stay zero."""
     loop = vehicle.stabilizer.loop
     belief, kalman = loop.belief, loop.kalman

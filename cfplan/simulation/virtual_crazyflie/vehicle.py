@@ -25,10 +25,10 @@ from cfplan.simulation.virtual_crazyflie.defaults import (
     PRIOR_PARAMETERS,
 )
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
-from cfplan.simulation.virtual_crazyflie.high_level import Goal, HighLevelCommander, Planner
+from cfplan.simulation.virtual_crazyflie.high_level import Goal, HighLevelCommander, PlannerState
 from cfplan.simulation.virtual_crazyflie.localization import Localization
 from cfplan.simulation.virtual_crazyflie.log_blocks import DATA_CHANNEL, LogBlocks
-from cfplan.simulation.virtual_crazyflie.log_variables import getters
+from cfplan.simulation.virtual_crazyflie.log_variables import log_variables
 from cfplan.simulation.virtual_crazyflie.parameters import Parameters
 from cfplan.simulation.virtual_crazyflie.services import Memories, answer_link, answer_platform
 from cfplan.simulation.virtual_crazyflie.setpoints import AttitudeSetpoints, FirmwareAssert, Setpoint, decode_setpoint
@@ -82,7 +82,7 @@ class VirtualCrazyflie:
         self._out: list[bytes] = []
         self._answers: list[tuple[int, bytes]] = []
         # to writes of parameters, with the tick from which on they may leave
-        self.log = LogBlocks(getters(self))
+        self.log = LogBlocks(log_variables(self))
         self._airframe = airframe
         self._faults: list[tuple[int, float, VehicleFault]] = []
         # with the ticks of their begin and end
@@ -155,7 +155,7 @@ class VirtualCrazyflie:
     def info(self) -> int:
         """The bits of supervisor.info."""
         return self.supervisor.info(
-            planner_active=self.planner.state is not Planner.IDLE,
+            planner_active=self.planner.state is not PlannerState.IDLE,
             planner_finished=self.planner.finished(self.tick / 1000),
         )
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from cfplan.flight.mocap.frames import Body
-from cfplan.flight.mocap.pose_classifier import Sorter, Verdict
+from cfplan.flight.mocap.frames import TrackedBody
+from cfplan.flight.mocap.pose_classifier import PoseClassifier, Verdict
 
 PERIOD, JUMP = 0.01, 0.15
 RADIUS, SPEED = 1.0, 2.0  # m, m/s of the circle that is flown
@@ -18,77 +18,80 @@ def flown(t, *, offset=(0.0, 0.0, 0.0), turned=0.0):
     angle = SPEED / RADIUS * t
     position = np.array([RADIUS * math.cos(angle), RADIUS * math.sin(angle), 1.0]) + noise + offset
     yaw = angle + math.pi / 2 + turned
-    return Body("cf1", tuple(position.tolist()), (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
+    return TrackedBody("cf1", tuple(position.tolist()), (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
 
 
-def sorter_after(seconds=0.5):
-    """A sorter that has seen good poses for a while, and the time of the next."""
-    sorter, steps = Sorter(JUMP), round(seconds / PERIOD)
+def classifier_after(seconds=0.5):
+    """A classifier that has seen good poses for a while, and the time of the next."""
+    classifier, steps = PoseClassifier(JUMP), round(seconds / PERIOD)
     for i in range(steps):
-        assert sorter.sort(i * PERIOD, flown(i * PERIOD), i) is Verdict.GOOD
-    return sorter, steps
+        assert classifier.classify(i * PERIOD, flown(i * PERIOD), i) is Verdict.GOOD
+    return classifier, steps
 
 
 def test_fast_flight_with_noise_is_good_throughout():
-    sorter, _ = sorter_after(4.0)
-    assert sorter.counts == {Verdict.GOOD: 400}
+    classifier, _ = classifier_after(4.0)
+    assert classifier.counts == {Verdict.GOOD: 400}
 
 
 @pytest.mark.parametrize("gap", [0.05, 0.1, 0.2, 0.3])
 def test_flight_goes_on_after_an_occlusion(gap):
-    sorter, i = sorter_after()
+    classifier, i = classifier_after()
     hidden = round(gap / PERIOD)
     for k in range(i, i + hidden):
-        assert sorter.sort(k * PERIOD, None, k) is Verdict.OCCLUDED
-    assert sorter.sort((i + hidden) * PERIOD, flown((i + hidden) * PERIOD), i + hidden) is Verdict.GOOD
+        assert classifier.classify(k * PERIOD, None, k) is Verdict.OCCLUDED
+    assert classifier.classify((i + hidden) * PERIOD, flown((i + hidden) * PERIOD), i + hidden) is Verdict.GOOD
 
 
 def test_a_body_sent_as_zeros_is_occluded():
-    sorter, i = sorter_after()
-    assert sorter.sort(i * PERIOD, Body("cf1", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), i) is Verdict.OCCLUDED
+    classifier, i = classifier_after()
+    assert (
+        classifier.classify(i * PERIOD, TrackedBody("cf1", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), i)
+        is Verdict.OCCLUDED
+    )
 
 
 def test_the_same_frame_again_is_repeated():
-    sorter, i = sorter_after()
-    assert sorter.sort((i - 1) * PERIOD, flown((i - 1) * PERIOD), i - 1) is Verdict.REPEATED
+    classifier, i = classifier_after()
+    assert classifier.classify((i - 1) * PERIOD, flown((i - 1) * PERIOD), i - 1) is Verdict.REPEATED
 
 
 @pytest.mark.parametrize("numbers", [True, False], ids=["numbered", "without numbers"])
 def test_new_frames_with_the_old_pose_are_frozen(numbers):
-    sorter, i = sorter_after()
+    classifier, i = classifier_after()
     stuck = flown((i - 1) * PERIOD)
     for k in range(i, i + 50):
-        assert sorter.sort(k * PERIOD, stuck, k if numbers else None) is Verdict.FROZEN
+        assert classifier.classify(k * PERIOD, stuck, k if numbers else None) is Verdict.FROZEN
 
 
 @pytest.mark.parametrize("size", [0.3, 1.0, 20.0])
 @pytest.mark.parametrize("lasting", [0.05, 0.5, 10.0])
 def test_a_jump_is_not_believed_however_long_and_its_end_is_good(size, lasting):
-    sorter, i = sorter_after()
+    classifier, i = classifier_after()
     end = i + round(lasting / PERIOD)
     for k in range(i, end):
-        assert sorter.sort(k * PERIOD, flown(k * PERIOD, offset=(size, 0, 0)), k) is Verdict.JUMPED
-    after = [sorter.sort(k * PERIOD, flown(k * PERIOD), k) for k in range(end, end + 10)]
+        assert classifier.classify(k * PERIOD, flown(k * PERIOD, offset=(size, 0, 0)), k) is Verdict.JUMPED
+    after = [classifier.classify(k * PERIOD, flown(k * PERIOD), k) for k in range(end, end + 10)]
     assert after[-1] is Verdict.GOOD
 
 
 @pytest.mark.parametrize("angle", [math.pi, math.pi / 2, -2.0])
 @pytest.mark.parametrize("lasting", [0.05, 0.5, 10.0])
 def test_a_flip_is_not_believed_however_long(angle, lasting):
-    sorter, i = sorter_after()
+    classifier, i = classifier_after()
     for k in range(i, i + round(lasting / PERIOD)):
-        assert sorter.sort(k * PERIOD, flown(k * PERIOD, turned=angle), k) is Verdict.FLIPPED
+        assert classifier.classify(k * PERIOD, flown(k * PERIOD, turned=angle), k) is Verdict.FLIPPED
 
 
 def test_a_single_outlier_costs_only_itself():
-    sorter, i = sorter_after()
-    assert sorter.sort(i * PERIOD, flown(i * PERIOD, offset=(0.16, 0, 0)), i) is Verdict.JUMPED
-    assert sorter.sort((i + 1) * PERIOD, flown((i + 1) * PERIOD), i + 1) is Verdict.GOOD
+    classifier, i = classifier_after()
+    assert classifier.classify(i * PERIOD, flown(i * PERIOD, offset=(0.16, 0, 0)), i) is Verdict.JUMPED
+    assert classifier.classify((i + 1) * PERIOD, flown((i + 1) * PERIOD), i + 1) is Verdict.GOOD
 
 
 def test_a_body_carried_elsewhere_is_believed_after_a_while():
-    sorter, i = sorter_after()
-    verdicts = [sorter.sort(k * PERIOD, flown(k * PERIOD, offset=(5, 0, 0)), k) for k in range(i, i + 3100)]
+    classifier, i = classifier_after()
+    verdicts = [classifier.classify(k * PERIOD, flown(k * PERIOD, offset=(5, 0, 0)), k) for k in range(i, i + 3100)]
     assert verdicts[0] is Verdict.JUMPED
     assert verdicts[2990] is Verdict.JUMPED
     assert verdicts[-1] is Verdict.GOOD
@@ -97,30 +100,30 @@ def test_a_body_carried_elsewhere_is_believed_after_a_while():
 @pytest.mark.parametrize(
     "body",
     [
-        Body("cf1", (math.nan, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)),
-        Body("cf1", (1.0, math.inf, 1.0), (0.0, 0.0, 0.0, 1.0)),
-        Body("cf1", (1.0, 0.0, 1.0), (math.nan, 0.0, 0.0, 1.0)),
-        Body("cf1", (1.0, 0.0, 1.0), (0.0, 0.0, 0.0, 0.0)),
-        Body("cf1", (1.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.1)),
+        TrackedBody("cf1", (math.nan, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0)),
+        TrackedBody("cf1", (1.0, math.inf, 1.0), (0.0, 0.0, 0.0, 1.0)),
+        TrackedBody("cf1", (1.0, 0.0, 1.0), (math.nan, 0.0, 0.0, 1.0)),
+        TrackedBody("cf1", (1.0, 0.0, 1.0), (0.0, 0.0, 0.0, 0.0)),
+        TrackedBody("cf1", (1.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.1)),
     ],
 )
 def test_what_is_no_pose_is_broken_and_forgotten(body):
-    sorter, i = sorter_after()
-    assert sorter.sort(i * PERIOD, body, i) is Verdict.BROKEN
-    assert sorter.sort((i + 1) * PERIOD, flown((i + 1) * PERIOD), i + 1) is Verdict.GOOD
-    assert sorter.counts[Verdict.BROKEN] == 1
+    classifier, i = classifier_after()
+    assert classifier.classify(i * PERIOD, body, i) is Verdict.BROKEN
+    assert classifier.classify((i + 1) * PERIOD, flown((i + 1) * PERIOD), i + 1) is Verdict.GOOD
+    assert classifier.counts[Verdict.BROKEN] == 1
 
 
 @pytest.mark.parametrize("gap", [0.8, 1.2])
 def test_a_vehicle_that_turned_while_it_was_not_seen_is_told_from_a_pattern_turned_over(gap):
     for turned, expected in ((0.0, Verdict.GOOD), (math.pi, Verdict.FLIPPED)):
-        sorter, i = sorter_after()
+        classifier, i = classifier_after()
         k = i + round(gap / PERIOD)
-        sorter.attitude = flown(k * PERIOD).quaternion
-        assert sorter.sort(k * PERIOD, flown(k * PERIOD, turned=turned), k) is expected
+        classifier.attitude = flown(k * PERIOD).quaternion
+        assert classifier.classify(k * PERIOD, flown(k * PERIOD, turned=turned), k) is expected
 
 
 def test_without_the_vehicles_word_a_large_turn_is_not_believed():
-    sorter, i = sorter_after()
+    classifier, i = classifier_after()
     k = i + 120
-    assert sorter.sort(k * PERIOD, flown(k * PERIOD), k) is Verdict.FLIPPED
+    assert classifier.classify(k * PERIOD, flown(k * PERIOD), k) is Verdict.FLIPPED

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from cfplan.flight.mocap.pose_gate import Freshness
+from cfplan.flight.mocap.pose_gate import PoseGate
 from cfplan.flight.mocap.poses import Pose
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -16,7 +16,7 @@ def pose(time, x=0.0, quaternion=LEVEL):
 
 @pytest.fixture
 def freshness():
-    judge = Freshness(jump=0.1)
+    judge = PoseGate(jump=0.1)
     assert not judge.fault(pose(1.0))
     return judge
 

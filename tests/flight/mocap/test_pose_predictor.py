@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cfplan.flight.mocap.pose_predictor import FARTHEST, Forecast
+from cfplan.flight.mocap.pose_predictor import FARTHEST, PosePredictor
 from cfplan.flight.mocap.poses import Pose
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -13,7 +13,7 @@ _TIMES = tuple(np.arange(20) * 0.01)
 
 
 def filled(place, times=_TIMES):
-    forecast = Forecast()
+    forecast = PosePredictor()
     for time in times:
         forecast.add(Pose(time, time, place(time), LEVEL))
     return forecast

@@ -6,7 +6,7 @@ import pytest
 
 from cfplan.errors import ExitCode
 from cfplan.flight.mocap.poses import Pose
-from cfplan.flight.pilot.abort_monitor import Seen, Watch
+from cfplan.flight.pilot.abort_monitor import AbortMonitor, Observation
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.outcome import Deviation, Rung, settle_time
 from cfplan.flight.telemetry import Estimate, VehicleStatus
@@ -16,37 +16,37 @@ STILL = (0.0, 0.0, 0.0)
 HERE = (0.0, 0.0, 1.0)
 
 
-def seen(now=10.0, place=HERE, age=0.01, velocity=STILL, rate=STILL, voltage=3.9, bits=0, **changes):
+def observation(now=10.0, place=HERE, age=0.01, velocity=STILL, rate=STILL, voltage=3.9, bits=0, **changes):
     pose = Pose(now - age, now, place, LEVEL)
     estimate = Estimate(now, place, velocity, STILL, LEVEL)
     status = VehicleStatus(now, rate, (0, 0, 0, 0), voltage, bits)
-    return Seen(now, pose=pose, estimate=estimate, status=status, **changes)
+    return Observation(now, pose=pose, estimate=estimate, status=status, **changes)
 
 
-def rung(watch, what):
-    trip = watch.gravest(what)
-    return trip.rung if trip is not None else Rung.NONE
+def rung(monitor, what):
+    abort = monitor.gravest(what)
+    return abort.rung if abort is not None else Rung.NONE
 
 
 @pytest.fixture
-def watch(limits):
-    return Watch(limits)
+def monitor(limits):
+    return AbortMonitor(limits)
 
 
-def test_a_good_flight_gives_no_reason(watch):
-    assert watch.gravest(seen(wanted=HERE)) is None
+def test_a_good_flight_gives_no_reason(monitor):
+    assert monitor.gravest(observation(wanted=HERE)) is None
 
 
 @pytest.mark.parametrize(("age", "expected"), [(0.1, Rung.NONE), (0.2, Rung.BRAKE), (0.6, Rung.LAND)])
-def test_old_poses_brake_and_then_land(watch, age, expected):
-    assert rung(watch, seen(age=age)) is expected
+def test_old_poses_brake_and_then_land(monitor, age, expected):
+    assert rung(monitor, observation(age=age)) is expected
 
 
 @pytest.mark.parametrize(
     ("off", "expected"), [(0.29, Rung.NONE), (0.31, Rung.BRAKE), (0.61, Rung.LAND), (1.01, Rung.CUT)]
 )
-def test_deviation_climbs_the_ladder(watch, off, expected):
-    assert rung(watch, seen(wanted=(off, 0.0, 1.0))) is expected
+def test_deviation_climbs_the_ladder(monitor, off, expected):
+    assert rung(monitor, observation(wanted=(off, 0.0, 1.0))) is expected
 
 
 @pytest.mark.parametrize(
@@ -59,75 +59,75 @@ def test_deviation_climbs_the_ladder(watch, off, expected):
         ((0.0, 0.0, 0.02), Rung.NONE),
     ],
 )
-def test_the_fence_has_walls_and_a_ceiling_but_no_floor(watch, place, expected):
-    assert rung(watch, seen(place=place)) is expected
+def test_the_fence_has_walls_and_a_ceiling_but_no_floor(monitor, place, expected):
+    assert rung(monitor, observation(place=place)) is expected
 
 
-def test_a_speed_counts_only_when_it_lasts(watch):
+def test_a_speed_counts_only_when_it_lasts(monitor):
     fast = (3.5, 0.0, 0.0)
-    assert rung(watch, seen(now=10.0, velocity=fast)) is Rung.NONE
-    assert rung(watch, seen(now=10.05, velocity=fast)) is Rung.NONE
-    assert rung(watch, seen(now=10.11, velocity=fast)) is Rung.BRAKE
+    assert rung(monitor, observation(now=10.0, velocity=fast)) is Rung.NONE
+    assert rung(monitor, observation(now=10.05, velocity=fast)) is Rung.NONE
+    assert rung(monitor, observation(now=10.11, velocity=fast)) is Rung.BRAKE
 
 
-def test_a_single_noisy_value_is_forgotten(watch):
+def test_a_single_noisy_value_is_forgotten(monitor):
     fast = (3.5, 0.0, 0.0)
-    assert rung(watch, seen(now=10.0, velocity=fast)) is Rung.NONE
-    assert rung(watch, seen(now=10.05)) is Rung.NONE
-    assert rung(watch, seen(now=10.14, velocity=fast)) is Rung.NONE
+    assert rung(monitor, observation(now=10.0, velocity=fast)) is Rung.NONE
+    assert rung(monitor, observation(now=10.05)) is Rung.NONE
+    assert rung(monitor, observation(now=10.14, velocity=fast)) is Rung.NONE
 
 
-def test_a_body_rate_beyond_the_limit_that_lasts_brakes(watch):
+def test_a_body_rate_beyond_the_limit_that_lasts_brakes(monitor):
     for now in (10.0, 10.06, 10.12):
-        last = rung(watch, seen(now=now, rate=(0.0, 12.0, 0.0)))
+        last = rung(monitor, observation(now=now, rate=(0.0, 12.0, 0.0)))
     assert last is Rung.BRAKE
 
 
 @pytest.mark.parametrize("broken", [{"velocity": (math.nan, 0.0, 0.0)}, {"rate": (0.0, 0.0, math.nan)}])
-def test_a_measurement_that_is_no_number_lands_when_it_lasts(watch, broken):
-    assert rung(watch, seen(now=10.0, **broken)) is Rung.NONE
-    assert rung(watch, seen(now=10.2, **broken)) is Rung.LAND
+def test_a_measurement_that_is_no_number_lands_when_it_lasts(monitor, broken):
+    assert rung(monitor, observation(now=10.0, **broken)) is Rung.NONE
+    assert rung(monitor, observation(now=10.2, **broken)) is Rung.LAND
 
 
-def test_a_voltage_dip_is_averaged_away_and_an_empty_battery_is_not(watch):
+def test_a_voltage_dip_is_averaged_away_and_an_empty_battery_is_not(monitor):
     for step in range(100):
-        assert rung(watch, seen(now=10.0 + step / 100)) is Rung.NONE
+        assert rung(monitor, observation(now=10.0 + step / 100)) is Rung.NONE
     for step in range(30):
-        assert rung(watch, seen(now=11.0 + step / 100, voltage=3.0)) is Rung.NONE
+        assert rung(monitor, observation(now=11.0 + step / 100, voltage=3.0)) is Rung.NONE
     for step in range(300):
-        last = rung(watch, seen(now=11.3 + step / 100, voltage=3.0))
+        last = rung(monitor, observation(now=11.3 + step / 100, voltage=3.0))
     assert last is Rung.LAND
 
 
 @pytest.mark.parametrize("bit", [5, 6, 7])
-def test_a_vehicle_that_is_out_of_control_is_cut(watch, bit):
-    assert rung(watch, seen(bits=1 << bit)) is Rung.CUT
+def test_a_vehicle_that_is_out_of_control_is_cut(monitor, bit):
+    assert rung(monitor, observation(bits=1 << bit)) is Rung.CUT
 
 
-def test_an_estimate_that_leaves_the_poses_brakes(watch):
-    what = seen()
+def test_an_estimate_that_leaves_the_poses_brakes(monitor):
+    what = observation()
     what.estimate = Estimate(10.0, (0.2, 0.0, 1.0), STILL, STILL, LEVEL)
-    assert rung(watch, what) is Rung.BRAKE
+    assert rung(monitor, what) is Rung.BRAKE
 
 
-def test_a_setpoint_far_too_late_brakes(watch):
-    assert rung(watch, seen(late=0.2)) is Rung.NONE
-    assert rung(watch, seen(late=0.3)) is Rung.BRAKE
+def test_a_setpoint_far_too_late_brakes(monitor):
+    assert rung(monitor, observation(late=0.2)) is Rung.NONE
+    assert rung(monitor, observation(late=0.3)) is Rung.BRAKE
 
 
-def test_no_pose_at_all_lands(watch):
-    assert rung(watch, Seen(10.0)) is Rung.LAND
+def test_no_pose_at_all_lands(monitor):
+    assert rung(monitor, Observation(10.0)) is Rung.LAND
 
 
-def test_the_operators_reason_is_told_before_others_of_its_rung(watch):
-    trip = watch.gravest(seen(order=Order.LAND, main_gone=True, age=0.6))
-    assert trip.exit_code is ExitCode.ENDED_BY_PILOT
+def test_the_operators_reason_is_told_before_others_of_its_rung(monitor):
+    abort = monitor.gravest(observation(order=Order.LAND, main_gone=True, age=0.6))
+    assert abort.exit_code is ExitCode.ENDED_BY_PILOT
 
 
-def test_the_gravest_reason_wins(watch):
-    trip = watch.gravest(seen(order=Order.LAND, bits=1 << 6))
-    assert trip.rung is Rung.CUT
-    assert "locked" in trip.text
+def test_the_gravest_reason_wins(monitor):
+    abort = monitor.gravest(observation(order=Order.LAND, bits=1 << 6))
+    assert abort.rung is Rung.CUT
+    assert "locked" in abort.text
 
 
 def test_deviation_is_summed_up():

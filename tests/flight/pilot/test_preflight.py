@@ -7,7 +7,7 @@ import pytest
 
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.deadlines import Lateness
-from cfplan.flight.pilot.preflight import Ground, run_checks
+from cfplan.flight.pilot.preflight import PreflightSnapshot, run_checks
 from cfplan.flight.radio.supervisor_bits import CAN_FLY, FLYING, LOCKED, TUMBLED
 from cfplan.flight.telemetry import Estimate, VehicleStatus
 
@@ -26,7 +26,7 @@ def poses(rate=100.0, place=PLACE, quaternion=LEVEL):
 
 @pytest.fixture
 def ground(mission):
-    return Ground(
+    return PreflightSnapshot(
         mission=mission,
         protocol=12,
         firmware="2026.08 (abcdef)",

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from cfplan.flight.pilot.keys import Order
-from cfplan.flight.pilot.process import Orders
+from cfplan.flight.pilot.process import OrderReceiver
 from cfplan.flight.pilot.reporter import Reporter
 from cfplan.flight.telemetry import Event, Level
 
@@ -79,7 +79,7 @@ def test_a_reader_that_is_gone_is_no_error(pipe):
 
 def test_the_gravest_order_stays(pipe):
     reader, writer = pipe
-    orders = Orders(reader)
+    orders = OrderReceiver(reader)
     for order in (Order.LAND, Order.CUT, Order.LAND):
         writer.send(order)
     wait_for(lambda: orders.worst is Order.CUT)
@@ -88,7 +88,7 @@ def test_the_gravest_order_stays(pipe):
 
 def test_a_main_process_that_ends_is_noticed(pipe):
     reader, writer = pipe
-    orders = Orders(reader)
+    orders = OrderReceiver(reader)
     writer.close()
     wait_for(lambda: orders.gone)
     assert orders.worst is None

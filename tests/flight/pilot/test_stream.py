@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cfplan.flight.pilot.deadlines import Lateness, Pace
+from cfplan.flight.pilot.deadlines import Deadlines, Lateness
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.setpoints.packets import decode
 
@@ -52,23 +52,23 @@ def test_the_reference_between_setpoints_is_between_them(payloads):
 
 def test_deadlines_do_not_drift_when_every_sleep_is_long():
     clock = Clock()
-    pace = Pace(100.0, clock, clock.sleep)
+    deadlines = Deadlines(100.0, clock, clock.sleep)
     clock.oversleep = 0.002
-    due = [pace.wait() for _ in range(500)]
+    due = [deadlines.wait() for _ in range(500)]
     assert due == pytest.approx(10.0 + np.arange(1, 501) / 100.0)
-    assert pace.skipped == 0
+    assert deadlines.skipped == 0
 
 
 def test_a_stall_skips_deadlines_and_keeps_the_schedule():
     clock = Clock()
-    pace = Pace(100.0, clock, clock.sleep)
-    pace.wait()
+    deadlines = Deadlines(100.0, clock, clock.sleep)
+    deadlines.wait()
     clock.now += 0.2
-    due = pace.wait()
+    due = deadlines.wait()
     assert due <= clock.now
     assert clock.now - due < 0.0101
     assert (due - 10.0) * 100.0 == pytest.approx(round((due - 10.0) * 100.0))
-    assert pace.skipped in (18, 19)
+    assert deadlines.skipped in (18, 19)
 
 
 def test_lateness_of_nothing_is_zero():

@@ -8,7 +8,7 @@ from cflib.crtp.exceptions import WrongUriType
 
 from cfplan.errors import LinkError
 from cfplan.flight.radio.connection import connect
-from cfplan.flight.radio.radio_lock import claim
+from cfplan.flight.radio.radio_lock import lock_radio
 
 
 class SilentDriver(CRTPDriver):
@@ -61,7 +61,7 @@ def test_a_radio_that_cannot_be_opened_says_what_to_do(reason, hint):
 
 def test_a_second_pilot_on_the_same_radio_is_refused_and_the_first_keeps_it(monkeypatch, tmp_path):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    first = claim("radio://0/80/2M/E7E7E7E7E7")
+    first = lock_radio("radio://0/80/2M/E7E7E7E7E7")
     assert first is not None
     for again in ("radio://0/80/2M/E7E7E7E7E7", "radio://0/90/1M/E7E7E7E701"):
         began = time.monotonic()
@@ -69,17 +69,17 @@ def test_a_second_pilot_on_the_same_radio_is_refused_and_the_first_keeps_it(monk
             connect(again, lambda message: None)
         assert time.monotonic() - began < 5.0
         assert caught.value.hint
-    other = claim("radio://1/80/2M/E7E7E7E7E7")
+    other = lock_radio("radio://1/80/2M/E7E7E7E7E7")
     assert other is not None
     other.close()
     first.close()
-    freed = claim("radio://0/80/2M/E7E7E7E7E7")
+    freed = lock_radio("radio://0/80/2M/E7E7E7E7E7")
     assert freed is not None
     freed.close()
 
 
-def test_what_nothing_else_can_reach_needs_no_claim():
-    assert claim("sim://0") is None
+def test_what_nothing_else_can_reach_needs_no_lock():
+    assert lock_radio("sim://0") is None
 
 
 @pytest.mark.parametrize(

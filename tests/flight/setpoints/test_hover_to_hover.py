@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cfplan.flight.setpoints.hover_to_hover import encode_transfer
+from cfplan.flight.setpoints.hover_to_hover import encode_hover_to_hover
 from cfplan.flight.setpoints.packets import decode
 
 BEGIN, END = (0.5, -1.0, 0.3), (-1.0, 2.0, 1.1)
@@ -11,7 +11,7 @@ BEGIN, END = (0.5, -1.0, 0.3), (-1.0, 2.0, 1.1)
 
 @pytest.fixture
 def told():
-    return decode(encode_transfer(BEGIN, 3.0, END, -3.0, 5.0, 100.0))
+    return decode(encode_hover_to_hover(BEGIN, 3.0, END, -3.0, 5.0, 100.0))
 
 
 def test_it_begins_and_ends_at_rest_where_it_should(told):
@@ -44,5 +44,5 @@ def test_it_turns_the_shorter_way(told):
 
 
 def test_a_transfer_to_the_same_place_hovers():
-    told = decode(encode_transfer(BEGIN, 0.0, BEGIN, 0.0, 1.5, 100.0))
+    told = decode(encode_hover_to_hover(BEGIN, 0.0, BEGIN, 0.0, 1.5, 100.0))
     assert np.ptp(told.position, axis=0) == pytest.approx([0.0, 0.0, 0.0])

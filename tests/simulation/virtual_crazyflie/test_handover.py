@@ -5,7 +5,7 @@ import struct
 import pytest
 
 from cfplan.simulation.virtual_crazyflie.commander import Priority
-from cfplan.simulation.virtual_crazyflie.high_level import Planner
+from cfplan.simulation.virtual_crazyflie.high_level import PlannerState
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.simulation.virtual_crazyflie.wire import Port
 
@@ -54,7 +54,7 @@ def test_streaming_takes_over_from_the_planner_without_a_gap(hovering):
     hovering.stream_hover(0.5)
     assert hovering.off_in_air == 0
     assert hovering.vehicle.commander.priority is Priority.RADIO
-    assert hovering.vehicle.planner.state is Planner.IDLE
+    assert hovering.vehicle.planner.state is PlannerState.IDLE
 
 
 def test_a_command_while_the_stream_goes_on_is_forgotten(streamed):

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from cfplan.simulation.virtual_crazyflie.high_level import Goal, HighLevelCommander, Planner, septic
+from cfplan.simulation.virtual_crazyflie.high_level import Goal, HighLevelCommander, PlannerState, septic
 from cfplan.simulation.virtual_crazyflie.setpoints import ACCELERATION, BODY_RATE, POSITION, VELOCITY, YAW
 
 STILL = np.zeros(4)
@@ -51,7 +51,7 @@ def test_a_go_to_starts_where_the_vehicle_is_and_stays_at_its_end(planner):
     assert last.values[POSITION] == pytest.approx([2.0, 2.0, 1.0])
     assert not last.values[VELOCITY].any()
     assert planner.finished(99.0)
-    assert planner.state is Planner.FLYING
+    assert planner.state is PlannerState.FLYING
 
 
 def test_a_second_go_to_carries_on_from_the_first_without_a_jump(planner):
@@ -99,7 +99,7 @@ def test_landing_ends_idle(planner):
     planner.receive(struct.pack("<BBff?f", 8, 0, 0.0, 0.0, True, 2.0), 0.0, blocked=False)
     assert planner.setpoint(1.0).mode.any()
     assert not planner.setpoint(2.01).mode.any()
-    assert planner.state is Planner.IDLE
+    assert planner.state is PlannerState.IDLE
 
 
 def piece(duration, coefficients):
