@@ -9,13 +9,13 @@ import sys
 import threading
 
 STREAM_PRIORITY = 20  # of SCHED_FIFO, for the thread that sends setpoints
-_LOCK_ALL_IN_USE = 1 | 2 | 4
 # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of mlockall(2): every page, now and later, once it is used
+_LOCK_ALL_IN_USE = 1 | 2 | 4
 _SHORT_SLICE = 100_000  # ns, the shortest that Linux grants
-_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
 # numbers of the system call, which has no name in older C libraries
-_SCHED_ATTR = struct.Struct("=IIQiIQQQ")
+_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
 # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
+_SCHED_ATTR = struct.Struct("=IIQiIQQQ")
 
 
 def uses_fifo_scheduling() -> bool:

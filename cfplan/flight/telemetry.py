@@ -31,12 +31,9 @@ class Phase(StrEnum):
 class SetpointSent:
     """A full-state setpoint as the vehicle decodes it."""
 
-    time: float
-    # s, when it was handed to the link
-    due: float
-    # s, its deadline; time - due is the lateness
-    index: int
-    # row of the encoded flight
+    time: float  # s, when it was handed to the link
+    due: float  # s, its deadline; time - due is the lateness
+    index: int  # row of the encoded flight
     position: Triple
     velocity: Triple
     acceleration: Triple
@@ -48,10 +45,8 @@ class SetpointSent:
 class PoseReceived:
     """A pose from motion capture."""
 
-    time: float
-    # s, when the vehicle was there
-    received: float
-    # s, when the pose reached the pilot
+    time: float  # s, when the vehicle was there
+    received: float  # s, when the pose reached the pilot
     position: Triple
     quaternion: Quaternion
 
@@ -73,11 +68,9 @@ class VehicleStatus:
 
     time: float
     body_rate: Triple
-    motor: tuple[int, int, int, int]
-    # 16-bit commands
+    motor: tuple[int, int, int, int]  # 16-bit commands
     battery_voltage: float
-    supervisor: int
-    # bits of supervisor.info
+    supervisor: int  # bits of supervisor.info
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,12 +14,9 @@ class TimedFault:
     """One fault."""
 
     kind: StrEnum
-    start: float = 0.0
-    # s since it was injected
-    duration: float = math.inf
-    # s
-    size: float | None = None
-    # in the unit of its kind; None for the usual one
+    start: float = 0.0  # s since it was injected
+    duration: float = math.inf  # s
+    size: float | None = None  # in the unit of its kind; None for the usual one
     usual: ClassVar[Mapping[StrEnum, float]] = {}
 
     def __post_init__(self) -> None:

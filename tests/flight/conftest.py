@@ -100,12 +100,9 @@ class World:
     refuses: dict[int, int] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
     unknown: tuple[str, ...] = ()
-    arms_lost: int = 0
-    # orders to arm or disarm that the radio swallows
-    cuts_lost: int = 0
-    # emergency stops that the radio swallows
-    other_body: bool = False
-    # motion capture tracks one that stays on the floor
+    arms_lost: int = 0  # orders to arm or disarm that the radio swallows
+    cuts_lost: int = 0  # emergency stops that the radio swallows
+    other_body: bool = False  # motion capture tracks one that stays on the floor
     stubborn: dict[str, float] = field(default_factory=dict)
     replies: dict[int, int] = field(default_factory=dict)
     extra_bits: int = 0

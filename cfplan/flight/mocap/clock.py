@@ -21,11 +21,11 @@ class FrameClock:
         self._latency = latency
         self._number: int | None = None
         self._rate = math.nan
-        self._proof: list[float] | None = None
         # s, the earliest of the first and of the second time of proof; None once the rate is proven
+        self._proof: list[float] | None = None
         self._proof_begin = math.nan
-        self._earliest = self._heard = math.inf
         # s, when number 0 came, as the earliest arrivals have it; the last arrival
+        self._earliest = self._heard = math.inf
 
     @property
     def sure(self) -> bool:

@@ -121,8 +121,7 @@ class _Known:
 
     name: str
     segments: dict[int, str]
-    tracked: int
-    # the segment that stands for the body
+    tracked: int  # the segment that stands for the body
 
 
 @dataclass(slots=True)

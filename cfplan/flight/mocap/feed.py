@@ -33,8 +33,7 @@ class Feed:
         self._closed = threading.Event()
         self._keeper: threading.Thread | None = None
         self._heard = 0.0
-        self.stage = "starting"
-        # the last that was heard of where the driver is
+        self.stage = "starting"  # the last that was heard of where the driver is
         self.restarts = 0
 
     def start(self) -> None:

@@ -12,30 +12,21 @@ class TrackedBody:
     """A body that was seen in a frame."""
 
     name: str
-    position: Triple
-    # m
-    quaternion: Quaternion
-    # body→world, x y z w; not a number where the system sent no rotation
-    quality: float = math.nan
-    # 0 to 1, where the system tells
+    position: Triple  # m
+    quaternion: Quaternion  # body→world, x y z w; not a number where the system sent no rotation
+    quality: float = math.nan  # 0 to 1, where the system tells
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
     """One frame of the cameras."""
 
-    received: float
-    # s on the clock of time.monotonic(), when it reached this computer
-    bodies: tuple[TrackedBody, ...]
-    # those that were seen
-    hidden: tuple[str, ...] = ()
-    # those that the system knows and did not see
-    number: int | None = None
-    # of the system's own count, where it tells
-    rate: float = math.nan
-    # Hz, where the system tells
-    latency: float = math.nan
-    # s from the exposure to the system's sending, where it tells
+    received: float  # s on the clock of time.monotonic(), when it reached this computer
+    bodies: tuple[TrackedBody, ...]  # those that were seen
+    hidden: tuple[str, ...] = ()  # those that the system knows and did not see
+    number: int | None = None  # of the system's own count, where it tells
+    rate: float = math.nan  # Hz, where the system tells
+    latency: float = math.nan  # s from the exposure to the system's sending, where it tells
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +34,7 @@ class Subject:
     """A body that the system knows, seen or not."""
 
     name: str
-    segments: tuple[str, ...]
-    # names, the root first
+    segments: tuple[str, ...]  # names, the root first
 
 
 @dataclass(frozen=True, slots=True)

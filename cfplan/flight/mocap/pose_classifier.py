@@ -48,9 +48,9 @@ class PoseClassifier:
         self._other_since = 0.0
         self._other_verdict = Verdict.JUMPED
         self.counts: Counter[Verdict] = Counter()
-        self.attitude: Quaternion | None = None
         # as the vehicle itself believes it: its gyroscopes tell a vehicle that turned, while it was not seen, from a
         # pattern that was turned over
+        self.attitude: Quaternion | None = None
 
     def classify(self, time: float, body: TrackedBody | None, number: int | None = None) -> Verdict:
         """What this pose is. Only a good one may be used."""

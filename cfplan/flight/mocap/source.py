@@ -44,8 +44,7 @@ class MocapSource:
         self._clock = FrameClock(self._limits.latency)
         self._scene: Scene | None = None
         self._next = -math.inf
-        self.fault = ""
-        # why there is silence; "" while good poses come
+        self.fault = ""  # why there is silence; "" while good poses come
 
     def tell_attitude(self, attitude: Quaternion) -> None:
         """What the vehicle believes."""

@@ -27,18 +27,12 @@ class BodyReport:
     """One body over the time that was looked at."""
 
     name: str
-    segments: tuple[str, ...]
-    # the root first; empty where the system does not tell
-    counts: dict[str, int]
-    # frames by verdict
-    position: Triple | None
-    # m, the last
-    yaw: float
-    # rad, the last
-    tilt: float
-    # rad, the last
-    quality: float
-    # the last, not a number where the system does not tell
+    segments: tuple[str, ...]  # the root first; empty where the system does not tell
+    counts: dict[str, int]  # frames by verdict
+    position: Triple | None  # m, the last
+    yaw: float  # rad, the last
+    tilt: float  # rad, the last
+    quality: float  # the last, not a number where the system does not tell
 
     @property
     def seen(self) -> float:
@@ -66,20 +60,14 @@ class Survey:
 
     seconds: float
     frames: int
-    rate: float
-    # Hz, as the frames came
-    announced_rate: float
-    # Hz, as the system says; not a number where it does not
-    jitter: float
-    # s, standard deviation of the time between frames
-    longest_gap: float
-    # s between frames
-    dropouts: int
-    # frames that are missing: by their numbers where there are some, else by the gaps
-    latency: float
-    # s from exposure to sending, as the system says; not a number where it does not
+    rate: float  # Hz, as the frames came
+    announced_rate: float  # Hz, as the system says; not a number where it does not
+    jitter: float  # s, standard deviation of the time between frames
+    longest_gap: float  # s between frames
+    dropouts: int  # frames that are missing: by their numbers where there are some, else by the gaps
+    latency: float  # s from exposure to sending, as the system says; not a number where it does not
     delay: float
-    # s, 99th percentile of what the way here added to its shortest; not a number without frame numbers, or too early
+    """s, 99th percentile of the delay over the shortest seen; not a number without frame numbers, or too early."""
     bodies: tuple[BodyReport, ...]
 
 

@@ -23,12 +23,10 @@ EXAMPLE = "vicon://192.168.1.2/cf1"
 class MocapUri:
     """A motion capture system and a body in it."""
 
-    system: str
-    # one of SYSTEMS
+    system: str  # one of SYSTEMS
     host: str
     port: int
-    subject: str
-    # "" where no body is named
+    subject: str  # "" where no body is named
 
     def __str__(self) -> str:
         return f"{self.system}://{self.address}/{self.subject}".rstrip("/")

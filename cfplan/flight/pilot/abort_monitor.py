@@ -31,21 +31,17 @@ class Abort:
 class Observation:
     """What the pilot knows at one moment."""
 
-    now: float
-    # s
+    now: float  # s
     order: Order | None = None
     main_gone: bool = False
     link_lost: str = ""
-    pose: Pose | None = None
-    # the last good one
-    pose_fault: str = ""
-    # why none has come since
+    pose: Pose | None = None  # the last good one
+    pose_fault: str = ""  # why none has come since
     wanted: Triple | None = None
-    # m, where the vehicle should have been when the pose was taken; None where no setpoint says so
+    """m, where the vehicle should have been when the pose was taken; None where no setpoint says so."""
     estimate: Estimate | None = None
     status: VehicleStatus | None = None
-    late: float = 0.0
-    # s, by which the last setpoint missed its deadline
+    late: float = 0.0  # s, by which the last setpoint missed its deadline
 
 
 class AbortMonitor:

@@ -12,15 +12,11 @@ import numpy as np
 class Lateness:
     """How long after their deadlines setpoints were handed to the link."""
 
-    p50: float
-    # s
-    p99: float
-    # s
-    max: float
-    # s
+    p50: float  # s
+    p99: float  # s
+    max: float  # s
     count: int
-    skipped: int
-    # deadlines that passed altogether; the clock chose a later setpoint instead
+    skipped: int  # deadlines that passed altogether; the clock chose a later setpoint instead
 
     @classmethod
     def of(cls, late: Sequence[float], skipped: int) -> "Lateness":

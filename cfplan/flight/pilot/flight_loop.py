@@ -65,32 +65,23 @@ class FlightLoop:
         self._monitor = AbortMonitor(mission.limits)
         self._pose_gate, self._predictor = PoseGate(mission.limits.pose.jump), PosePredictor()
         self.plan = Stream(mission.payloads, mission.rate, stop_from=mission.stops.__getitem__)
-        self.stream: Stream | None = None
-        # what each tick sends; None while the on-board commander flies
-        self.sending_paused = False
-        # sends nothing for a moment
+        self.stream: Stream | None = None  # what each tick sends; None while the on-board commander flies
+        self.sending_paused = False  # sends nothing for a moment
         self.link: Link
         self.connected = self.feeding = self.airborne = False
-        self.floor = 0.0
-        # m, height of the tracked body before take-off
-        self.rung = Rung.NONE
-        # an abort of this rung or a lesser one changes nothing
+        self.floor = 0.0  # m, height of the tracked body before take-off
+        self.rung = Rung.NONE  # an abort of this rung or a lesser one changes nothing
         self.deadlines: Deadlines
         self.phases: list[tuple[Phase, float]] = []
         self.checks: tuple[Check, ...] = ()
-        self.pose_fault = ""
-        # why the last pose was not good
+        self.pose_fault = ""  # why the last pose was not good
         self._source_fault = ""
-        self._sign_of_life = -math.inf
-        # s, when the vehicle's watchdog last had one
-        self.recent: deque[Pose] = deque()
-        # the good poses of the last second
-        self.waking: deque[float] = deque(maxlen=200)
-        # s by which the last ticks were late
-        self.late: list[float] = []
-        # the same of the plan's setpoints
-        self.off_plan: list[tuple[float, float]] = []
+        self._sign_of_life = -math.inf  # s, when the vehicle's watchdog last had one
+        self.recent: deque[Pose] = deque()  # the good poses of the last second
+        self.waking: deque[float] = deque(maxlen=200)  # s by which the last ticks were late
+        self.late: list[float] = []  # the same of the plan's setpoints
         # (s from the first setpoint, m) of each pose in the stream and the hover behind it
+        self.off_plan: list[tuple[float, float]] = []
 
     def tick(self) -> float:
         """One deadline: the setpoint, then the pose, then the look-out. The time after it, s."""

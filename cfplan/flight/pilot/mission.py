@@ -22,17 +22,12 @@ _SHORTEST = 1.5  # s, of any manoeuvre of the on-board commander
 class Mission:
     """One certified flight, encoded."""
 
-    payloads: NDArray
-    # (N, 29) uint8, the setpoints from rest to rest
-    stops: NDArray
-    # (N, M, 29) uint8, a way to stop from each setpoint, as brake.encode_stops gives it
+    payloads: NDArray  # (N, 29) uint8, the setpoints from rest to rest
+    stops: NDArray  # (N, M, 29) uint8, a way to stop from each setpoint, as brake.encode_stops gives it
     limits: Limits
-    lead: float = 0.0
-    # s by which each setpoint is ahead of the trajectory at its time
-    hold_time: float = 1.0
-    # s that the vehicle hovers behind the last setpoint before it is handed back
-    rate: float = RATE
-    # Hz
+    lead: float = 0.0  # s by which each setpoint is ahead of the trajectory at its time
+    hold_time: float = 1.0  # s that the vehicle hovers behind the last setpoint before it is handed back
+    rate: float = RATE  # Hz
 
     @property
     def start(self) -> tuple[Triple, float]:

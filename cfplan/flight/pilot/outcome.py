@@ -34,14 +34,10 @@ class Check:
 class Deviation:
     """Distance of the measured position from the setpoint of the same moment, over the stream."""
 
-    max: float
-    # m
-    rms: float
-    # m
-    time_of_max: float
-    # s from the first setpoint
-    count: int
-    # poses that were compared
+    max: float  # m
+    rms: float  # m
+    time_of_max: float  # s from the first setpoint
+    count: int  # poses that were compared
 
     @classmethod
     def of(cls, samples: Sequence[tuple[float, float]]) -> "Deviation":
@@ -67,23 +63,14 @@ class FlightOutcome:
     """What the pilot reports when the vehicle is down, or was never armed."""
 
     exit_code: ExitCode
-    reason: str
-    # one line
-    rung: Rung
-    # how far down the abort ladder it went
-    checks: tuple[Check, ...]
-    # the preflight table, as far as it came
-    phases: tuple[tuple[Phase, float], ...]
-    # each phase entered, with its time on the clock of time.monotonic()
-    first_setpoint: float
-    # s on the same clock; 0 where none was sent
-    flown: float
-    # s, from the first setpoint to the last that moved
+    reason: str  # one line
+    rung: Rung  # how far down the abort ladder it went
+    checks: tuple[Check, ...]  # the preflight table, as far as it came
+    phases: tuple[tuple[Phase, float], ...]  # each phase entered, with its time on the clock of time.monotonic()
+    first_setpoint: float  # s on the same clock; 0 where none was sent
+    flown: float  # s, from the first setpoint to the last that moved
     lateness: Lateness
     deviation: Deviation
-    settled_after: float
-    # s after the last moving setpoint; inf where it did not settle, or was not asked to
-    end_position: Triple
-    # m, where it was last seen
-    telemetry_dropped: int = 0
-    # messages that found the main process too slow
+    settled_after: float  # s after the last moving setpoint; inf where it did not settle, or was not asked to
+    end_position: Triple  # m, where it was last seen
+    telemetry_dropped: int = 0  # messages that found the main process too slow

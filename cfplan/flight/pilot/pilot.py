@@ -57,11 +57,9 @@ class Pilot:
         self._mission, self._limits = mission, mission.limits
         self._connect, self._enter_real_time = connect, enter_real_time
         self._loop = FlightLoop(mission, source, report, orders, clock, sleep)
-        self._reached = Rung.NONE
-        # how far down the abort ladder
+        self._reached = Rung.NONE  # how far down the abort ladder
         self._skipped = 0
-        self._stopped_at = 0.0
-        # s, when the plan was left for a stop
+        self._stopped_at = 0.0  # s, when the plan was left for a stop
 
     def fly(self) -> FlightOutcome:
         """All phases. Raises a CfplanError where the vehicle or its poses cannot be had; nothing is armed then."""

@@ -26,28 +26,21 @@ class PreflightSnapshot:
 
     mission: Mission
     protocol: int
-    firmware: str
-    # as the vehicle says it; empty where it does not
-    round_trip: float
-    # s
+    firmware: str  # as the vehicle says it; empty where it does not
+    round_trip: float  # s
     could_fly: bool
-    # the supervisor said so at least once in the last second, or that it waits to be armed, as brushless vehicles do
+    """The supervisor reported at least once in the last second that it can fly or, as brushless vehicles do, that it
+    waits to be armed."""
     status: VehicleStatus
-    wanted: Mapping[str, float]
-    # parameters as they were set
-    read_back: Mapping[str, float]
-    # the same as the vehicle then had them
-    poses: Sequence[Pose]
-    # of about the last second, oldest first
-    pose_age: float
-    # s, of the newest
+    wanted: Mapping[str, float]  # parameters as they were set
+    read_back: Mapping[str, float]  # the same as the vehicle then had them
+    poses: Sequence[Pose]  # of about the last second, oldest first
+    pose_age: float  # s, of the newest
     estimate: Estimate
-    variance: Sequence[float]
-    # m², of position along x, y, z
-    waking: Lateness
-    # how late this computer met its deadlines in the last second
+    variance: Sequence[float]  # m², of position along x, y, z
+    waking: Lateness  # how late this computer met its deadlines in the last second
     uses_fifo_scheduling: bool = False
-    # the stream has the processor ahead of ordinary programs, which the system must permit
+    """The stream has the processor ahead of ordinary programs, which the system must permit."""
 
 
 def run_checks(snapshot: PreflightSnapshot) -> tuple[Check, ...]:

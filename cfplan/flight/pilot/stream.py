@@ -29,8 +29,8 @@ class Stream:
         self.packets: list[Any] = [packet(GENERIC_PORT, 0, row.tobytes()) for row in payloads]
         state = decode(payloads)
         fields = (state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate)
-        self.states = list(zip(*([tuple(row) for row in field.tolist()] for field in fields), strict=True))
         # (position, velocity, acceleration, quaternion, body rate) of each, as the vehicle decodes them
+        self.states = list(zip(*([tuple(row) for row in field.tolist()] for field in fields), strict=True))
         self.last = len(self.packets) - 1
 
     @property

@@ -8,11 +8,11 @@ CRAZYRADIO = (0x1915, 0x7777)  # vendor and product; Crazyradio 2.0 too, with th
 OTHER_FIRMWARE = (0x35F0, 0xBAD2)  # Crazyradio 2.0 with its own
 _DENIED, _BUSY = 13, 16
 
+# For Crazyradio, Crazyradio 2.0 and the Crazyflie on a cable, as on Bitcraze's own page.
 UDEV_RULES = (
     """printf 'SUBSYSTEM=="usb", ATTRS{idVendor}=="%s", MODE="0664", GROUP="plugdev"\\n' 1915 35f0 0483 """
     "| sudo tee /etc/udev/rules.d/99-bitcraze.rules && sudo udevadm control --reload-rules"
 )
-# for Crazyradio, Crazyradio 2.0 and the Crazyflie on a cable; Bitcraze's own page has the same
 
 
 def find_radios(kind: tuple[int, int] = CRAZYRADIO) -> list[Any]:

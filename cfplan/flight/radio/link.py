@@ -47,20 +47,16 @@ class Link:
         clock: Callable[[], float] = time.monotonic,
     ):
         self._crazyflie, self.uri, self._report, self._clock = crazyflie, uri, report, clock
-        self.lost = ""
-        # why the link is gone; empty while it stands
+        self.lost = ""  # why the link is gone; empty while it stands
         self.estimate: Estimate | None = None
         self.status: VehicleStatus | None = None
-        self.position_variance: Triple | None = None
-        # m² along x, y, z
-        self.replies: dict[int, int] = {}
-        # command of the on-board commander: the code that it answered, 0 for done
+        self.position_variance: Triple | None = None  # m² along x, y, z
+        self.replies: dict[int, int] = {}  # command of the on-board commander: the code that it answered, 0 for done
         self.firmware = ""
-        self.radio_lock: Any = None
-        # keeps others from the radio until it is closed
+        self.radio_lock: Any = None  # keeps others from the radio until it is closed
         self._variance_block: Any = None
-        self._log_zero, self._log_heard = math.inf, 0.0
         # s, when the vehicle's clock of ms was zero, as the quickest messages have it; the last message
+        self._log_zero, self._log_heard = math.inf, 0.0
         crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
         crazyflie.add_port_callback(PLATFORM_PORT, self._on_platform)
 

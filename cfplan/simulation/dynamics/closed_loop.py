@@ -48,12 +48,9 @@ _STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)
 class EstimateErrors:
     """How what the controller believes differs from the truth; attitude and body rate are believed as they are."""
 
-    latency: float = 0.0
-    # s by which position and velocity are late
-    position_noise: float = 0.0
-    # m, standard deviation, anew each 10 ms
-    velocity_noise: float = 0.0
-    # m/s, likewise
+    latency: float = 0.0  # s by which position and velocity are late
+    position_noise: float = 0.0  # m, standard deviation, anew each 10 ms
+    velocity_noise: float = 0.0  # m/s, likewise
     seed: int = 0
 
 
@@ -64,12 +61,9 @@ PERFECT = EstimateErrors()
 class ClosedLoop:
     """What the vehicle did, every millisecond from the start to the end."""
 
-    time: NDArray
-    # (N,) s
-    states: NDArray
-    # (N, 17) as in `body`
-    commands: NDArray
-    # (N, 4) what the controller asked of each motor, 16-bit units
+    time: NDArray  # (N,) s
+    states: NDArray  # (N, 17) as in `body`
+    commands: NDArray  # (N, 4) what the controller asked of each motor, 16-bit units
 
     @property
     def position(self) -> NDArray:

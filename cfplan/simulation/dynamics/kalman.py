@@ -41,23 +41,17 @@ class Prior:
     noise_velocity: float = 0.0
     noise_position: float = 0.0
     noise_attitude: float = 0.0
-    noise_gyro_roll_pitch: float = 0.1
-    # rad/s
-    noise_gyro_yaw: float = 0.1
-    # rad/s
+    noise_gyro_roll_pitch: float = 0.1  # rad/s
+    noise_gyro_yaw: float = 0.1  # rad/s
     initial_x: float = 0.0
     initial_y: float = 0.0
     initial_z: float = 0.0
-    initial_yaw: float = 0.0
-    # rad
-    most_position: float = 100.0
-    # m; beyond, the filter resets itself
-    most_velocity: float = 10.0
-    # m/s
+    initial_yaw: float = 0.0  # rad
+    most_position: float = 100.0  # m; beyond, the filter resets itself
+    most_velocity: float = 10.0  # m/s
     drag_x: float = 0.0
     drag_y: float = 0.0
-    drag_z: float = 0.0
-    # 1/s
+    drag_z: float = 0.0  # 1/s
 
     def pack(self) -> NDArray:
         """(16,) for the functions below."""
@@ -73,16 +67,11 @@ class Prior:
 class Filter(NamedTuple):
     """Changed in place."""
 
-    state: NDArray
-    # (9,)
-    quaternion: NDArray
-    # (4,) body→world x y z w
-    covariance: NDArray
-    # (9, 9)
-    sums: NDArray
-    # (7,) gyroscope 0:3 and accelerometer 3:6 since the last prediction, and how many
-    initial: NDArray
-    # (4,) quaternion to which a standing vehicle reverts
+    state: NDArray  # (9,)
+    quaternion: NDArray  # (4,) body→world x y z w
+    covariance: NDArray  # (9, 9)
+    sums: NDArray  # (7,) gyroscope 0:3 and accelerometer 3:6 since the last prediction, and how many
+    initial: NDArray  # (4,) quaternion to which a standing vehicle reverts
 
 
 def new_filter(prior: NDArray) -> Filter:

@@ -28,15 +28,13 @@ SETPOINT_SIZE = 20
 MEMORY_SIZE = 10
 
 DISABLE, ABSOLUTE, VELOCITY_MODE = 0, 1, 2
-# Where each mode lies in the array.
+# Index of each mode in the array.
 MODE_X, MODE_Y, MODE_Z, MODE_ROLL, MODE_PITCH, MODE_YAW, MODE_QUATERNION = range(7)
 
-FULL_STATE = np.array([ABSOLUTE, ABSOLUTE, ABSOLUTE, DISABLE, DISABLE, DISABLE, ABSOLUTE])
-# A full-state packet.
+FULL_STATE = np.array([ABSOLUTE, ABSOLUTE, ABSOLUTE, DISABLE, DISABLE, DISABLE, ABSOLUTE])  # of a full-state packet
+# Of the high-level commander: yaw as an angle.
 ON_BOARD = np.array([ABSOLUTE, ABSOLUTE, ABSOLUTE, DISABLE, DISABLE, ABSOLUTE, DISABLE])
-# The high-level commander: yaw as an angle.
-NOTHING = np.zeros(7, dtype=np.int64)
-# The null setpoint: motors off.
+NOTHING = np.zeros(7, dtype=np.int64)  # of the null setpoint: motors off
 
 FULL_COMMAND = 65535  # a motor at its most
 _MOMENT_LIMIT = 32000.0
@@ -46,10 +44,8 @@ _MOMENT_LIMIT = 32000.0
 class MellingerGains:
     """The parameters of the group ctrlMel, with the firmware's defaults."""
 
-    mass: float = 0.029
-    # kg; set this to the true mass before a flight
-    mass_thrust: float = 132000.0
-    # 16-bit units per N
+    mass: float = 0.029  # kg; set this to the true mass before a flight
+    mass_thrust: float = 132000.0  # 16-bit units per N
     kp_xy: float = 0.4
     kd_xy: float = 0.2
     ki_xy: float = 0.05

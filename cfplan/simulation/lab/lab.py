@@ -40,24 +40,15 @@ ROW_SIZE = 24
 class Truth:
     """What really happened: for tests and reports, never for a pilot. One row every 10 ms."""
 
-    time: NDArray
-    # (N,) s on the clock of time.monotonic()
-    position: NDArray
-    # (N, 3) m
-    velocity: NDArray
-    # (N, 3) m/s
-    quaternion: NDArray
-    # (N, 4) body→world x y z w
-    body_rate: NDArray
-    # (N, 3) rad/s
-    motor: NDArray
-    # (N, 4) 16-bit commands
-    off_in_air: NDArray
-    # (N,) ticks of 1 ms, so far, with all motors off well above the floor
-    supervisor: NDArray
-    # (N,) the supervisor's state
-    locked: bool
-    # whether the supervisor was ever locked
+    time: NDArray  # (N,) s on the clock of time.monotonic()
+    position: NDArray  # (N, 3) m
+    velocity: NDArray  # (N, 3) m/s
+    quaternion: NDArray  # (N, 4) body→world x y z w
+    body_rate: NDArray  # (N, 3) rad/s
+    motor: NDArray  # (N, 4) 16-bit commands
+    off_in_air: NDArray  # (N,) ticks of 1 ms, so far, with all motors off well above the floor
+    supervisor: NDArray  # (N,) the supervisor's state
+    locked: bool  # whether the supervisor was ever locked
 
     @staticmethod
     def of(rows: NDArray, locked: bool) -> "Truth":
@@ -90,8 +81,7 @@ class Lab:
         self.number = number
         self.uri = f"sim://{number}"
         self.port = port
-        self.mocap_uri = mocap_uri
-        # of the vehicle in the virtual Vicon; "" where the room has none
+        self.mocap_uri = mocap_uri  # of the vehicle in the virtual Vicon; "" where the room has none
         self._process = process
         self._connection = connection
         self._address = f"127.0.0.1:{port}"

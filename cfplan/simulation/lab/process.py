@@ -79,8 +79,7 @@ class LabLoop:
         self._heard = 0.0
         self._subscribers: dict[_Address, float] = {}
         self._origin = 0.0
-        self._radio: Radio | None = None
-        # None while the link is perfect
+        self._radio: Radio | None = None  # None while the link is perfect
 
     def _warm_up(self) -> None:
         """Compile, and let the supervisor pass its checks, before anyone looks."""

@@ -53,8 +53,7 @@ class Radio:
         self._down: deque[bytes] = deque()
         self._on_way_up: deque[tuple[float, bytes]] = deque()
         self._on_way_down: deque[tuple[float, bytes]] = deque()
-        self.dropped = 0
-        # packets that a full queue turned away
+        self.dropped = 0  # packets that a full queue turned away
 
     def inject(self, fault: RadioFault, now: float) -> None:
         """Let something go wrong; its start counts from now."""

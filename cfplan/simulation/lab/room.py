@@ -29,19 +29,13 @@ _POSE = struct.Struct("<dI7d")  # time s, number, position m, quaternion x y z w
 class RoomSettings:
     """What the motion capture is like."""
 
-    rate: float = 100.0
-    # Hz
-    position_noise: float = 0.001
-    # m, standard deviation of each axis
-    attitude_noise: float = float(np.radians(0.2))
-    # rad, standard deviation about each axis
-    latency: float = 0.010
-    # s from the moment of a pose to its leaving the room
+    rate: float = 100.0  # Hz
+    position_noise: float = 0.001  # m, standard deviation of each axis
+    attitude_noise: float = float(np.radians(0.2))  # rad, standard deviation about each axis
+    latency: float = 0.010  # s from the moment of a pose to its leaving the room
     seed: int = 7
-    on_board: bool = False
-    # the vehicle has the poses too, as from a positioning deck
-    vicon: ViconSettings | None = None
-    # a virtual Vicon that sees the vehicle too, with its own rate, noise and faults
+    on_board: bool = False  # the vehicle has the poses too, as from a positioning deck
+    vicon: ViconSettings | None = None  # a virtual Vicon that sees the vehicle too, with its own rate, noise and faults
 
     def __post_init__(self) -> None:
         for name in ("rate", "position_noise", "attitude_noise", "latency"):
@@ -121,8 +115,7 @@ def lab_variable(number: int) -> str:
 class RoomPoseSource:
     """The poses of the simulated room of a lab; a PoseSource. Can go to another process before it is opened."""
 
-    number: int = 0
-    # of the lab, as in sim://0
+    number: int = 0  # of the lab, as in sim://0
     fault: str = ""
     _socket: socket.socket | None = None
     _first: list[Pose] | None = None

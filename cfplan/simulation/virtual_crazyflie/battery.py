@@ -18,8 +18,7 @@ class Battery:
     def __init__(self, charge: float = 1.0):
         self.charge = charge
         self.voltage = self._at_rest
-        self.sag = 0.0
-        # V by which it is lower than such a battery's
+        self.sag = 0.0  # V by which the voltage is lower than a healthy battery's
 
     @property
     def _at_rest(self) -> float:

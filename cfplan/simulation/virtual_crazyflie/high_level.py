@@ -53,22 +53,16 @@ class PlannerState(Enum):
 class Goal:
     """Where the planner wants the vehicle at one moment. Columns x, y, z, yaw."""
 
-    position: NDArray
-    # (4,)
-    velocity: NDArray
-    # (4,)
-    acceleration: NDArray
-    # (4,)
-    jerk: NDArray
-    # (4,)
+    position: NDArray  # (4,)
+    velocity: NDArray  # (4,)
+    acceleration: NDArray  # (4,)
+    jerk: NDArray  # (4,)
 
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    duration: float
-    # s
-    coefficients: NDArray
-    # (8, 4) ascending powers of time, s; columns x, y, z, yaw
+    duration: float  # s
+    coefficients: NDArray  # (8, 4) ascending powers of time, s; columns x, y, z, yaw
 
     def at(self, time: float) -> Goal:
         rows = []

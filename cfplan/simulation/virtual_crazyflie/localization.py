@@ -18,10 +18,8 @@ class Localization:
     """Collects measurements until the filter takes them."""
 
     def __init__(self) -> None:
-        self.tick = 0
-        # of the last packet
-        self.latest = np.zeros(7)
-        # (7,) position and quaternion as last received
+        self.tick = 0  # of the last packet
+        self.latest = np.zeros(7)  # (7,) position and quaternion as last received
         self.emergency_stop = False
         self.kept_alive = False
         self._waiting: list[tuple[float, ...]] = []

@@ -37,10 +37,8 @@ def log_toc() -> Toc:
 class _Block:
     formats: list[str] = field(default_factory=list)
     getters: list[Getter] = field(default_factory=list)
-    period: int = 0
-    # ms; 0 while it is stopped
-    due: int = 0
-    # tick of the next packet
+    period: int = 0  # ms; 0 while it is stopped
+    due: int = 0  # tick of the next packet
 
     @property
     def size(self) -> int:

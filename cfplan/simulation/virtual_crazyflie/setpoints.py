@@ -49,14 +49,10 @@ class FirmwareAssert(Exception):
 class Setpoint:
     """Values and modes as in `mellinger`; a new one asks for nothing: motors off."""
 
-    values: NDArray = field(default_factory=lambda: np.zeros(SETPOINT_SIZE))
-    # (20,)
-    mode: NDArray = field(default_factory=NOTHING.copy)
-    # (7,)
-    velocity_in_body: bool = False
-    # horizontal velocity along the body's axes
-    tick: int = 0
-    # when the commander took it
+    values: NDArray = field(default_factory=lambda: np.zeros(SETPOINT_SIZE))  # (20,)
+    mode: NDArray = field(default_factory=NOTHING.copy)  # (7,)
+    velocity_in_body: bool = False  # horizontal velocity along the body's axes
+    tick: int = 0  # when the commander took it
 
 
 def decode_setpoint(payload: bytes) -> Setpoint:

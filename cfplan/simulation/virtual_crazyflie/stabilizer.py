@@ -46,29 +46,18 @@ _NOISE_ROWS = 8191  # ms after which the sensors' noise repeats; a prime, so tha
 class Loop(NamedTuple):
     """Everything that the compiled loop reads and changes, in place."""
 
-    truth: NDArray
-    # (17,) the body's state, see `body`
+    truth: NDArray  # (17,) the body's state, see `body`
     kalman: Filter
-    belief: NDArray
-    # (13,) estimated position, velocity, quaternion; body rate as measured
-    acceleration: NDArray
-    # (3,) m/s², specific force as measured, body axes
-    memory: NDArray
-    # (10,) of the Mellinger controller
-    pid_memory: NDArray
-    # (36,) of the PID controller
-    control: NDArray
-    # (4,)
-    motors: NDArray
-    # (4,) 16-bit commands
-    counts: NDArray
-    # OFF_TICKS, OFF_IN_AIR_TICKS, RESETS
-    noise: NDArray
-    # (8191, 6) gyroscope rad/s, accelerometer m/s², biases included
-    wind: NDArray
-    # (3,) m/s
-    efficiency: NDArray
-    # (4,) share of its thrust that each motor gives
+    belief: NDArray  # (13,) estimated position, velocity, quaternion; body rate as measured
+    acceleration: NDArray  # (3,) m/s², specific force as measured, body axes
+    memory: NDArray  # (10,) of the Mellinger controller
+    pid_memory: NDArray  # (36,) of the PID controller
+    control: NDArray  # (4,)
+    motors: NDArray  # (4,) 16-bit commands
+    counts: NDArray  # OFF_TICKS, OFF_IN_AIR_TICKS, RESETS
+    noise: NDArray  # (8191, 6) gyroscope rad/s, accelerometer m/s², biases included
+    wind: NDArray  # (3,) m/s
+    efficiency: NDArray  # (4,) share of its thrust that each motor gives
 
 
 class Stabilizer:
@@ -79,8 +68,7 @@ class Stabilizer:
         self.body = pack_body(airframe, floor=float(position[2]))
         self.prior, self.gains = prior, gains
         self.pid_gains, self.pid_limits = default_gains(), default_limits()
-        self.mellinger = False
-        # which of the two controllers flies
+        self.mellinger = False  # which of the two controllers flies
         self.loop = Loop(
             truth=at_rest(position, settings.yaw),
             kalman=new_filter(prior),

@@ -45,14 +45,10 @@ class Settings:
     """What parameters of the groups supervisor and stabilizer set."""
 
     tumble_check: bool = True
-    preflight_timeout: int = 30000
-    # ms armed without a flight
-    landed_timeout: int = 3000
-    # ms
-    crash_detection: float = 0.0
-    # g beyond 1; 0 is off
-    stop: bool = False
-    # emergency stop
+    preflight_timeout: int = 30000  # ms armed without a flight
+    landed_timeout: int = 3000  # ms
+    crash_detection: float = 0.0  # g beyond 1; 0 is off
+    stop: bool = False  # emergency stop
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,12 +14,9 @@ class Variable:
 
     group: str
     name: str
-    code: int
-    # the type as the wire has it, flags included
-    format: str
-    # of the struct module, little-endian
-    stored: bool = False
-    # a parameter that can be kept over a restart
+    code: int  # the type as the wire has it, flags included
+    format: str  # of the struct module, little-endian
+    stored: bool = False  # a parameter that can be kept over a restart
     read_only: bool = False
 
     @property
@@ -33,8 +30,7 @@ class Toc:
 
     variables: tuple[Variable, ...]
     checksum: int
-    trailer: bytes = b""
-    # what follows the checksum in the answer about the table
+    trailer: bytes = b""  # what follows the checksum in the answer about the table
 
     def answer(self, request: bytes) -> bytes | None:
         """The payload that answers a request on channel 0, None where the firmware is silent."""

@@ -80,12 +80,11 @@ class VirtualCrazyflie:
         self.setpoint = Setpoint()  # what the controller is given
         self._attitude_setpoints = AttitudeSetpoints()
         self._out: list[bytes] = []
-        self._answers: list[tuple[int, bytes]] = []
         # to writes of parameters, with the tick from which on they may leave
+        self._answers: list[tuple[int, bytes]] = []
         self.log = LogBlocks(log_variables(self))
         self._airframe = airframe
-        self._faults: list[tuple[int, float, VehicleFault]] = []
-        # with the ticks of their begin and end
+        self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks of their begin and end
         self._watch_parameters()
 
     def use_kalman(self) -> None:

@@ -23,28 +23,18 @@ _LEVEL: Quaternion = (0.0, 0.0, 0.0, 1.0)
 class ViconSettings:
     """What the virtual Vicon is like."""
 
-    subject: str = "cf1"
-    # the vehicle's name
-    segment: str = ""
-    # of the vehicle's root segment; "" for the subject's own name
-    others: tuple[tuple[str, Triple], ...] = ()
-    # bodies that stand in the room, and where, m
-    rate: float = 100.0
-    # Hz
-    position_noise: float = 0.001
-    # m, standard deviation of each axis
-    attitude_noise: float = math.radians(0.2)
-    # rad, standard deviation about each axis
-    latency: float = 0.010
-    # s from the moment of a pose to its leaving; also what the server says about itself
+    subject: str = "cf1"  # the vehicle's name
+    segment: str = ""  # of the vehicle's root segment; "" for the subject's own name
+    others: tuple[tuple[str, Triple], ...] = ()  # bodies that stand in the room, and where, m
+    rate: float = 100.0  # Hz
+    position_noise: float = 0.001  # m, standard deviation of each axis
+    attitude_noise: float = math.radians(0.2)  # rad, standard deviation about each axis
+    latency: float = 0.010  # s from the moment of a pose to its leaving; also what the server says about itself
     y_up: bool = False
-    spare: bool = False
-    # what has not changed is not sent again
-    port: int = 0
-    # 0 takes a free one
+    spare: bool = False  # what has not changed is not sent again
+    port: int = 0  # 0 takes a free one
     first_frame: int = 1000
-    faults: tuple[ViconFault, ...] = ()
-    # from the server's start
+    faults: tuple[ViconFault, ...] = ()  # from the server's start
     seed: int = 7
 
     def __post_init__(self) -> None:

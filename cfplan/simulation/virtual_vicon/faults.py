@@ -32,8 +32,7 @@ class ViconFault(TimedFault):
     """One fault of motion capture; one that is there from the start counts from the server's."""
 
     kind: FaultKind
-    subject: str | None = None
-    # None: every body
+    subject: str | None = None  # None: every body
     usual: ClassVar[Mapping[StrEnum, float]] = {FaultKind.JUMP: 1.0, FaultKind.FLIP: math.pi, FaultKind.DELAY: 0.2}
 
 

@@ -39,8 +39,7 @@ class Shown:
 
     name: str
     segment: str
-    pose: tuple[Triple, Quaternion] | None
-    # None where it is not seen
+    pose: tuple[Triple, Quaternion] | None  # None where it is not seen
     quality: float = 1.0
 
 
