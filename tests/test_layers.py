@@ -104,3 +104,19 @@ def test_shared_modules_import_no_layer():
     for file in PACKAGE.glob("*.py"):
         layers = {parts[0] for parts in imports(file) if parts and parts[0] in LAYERS}
         assert layers == set(), f"{file} belongs to a layer"
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    graph = {file.relative_to(PACKAGE).with_suffix("").parts: {*imports(file)} for file in FILES}
+    done: set[tuple[str, ...]] = set()
+
+    def visit(module: tuple[str, ...], way: list[tuple[str, ...]]) -> None:
+        assert module not in way, " → ".join(".".join(parts) for parts in [*way[way.index(module) :], module])
+        if module in done:
+            return
+        for other in graph.get(module, graph.get((*module, "__init__"), set())):
+            visit(other, [*way, module])
+        done.add(module)
+
+    for module in graph:
+        visit(module, [])

@@ -1,24 +1,25 @@
-"""What the log variables that matter are worth, in the firmware's units and signs."""
+"""The log variables of the virtual Crazyflie that have a value, in the firmware's units and signs."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.packets import compress_quaternion
 from cfplan.simulation.dynamics.body import rotation
-from cfplan.simulation.virtual_crazyflie.setpoints import PITCH, ROLL, YAW
+from cfplan.simulation.dynamics.kalman import Filter
+from cfplan.simulation.virtual_crazyflie.battery import Battery
+from cfplan.simulation.virtual_crazyflie.localization import Localization
+from cfplan.simulation.virtual_crazyflie.setpoints import PITCH, ROLL, YAW, Setpoint
+from cfplan.simulation.virtual_crazyflie.stabilizer import Loop
+from cfplan.simulation.virtual_crazyflie.supervisor import Supervisor
 from cfplan.vehicle.airframe import GRAVITY
-
-if TYPE_CHECKING:
-    from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 
 Getter = Callable[[], float]
 
 _AXES = "xyz"
-_LOW_BATTERY_LEVELS = (3.5, 4.18)  # V at 0 and 100 %
+_BATTERY_LEVELS = (3.5, 4.18)  # V at 0 and 100 %
 
 
 def _element(array: NDArray, place: int, scale: float = 1.0) -> Getter:
@@ -34,9 +35,19 @@ def euler(quaternion: NDArray) -> tuple[float, float, float]:
     return float(np.degrees(roll)), float(np.degrees(pitch)), float(np.degrees(yaw))
 
 
-def log_variables(vehicle: "VirtualCrazyflie") -> Mapping[str, Getter]:
-    """A function for each log variable that is alive; the others stay zero."""
-    loop = vehicle.stabilizer.loop
+def log_variables(
+    loop: Loop,
+    *,
+    localization: Localization,
+    supervisor: Supervisor,
+    battery: Battery,
+    setpoint: Callable[[], Setpoint],
+    info: Callable[[], int],
+) -> Mapping[str, Getter]:
+    """Return a function for each log variable that has a value; the others stay zero.
+
+    `setpoint` returns what the controller is given now, `info` the bits of supervisor.info.
+    """
     belief, kalman = loop.belief, loop.kalman
     found: dict[str, Getter] = {}
     for place, axis in enumerate(_AXES):
@@ -49,29 +60,27 @@ def log_variables(vehicle: "VirtualCrazyflie") -> Mapping[str, Getter]:
         found[f"kalman.state{axis.upper()}"] = _element(kalman.state, place)
         found[f"kalman.stateP{axis.upper()}"] = _element(kalman.state, 3 + place)
         found[f"kalman.stateD{place}"] = _element(kalman.state, 6 + place)
-        found[f"locSrv.{axis}"] = _element(vehicle.localization.latest, place)
-        found[f"ext_pos.{axis.upper()}"] = _element(vehicle.localization.latest, place)
-    found |= _variances(vehicle) | _attitude(vehicle) | _accelerations(vehicle) | _targets(vehicle)
-    found |= _motors_and_power(vehicle)
-    supervisor = vehicle.supervisor
-    found["supervisor.info"] = vehicle.info
+        found[f"locSrv.{axis}"] = _element(localization.latest, place)
+        found[f"ext_pos.{axis.upper()}"] = _element(localization.latest, place)
+    for place, name in enumerate("xyzw"):
+        found[f"locSrv.q{name}"] = _element(localization.latest, 3 + place)
+    found |= _variances(kalman) | _attitude(belief) | _accelerations(loop) | _targets(setpoint)
+    found |= _motors(loop) | _power(battery)
+    found["supervisor.info"] = info
     found["sys.canfly"] = lambda: supervisor.can_fly
     found["sys.isFlying"] = lambda: supervisor.is_flying
     found["sys.isTumbled"] = lambda: supervisor.tumbled
-    found["locSrvZ.tick"] = lambda: vehicle.localization.tick
+    found["locSrvZ.tick"] = lambda: localization.tick
     found["radio.isConnected"] = lambda: 1
     return found
 
 
-def _variances(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
-    covariance = vehicle.stabilizer.loop.kalman.covariance
+def _variances(kalman: Filter) -> dict[str, Getter]:
     names = ("X", "Y", "Z", "PX", "PY", "PZ", "D0", "D1", "D2")
-    return {f"kalman.var{name}": _element(covariance.diagonal(), place) for place, name in enumerate(names)}
+    return {f"kalman.var{name}": _element(kalman.covariance.diagonal(), place) for place, name in enumerate(names)}
 
 
-def _attitude(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
-    belief = vehicle.stabilizer.loop.belief
-
+def _attitude(belief: NDArray) -> dict[str, Getter]:
     def angle(place: int) -> float:
         return euler(belief[6:10])[place]
 
@@ -82,7 +91,6 @@ def _attitude(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
     for place, name in enumerate("xyzw"):
         found[f"stateEstimate.q{name}"] = _element(belief, 6 + place)
         found[f"kalman.q{(place + 1) % 4}"] = _element(belief, 6 + place)
-        found[f"locSrv.q{name}"] = _element(vehicle.localization.latest, 3 + place)
     found["stateEstimateZ.quat"] = lambda: int(compress_quaternion(belief[None, 6:10])[0])
     # The firmware gives pitch in its legacy sign here too.
     for place, name, sign in ((10, "Roll", 1), (11, "Pitch", -1), (12, "Yaw", 1)):
@@ -90,9 +98,8 @@ def _attitude(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
     return found
 
 
-def _accelerations(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
+def _accelerations(loop: Loop) -> dict[str, Getter]:
     """World axes: stateEstimate in g without gravity, stateEstimateZ in mm/s² with it."""
-    loop = vehicle.stabilizer.loop
 
     def world(axis: int, scale: float, gravity: float) -> float:
         return float(rotation(loop.belief[6:10])[axis] @ loop.acceleration - gravity) * scale
@@ -104,12 +111,12 @@ def _accelerations(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
     return found
 
 
-def _targets(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
+def _targets(setpoint: Callable[[], Setpoint]) -> dict[str, Getter]:
     def target(place: int, scale: float = 1.0) -> Getter:
-        return lambda: float(vehicle.setpoint.values[place]) * scale
+        return lambda: float(setpoint().values[place]) * scale
 
     def mode(place: int) -> Getter:
-        return lambda: int(vehicle.setpoint.mode[place])
+        return lambda: int(setpoint().mode[place])
 
     found: dict[str, Getter] = {}
     for start, prefix in ((0, ""), (3, "v"), (6, "a")):
@@ -123,15 +130,19 @@ def _targets(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
     return found
 
 
-def _motors_and_power(vehicle: "VirtualCrazyflie") -> dict[str, Getter]:
-    loop, battery = vehicle.stabilizer.loop, vehicle.battery
+def _motors(loop: Loop) -> dict[str, Getter]:
     found: dict[str, Getter] = {f"motor.m{place + 1}": _element(loop.motors, place) for place in range(4)}
     for place, name in enumerate(("thrust", "roll", "pitch", "yaw")):
         found[f"controller.cmd_{name}"] = _element(loop.control, place)
         found[f"ctrlMel.cmd_{name}"] = _element(loop.control, place)
     found["stabilizer.thrust"] = _element(loop.control, 0)
-    found["pm.vbat"] = lambda: battery.voltage
-    found["pm.vbatMV"] = lambda: battery.voltage * 1000
-    empty, full = _LOW_BATTERY_LEVELS
-    found["pm.batteryLevel"] = lambda: float(np.clip(100 * (battery.voltage - empty) / (full - empty), 0, 100))
     return found
+
+
+def _power(battery: Battery) -> dict[str, Getter]:
+    empty, full = _BATTERY_LEVELS
+    return {
+        "pm.vbat": lambda: battery.voltage,
+        "pm.vbatMV": lambda: battery.voltage * 1000,
+        "pm.batteryLevel": lambda: float(np.clip(100 * (battery.voltage - empty) / (full - empty), 0, 100)),
+    }

@@ -82,7 +82,16 @@ class VirtualCrazyflie:
         self._out: list[bytes] = []
         # to writes of parameters, with the tick from which on they may leave
         self._answers: list[tuple[int, bytes]] = []
-        self.log = LogBlocks(log_variables(self))
+        self.log = LogBlocks(
+            log_variables(
+                self.stabilizer.loop,
+                localization=self.localization,
+                supervisor=self.supervisor,
+                battery=self.battery,
+                setpoint=lambda: self.setpoint,
+                info=self.info,
+            )
+        )
         self._airframe = airframe
         self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks of their begin and end
         self._watch_parameters()
