@@ -31,7 +31,7 @@ from cfplan.learning.features import (
 )
 from cfplan.learning.inference import Network
 from cfplan.learning.model_files import Model, find_model
-from cfplan.learning.smooth import Begin, smoothed, track_through
+from cfplan.learning.smooth import Begin, smoothed
 from cfplan.learning.windows import chain, kept
 from cfplan.planners.solution import Solution, Status
 from cfplan.safety.feasibility import broken_by, check_arguments, unsolvable
@@ -39,7 +39,7 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import spline_profile
-from cfplan.vehicle.yaw_spline import YawTrack, fixed_yaw, tangent_yaw
+from cfplan.vehicle.yaw_spline import YawSpline
 
 LEAST_NODES = 10
 LEAD = 3.0
@@ -88,7 +88,7 @@ def plan_learned(
 
     track = None
     if yaw is not YawMode.FREE:
-        track = (tangent_yaw if yaw is YawMode.TANGENT else fixed_yaw)(path, nodes, yaw_angle, start, end)
+        track = YawSpline.along(path, nodes, yaw, yaw_angle, start, end)
     known, allowed = model.card.limits, model.limits_within(limits)
     coefficients, turned = predict(
         path, model.network, bounds(airframe, known), nodes, model.window, start=start, end=end,
@@ -102,7 +102,7 @@ def plan_learned(
         "solver": "learned",
         "model": model.name,
     }
-    track = track or track_through(turned, path.end / nodes, start, end)
+    track = track or YawSpline.smoothed(turned, path.end / nodes, start, end)
     begins = (part.first for part in chain(nodes, model.window, kept(model.window)))
     joints = tuple(path.end / nodes * first for first in begins if first > 0)
     return Solution(Status.SOLVED, spline_profile(coefficients, path.end, track), "", stats, joints)
@@ -117,7 +117,7 @@ def predict(
     *,
     start: BoundaryState | None = None,
     end: BoundaryState | None = None,
-    track: YawTrack | None = None,
+    track: YawSpline | None = None,
     yaw_angle: float = 0.0,
     allowed: Bounds | None = None,
 ) -> tuple[NDArray, NDArray]:

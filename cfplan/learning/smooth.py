@@ -12,15 +12,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cfplan.vehicle.profile import BoundaryState
-from cfplan.vehicle.yaw_spline import YawTrack
+from cfplan.vehicle.profile_spline import weights_at
 
 DURATION = 0.07
 # s, over which answers are smoothed
-YAW_WIDTH = 3.0
-# nodes, over which yaw is smoothed
-_YAW_REACH = 12
-# nodes on each side, likewise
 STIFFEST = 1e6
 # of third differences against changes, at most
 _BAND = 3
@@ -93,39 +88,9 @@ def _solve(band: NDArray, right: NDArray) -> None:
         right[n] /= band[n, 0]
 
 
-def track_through(yaw: NDArray, step: float, start: BoundaryState | None, end: BoundaryState | None) -> YawTrack:
-    """A smooth track by yaw at the nodes, (N+1,): a quadratic spline, with the yaw and its rate of states given."""
-    states = [(state is not None, state.yaw, state.dyaw) if state else (False, 0.0, 0.0) for state in (start, end)]
-    return YawTrack(*_track_through(np.asarray(yaw, dtype=float), step, *states))
-
-
-@njit(cache=True, error_model="numpy")
-def _track_through(
-    yaw: NDArray, step: float, start: tuple[bool, float, float], end: tuple[bool, float, float]
-) -> tuple[NDArray, NDArray, NDArray]:
-    """What a YawTrack has. Smoothed by a Gaussian, as if the first and last yaw went on."""
-    weights = np.exp(-0.5 * (np.arange(-_YAW_REACH, _YAW_REACH + 1) / YAW_WIDTH) ** 2)
-    weights /= weights.sum()
-    last = len(yaw) - 1
-    smooth = np.zeros(len(yaw))
-    for k in range(-_YAW_REACH, _YAW_REACH + 1):
-        for n in range(len(yaw)):
-            smooth[n] += weights[_YAW_REACH + k] * yaw[min(max(n + k, 0), last)]
-    spline = np.empty(len(yaw) + 1)
-    spline[1:-1] = (smooth[1:] + smooth[:-1]) / 2
-    spline[0], spline[-1] = spline[1], spline[-2]
-    if start[0]:
-        spline[0], spline[1] = start[1] - start[2] * step / 2, start[1] + start[2] * step / 2
-    if end[0]:
-        spline[-1], spline[-2] = end[1] + end[2] * step / 2, end[1] - end[2] * step / 2
-    turning = spline[1:] - spline[:-1]
-    return (spline[:-1] + spline[1:]) / 2, turning / step, (turning[1:] - turning[:-1]) / step**2
-
-
 def travel_time(coefficients: NDArray, step: float) -> float:
     """s, of a spline of h, by four-point Gauss quadrature on every interval."""
     places, shares = np.polynomial.legendre.leggauss(4)
-    x = (places[:, None] + 1.0) / 2.0
-    u0, u1, u2, u3 = (coefficients[k : len(coefficients) - 3 + k] for k in range(4))
-    h = ((1 - x) ** 3 * u0 + (3 * x**3 - 6 * x**2 + 4) * u1 + (-3 * x**3 + 3 * x**2 + 3 * x + 1) * u2 + x**3 * u3) / 6
+    last = len(coefficients) - 3
+    h = sum(w[:, None] * coefficients[k : last + k] for k, w in enumerate(weights_at((places + 1.0) / 2.0)))
     return float(step / 2.0 * (shares @ (1.0 / np.sqrt(h))).sum())

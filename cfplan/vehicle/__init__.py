@@ -7,7 +7,7 @@ __all__ = [
     "flatness",
     "profile",
     "profile_spline",
-    "sampled_yaw",
+    "rotations",
     "timing",
     "trajectory",
     "trigonometry",

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.flatness import ROUNDING, Body, Flat, compiled_body, flat_state, profile_within
-from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.flatness import ROUNDING, Body, Flat, compiled_body, flat_state
+from cfplan.vehicle.profile import SpeedProfile, h_within, yaw_within
+from cfplan.vehicle.rotations import hopf_quaternion
 from cfplan.vehicle.trigonometry import cosine, sine
 
 # What `dense_rows` gives, by row; all of it is smooth where path and profile are, as norms and angles near 0 are not.
@@ -247,9 +248,10 @@ def _step(x: float, c: float, p: _Derivatives) -> _Derivatives:
 @register_jitable(forceinline=True, fastmath=ROUNDING)
 def _flat_at(panel: NDArray, body: Body, node: _Node, n: int) -> tuple[Flat, float]:
     """The full state, and yaw, from path and profile."""
-    speed, turn = profile_within(panel[_X * WIDTH + n], *node)
+    x = panel[_X * WIDTH + n]
+    h, yaw = h_within(x, node[0], node[1], node[2], node[3]), yaw_within(x, node[4], node[5], node[6])
     derivatives = _vector(panel, 3, n), _vector(panel, 6, n), _vector(panel, 9, n), _vector(panel, 12, n)
-    return flat_state(body, derivatives, speed, turn, cosine, sine), turn[0]
+    return flat_state(body, derivatives, h, yaw, cosine, sine), yaw[0]
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
@@ -316,11 +318,9 @@ def _flatten_whole(panel: NDArray, body: Body, lanes: int) -> None:
         _write(panel, 24, n, flat.torque)
         _write(panel, 27, n, flat.motor_thrust[:3])
         panel[(_RESULT + 30) * WIDTH + n] = flat.motor_thrust[3]
-        # The least turn from the vertical to the thrust axis, after a turn by yaw.
-        a, b, c = flat.thrust_axis
-        cos, sin, norm = cosine(yaw / 2), sine(yaw / 2), (2.0 * (1.0 + c)) ** 0.5
-        _write(panel, 31, n, ((a * sin - b * cos) / norm, (a * cos + b * sin) / norm, sin * norm / 2))
-        _write(panel, 34, n, (cos * norm / 2, yaw, flat.specific_thrust))
+        quaternion = hopf_quaternion(flat.thrust_axis, cosine(yaw / 2), sine(yaw / 2))
+        _write(panel, 31, n, quaternion[:3])
+        _write(panel, 34, n, (quaternion[3], yaw, flat.specific_thrust))
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
@@ -345,7 +345,8 @@ def _squared(vector: tuple[float, float, float]) -> float:
     return vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]
 
 
-_CALLED = [FilePath(__file__).with_name(name).read_bytes() for name in ("flatness.py", "trigonometry.py")]
+_NAMES = ("flatness.py", "profile.py", "rotations.py", "trigonometry.py")
+_CALLED = [FilePath(__file__).with_name(name).read_bytes() for name in _NAMES]
 SOURCES = zlib.crc32(b"".join([*_CALLED, FilePath(__file__).read_bytes()]))
 # a checksum of what compiled samples come from, for those that compile this in; numba's cache does not look there
 _at_points, _states = _compile(zlib.crc32(b"".join(_CALLED)))

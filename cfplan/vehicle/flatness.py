@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 from numba.extending import register_jitable
 
 from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.rotations import Scalar, Vector
 
-Scalar = Any  # float, NDArray or casadi.SX
-Vector = tuple[Scalar, Scalar, Scalar]
 ROUNDING = {"contract", "arcp", "nsz"}
 # what a compiler may do to compiled arithmetic: multiply and add at once, divide by way of a reciprocal, drop the
 # sign of a zero. Nothing about order, infinities or what is not a number.
@@ -169,17 +168,6 @@ def motor_thrusts(
         share - roll + pitch + yaw,
         share + roll + pitch - yaw,
         share + roll - pitch + yaw,
-    )
-
-
-@register_jitable(forceinline=True, fastmath=False)  # to the last bit as SpeedProfile.at has it
-def profile_within(
-    x: Scalar, h: Scalar, dh: Scalar, ddh: Scalar, dddh: Scalar, yaw: Scalar, dyaw: Scalar, ddyaw: Scalar
-) -> tuple[tuple[Scalar, Scalar, Scalar, Scalar], Vector]:
-    """h with three derivatives and yaw with two, at x from the grid point where they have the values given."""
-    return (
-        (h + x * (dh + x * (ddh / 2 + x * dddh / 6)), dh + x * (ddh + x * dddh / 2), ddh + x * dddh, dddh),
-        (yaw + x * (dyaw + x * ddyaw / 2), dyaw + x * ddyaw, ddyaw),
     )
 
 

@@ -1,21 +1,27 @@
-"""How fast a path is flown, and which way the vehicle points: h(s) = (ds/dt)² and yaw ψ(s)."""
+"""The speed profile of a path: h(s) = (ds/dt)², how fast it is flown, and yaw ψ(s), where the vehicle points."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
+
+from cfplan.vehicle.rotations import Scalar
+
+# Compiled into the loop that calls it; without fast arithmetic, so that all callers get the same to the last bit.
+_within_the_loop = register_jitable(forceinline=True, fastmath=False)
 
 
 @dataclass(frozen=True, slots=True)
 class BoundaryState:
-    """Where one segment hands over to the next."""
+    """The profile where one segment hands over to the next."""
 
     h: float
     dh: float
     ddh: float
-    yaw: float
+    yaw: float  # rad
     dyaw: float
 
 
@@ -38,58 +44,56 @@ class SpeedProfile:
     The jumps of h''' and ψ'' at the grid points are jumps of angular acceleration: check both sides.
     """
 
-    s: NDArray
-    # (N+1,) from 0 to the path's end
-    h: NDArray
-    # (N+1,) 1, positive
-    dh: NDArray
-    # (N+1,)
-    ddh: NDArray
-    # (N+1,)
-    dddh: NDArray
-    # (N,) constant in each interval
-    yaw: NDArray
-    # (N+1,) rad, not wrapped
-    dyaw: NDArray
-    # (N+1,)
-    ddyaw: NDArray
-    # (N,) constant in each interval
+    s: NDArray  # (N+1,) from 0 to the path's end
+    h: NDArray  # (N+1,) positive
+    dh: NDArray  # (N+1,)
+    ddh: NDArray  # (N+1,)
+    dddh: NDArray  # (N,) constant in each interval
+    yaw: NDArray  # (N+1,) rad, not wrapped
+    dyaw: NDArray  # (N+1,)
+    ddyaw: NDArray  # (N,) constant in each interval
 
     def interval(self, s: NDArray) -> NDArray:
-        """Index of the interval in which s lies; a grid point belongs to the interval on its right."""
+        """Return the index of the interval in which s lies; a grid point belongs to the interval on its right."""
         return np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
 
     def at(self, s: NDArray, interval: NDArray | None = None) -> ProfileSample:
-        """The profile at s, by the polynomials of `interval` where given (for the left side of a grid point)."""
+        """Return the profile at s, by the polynomials of `interval` where given (for the left of a grid point)."""
         s = np.asarray(s, dtype=float)
         i = self.interval(s) if interval is None else interval
         x = s - self.s[i]
-        jerk, turn = self.dddh[i], self.ddyaw[i]
         return ProfileSample(
-            h=self.h[i] + x * (self.dh[i] + x * (self.ddh[i] / 2 + x * jerk / 6)),
-            dh=self.dh[i] + x * (self.ddh[i] + x * jerk / 2),
-            ddh=self.ddh[i] + x * jerk,
-            dddh=jerk,
-            yaw=self.yaw[i] + x * (self.dyaw[i] + x * turn / 2),
-            dyaw=self.dyaw[i] + x * turn,
-            ddyaw=turn,
+            *h_within(x, self.h[i], self.dh[i], self.ddh[i], self.dddh[i]),
+            *yaw_within(x, self.yaw[i], self.dyaw[i], self.ddyaw[i]),
         )
 
     def table(self) -> NDArray:
-        """(N+1, 8), for compiled code: s, h with three derivatives, yaw with two; what has N values ends in 0."""
+        """Return (N+1, 8) for compiled code: s, h with three derivatives, yaw with two; N values are followed by 0."""
         return _table(self.s, self.h, self.dh, self.ddh, self.dddh, self.yaw, self.dyaw, self.ddyaw)
 
     def boundary(self, node: int) -> BoundaryState:
-        """The state at a grid point."""
+        """Return the state at a grid point."""
         return BoundaryState(*(float(values[node]) for values in (self.h, self.dh, self.ddh, self.yaw, self.dyaw)))
 
-    def slowed(self, share: float) -> "SpeedProfile":
-        """The same flight at `share` of its speed: h scaled by share², yaw unchanged along the path."""
-        factor = share * share
+    def slowed(self, speed_factor: float) -> "SpeedProfile":
+        """Return the same flight at speed_factor times its speed: h by its square, yaw unchanged along the path."""
+        factor = speed_factor * speed_factor
         return SpeedProfile(
             self.s, self.h * factor, self.dh * factor, self.ddh * factor, self.dddh * factor,
             self.yaw, self.dyaw, self.ddyaw,
         )  # fmt: skip
+
+
+@_within_the_loop
+def h_within(x: Scalar, h: Scalar, dh: Scalar, ddh: Scalar, dddh: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Return h with three derivatives at x from the grid point where it has the values given."""
+    return h + x * (dh + x * (ddh / 2 + x * dddh / 6)), dh + x * (ddh + x * dddh / 2), ddh + x * dddh, dddh
+
+
+@_within_the_loop
+def yaw_within(x: Scalar, yaw: Scalar, dyaw: Scalar, ddyaw: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Return yaw with two derivatives at x from the grid point where it has the values given."""
+    return yaw + x * (dyaw + x * ddyaw / 2), dyaw + x * ddyaw, ddyaw
 
 
 @njit(cache=True)

@@ -1,42 +1,37 @@
-"""SpeedProfiles and splines on their grid: from coefficients and back, and penalised splines through samples."""
+"""h as a cubic B-spline on the profile's grid: coefficients to derivatives and back, and fits through samples.
+
+On a grid of N intervals the spline has N+3 coefficients, c₋₁ to c_N+1. With Δs the step of the grid, at node n
+
+    h = (c₋ + 4c + c₊)/6,   h'Δs = (c₊ - c₋)/2,   h''Δs² = c₋ - 2c + c₊       with c = c_n, c₋ and c₊ its neighbours
+
+and h'''Δs³ is their third difference in the interval. h lies between the least and the largest coefficient. Of yaw, a
+quadratic spline on the same grid, yaw_spline.py has the same.
+"""
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
 from cfplan.vehicle.profile import SpeedProfile
-from cfplan.vehicle.yaw_spline import YawTrack
+from cfplan.vehicle.rotations import Scalar
+from cfplan.vehicle.yaw_spline import YawSpline
+
+# h, h'Δs, h''Δs², h'''Δs³ where an interval begins, from its four coefficients.
+AT_NODE = np.array([[1 / 6, 4 / 6, 1 / 6, 0], [-1 / 2, 0, 1 / 2, 0], [1, -2, 1, 0], [-1, 3, -3, 1]])
 
 
-def profile_through(
-    grid: NDArray, s: NDArray, h: NDArray, yaw: NDArray, *, h_stiffness: float = 0.0, yaw_stiffness: float = 0.0
-) -> SpeedProfile:
-    """The profile on `grid`, (N+1,) uniform, nearest to h and yaw, both (K,), at s, (K,) ascending.
-
-    Errors of h count relative to h. The stiffnesses weigh the squared jumps of h''' (relative to h) and of ψ'' between
-    the intervals, in units of one interval, against the mean squared error. Where samples are sparse a little
-    stiffness is what fills in.
-    """
-    speed = _fit(grid, s, h, 1.0 / np.square(h), 3, h_stiffness)
-    turn = _fit(grid, s, yaw, np.ones_like(yaw), 2, yaw_stiffness)
-    middle = 0.5 * (grid[1:] + grid[:-1])
-    return SpeedProfile(
-        s=grid, h=speed(grid), dh=speed(grid, 1), ddh=speed(grid, 2), dddh=speed(middle, 3),
-        yaw=turn(grid), dyaw=turn(grid, 1), ddyaw=turn(middle, 2),
-    )  # fmt: skip
-
-
-def spline_profile(cubic: NDArray, end: float, yaw: YawTrack) -> SpeedProfile:
-    """The profile whose h is the cubic B-spline with these coefficients, (N+3,), on the grid from 0 to `end`."""
-    return SpeedProfile(*_h_on_grid(cubic, end), yaw.yaw, yaw.dyaw, yaw.ddyaw)
+def spline_profile(coefficients: NDArray, end: float, yaw: YawSpline) -> SpeedProfile:
+    """Return the profile whose h is the spline with these coefficients, (N+3,), on the grid from 0 to `end`."""
+    return SpeedProfile(*_on_grid(coefficients, end), yaw.yaw, yaw.dyaw, yaw.ddyaw)
 
 
 @njit(cache=True)
-def _h_on_grid(cubic: NDArray, end: float) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """s, and h with two derivatives, at nodes; the third in intervals."""
+def _on_grid(cubic: NDArray, end: float) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+    """Return s, and h with two derivatives, at nodes; the third in intervals."""
     count = len(cubic) - 3
     step = end / count
     s, h, dh, ddh = np.empty(count + 1), np.empty(count + 1), np.empty(count + 1), np.empty(count + 1)
@@ -53,16 +48,63 @@ def _h_on_grid(cubic: NDArray, end: float) -> tuple[NDArray, NDArray, NDArray, N
 
 
 def h_coefficients(profile: SpeedProfile) -> NDArray:
-    """(N+3,) the coefficients of h as a cubic B-spline on its grid."""
-    step = profile.s[1] - profile.s[0]
-    inner = profile.h - profile.ddh * step**2 / 6
-    before = inner[1] - 2 * step * profile.dh[0]
-    return np.concatenate([[before], inner, [inner[-2] + 2 * step * profile.dh[-1]]])
+    """Return the (N+3,) coefficients of a profile's h."""
+    return coefficients_of(profile.h, profile.dh, profile.ddh, profile.s[1] - profile.s[0])
 
 
-def yaw_of(profile: SpeedProfile) -> YawTrack:
-    """Yaw all along."""
-    return YawTrack(profile.yaw, profile.dyaw, profile.ddyaw)
+def coefficients_of(h: NDArray, dh: NDArray, ddh: NDArray, step: float) -> NDArray:
+    """Return the (N+3,) coefficients of the spline that has these h, h', h'', (N+1,) each, at its nodes."""
+    inner = h - ddh * step**2 / 6
+    return np.concatenate([[inner[1] - 2 * step * dh[0]], inner, [inner[-2] + 2 * step * dh[-1]]])
+
+
+@register_jitable
+def node_coefficients(h: Scalar, slope: Scalar, bend: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Return the three coefficients about a node where the spline has this h, h'Δs and h''Δs²."""
+    return h - slope + bend / 3, h - bend / 6, h + slope + bend / 3
+
+
+@register_jitable
+def node_values(before: Scalar, here: Scalar, after: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Return h, h'Δs and h''Δs² at the node with these three coefficients about it."""
+    return (before + 4 * here + after) / 6, (after - before) / 2, before - 2 * here + after
+
+
+def weights_at(place: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Return what each of an interval's four coefficients weighs in h at a place from 0 to 1 within it."""
+    x = place
+    return (
+        (1 - x) ** 3 / 6,
+        (3 * x**3 - 6 * x**2 + 4) / 6,
+        (-3 * x**3 + 3 * x**2 + 3 * x + 1) / 6,
+        x**3 / 6,
+    )
+
+
+def profile_through(
+    grid: NDArray, s: NDArray, h: NDArray, yaw: NDArray, *, h_stiffness: float = 0.0, yaw_stiffness: float = 0.0
+) -> SpeedProfile:
+    """Return the profile on `grid`, (N+1,) uniform, nearest to h and yaw, both (K,), at s, (K,) ascending.
+
+    Errors of h count relative to h. The stiffnesses weigh the squared jumps of h''' (relative to h) and of ψ'' between
+    the intervals, in units of one interval, against the mean squared error. Where samples are sparse a little
+    stiffness is what fills in.
+    """
+    turn = _fit(grid, s, yaw, np.ones_like(yaw), 2, yaw_stiffness)
+    track = YawSpline(turn(grid), turn(grid, 1), turn(_middles(grid), 2))
+    return speed_through(grid, s, h, track, stiffness=h_stiffness)
+
+
+def speed_through(grid: NDArray, s: NDArray, h: NDArray, yaw: YawSpline, *, stiffness: float = 0.0) -> SpeedProfile:
+    """Return what profile_through() does, with yaw as given."""
+    speed = _fit(grid, s, h, 1.0 / np.square(h), 3, stiffness)
+    return SpeedProfile(
+        grid, speed(grid), speed(grid, 1), speed(grid, 2), speed(_middles(grid), 3), yaw.yaw, yaw.dyaw, yaw.ddyaw
+    )
+
+
+def _middles(grid: NDArray) -> NDArray:
+    return 0.5 * (grid[1:] + grid[:-1])
 
 
 def _fit(grid: NDArray, s: NDArray, values: NDArray, weights: NDArray, degree: int, stiffness: float) -> BSpline:
@@ -86,7 +128,7 @@ def _fit(grid: NDArray, s: NDArray, values: NDArray, weights: NDArray, degree: i
 
 
 def _difference(count: int, order: int) -> sparse.csr_array:
-    """(count - order, count): the difference of that order."""
+    """Return (count - order, count): the difference of that order."""
     matrix = sparse.eye_array(count, format="csr")
     for _ in range(order):
         matrix = matrix[1:] - matrix[:-1]
@@ -94,5 +136,5 @@ def _difference(count: int, order: int) -> sparse.csr_array:
 
 
 def _coefficient(grid: NDArray, s: NDArray, count: int) -> NDArray:
-    """Which coefficient each s, ascending, touches most, as a fraction of an index."""
+    """Return which coefficient each s, ascending, touches most, as a fraction of an index."""
     return (s - grid[0]) / (grid[-1] - grid[0]) * (count - 1)

@@ -1,71 +1,144 @@
-"""Yaw that is given before the speed: ψ(s) as a parabola in each interval, C¹.
+"""Yaw along a path as a quadratic spline: ψ(s) is a parabola in each interval of the profile's grid, and C¹.
 
-A quadratic spline on the profile's grid, fitted to the wanted angle by least squares with a penalty on its second
-differences: where the wanted angle is undefined (flight straight up, a rest) or turns at once, the spline goes smoothly
-across. It is the yaw of the Hopf fibration; heading differs from it by a little that vanishes with tilt.
+Its quadratic B-spline has N+2 coefficients, c₋₁ to c_N, on a grid of N intervals:
+
+    ψ = (c₀ + c₁)/2,   ψ'Δs = c₁ - c₀,   ψ''Δs² = c₂ - 2c₁ + c₀       where the interval of c₀, c₁, c₂ begins
+
+Where yaw is given before the speed, the spline is fitted to the wanted angle by least squares with a penalty on its
+second differences: where that angle is undefined (flight straight up, a rest) or turns at once, the spline goes
+smoothly across. This is the yaw of the Hopf fibration; heading differs from it by a little that vanishes with tilt.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import bmat, csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from cfplan.geometry.path import Path
-from cfplan.vehicle.profile import BoundaryState
+from cfplan.geometry.yaw import YawMode
+from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 
-SMOOTHING_LENGTH = 0.15
-# s of nominal time, over which a sudden turn is spread
-SAMPLES = 16
-# an interval, where the direction of flight is followed
-LEVEL = 0.1
-# horizontal share of the direction of flight below which it says nothing of yaw
+SMOOTHING_LENGTH = 0.15  # s of nominal time, over which a sudden turn is spread
+SAMPLES = 16  # an interval, where the direction of flight is followed
+LEVEL = 0.1  # horizontal share of the direction of flight below which it says nothing about yaw
+KERNEL_WIDTH = 3.0  # nodes, standard deviation of the Gaussian that smooths given angles
+KERNEL_REACH = 12  # nodes on each side, where that Gaussian ends
+# ψ, ψ'Δs, ψ''Δs² where an interval begins, from its three coefficients.
+AT_NODE = np.array([[1 / 2, 1 / 2, 0], [-1, 1, 0], [1, -2, 1]])
 
 
 @dataclass(frozen=True, slots=True)
-class YawTrack:
-    """ψ in the profile's own terms."""
+class YawSpline:
+    """ψ in the terms of a SpeedProfile over N intervals."""
 
-    yaw: NDArray
-    # (N+1,) rad at the nodes
-    dyaw: NDArray
-    # (N+1,)
-    ddyaw: NDArray
-    # (N,) constant in each interval
+    yaw: NDArray  # (N+1,) rad at the nodes, not wrapped
+    dyaw: NDArray  # (N+1,)
+    ddyaw: NDArray  # (N,) constant in each interval
 
-    def part(self, first: int, last: int) -> "YawTrack":
-        """The intervals from `first` to before `last`."""
-        return YawTrack(self.yaw[first : last + 1], self.dyaw[first : last + 1], self.ddyaw[first:last])
+    @classmethod
+    def along(
+        cls,
+        path: Path,
+        nodes: int,
+        mode: YawMode,
+        angle: float,
+        start: BoundaryState | None = None,
+        end: BoundaryState | None = None,
+    ) -> "YawSpline":
+        """Return the yaw that `mode` gives over `nodes` intervals: tangent, or else fixed."""
+        return (cls.tangent if mode is YawMode.TANGENT else cls.fixed)(path, nodes, angle, start, end)
+
+    @classmethod
+    def fixed(
+        cls, path: Path, nodes: int, angle: float, start: BoundaryState | None = None, end: BoundaryState | None = None
+    ) -> "YawSpline":
+        """Return one angle all along, which begins and ends with the yaw of boundary states where given."""
+        if start is None and end is None:
+            return cls(np.full(nodes + 1, angle), np.zeros(nodes + 1), np.zeros(nodes))
+        target = np.full(2 * nodes + 1, angle)
+        return _fit(path, nodes, target, np.ones_like(target), start, end)
+
+    @classmethod
+    def tangent(
+        cls, path: Path, nodes: int, angle: float, start: BoundaryState | None = None, end: BoundaryState | None = None
+    ) -> "YawSpline":
+        """Return the horizontal direction of flight; `angle` for a path that goes straight up or down."""
+        s = np.linspace(0.0, path.end, SAMPLES * nodes + 1)
+        inside = np.clip(s, 1e-4 * path.end, (1 - 1e-4) * path.end)  # at a rest end γ' = 0 has no direction
+        tangent = path(inside, 1)
+        tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
+        share = np.hypot(tangent[:, 0], tangent[:, 1])
+        seen = share > LEVEL
+        if not seen.any():
+            return cls.fixed(path, nodes, angle, start, end)
+        heading = np.unwrap(np.arctan2(tangent[seen, 1], tangent[seen, 0]))
+        if start is not None:  # the turn of 2π that is nearest
+            heading += 2 * np.pi * np.round((start.yaw - heading[0]) / (2 * np.pi))
+        wanted = np.interp(s, s[seen], heading)
+        weight = np.where(seen, share**2, 0.0)
+        every = SAMPLES // 2
+        return _fit(path, nodes, wanted[::every], np.maximum(weight[::every], 1e-6), start, end)
+
+    @classmethod
+    def smoothed(cls, yaw: NDArray, step: float, start: BoundaryState | None, end: BoundaryState | None) -> "YawSpline":
+        """Return a smooth spline through angles at the nodes, (N+1,), smoothed by a Gaussian.
+
+        The first and last angle count as if they went on. Yaw and its rate are those of boundary states where given.
+        """
+        coefficients = _smooth(np.asarray(yaw, dtype=float))
+        if start is not None:
+            coefficients[:2] = end_coefficients(start.yaw, start.dyaw * step)
+        if end is not None:
+            coefficients[-2:] = end_coefficients(end.yaw, end.dyaw * step)
+        return cls.from_coefficients(coefficients, step)
+
+    @classmethod
+    def from_coefficients(cls, coefficients: NDArray, step: float) -> "YawSpline":
+        """Return the spline with these coefficients, (N+2,), on a grid of that step."""
+        turning = coefficients[1:] - coefficients[:-1]
+        return cls((coefficients[:-1] + coefficients[1:]) / 2, turning / step, (turning[1:] - turning[:-1]) / step**2)
+
+    @classmethod
+    def of(cls, profile: SpeedProfile) -> "YawSpline":
+        """Return the yaw of a profile."""
+        return cls(profile.yaw, profile.dyaw, profile.ddyaw)
+
+    def coefficients(self, step: float) -> NDArray:
+        """Return the (N+2,) coefficients on a grid of that step."""
+        half = self.dyaw * (step / 2)
+        return np.append(self.yaw - half, self.yaw[-1] + half[-1])
+
+    def part(self, first: int, last: int) -> "YawSpline":
+        """Return the intervals from `first` to before `last`."""
+        return YawSpline(self.yaw[first : last + 1], self.dyaw[first : last + 1], self.ddyaw[first:last])
 
 
-def fixed_yaw(path: Path, nodes: int, angle: float, start: BoundaryState | None, end: BoundaryState | None) -> YawTrack:
-    """One angle all along; from and to the yaw of boundary states where given."""
-    if start is None and end is None:
-        return YawTrack(np.full(nodes + 1, angle), np.zeros(nodes + 1), np.zeros(nodes))
-    target = np.full(2 * nodes + 1, angle)
-    return _fit(path, nodes, target, np.ones_like(target), start, end)
+def end_coefficients(yaw: float, turn: float) -> tuple[float, float]:
+    """Return the two coefficients about a node where the spline has this ψ and this ψ'Δs."""
+    return yaw - turn / 2, yaw + turn / 2
 
 
-def tangent_yaw(
-    path: Path, nodes: int, angle: float, start: BoundaryState | None, end: BoundaryState | None
-) -> YawTrack:
-    """Along the horizontal direction of flight; `angle` for a path that goes straight up or down."""
-    s = np.linspace(0.0, path.end, SAMPLES * nodes + 1)
-    inside = np.clip(s, 1e-4 * path.end, (1 - 1e-4) * path.end)  # at a rest end γ' = 0 has no direction
-    tangent = path(inside, 1)
-    tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
-    share = np.hypot(tangent[:, 0], tangent[:, 1])
-    seen = share > LEVEL
-    if not seen.any():
-        return fixed_yaw(path, nodes, angle, start, end)
-    heading = np.unwrap(np.arctan2(tangent[seen, 1], tangent[seen, 0]))
-    if start is not None:  # the turn of 2π that is nearest
-        heading += 2 * np.pi * np.round((start.yaw - heading[0]) / (2 * np.pi))
-    wanted = np.interp(s, s[seen], heading)
-    weight = np.where(seen, share**2, 0.0)
-    every = SAMPLES // 2
-    return _fit(path, nodes, wanted[::every], np.maximum(weight[::every], 1e-6), start, end)
+@njit(cache=True, error_model="numpy")
+def _smooth(yaw: NDArray) -> NDArray:
+    """Return (N+2,) coefficients of smoothed angles, (N+1,): means of neighbours, level at both ends."""
+    last = len(yaw) - 1
+    weights, total = np.empty(2 * KERNEL_REACH + 1), 0.0
+    for k in range(len(weights)):
+        weights[k] = np.exp(-0.5 * ((k - KERNEL_REACH) / KERNEL_WIDTH) ** 2)
+        total += weights[k]
+    smooth = np.zeros(len(yaw))
+    for k in range(len(weights)):
+        share, ahead = weights[k] / total, k - KERNEL_REACH
+        for n in range(len(yaw)):
+            smooth[n] += share * yaw[min(max(n + ahead, 0), last)]
+    out = np.empty(len(yaw) + 1)
+    for n in range(last):
+        out[n + 1] = (smooth[n + 1] + smooth[n]) / 2
+    out[0], out[last + 1] = out[1], out[last]
+    return out
 
 
 def _fit(
@@ -75,7 +148,7 @@ def _fit(
     weight: NDArray,
     start: BoundaryState | None,
     end: BoundaryState | None,
-) -> YawTrack:
+) -> YawSpline:
     """Fit to a target at nodes and midpoints, (2 nodes + 1,)."""
     step = path.end / nodes
     size = nodes + 2
@@ -91,8 +164,8 @@ def _fit(
     rows, values = [], []
     for boundary, s, first in ((start, 0.0, 0), (end, path.end, size - 2)):
         value, slope = np.zeros(size), np.zeros(size)
-        value[first : first + 2] = 0.5
-        slope[first : first + 2] = -1.0, 1.0
+        value[first : first + 2] = AT_NODE[0, :2]
+        slope[first : first + 2] = AT_NODE[1, :2]
         if boundary is not None:
             rows += [value, slope]
             values += [boundary.yaw, boundary.dyaw * step]
@@ -103,9 +176,4 @@ def _fit(
         held = csr_matrix(np.array(rows))
         matrix = bmat([[matrix, held.T], [held, None]])
         right = np.concatenate([right, values])
-    spline = spsolve(matrix.tocsc(), right)[:size]
-    return YawTrack(
-        yaw=(spline[:-1] + spline[1:]) / 2,
-        dyaw=np.diff(spline) / step,
-        ddyaw=np.diff(spline, 2) / step**2,
-    )
+    return YawSpline.from_coefficients(spsolve(matrix.tocsc(), right)[:size], step)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from cfplan.learning.smooth import Begin, smoothed, track_through
+from cfplan.learning.smooth import Begin, smoothed
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import spline_profile
-from cfplan.vehicle.yaw_spline import YawTrack
+from cfplan.vehicle.yaw_spline import YawSpline
 
 SETTLED = np.array([2.0, 2.05, 2.12])
 
@@ -47,7 +47,7 @@ def test_what_is_settled_stays():
 def test_h_is_constant_next_to_a_rest():
     u = np.exp(2 * smoothed(rough(), SETTLED, int(Begin.REST), True))
     zeros = np.zeros(21)
-    profile = spline_profile(u, 3.0, YawTrack(zeros, zeros, zeros[1:]))
+    profile = spline_profile(u, 3.0, YawSpline(zeros, zeros, zeros[1:]))
     for values, at in ((profile.dh, [0, 1]), (profile.ddh, [0, 1]), (profile.dddh, [0])):
         assert np.all(values[at] == 0.0)
         assert np.all(values[[-1 - k for k in at]] == 0.0)
@@ -68,7 +68,7 @@ def test_smoothing_takes_the_same_time_whatever_the_grid():
 def test_a_profile_is_the_spline_of_its_coefficients(make_profile):
     u = np.random.default_rng(1).uniform(0.5, 2.0, 23)
     zeros = np.zeros(21)
-    found, expected = spline_profile(u, 3.0, YawTrack(zeros, zeros, zeros[1:])), make_profile(3.0, u)
+    found, expected = spline_profile(u, 3.0, YawSpline(zeros, zeros, zeros[1:])), make_profile(3.0, u)
     for name in ("s", "h", "dh", "ddh", "dddh"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-8)
 
@@ -76,13 +76,13 @@ def test_a_profile_is_the_spline_of_its_coefficients(make_profile):
 @pytest.mark.parametrize("nodes", [10, 64, 100])
 def test_yaw_is_smoothed_as_scipy_does_and_keeps_the_states_it_is_given(nodes):
     yaw = np.random.default_rng(nodes).normal(size=nodes + 1).cumsum()
-    track = track_through(yaw, 0.2, None, None)
+    track = YawSpline.smoothed(yaw, 0.2, None, None)
     smooth = gaussian_filter1d(yaw, 3.0, mode="nearest")
     middles = (smooth[1:] + smooth[:-1]) / 2
     np.testing.assert_allclose(track.yaw[1:-1], (middles[1:] + middles[:-1]) / 2, atol=1e-12)
     np.testing.assert_allclose(track.dyaw[1:-1], np.diff(middles) / 0.2, atol=1e-12)
     start, end = BoundaryState(1.0, 0.0, 0.0, 0.3, 0.2), BoundaryState(1.0, 0.0, 0.0, -0.4, -0.7)
-    held = track_through(yaw, 0.2, start, end)
+    held = YawSpline.smoothed(yaw, 0.2, start, end)
     assert (held.yaw[0], held.dyaw[0], held.yaw[-1], held.dyaw[-1]) == pytest.approx((0.3, 0.2, -0.4, -0.7))
     # a parabola in each interval, continuous with its slope
     np.testing.assert_allclose(held.yaw[:-1] + 0.2 * held.dyaw[:-1] + 0.02 * held.ddyaw, held.yaw[1:], atol=1e-12)

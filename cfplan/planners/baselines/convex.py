@@ -24,7 +24,7 @@ from cfplan.planners.solution import Solution, Status
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
-from cfplan.vehicle.sampled_yaw import yaw_along
+from cfplan.vehicle.yaw_spline import YawSpline
 
 BOUND_SPACING, BOUND_TURN = 0.005, 0.004
 # m and rad between stations: what discretisation costs the bound falls with both, to 0.3 % of time at 2 m/s
@@ -96,7 +96,7 @@ def plan_convex(
         speeds = _solved(at, inner_rows(at, airframe, limits, fastest), boundary)
     except InfeasibleError as error:
         return Solution(Status.INFEASIBLE, None, str(error))
-    along = yaw_along(path, yaw, yaw_angle)
+    along = YawSpline.along(path, nodes, yaw, yaw_angle)
     width = window(airframe, limits)
     profiles = (smooth_profile(path, at, speeds, share * width, nodes, along) for share in WINDOW_SHARES)
     profile = least_slowed(path, profiles, airframe, limits)

@@ -5,8 +5,6 @@ bounds jerk and snap where acceleration jumps, and from rest makes l grow as t�
 end of a path, where l grows as s⁴.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +13,8 @@ from cfplan.planners.baselines.convex_stations import Stations
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile import SpeedProfile
-from cfplan.vehicle.profile_spline import profile_through
+from cfplan.vehicle.profile_spline import speed_through
+from cfplan.vehicle.yaw_spline import YawSpline
 
 SAMPLES_PER_INTERVAL = 8
 TIME_STEPS_PER_WINDOW = 200
@@ -35,10 +34,8 @@ def window(airframe: Airframe, limits: PlanLimits) -> float:
     return max(2 * most / rate, (4 * most / acceleration) ** 0.5)
 
 
-def smooth_profile(
-    path: Path, at: Stations, b: NDArray, half_width: float, nodes: int, yaw: Callable[[NDArray], NDArray]
-) -> SpeedProfile:
-    """The profile over `nodes` intervals of the speeds √b at the stations, averaged over ± half_width s."""
+def smooth_profile(path: Path, at: Stations, b: NDArray, half_width: float, nodes: int, yaw: YawSpline) -> SpeedProfile:
+    """Return the profile over `nodes` intervals of the speeds √b at the stations, averaged over ± half_width s."""
     length, speed = _averaged(at.length, b, half_width)
     grid = np.linspace(0.0, path.end, nodes + 1)
     samples = grid[-1] * (np.arange(SAMPLES_PER_INTERVAL * nodes) + 0.5) / (SAMPLES_PER_INTERVAL * nodes)
@@ -46,7 +43,7 @@ def smooth_profile(
     here = np.interp(samples, at.s, _graded(at.length, total))
     rate = np.interp(here, _graded(length, total), np.cbrt(speed)) ** 3
     h = np.square(rate / np.linalg.norm(path(samples, 1), axis=1))
-    return profile_through(grid, samples, h, yaw(samples), h_stiffness=H_STIFFNESS)
+    return speed_through(grid, samples, h, yaw, stiffness=H_STIFFNESS)
 
 
 def _averaged(length: NDArray, b: NDArray, half_width: float) -> tuple[NDArray, NDArray]:

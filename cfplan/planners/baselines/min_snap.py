@@ -12,9 +12,8 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
-from cfplan.vehicle.profile_spline import profile_through
-from cfplan.vehicle.sampled_yaw import yaw_along
 from cfplan.vehicle.trajectory import Trajectory
+from cfplan.vehicle.yaw_spline import YawSpline
 
 SAMPLES_PER_UNIT = 200  # of s, where the greatest nominal speed is sought
 
@@ -35,9 +34,7 @@ def plan_min_snap(
     grid = np.linspace(0.0, path.end, nodes + 1)
     dense = np.linspace(0.0, path.end, max(1000, int(SAMPLES_PER_UNIT * path.end)))
     fastest = limits.speed / np.linalg.norm(path(dense, 1), axis=1).max()  # ds/dt that meets the speed limit
-    middles = 0.5 * (grid[1:] + grid[:-1])
-    where = np.sort(np.concatenate([grid, middles]))
-    turning = profile_through(grid, where, np.ones_like(where), yaw_along(path, yaw, yaw_angle)(where))
+    turning = YawSpline.along(path, nodes, yaw, yaw_angle)
     zeros = np.zeros(nodes + 1)
     profile = SpeedProfile(
         grid, np.full(nodes + 1, fastest**2), zeros, zeros, zeros[1:], turning.yaw, turning.dyaw, turning.ddyaw

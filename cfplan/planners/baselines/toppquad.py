@@ -19,7 +19,8 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import profile_through
-from cfplan.vehicle.sampled_yaw import yaw_along
+from cfplan.vehicle.rotations import hopf_quaternion, product
+from cfplan.vehicle.yaw_spline import YawSpline
 
 NODES_LEAST = 8
 MAX_ITERATIONS = 1000
@@ -57,7 +58,7 @@ def plan_toppquad(
     grid = np.linspace(0.0, path.end, nodes + 1)
     if start is not None and yaw is YawMode.FREE:
         yaw_angle = start.yaw
-    angles = yaw_along(path, yaw, yaw_angle)(grid)
+    angles = YawSpline.along(path, nodes, yaw, yaw_angle).yaw
     asked = _bounds(path, grid, airframe, limits, yaw, start, end)
     held = _bounds(path, grid, airframe, limits, YawMode.FIXED, start, end)
     guesses = [_guess(path, grid, airframe, angles, _guessed_h(path, grid, limits, speed)) for speed in GUESS_SPEEDS]
@@ -190,8 +191,10 @@ def _guess(path: Path, grid: NDArray, airframe: Airframe, angles: NDArray, h: fl
     step = grid[1] - grid[0]
     force = h * path(grid, 2) + np.array([0.0, 0.0, GRAVITY])
     specific = np.linalg.norm(force, axis=1)
-    q = _hopf(force / specific[:, None], angles)
-    turn = _relative(q[:-1], q[1:])
+    axis = force / specific[:, None]
+    q = np.stack(hopf_quaternion((axis[:, 0], axis[:, 1], axis[:, 2]), np.cos(angles / 2), np.sin(angles / 2)), axis=1)
+    before, after = q[:-1].T, q[1:].T
+    turn = np.stack(product((-before[0], -before[1], -before[2], before[3]), after), axis=1)
     omega = np.zeros((len(grid), 3))
     omega[:-1] = 2 * turn[:, :3] / (step * turn[:, 3:])
     omega[-1] = omega[-2]
@@ -202,18 +205,3 @@ def _guess(path: Path, grid: NDArray, airframe: Airframe, angles: NDArray, h: fl
     wrench = np.concatenate([airframe.mass * specific[:, None], torque], axis=1)
     thrusts = np.linalg.solve(airframe.mixing, wrench.T).T / airframe.hover_thrust
     return np.concatenate([np.full((len(grid), 1), h), np.zeros((len(grid), 1)), q, omega, alpha, thrusts], axis=1)
-
-
-def _relative(before: NDArray, after: NDArray) -> NDArray:
-    """(N, 4) x y z w: before⁻¹ ⊗ after."""
-    v, w = -before[:, :3], before[:, 3:]
-    vector = w * after[:, :3] + after[:, 3:] * v + np.cross(v, after[:, :3])
-    return np.concatenate([vector, w * after[:, 3:] - np.sum(v * after[:, :3], axis=1, keepdims=True)], axis=1)
-
-
-def _hopf(axis: NDArray, yaw: NDArray) -> NDArray:
-    """(N, 4) x y z w: the least turn from the vertical to `axis`, (N, 3) unit, after a turn by yaw, (N,)."""
-    a, b, c = axis.T
-    cos, sin = np.cos(yaw / 2), np.sin(yaw / 2)
-    norm = np.sqrt(2.0 * (1.0 + c))
-    return np.stack([(a * sin - b * cos) / norm, (a * cos + b * sin) / norm, sin * norm / 2, cos * norm / 2], axis=-1)

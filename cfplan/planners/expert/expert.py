@@ -33,7 +33,7 @@ from cfplan.safety.feasibility import broken_by, check_arguments, unsolvable
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
-from cfplan.vehicle.yaw_spline import fixed_yaw, tangent_yaw
+from cfplan.vehicle.yaw_spline import YawSpline
 
 WINDOW = (96, 24)
 # intervals that a window keeps, and how much further it looks: longer windows take more steps
@@ -72,7 +72,7 @@ def plan_expert(
         if boundary and (reason := broken_by(boundary, path, s, airframe, limits)):
             return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
 
-    track = (tangent_yaw if yaw is YawMode.TANGENT else fixed_yaw)(path, nodes, yaw_angle, start, end)
+    track = YawSpline.along(path, nodes, yaw, yaw_angle, start, end)
     shape = Shape(nodes, yaw is YawMode.FREE, turning_limited=limits.angular_acceleration < math.inf)
     whole = Task(path, airframe, limits, Ends(start, end), track, layout_of(shape), backend)
     failures: list[str] = []

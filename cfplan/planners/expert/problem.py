@@ -16,7 +16,7 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 from cfplan.vehicle.profile_spline import spline_profile
-from cfplan.vehicle.yaw_spline import YawTrack
+from cfplan.vehicle.yaw_spline import YawSpline
 
 MARGIN = 1e-3
 # share by which limits are tightened, for what happens between points
@@ -76,7 +76,7 @@ def pose(
     path: Path,
     airframe: Airframe,
     limits: PlanLimits,
-    track: YawTrack,
+    track: YawSpline,
     yaw_angle: float,
     ends: Ends,
     penalties: point_constraints.Penalties,
@@ -168,11 +168,11 @@ def variables_of(table: NDArray, layout: Layout) -> NDArray:
     return x
 
 
-def profile_of(table: NDArray, unit: float, track: YawTrack, end: float) -> SpeedProfile:
+def profile_of(table: NDArray, unit: float, track: YawSpline, end: float) -> SpeedProfile:
     """The profile of these splines, and of the track where yaw is not among them."""
     if table.shape[1] == 2:
         quadratic, step = table[:-1, 1], end / (len(table) - 3)
-        track = YawTrack(
+        track = YawSpline(
             (quadratic[:-1] + quadratic[1:]) / 2, np.diff(quadratic) / step, np.diff(quadratic, 2) / step**2
         )
     return spline_profile(table[:, 0] * unit, end, track)

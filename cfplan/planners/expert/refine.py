@@ -22,7 +22,8 @@ from cfplan.planners.solution import Solution, Status
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
-from cfplan.vehicle.profile_spline import h_coefficients, spline_profile, yaw_of
+from cfplan.vehicle.profile_spline import h_coefficients, spline_profile
+from cfplan.vehicle.yaw_spline import YawSpline
 
 WINDOW = (224, 32)
 # intervals that a window keeps, and how much further it looks
@@ -47,7 +48,7 @@ def refine(
     held at points first; what exceeds them between is looked for where `passes` says that it must be.
     """
     began = time.perf_counter()
-    nodes, unit, track = len(profile.s) - 1, limits.speed**2, yaw_of(profile)
+    nodes, unit, track = len(profile.s) - 1, limits.speed**2, YawSpline.of(profile)
     near = np.maximum(h_coefficients(profile) / unit, FLOOR)[:, None]
     layout = layout_of(Shape(nodes, False, turning_limited=limits.angular_acceleration < math.inf))
     whole = Task(path, airframe, limits, Ends(start, end), track, layout)

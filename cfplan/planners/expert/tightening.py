@@ -16,7 +16,7 @@ from cfplan.planners.expert.solvers import AGAIN, Attempt, again
 from cfplan.planners.solver.interior_point import Search
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.yaw_spline import YawTrack
+from cfplan.vehicle.yaw_spline import YawSpline
 
 ROUNDS = 5
 # of tightening, at most
@@ -32,7 +32,7 @@ class Task:
     airframe: Airframe
     limits: PlanLimits
     ends: Ends
-    track: YawTrack
+    track: YawSpline
     layout: Layout
     backend: Backend | None = None
 

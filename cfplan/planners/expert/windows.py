@@ -16,7 +16,7 @@ from cfplan.planners.expert.program import Shape, layout_of
 from cfplan.planners.expert.tightening import Kept, Task
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.profile import BoundaryState
-from cfplan.vehicle.yaw_spline import YawTrack
+from cfplan.vehicle.yaw_spline import YawSpline
 
 NEAR = 0.5
 # m that a window looks ahead at least, beyond twice what braking takes
@@ -84,7 +84,7 @@ def by_windows(
     return Joined(table, tuple(first * step for first, _ in windows[1:]), iterations, rounds)
 
 
-def _state(rows: NDArray, track: YawTrack, unit: float, step: float) -> BoundaryState:
+def _state(rows: NDArray, track: YawSpline, unit: float, step: float) -> BoundaryState:
     """The state at a node whose first three coefficients of h, and two of yaw where it is free, are in these rows."""
     cubic = rows[:, 0] * unit
     h, slope, bend = (cubic[0] + 4 * cubic[1] + cubic[2]) / 6, (cubic[2] - cubic[0]) / 2, np.diff(cubic, 2)[0]

@@ -14,8 +14,9 @@ from cfplan.planners.expert.windows import windows_of
 from cfplan.planners.solution import Status
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
-from cfplan.vehicle.profile_spline import h_coefficients, spline_profile, yaw_of
+from cfplan.vehicle.profile_spline import h_coefficients, spline_profile
 from cfplan.vehicle.trajectory import Trajectory
+from cfplan.vehicle.yaw_spline import YawSpline
 
 BOX = np.array([[-2.0, -4.0, 0.0], [2.5, 4.0, 2.0]])
 
@@ -32,7 +33,7 @@ def disturbed(profile, end, size, seed=0):
     random = np.random.default_rng(seed)
     coefficients = h_coefficients(profile)
     waves = sum(random.normal() * np.sin(np.linspace(0, k * np.pi, len(coefficients))) for k in range(2, 9))
-    return spline_profile(coefficients * (1 + size * waves / np.abs(waves).max()) ** 2, end, yaw_of(profile))
+    return spline_profile(coefficients * (1 + size * waves / np.abs(waves).max()) ** 2, end, YawSpline.of(profile))
 
 
 @pytest.mark.parametrize("limit_set", ["hardware", "simulation"])
@@ -75,7 +76,9 @@ def test_boundary_states_are_kept():
     first, last = 30, 80
     part = path.part(expert.s[first], expert.s[last])
     start, end = expert.boundary(first), expert.boundary(last)
-    cut = spline_profile(h_coefficients(expert)[first : last + 3] * 0.98**2, part.end, yaw_of(expert).part(first, last))
+    cut = spline_profile(
+        h_coefficients(expert)[first : last + 3] * 0.98**2, part.end, YawSpline.of(expert).part(first, last)
+    )
     profile = refine(part, cut, chosen.airframe, chosen.limits, start=start, end=end).profile
     for state, found in ((start, profile.boundary(0)), (end, profile.boundary(-1))):
         assert (found.h, found.dh, found.ddh) == pytest.approx((state.h, state.dh, state.ddh), rel=1e-6, abs=1e-6)
@@ -84,7 +87,7 @@ def test_boundary_states_are_kept():
 def test_what_cannot_be_refined_has_a_reason():
     path, chosen, expert = planned("hardware", 2)
     rough = np.random.default_rng(3).uniform(0.01, 400.0, len(expert.s) + 2)
-    solution = refine(path, spline_profile(rough, path.end, yaw_of(expert)), chosen.airframe, chosen.limits)
+    solution = refine(path, spline_profile(rough, path.end, YawSpline.of(expert)), chosen.airframe, chosen.limits)
     if solution.profile is None:
         assert solution.status is Status.NOT_CONVERGED
         assert "refining s = " in solution.reason

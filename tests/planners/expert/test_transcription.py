@@ -21,14 +21,14 @@ from cfplan.planners.solution import Status
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.vehicle.trajectory import Trajectory
-from cfplan.vehicle.yaw_spline import fixed_yaw
+from cfplan.vehicle.yaw_spline import YawSpline
 
 HARDWARE = LIMIT_SETS["hardware"]
 PATH = min_snap(np.array([[0.5, 0.5, 1.0], [3.5, 1.0, 1.5], [3.0, 4.0, 0.8]]))
 
 
 def posed(shape: Shape):
-    track = fixed_yaw(PATH, shape.nodes, 0.2, None, None)
+    track = YawSpline.fixed(PATH, shape.nodes, 0.2, None, None)
     return pose(
         layout_of(shape), PATH, HARDWARE.airframe, HARDWARE.limits, track, 0.2, Ends(None, None), Penalties()
     ), track
