@@ -75,6 +75,7 @@ def obtain_plan(path_or_plan: Path, options: PlanOptions, steps: Steps) -> Plann
 
     from cfplan.geometry.path_file import load_path_file
     from cfplan.planners.baselines.convex import lower_bound
+    from cfplan.planners.task import PlanningTask
     from cfplan.planning.plan import plan as make_plan
     from cfplan.safety.space import check_space
 
@@ -96,7 +97,7 @@ def obtain_plan(path_or_plan: Path, options: PlanOptions, steps: Steps) -> Plann
         said.append(f"{plan.trajectory.duration:.2f} s of flight by {plan.planner}")
         said.extend(plan.notes)
     with steps.step("bound") as said:
-        bound = plan.lower_bound or lower_bound(plan.path, plan.airframe, limits.plan)
+        bound = plan.lower_bound or lower_bound(PlanningTask(plan.path, plan.airframe, limits.plan))
         said.append(
             f"no flight takes less than {bound:.2f} s; this one {plan.trajectory.duration / bound - 1:.1%} more"
         )

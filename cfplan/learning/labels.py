@@ -14,6 +14,7 @@ from cfplan.geometry.random_paths import perturbed, random_waypoints
 from cfplan.learning.dataset_spec import DatasetSpec, Relabel
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.solution import Solution, Status
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.safety.limits import PlanLimits
@@ -111,7 +112,7 @@ def _row(spec: DatasetSpec, row: int) -> tuple[dict[str, Any], float]:
 
 def _solve(spec: DatasetSpec, path: Path) -> Solution:
     chosen = LIMIT_SETS[spec.limits]
-    return plan_expert(path, chosen.airframe, chosen.limits, nodes=spec.nodes, yaw=spec.yaw)
+    return plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes=spec.nodes, yaw=spec.yaw))
 
 
 @lru_cache(maxsize=1)

@@ -8,6 +8,7 @@ The profile is what the network makes of the path, no more: it becomes a flight 
 """
 
 import time
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +35,7 @@ from cfplan.learning.model_files import Model, find_model
 from cfplan.learning.smooth import Begin, smoothed
 from cfplan.learning.windows import chain, kept
 from cfplan.planners.solution import Solution, Status
-from cfplan.safety.feasibility import broken_by, check_arguments, unsolvable
-from cfplan.safety.limits import PlanLimits
-from cfplan.vehicle.airframe import Airframe
+from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import spline_profile
 from cfplan.vehicle.yaw_spline import YawSpline
@@ -48,29 +47,21 @@ LOWERED_WIDTH = 2.0
 # nodes, over which lowering for tighter limits is smoothed
 
 
-def plan_learned(
-    path: Path,
-    airframe: Airframe,
-    limits: PlanLimits,
-    *,
-    nodes: int = 100,
-    yaw: YawMode = YawMode.FIXED,
-    yaw_angle: float = 0.0,
-    start: BoundaryState | None = None,
-    end: BoundaryState | None = None,
-    model: Model | None = None,
-) -> Solution:
-    """Plan over `nodes` intervals uniform in s, or over one window's where those are more; see Planner.
+def plan_learned(task: PlanningTask, *, model: Model | None = None) -> Solution:
+    """Plan by the network over the task's intervals, or over one window's where those are more.
 
     Limits looser than the model's are used as far as the model knows; for tighter ones the profile is lowered to about
     what they allow, and repair does the rest.
 
     Raises:
-        InputError: fewer than ten nodes, arguments that are not numbers, or no model for this vehicle and these limits.
+        InputError: fewer than ten nodes, or than the path needs, or no model for this vehicle and these limits.
     """
     began = time.perf_counter()
-    if nodes < LEAST_NODES:
-        raise InputError(f"{nodes} nodes; the learned planner needs {LEAST_NODES}", where="nodes", hint="100 is usual")
+    if task.nodes < LEAST_NODES:
+        raise InputError(
+            f"{task.nodes} nodes; the learned planner needs {LEAST_NODES}", where="nodes", hint="100 is usual"
+        )
+    path, airframe, limits = task.path, task.airframe, task.limits
     model = model or find_model(airframe, limits)
     if model is None:
         raise InputError(
@@ -78,21 +69,19 @@ def plan_learned(
             where="models",
             hint="train one with `cfplan train`, or take another planner",
         )
-    nodes = max(nodes, model.window)
-    check_arguments(path, nodes, yaw_angle, start, end)
-    if reason := unsolvable(airframe, limits):
-        return Solution(Status.INFEASIBLE, None, reason)
-    for name, boundary, s in (("start", start, 0.0), ("end", end, path.end)):
-        if boundary and (reason := broken_by(boundary, path, s, airframe, limits)):
-            return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
-
+    if task.nodes < model.window:
+        task = replace(task, nodes=model.window)
+    task.check_nodes()
+    if task.refusal:
+        return task.refusal
+    nodes, yaw, start, end = task.nodes, task.yaw, task.start, task.end
     track = None
     if yaw is not YawMode.FREE:
-        track = YawSpline.along(path, nodes, yaw, yaw_angle, start, end)
+        track = YawSpline.along(path, nodes, yaw, task.yaw_angle, start, end)
     known, allowed = model.card.limits, model.limits_within(limits)
     coefficients, turned = predict(
         path, model.network, bounds(airframe, known), nodes, model.window, start=start, end=end,
-        track=track, yaw_angle=yaw_angle, allowed=bounds(airframe, allowed) if allowed != known else None,
+        track=track, yaw_angle=task.yaw_angle, allowed=bounds(airframe, allowed) if allowed != known else None,
     )  # fmt: skip
     if not (np.isfinite(coefficients).all() and np.isfinite(turned).all() and (coefficients[1:-1] > 0).all()):
         return Solution(Status.NOT_CONVERGED, None, f"the network {model.name} answered what is not a number")

@@ -1,3 +1,3 @@
-"""Planners of the speed profile: the expert, its solver, and the baselines that it is measured against."""
+"""Planners of the speed profile: the task and the answer, the expert, its solver, and baselines to compare with."""
 
-__all__ = ["baselines", "expert", "solution"]
+__all__ = ["baselines", "expert", "solution", "task"]

@@ -12,6 +12,7 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.learning.model_files import find_model
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.solution import Solution
+from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO, find_planner
 from cfplan.planning.repair import Repaired, repair, slow
@@ -66,6 +67,13 @@ class _Question:
     def nodes_for(self, planner: str) -> int:
         return self.nodes if self.nodes is not None else default_nodes(self.path, planner)
 
+    def task(self, planner: str, nodes: int | None = None) -> PlanningTask:
+        """What that planner is asked, over its own number of nodes where none is given."""
+        return PlanningTask(
+            self.path, self.airframe, self.limits.plan, nodes or self.nodes_for(planner), self.yaw, self.yaw_angle,
+            self.start, self.end,
+        )  # fmt: skip
+
 
 def default_nodes(path: Path, planner: str = "expert") -> int:
     """Intervals for a path: some a metre, within bounds, and a few for each of its pieces."""
@@ -119,7 +127,7 @@ def plan(
         notes.append(f"{found.planner}'s profile was {changed}")
     flown = slowed
     if speed_share < 1.0:
-        flown = slow(path, slowed.trajectory.profile.slowed(speed_share), airframe, limits.plan, limits.space)
+        flown = slow(question.task(found.planner), slowed.trajectory.profile.slowed(speed_share), limits.space)
     _check_endurance(flown.trajectory.duration, limits)
     return Plan(
         path=path,
@@ -140,7 +148,7 @@ def plan(
 
 def _automatic(question: _Question, notes: list[str]) -> tuple[_Found, float]:
     """The fastest of what takes milliseconds, or of the expert; and the proven bound, s."""
-    path, airframe, limits = question.path, question.airframe, question.limits.plan
+    airframe, limits = question.airframe, question.limits.plan
     names = ["convex"]
     try:
         if model := find_model(airframe, limits):
@@ -151,7 +159,7 @@ def _automatic(question: _Question, notes: list[str]) -> tuple[_Found, float]:
     except InputError as error:
         notes.append(f"no learned plan: {error}")
     found = [one for name in names if (one := _ask(question, name, question.nodes_for(name), notes))]
-    bound = lower_bound(path, airframe, limits, start=question.start, end=question.end)
+    bound = lower_bound(question.task("convex"))
     best = min(found, key=lambda one: one.duration, default=None)
     if best is None or best.repaired.share < 1.0 or best.duration > (1.0 + EXPERT_GAP) * bound:
         try:
@@ -213,21 +221,17 @@ def _best(question: _Question, planner: str, notes: list[str]) -> _Found:
 
 def _ask(question: _Question, name: str, nodes: int, notes: list[str]) -> _Found | None:
     """A planner's profile, repaired; None, and a note why, where nothing came of it."""
-    path, airframe, limits = question.path, question.airframe, question.limits
-    solution = find_planner(name)(
-        path, airframe, limits.plan, nodes=nodes, yaw=question.yaw, yaw_angle=question.yaw_angle,
-        start=question.start, end=question.end,
-    )  # fmt: skip
+    task = question.task(name, nodes)
+    solution = find_planner(name)(task)
     if solution.profile is None:
         notes.append(_failure(name, nodes, solution))
         return None
     nodes = len(solution.profile.s) - 1
     try:
         if name in REFINED:
-            ends = {"start": question.start, "end": question.end}
-            repaired = repair(path, solution.profile, airframe, limits.plan, limits.space, **ends)
+            repaired = repair(task, solution.profile, question.limits.space)
         else:
-            repaired = slow(path, solution.profile, airframe, limits.plan, limits.space)
+            repaired = slow(task, solution.profile, question.limits.space)
     except (InfeasibleError, NotCertifiedError) as error:
         notes.append(f"{name} with {nodes} nodes: {error}")
         return None

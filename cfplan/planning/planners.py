@@ -5,7 +5,7 @@ from importlib import import_module
 from types import MappingProxyType
 
 from cfplan.errors import InputError
-from cfplan.planners.solution import Planner
+from cfplan.planners.task import Planner
 
 AUTO = "auto"
 # no planner: the fastest of some, see plan()

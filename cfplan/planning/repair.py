@@ -9,15 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cfplan.geometry.path import Path
 from cfplan.planners.expert.intersample import violates_at_nodes
 from cfplan.planners.expert.refine import refine
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import Certificate, certify
-from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import Slowed, slow_until_certified
 from cfplan.safety.space import Space
-from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.profile import BoundaryState, SpeedProfile
+from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import duration_of
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -59,22 +57,14 @@ class Repaired:
         return f"refined; {cost}" if duration != self.before else ""
 
 
-def repair(
-    path: Path,
-    profile: SpeedProfile,
-    airframe: Airframe,
-    limits: PlanLimits,
-    space: Space | None = None,
-    *,
-    start: BoundaryState | None = None,
-    end: BoundaryState | None = None,
-) -> Repaired:
-    """The certified trajectory nearest to the profile. Boundary states are kept by refining, not by slowing.
+def repair(task: PlanningTask, profile: SpeedProfile, space: Space | None = None) -> Repaired:
+    """Return the certified trajectory nearest to the profile. Boundary states are kept by refining, not by slowing.
 
     Raises:
         InfeasibleError: hovering, or the path itself, breaks a limit; says which.
         NotCertifiedError: the profile is not finite, not smooth, or h is not positive.
     """
+    path, airframe, limits = task.path, task.airframe, task.limits
     before = duration_of(profile)
     if not violates_at_nodes(path, profile, airframe, limits):
         trajectory = Trajectory(path, profile, airframe)
@@ -90,9 +80,9 @@ def repair(
             certified.append(Slowed(trajectory, certificate, 1.0))
         return certificate.passed
 
-    solution = refine(path, profile, airframe, limits, start=start, end=end, passes=passes)
+    solution = refine(task, profile, passes=passes)
     if solution.profile is None:
-        return slow(path, profile, airframe, limits, space, failed=solution.reason)
+        return slow(task, profile, space, failed=solution.reason)
     if not certified:
         certified.append(slow_until_certified(Trajectory(path, solution.profile, airframe), limits, space))
     (slowed,) = certified
@@ -102,13 +92,10 @@ def repair(
     )  # fmt: skip
 
 
-def slow(
-    path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits, space: Space | None = None,
-    *, failed: str = "",
-) -> Repaired:  # fmt: skip
-    """The profile slowed as a whole until it passes: itself where it does. Raises as repair()."""
-    trajectory = Trajectory(path, profile, airframe)
-    slowed = slow_until_certified(trajectory, limits, space)
+def slow(task: PlanningTask, profile: SpeedProfile, space: Space | None = None, *, failed: str = "") -> Repaired:
+    """Slow the profile as a whole until it passes; one that does stays as it is. Raises as repair()."""
+    trajectory = Trajectory(task.path, profile, task.airframe)
+    slowed = slow_until_certified(trajectory, task.limits, space)
     return Repaired(slowed.trajectory, slowed.certificate, slowed.share, trajectory.duration, failed=failed)
 
 

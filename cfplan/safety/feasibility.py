@@ -1,39 +1,18 @@
 """What makes a plan impossible before any solver is asked."""
 
 import math
-from dataclasses import astuple
 
-from cfplan.errors import InputError
 from cfplan.geometry.path import Path
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.flatness import flat_state
 from cfplan.vehicle.profile import BoundaryState
 
-LEAST_NODES = 12
-NODES_PER_PIECE = 3
 HARDLY = 1e-3
 # share by which a boundary state may exceed a limit: noise of whoever made it
 
 
-def check_arguments(
-    path: Path, nodes: int, yaw_angle: float, start: BoundaryState | None, end: BoundaryState | None
-) -> None:
-    """Refuse what is not a number, and fewer nodes than the path has shape for. Raises InputError."""
-    if not math.isfinite(yaw_angle):
-        raise InputError(f"the yaw angle must be a finite number, not {yaw_angle}")
-    for name, boundary in (("start", start), ("end", end)):
-        if boundary and not all(math.isfinite(value) for value in astuple(boundary)):
-            raise InputError(f"the {name} state is not finite: {boundary}")
-    pieces = len(path.breaks) - 1
-    least = max(LEAST_NODES, NODES_PER_PIECE * pieces)
-    if nodes < least:
-        raise InputError(
-            f"{nodes} nodes are too few for a path of {pieces} pieces", hint=f"take at least {least}; 100 is usual"
-        )
-
-
-def unsolvable(airframe: Airframe, limits: PlanLimits) -> str:
+def infeasible_limit(airframe: Airframe, limits: PlanLimits) -> str:
     """Which limit excludes every flight, because it excludes hovering; empty where none does."""
     for name in PlanLimits.__slots__:
         value = getattr(limits, name)
@@ -50,7 +29,7 @@ def unsolvable(airframe: Airframe, limits: PlanLimits) -> str:
     return ""
 
 
-def broken_by(boundary: BoundaryState, path: Path, s: float, airframe: Airframe, limits: PlanLimits) -> str:
+def violated_limit(boundary: BoundaryState, path: Path, s: float, airframe: Airframe, limits: PlanLimits) -> str:
     """Which limit a boundary state breaks by itself, whatever follows; empty where it breaks none."""
     if boundary.h <= 0:
         return f"h must be positive, not {boundary.h:g}"

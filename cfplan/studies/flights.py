@@ -13,6 +13,7 @@ from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import encode
 from cfplan.geometry.path_file import load_path_file
 from cfplan.planners.baselines.convex import lower_bound
+from cfplan.planners.task import PlanningTask
 from cfplan.simulation.dry_run import dry_run
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.missions import PlannedMission, planned_mission
@@ -185,7 +186,7 @@ def _rehearsed(name: str, made: PlannedMission) -> Planned:
         length=plan.path.length,
         planner=plan.planner,
         planned=plan.trajectory.duration,
-        lower_bound=plan.lower_bound or lower_bound(plan.path, plan.airframe, plan.limits.plan),
+        lower_bound=plan.lower_bound or lower_bound(PlanningTask(plan.path, plan.airframe, plan.limits.plan)),
         slowed=plan.slowed,
         worst_share=plan.certificate.worst.share,
         dry_run=rehearsal.deviation,

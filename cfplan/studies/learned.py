@@ -17,14 +17,14 @@ from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.baselines.convex import plan_convex
 from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.task import PlanningTask
 from cfplan.planning.repair import repair, slow
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import BOXES, LIMIT_SETS, LimitSet
-from cfplan.safety.limits import FlightLimits, Ladder, PlanLimits
+from cfplan.safety.limits import FlightLimits, Ladder
 from cfplan.simulation.dry_run import dry_run
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.trials import find_box, find_limit_set, random_path
-from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
 NODES = 100
@@ -231,24 +231,25 @@ def _fly(path: Path, box: str, seed: int, chosen: LimitSet) -> Flight:
     values |= {"box": box, "limits": chosen.name, "seed": seed, "length": path.length}
     try:
         path.check()
-        expert = plan_expert(path, airframe, limits, nodes=NODES)
+        task = PlanningTask(path, airframe, limits, NODES)
+        expert = plan_expert(task)
         if expert.profile is None:
             return Flight(**values | {"reason": f"expert: {expert.reason or expert.status}"})
-        mended = repair(path, expert.profile, airframe, limits)
+        mended = repair(task, expert.profile)
         values |= {"expert_planned": mended.before, "expert": mended.trajectory.duration}
 
         begun = time.perf_counter()
-        solution = plan_learned(path, airframe, limits, nodes=NODES)
+        solution = plan_learned(task)
         planned = time.perf_counter()
         if solution.profile is None:
             return Flight(**values | {"reason": f"learned: {solution.reason or solution.status}"})
-        found = repair(path, solution.profile, airframe, limits)
+        found = repair(task, solution.profile)
         repaired = time.perf_counter()
         values |= {"network": found.before, "learned": found.trajectory.duration, "share": found.share}
         raw = certify(Trajectory(path, solution.profile, airframe), limits)
         values["worst_share"] = raw.worst.share
         if seed % CONVEX_EVERY == 0:
-            values |= _convex(path, airframe, limits)
+            values |= _convex(task)
 
         encoding = time.perf_counter()
         encoded = encode_checked(found.trajectory, limits)
@@ -264,12 +265,12 @@ def _fly(path: Path, box: str, seed: int, chosen: LimitSet) -> Flight:
         return Flight(**values | {"reason": str(error)})
 
 
-def _convex(path: Path, airframe: Airframe, limits: PlanLimits) -> dict[str, float]:
+def _convex(task: PlanningTask) -> dict[str, float]:
     """Times of flight of the convex planner's profile, repaired in either way; none where it has no profile."""
-    profile = plan_convex(path, airframe, limits, nodes=NODES).profile
+    profile = plan_convex(task).profile
     if profile is None:
         return {}
-    refined, slowed = repair(path, profile, airframe, limits), slow(path, profile, airframe, limits)
+    refined, slowed = repair(task, profile), slow(task, profile)
     return {"convex_refined": refined.trajectory.duration, "convex_slowed": slowed.trajectory.duration}
 
 

@@ -16,6 +16,7 @@ from cfplan.flight.setpoints.encoding import encode_checked
 from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import default_nodes
 from cfplan.planning.repair import Repaired, repair
 from cfplan.safety.limit_sets import LimitSet
@@ -161,7 +162,7 @@ def _walk(path: Path, seed: int, chosen: LimitSet) -> Walk:
         values |= {"kept": _memory("VmRSS") - before, "peak": _memory("VmHWM") - before}
         values |= {"share": found.share, "flight": found.trajectory.duration}
         values["worst_share"] = found.certificate.worst.share
-        expert = plan_expert(path, chosen.airframe, chosen.limits, nodes=nodes, windows=False)
+        expert = plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes), windows=False)
         if expert.profile is not None:
             values["expert_flight"] = Trajectory(path, expert.profile, chosen.airframe).duration
     except InputError:
@@ -179,11 +180,12 @@ def _repeated(walk: Walk, path: Path, chosen: LimitSet) -> Walk:
 def _planned(path: Path, chosen: LimitSet) -> tuple[Repaired, tuple[float, float, float]]:
     """From the path to certified bytes, and the seconds of each part."""
     begun = time.process_time()
-    solution = plan_learned(path, chosen.airframe, chosen.limits, nodes=default_nodes(path, "learned"))
+    task = PlanningTask(path, chosen.airframe, chosen.limits, default_nodes(path, "learned"))
+    solution = plan_learned(task)
     planned = time.process_time()
     if solution.profile is None:
         raise CfplanError(solution.reason or str(solution.status))
-    found = repair(path, solution.profile, chosen.airframe, chosen.limits)
+    found = repair(task, solution.profile)
     repaired = time.process_time()
     encode_checked(found.trajectory, chosen.limits)
     return found, (planned - begun, repaired - planned, time.process_time() - repaired)

@@ -12,7 +12,7 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.solution import Planner
+from cfplan.planners.task import Planner, PlanningTask
 from cfplan.planning.planners import find_planner
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.trials import find_box, find_limit_set, quantiles
@@ -105,7 +105,7 @@ def scaling(
 
             def solve(planner: Planner, path: Path, nodes: int = nodes) -> tuple[float, int, bool]:
                 begun = time.perf_counter()
-                solution = planner(path, chosen.airframe, chosen.limits, nodes=nodes, yaw=yaw)
+                solution = planner(PlanningTask(path, chosen.airframe, chosen.limits, nodes, yaw))
                 seconds = time.perf_counter() - begun
                 return seconds, int(solution.stats.get("iterations", 0)), solution.profile is not None
 

@@ -13,7 +13,8 @@ from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.baselines.convex import lower_bound
-from cfplan.planners.solution import Planner, Status
+from cfplan.planners.solution import Status
+from cfplan.planners.task import Planner, PlanningTask
 from cfplan.planning.planners import find_planner
 from cfplan.planning.repair import Repaired, repair, slow
 from cfplan.safety.certificate import certify
@@ -119,7 +120,7 @@ def path_trials(
     try:
         path = random_path(seed, box)
         path.check()
-        bound = lower_bound(path, chosen.airframe, chosen.limits)
+        bound = lower_bound(PlanningTask(path, chosen.airframe, chosen.limits))
     except CfplanError as error:
         return [failed_trial(name, seed, BAD_PATH, str(error)) for name in entrants]
     return [
@@ -133,7 +134,8 @@ def run_trial(
 ) -> Trial:
     """Plan, certify, repair. Whatever fails is a trial with a reason."""
     begun = time.perf_counter()
-    solution = entrant.plan(path, chosen.airframe, chosen.limits, nodes=nodes, yaw=yaw)
+    task = PlanningTask(path, chosen.airframe, chosen.limits, nodes, yaw)
+    solution = entrant.plan(task)
     plan_seconds = time.perf_counter() - begun
     solve_seconds = float(solution.stats.get("solve_seconds", np.nan))
     values = {"plan_seconds": plan_seconds, "solve_seconds": solve_seconds, "bound": bound}
@@ -143,7 +145,7 @@ def run_trial(
         planned = Trajectory(path, solution.profile, chosen.airframe)
         certificate = certify(planned, chosen.limits)
         begun = time.perf_counter()
-        repaired = entrant.mend(path, solution.profile, chosen.airframe, chosen.limits)
+        repaired = entrant.mend(task, solution.profile)
         repair_seconds = time.perf_counter() - begun
     except CfplanError as error:
         return failed_trial(name, seed, Status.SOLVED.name, f"not certified: {error}", **values)

@@ -16,6 +16,7 @@ from cfplan.learning.features import REFERENCE, bounds, start_logs, told
 from cfplan.learning.learned import plan_learned, predict
 from cfplan.learning.windows import chain, kept
 from cfplan.planners.solution import Status
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
@@ -25,7 +26,7 @@ PATH = min_snap([[-1, -1, 0.8], [0, 0.5, 1.2], [1, -0.5, 0.9], [1.5, 1.0, 1.4]])
 
 
 def plan(model, path=PATH, **options):
-    return plan_learned(path, CHOSEN.airframe, CHOSEN.limits, model=model, **options)
+    return plan_learned(PlanningTask(path, CHOSEN.airframe, CHOSEN.limits, **options), model=model)
 
 
 def long_path(turns: int):
@@ -154,7 +155,7 @@ def test_tighter_limits_lower_the_profile_and_looser_ones_leave_it(model):
     own = plan(model).profile
     for change, compare in (({"speed": 3.0, "tilt": 1.0}, np.equal), ({"speed": 1.2}, np.less_equal)):
         limits = replace(CHOSEN.limits, **change)
-        found = plan_learned(PATH, CHOSEN.airframe, limits, model=model).profile
+        found = plan_learned(PlanningTask(PATH, CHOSEN.airframe, limits), model=model).profile
         assert compare(found.h, own.h).all()
     speed = np.linalg.norm(PATH(found.s, 1), axis=1) * np.sqrt(found.h)
     before = np.linalg.norm(PATH(own.s, 1), axis=1) * np.sqrt(own.h)

@@ -22,9 +22,9 @@ def stub(monkeypatch, **answers):
     calls = []
 
     def find(name):
-        def planner(path, airframe, limits, *, nodes, **options):
-            calls.append((name, nodes, options))
-            return answers[name](path, nodes)
+        def planner(task):
+            calls.append((name, task.nodes, task))
+            return answers[name](task.path, task.nodes)
 
         return planner
 
@@ -134,7 +134,8 @@ def test_yaw_and_boundary_states_reach_the_planner(path, limits, make_profile, m
     calls = stub(monkeypatch, toppquad=lambda path, nodes: Solution(Status.SOLVED, slow))
     end = slow.boundary(-1)
     plan(path, limits.airframe, limits, planner="toppquad", yaw=YawMode.TANGENT, yaw_angle=0.3, end=end)
-    assert calls[0][2] == {"yaw": YawMode.TANGENT, "yaw_angle": 0.3, "start": None, "end": end}
+    task = calls[0][2]
+    assert (task.yaw, task.yaw_angle, task.start, task.end) == (YawMode.TANGENT, 0.3, None, end)
 
 
 def test_a_path_outside_the_space_is_refused_before_any_planner_runs(limits, monkeypatch):
@@ -197,7 +198,7 @@ def automatic(monkeypatch, make_profile, model=True, **rates):
     }
     known = SimpleNamespace(differences=lambda limits: ("speed is tighter",))
     monkeypatch.setattr("cfplan.planning.plan.find_model", lambda airframe, limits: known if model else None)
-    monkeypatch.setattr("cfplan.planning.plan.lower_bound", lambda path, *_, **__: path.end / 0.4**0.5)
+    monkeypatch.setattr("cfplan.planning.plan.lower_bound", lambda task: task.path.end / 0.4**0.5)
     return stub(monkeypatch, **answers)
 
 

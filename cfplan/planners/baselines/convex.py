@@ -14,16 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InfeasibleError
-from cfplan.geometry.path import Path
-from cfplan.geometry.yaw import YawMode
 from cfplan.planners.baselines.convex_profile import smooth_profile, window
 from cfplan.planners.baselines.convex_rows import Rows, inner_rows, outer_rows
 from cfplan.planners.baselines.convex_stations import Stations, stations
-from cfplan.planners.baselines.selection import least_slowed
+from cfplan.planners.baselines.selection import select_fastest
 from cfplan.planners.solution import Solution, Status
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.yaw_spline import YawSpline
 
 BOUND_SPACING, BOUND_TURN = 0.005, 0.004
@@ -38,15 +36,8 @@ Boundary = tuple[float | None, float | None]
 # m²/s² at the start and the end of the path, None where it is free
 
 
-def lower_bound(
-    path: Path,
-    airframe: Airframe,
-    limits: PlanLimits,
-    *,
-    start: BoundaryState | None = None,
-    end: BoundaryState | None = None,
-) -> float:
-    """s: no motion along the path within speed, acceleration and collective thrust takes less.
+def lower_bound(task: PlanningTask) -> float:
+    """Return the time, s, below which no motion keeps the limits of speed, acceleration and collective thrust.
 
     What is proven: a feasible motion sampled at the stations meets every row (`outer_rows`), so at each station it is
     no faster than the reachable set's top; between two stations it cannot exceed what full acceleration from both
@@ -56,9 +47,9 @@ def lower_bound(
     Raises:
         InfeasibleError: not even these limits can be met.
     """
-    at = stations(path, spacing=BOUND_SPACING, turn=BOUND_TURN)
-    top = _outer_top(at, airframe, limits, _boundary(path, start, end))
-    return float(np.sum(_least_times(at, top, limits)))
+    at = stations(task.path, spacing=BOUND_SPACING, turn=BOUND_TURN)
+    top = _outer_top(at, task.airframe, task.limits, _boundary(task))
+    return float(np.sum(_least_times(at, top, task.limits)))
 
 
 def _outer_top(at: Stations, airframe: Airframe, limits: PlanLimits, boundary: Boundary) -> NDArray:
@@ -76,30 +67,20 @@ def _fastest(at: Stations, top: NDArray, limits: PlanLimits) -> NDArray:
     return np.minimum(np.sqrt(around), limits.speed)
 
 
-def plan_convex(
-    path: Path,
-    airframe: Airframe,
-    limits: PlanLimits,
-    *,
-    nodes: int = 100,
-    yaw: YawMode = YawMode.FIXED,
-    yaw_angle: float = 0.0,
-    start: BoundaryState | None = None,
-    end: BoundaryState | None = None,
-) -> Solution:
-    """The convex problem from inside, made smooth. Of a boundary state only h is met, and only roughly."""
+def plan_convex(task: PlanningTask) -> Solution:
+    """Solve the convex problem from inside and smooth it. Of a boundary state only h is met, and only roughly."""
     begun = time.perf_counter()
-    boundary = _boundary(path, start, end)
-    at = stations(path, spacing=PLAN_SPACING, turn=PLAN_TURN)
+    airframe, limits, boundary = task.airframe, task.limits, _boundary(task)
+    at = stations(task.path, spacing=PLAN_SPACING, turn=PLAN_TURN)
     fastest = np.full(len(at.length), limits.speed)
     try:
         speeds = _solved(at, inner_rows(at, airframe, limits, fastest), boundary)
     except InfeasibleError as error:
         return Solution(Status.INFEASIBLE, None, str(error))
-    along = YawSpline.along(path, nodes, yaw, yaw_angle)
+    along = YawSpline.along(task.path, task.nodes, task.yaw, task.yaw_angle)
     width = window(airframe, limits)
-    profiles = (smooth_profile(path, at, speeds, share * width, nodes, along) for share in WINDOW_SHARES)
-    profile = least_slowed(path, profiles, airframe, limits)
+    profiles = (smooth_profile(task.path, at, speeds, share * width, task.nodes, along) for share in WINDOW_SHARES)
+    profile = select_fastest(task, profiles)
     stats: dict[str, float | int | str] = {
         "solver": "copp-py",
         "solve_seconds": time.perf_counter() - begun,
@@ -110,11 +91,11 @@ def plan_convex(
     return Solution(Status.SOLVED, profile, stats=stats)
 
 
-def _boundary(path: Path, start: BoundaryState | None, end: BoundaryState | None) -> Boundary:
-    """b at the path's ends: 0 at a rest end, None where it is free."""
+def _boundary(task: PlanningTask) -> Boundary:
+    """Return b at the path's ends: 0 at a rest end, None where it is free."""
     values = []
-    for s, state in ((0.0, start), (path.end, end)):
-        square = float(np.sum(path(np.array([s]), 1) ** 2))
+    for s, state in ((0.0, task.start), (task.path.end, task.end)):
+        square = float(np.sum(task.path(np.array([s]), 1) ** 2))
         values.append(0.0 if square == 0.0 else None if state is None else state.h * square)
     return values[0], values[1]
 

@@ -5,36 +5,24 @@ import time
 import numpy as np
 
 from cfplan.errors import InfeasibleError, NotCertifiedError
-from cfplan.geometry.path import Path
-from cfplan.geometry.yaw import YawMode
 from cfplan.planners.solution import Solution, Status
-from cfplan.safety.limits import PlanLimits
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.slowing import slow_until_certified
-from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.profile import BoundaryState, SpeedProfile
+from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 from cfplan.vehicle.yaw_spline import YawSpline
 
 SAMPLES_PER_UNIT = 200  # of s, where the greatest nominal speed is sought
 
 
-def plan_min_snap(
-    path: Path,
-    airframe: Airframe,
-    limits: PlanLimits,
-    *,
-    nodes: int = 100,
-    yaw: YawMode = YawMode.FIXED,
-    yaw_angle: float = 0.0,
-    start: BoundaryState | None = None,
-    end: BoundaryState | None = None,
-) -> Solution:
-    """h constant, as great as the certificate allows. A boundary state's h would have to be just that one: not met."""
+def plan_min_snap(task: PlanningTask) -> Solution:
+    """Plan h constant, as great as the certificate allows. Boundary states are not met: h would have to be theirs."""
     begun = time.perf_counter()
+    path, airframe, limits, nodes = task.path, task.airframe, task.limits, task.nodes
     grid = np.linspace(0.0, path.end, nodes + 1)
     dense = np.linspace(0.0, path.end, max(1000, int(SAMPLES_PER_UNIT * path.end)))
     fastest = limits.speed / np.linalg.norm(path(dense, 1), axis=1).max()  # ds/dt that meets the speed limit
-    turning = YawSpline.along(path, nodes, yaw, yaw_angle)
+    turning = YawSpline.along(path, nodes, task.yaw, task.yaw_angle)
     zeros = np.zeros(nodes + 1)
     profile = SpeedProfile(
         grid, np.full(nodes + 1, fastest**2), zeros, zeros, zeros[1:], turning.yaw, turning.dyaw, turning.ddyaw

@@ -5,10 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from cfplan.errors import NotCertifiedError
-from cfplan.geometry.path import Path
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import Certificate, certify
-from cfplan.safety.limits import PlanLimits
-from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -16,14 +14,12 @@ PROPORTIONAL = frozenset({"speed", "angular velocity"})
 # to speed; every other share grows with its square
 
 
-def least_slowed(
-    path: Path, profiles: Iterable[SpeedProfile], airframe: Airframe, limits: PlanLimits
-) -> SpeedProfile | None:
-    """The fastest once slowed as far as each one's certificate asks; None if none can be flown."""
+def select_fastest(task: PlanningTask, profiles: Iterable[SpeedProfile]) -> SpeedProfile | None:
+    """Return the profile that is fastest once slowed as far as its certificate asks; None if none can be flown."""
     best, least = None, np.inf
     for profile in profiles:
         try:
-            certificate = certify(Trajectory(path, profile, airframe), limits)
+            certificate = certify(Trajectory(task.path, profile, task.airframe), task.limits)
         except NotCertifiedError:  # h falls to zero somewhere
             continue
         share = _speed_share(certificate)

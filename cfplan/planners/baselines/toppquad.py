@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.baselines.selection import least_slowed
+from cfplan.planners.baselines.selection import select_fastest
 from cfplan.planners.baselines.toppquad_nlp import H_LEAST, ROWS, STEP_ROWS, VARIABLES, Program, program
 from cfplan.planners.solution import Solution, Status
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import profile_through
 from cfplan.vehicle.rotations import hopf_quaternion, product
 from cfplan.vehicle.yaw_spline import YawSpline
@@ -35,32 +35,24 @@ H_STIFFNESSES = (1e-2, 1e-1, 1.0, 10.0, 100.0)
 YAW_STIFFNESS = 1e-2
 
 
-def plan_toppquad(
-    path: Path,
-    airframe: Airframe,
-    limits: PlanLimits,
-    *,
-    nodes: int = 100,
-    yaw: YawMode = YawMode.FREE,
-    yaw_angle: float = 0.0,
-    start: BoundaryState | None = None,
-    end: BoundaryState | None = None,
-) -> Solution:
-    """Solve the paper's problem over `nodes` intervals. Free yaw starts in [0, π/2].
+def plan_toppquad(task: PlanningTask) -> Solution:
+    """Solve the paper's problem. Free yaw, which is the paper's, starts in [0, π/2].
 
     Of a boundary state h and h' are met, and yaw at the start: the problem's states have no more.
     """
+    path, airframe, limits, nodes = task.path, task.airframe, task.limits, task.nodes
+    yaw, yaw_angle = task.yaw, task.yaw_angle
     if nodes < NODES_LEAST:
         return Solution(Status.NOT_CONVERGED, None, f"{nodes} intervals are too few, take {NODES_LEAST} at least")
     begun = time.perf_counter()
     prepared = program(nodes + 1, airframe, limits.angular_acceleration, MAX_ITERATIONS, MAX_SECONDS)
     built = time.perf_counter()
     grid = np.linspace(0.0, path.end, nodes + 1)
-    if start is not None and yaw is YawMode.FREE:
-        yaw_angle = start.yaw
+    if task.start is not None and yaw is YawMode.FREE:
+        yaw_angle = task.start.yaw
     angles = YawSpline.along(path, nodes, yaw, yaw_angle).yaw
-    asked = _bounds(path, grid, airframe, limits, yaw, start, end)
-    held = _bounds(path, grid, airframe, limits, YawMode.FIXED, start, end)
+    asked = _bounds(task, grid, yaw)
+    held = _bounds(task, grid, YawMode.FIXED)
     guesses = [_guess(path, grid, airframe, angles, _guessed_h(path, grid, limits, speed)) for speed in GUESS_SPEEDS]
     parameters = _parameters(path, grid, angles)
 
@@ -89,7 +81,7 @@ def plan_toppquad(
         profile_through(grid, grid, found.x[:, 0], angles, h_stiffness=stiffness, yaw_stiffness=YAW_STIFFNESS)
         for stiffness in H_STIFFNESSES
     )
-    profile = least_slowed(path, profiles, airframe, limits)
+    profile = select_fastest(task, profiles)
     stats["fit_seconds"] = time.perf_counter() - solved
     if profile is None:
         return Solution(Status.NOT_CONVERGED, None, "no spline through the solution stays above h = 0", stats)
@@ -119,16 +111,9 @@ def _parameters(path: Path, grid: NDArray, angles: NDArray) -> NDArray:
     return np.concatenate([[grid[1] - grid[0]], columns.ravel()])
 
 
-def _bounds(
-    path: Path,
-    grid: NDArray,
-    airframe: Airframe,
-    limits: PlanLimits,
-    yaw: YawMode,
-    start: BoundaryState | None,
-    end: BoundaryState | None,
-) -> dict[str, NDArray]:
-    """lbx, ubx, lbg, ubg."""
+def _bounds(task: PlanningTask, grid: NDArray, yaw: YawMode) -> dict[str, NDArray]:
+    """Return lbx, ubx, lbg, ubg for that way to yaw."""
+    path, airframe, limits = task.path, task.airframe, task.limits
     count = len(grid)
     low, high = np.full((count, VARIABLES), -np.inf), np.full((count, VARIABLES), np.inf)
     square = np.maximum(np.sum(path(grid, 1) ** 2, axis=1), 1e-12)
@@ -144,11 +129,11 @@ def _bounds(
     rows_low[:, 8], rows_low[:, 9] = np.cos(limits.tilt), limits.specific_thrust_min
     if yaw is not YawMode.FREE:
         rows_low[:, 10] = rows_high[:, 10] = 0.0
-    elif start is not None:
+    elif task.start is not None:
         rows_low[0, 10] = rows_high[0, 10] = 0.0
     else:
         low[0, 4], low[0, 5], rows_low[0, 11] = 0.0, 0.0, 0.0  # z ≥ 0, w ≥ 0 and z ≤ w: yaw in [0, π/2]
-    for index, state in ((0, start), (-1, end)):
+    for index, state in ((0, task.start), (-1, task.end)):
         if state is not None:
             low[index, :2] = high[index, :2] = (state.h, state.dh)
     steps = np.zeros((count - 1) * STEP_ROWS)

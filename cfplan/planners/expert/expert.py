@@ -18,7 +18,6 @@ import time
 
 from numpy.typing import NDArray
 
-from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert.compiled import Backend
 from cfplan.planners.expert.kernel import backend as backend_in_use
@@ -29,10 +28,7 @@ from cfplan.planners.expert.solvers import interior_point, ipopt
 from cfplan.planners.expert.tightening import Kept, Task, flaw, kept_between
 from cfplan.planners.expert.windows import by_windows
 from cfplan.planners.solution import Solution, Status
-from cfplan.safety.feasibility import broken_by, check_arguments, unsolvable
-from cfplan.safety.limits import PlanLimits
-from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.profile import BoundaryState
+from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.yaw_spline import YawSpline
 
 WINDOW = (96, 24)
@@ -40,56 +36,47 @@ WINDOW = (96, 24)
 
 
 def plan_expert(
-    path: Path,
-    airframe: Airframe,
-    limits: PlanLimits,
+    task: PlanningTask,
     *,
-    nodes: int = 100,
-    yaw: YawMode = YawMode.FIXED,
-    yaw_angle: float = 0.0,
-    start: BoundaryState | None = None,
-    end: BoundaryState | None = None,
     penalties: Penalties | None = None,
     windows: bool = True,
     backend: Backend | None = None,
 ) -> Solution:
-    """Plan over `nodes` intervals uniform in s; see Planner.
+    """Plan the fastest profile that keeps every limit of the task.
 
-    Yaw is that of the Hopf fibration. FIXED holds `yaw_angle`, TANGENT follows the horizontal direction of flight;
+    Yaw is that of the Hopf fibration. FIXED holds the yaw angle, TANGENT follows the horizontal direction of flight;
     both are laid out before the speed (see yaw_track), which then respects what turning takes. FREE leaves yaw to the
-    optimiser, from a first yaw between `yaw_angle` and a quarter turn more, as the paper has it. A start or end state
+    optimiser, from a first yaw between that angle and a quarter turn more, as the paper has it. A start or end state
     brings its own yaw in every mode. Long paths are taken window by window, unless `windows` is False. `backend` is for
     tests: left out, compiled code where there is a compiler.
 
     Raises:
-        InputError: arguments that are not numbers, or fewer nodes than the path needs.
+        InputError: fewer nodes than the path needs.
     """
-    check_arguments(path, nodes, yaw_angle, start, end)
+    task.check_nodes()
+    if task.refusal:
+        return task.refusal
     began = time.perf_counter()
-    if reason := unsolvable(airframe, limits):
-        return Solution(Status.INFEASIBLE, None, reason)
-    for name, boundary, s in (("start", start, 0.0), ("end", end, path.end)):
-        if boundary and (reason := broken_by(boundary, path, s, airframe, limits)):
-            return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
-
+    path, airframe, limits, nodes = task.path, task.airframe, task.limits, task.nodes
+    yaw, yaw_angle, start, end = task.yaw, task.yaw_angle, task.start, task.end
     track = YawSpline.along(path, nodes, yaw, yaw_angle, start, end)
     shape = Shape(nodes, yaw is YawMode.FREE, turning_limited=limits.angular_acceleration < math.inf)
     whole = Task(path, airframe, limits, Ends(start, end), track, layout_of(shape), backend)
     failures: list[str] = []
     solvers: set[str] = set()
 
-    def search(task: Task, _near: NDArray) -> Kept | str:
+    def search(window: Task, _near: NDArray) -> Kept | str:
         problem = pose(
-            task.layout, task.path, airframe, limits, task.track, yaw_angle, task.ends, penalties or Penalties()
+            window.layout, window.path, airframe, limits, window.track, yaw_angle, window.ends, penalties or Penalties()
         )
         reasons: list[str] = []
         for solve in (interior_point, ipopt):
             attempt = solve(problem, backend)
-            reason = flaw(attempt, problem, task)
+            reason = flaw(attempt, problem, window)
             if not reason:
                 failures.extend(reasons)
                 solvers.add(attempt.solver)
-                return kept_between(attempt, problem, task)
+                return kept_between(attempt, problem, window)
             reasons.append(f"{attempt.solver}: {reason}")
         return "; ".join(reasons)
 

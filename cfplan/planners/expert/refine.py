@@ -11,7 +11,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.geometry.path import Path
 from cfplan.planners.expert.point_constraints import Penalties
 from cfplan.planners.expert.problem import FLOOR, Ends, pose, profile_of
 from cfplan.planners.expert.program import Shape, layout_of
@@ -19,9 +18,8 @@ from cfplan.planners.expert.solvers import interior_point, quickly, quickly_agai
 from cfplan.planners.expert.tightening import Kept, Task, flaw, kept_between
 from cfplan.planners.expert.windows import by_windows
 from cfplan.planners.solution import Solution, Status
-from cfplan.safety.limits import PlanLimits
-from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.profile import BoundaryState, SpeedProfile
+from cfplan.planners.task import PlanningTask
+from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.profile_spline import h_coefficients, spline_profile
 from cfplan.vehicle.yaw_spline import YawSpline
 
@@ -33,25 +31,22 @@ SLOWER, OVER = 0.1, 10
 
 
 def refine(
-    path: Path,
+    task: PlanningTask,
     profile: SpeedProfile,
-    airframe: Airframe,
-    limits: PlanLimits,
     *,
-    start: BoundaryState | None = None,
-    end: BoundaryState | None = None,
     passes: Callable[[SpeedProfile], bool] | None = None,
 ) -> Solution:
-    """A profile within a few thousandths of the fastest, on the grid and with the yaw of the given one.
+    """A profile within a few thousandths of the fastest, with the grid and the yaw of the given one, not of the task.
 
-    `start` and `end` are kept where given. Long paths are taken window by window. On a path of one window limits are
-    held at points first; what exceeds them between is looked for where `passes` says that it must be.
+    Long paths are taken window by window. On a path of one window limits are held at points first; what exceeds them
+    between is looked for where `passes` says that it must be.
     """
     began = time.perf_counter()
+    path, limits = task.path, task.limits
     nodes, unit, track = len(profile.s) - 1, limits.speed**2, YawSpline.of(profile)
     near = np.maximum(h_coefficients(profile) / unit, FLOOR)[:, None]
     layout = layout_of(Shape(nodes, False, turning_limited=limits.angular_acceleration < math.inf))
-    whole = Task(path, airframe, limits, Ends(start, end), track, layout)
+    whole = Task(path, task.airframe, limits, Ends(task.start, task.end), track, layout)
     joined = by_windows(whole, WINDOW, partial(_refined, passes=passes), near)
     if isinstance(joined, str):
         return Solution(Status.NOT_CONVERGED, None, f"refining: {joined}")

@@ -16,6 +16,7 @@ from cfplan.planners.baselines.convex_rows import inner_rows
 from cfplan.planners.baselines.convex_stations import stations
 from cfplan.planners.baselines.min_snap import plan_min_snap
 from cfplan.planners.solution import Status
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.safety.slowing import slow_until_certified
@@ -36,7 +37,7 @@ def test_a_straight_line_takes_its_analytic_time(length):
     v, a = HARDWARE.limits.speed, HARDWARE.limits.acceleration
     exact = length / v + v / a if length > v * v / a else 2 * math.sqrt(length / a)
     line = min_snap([[0, 0, 1], [length, 0, 1]])
-    bound = lower_bound(line, HARDWARE.airframe, HARDWARE.limits)
+    bound = lower_bound(PlanningTask(line, HARDWARE.airframe, HARDWARE.limits))
     assert bound == pytest.approx(exact, rel=1e-6)
     assert bound <= exact * (1 + 1e-12)
 
@@ -48,7 +49,7 @@ def test_a_straight_climb_is_held_back_by_thrust_and_a_straight_descent_is_not()
     climb = 4 * limits.motor_thrust_max / still.mass - 9.81
     assert climb < brake
     exact = 6.0 / v + v / (2 * climb) + v / (2 * brake)
-    bound = lower_bound(min_snap([[0, 0, 0], [0, 0, 6.0]]), still, limits)
+    bound = lower_bound(PlanningTask(min_snap([[0, 0, 0], [0, 0, 6.0]]), still, limits))
     assert exact * 0.997 <= bound <= exact * (1 + 1e-9)
 
 
@@ -57,7 +58,7 @@ def test_on_a_circle_curvature_sets_the_speed():
     for turns in (2, 5):
         angle = np.linspace(0, 2 * np.pi * turns, 24 * turns + 1)
         points = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.ones_like(angle)], axis=1)
-        bounds.append(lower_bound(min_snap(points), HARDWARE.airframe, HARDWARE.limits))
+        bounds.append(lower_bound(PlanningTask(min_snap(points), HARDWARE.airframe, HARDWARE.limits)))
     steady = math.sqrt(HARDWARE.limits.acceleration * radius)
     three_turns = bounds[1] - bounds[0]  # starting and stopping take the same in both
     assert three_turns == pytest.approx(3 * 2 * math.pi * radius / steady, rel=0.01)
@@ -66,17 +67,17 @@ def test_on_a_circle_curvature_sets_the_speed():
 @pytest.mark.parametrize("set_name", list(LIMIT_SETS))
 def test_nothing_that_is_certified_is_faster_than_the_bound(set_name, wiggly):
     chosen = LIMIT_SETS[set_name]
-    bound = lower_bound(wiggly, chosen.airframe, chosen.limits)
+    bound = lower_bound(PlanningTask(wiggly, chosen.airframe, chosen.limits))
     for planner in (plan_convex, plan_min_snap):
-        profile = planner(wiggly, chosen.airframe, chosen.limits).profile
+        profile = planner(PlanningTask(wiggly, chosen.airframe, chosen.limits)).profile
         slowed = slow_until_certified(Trajectory(wiggly, profile, chosen.airframe), chosen.limits)
         assert slowed.trajectory.duration > bound
 
 
 def test_the_convex_profile_is_near_the_bound_before_it_is_slowed(wiggly):
     limits = replace(HARDWARE.limits, angular_acceleration=math.inf)  # it has no share in the bound
-    bound = lower_bound(wiggly, HARDWARE.airframe, limits)
-    solution = plan_convex(wiggly, HARDWARE.airframe, limits)
+    bound = lower_bound(PlanningTask(wiggly, HARDWARE.airframe, limits))
+    solution = plan_convex(PlanningTask(wiggly, HARDWARE.airframe, limits))
     assert solution.status is Status.SOLVED
     assert solution.profile is not None
     duration = Trajectory(wiggly, solution.profile, HARDWARE.airframe).duration
@@ -86,8 +87,8 @@ def test_the_convex_profile_is_near_the_bound_before_it_is_slowed(wiggly):
 @pytest.mark.parametrize("set_name", list(LIMIT_SETS))
 def test_the_inner_polygons_come_close_to_the_outer_ones(set_name, wiggly):
     chosen = LIMIT_SETS[set_name]
-    bound = lower_bound(wiggly, chosen.airframe, chosen.limits)
-    inside = plan_convex(wiggly, chosen.airframe, chosen.limits).stats["point_mass_time"]
+    bound = lower_bound(PlanningTask(wiggly, chosen.airframe, chosen.limits))
+    inside = plan_convex(PlanningTask(wiggly, chosen.airframe, chosen.limits)).stats["point_mass_time"]
     assert bound < inside < 1.03 * bound
 
 
@@ -112,7 +113,9 @@ def test_the_inner_solution_keeps_the_limits_when_differentiated_in_the_world(se
 
 def test_looser_limits_never_raise_the_bound(wiggly):
     bounds = [
-        lower_bound(wiggly, HARDWARE.airframe, replace(HARDWARE.limits, speed=speed, acceleration=acceleration))
+        lower_bound(
+            PlanningTask(wiggly, HARDWARE.airframe, replace(HARDWARE.limits, speed=speed, acceleration=acceleration))
+        )
         for speed, acceleration in ((1.0, 2.0), (2.0, 2.0), (2.0, 5.0), (3.0, 8.0))
     ]
     assert bounds == sorted(bounds, reverse=True)
@@ -121,13 +124,17 @@ def test_looser_limits_never_raise_the_bound(wiggly):
 def test_drag_holds_the_bound_up_because_it_takes_thrust(wiggly):
     still = replace(SIMULATION.airframe, drag=(0.0, 0.0))
     draggy = replace(SIMULATION.airframe, drag=(0.03, 0.03))
-    assert lower_bound(wiggly, draggy, SIMULATION.limits) > lower_bound(wiggly, still, SIMULATION.limits)
+    assert lower_bound(PlanningTask(wiggly, draggy, SIMULATION.limits)) > lower_bound(
+        PlanningTask(wiggly, still, SIMULATION.limits)
+    )
 
 
 def test_a_flying_start_takes_less_time_than_a_slow_one():
     straight = Path(np.array([0.0, 2.0, 4.0]), np.array([[[0.0, 0, 1], [1, 0, 0]], [[4, 0, 1], [1, 0, 0]]]))
     slow, fast = (BoundaryState(h, 0.0, 0.0, 0.0, 0.0) for h in (0.01, 4.0))
-    times = [lower_bound(straight, HARDWARE.airframe, HARDWARE.limits, start=x, end=x) for x in (slow, fast)]
+    times = [
+        lower_bound(PlanningTask(straight, HARDWARE.airframe, HARDWARE.limits, start=x, end=x)) for x in (slow, fast)
+    ]
     assert times[1] == pytest.approx(4.0 / 2.0, rel=1e-6)
     assert times[0] > times[1]
 
@@ -135,7 +142,9 @@ def test_a_flying_start_takes_less_time_than_a_slow_one():
 def test_a_start_faster_than_the_limits_is_infeasible_and_says_so():
     straight = Path(np.array([0.0, 2.0, 4.0]), np.array([[[0.0, 0, 1], [1, 0, 0]], [[4, 0, 1], [1, 0, 0]]]))
     solution = plan_convex(
-        straight, HARDWARE.airframe, HARDWARE.limits, start=BoundaryState(h=9.0, dh=0.0, ddh=0.0, yaw=0.0, dyaw=0.0)
+        PlanningTask(
+            straight, HARDWARE.airframe, HARDWARE.limits, start=BoundaryState(h=9.0, dh=0.0, ddh=0.0, yaw=0.0, dyaw=0.0)
+        )
     )
     assert solution.status is Status.INFEASIBLE
     assert "3.000 m/s" in solution.reason
@@ -144,8 +153,8 @@ def test_a_start_faster_than_the_limits_is_infeasible_and_says_so():
 def test_thrust_below_weight_is_infeasible_in_both_faces(wiggly):
     limits = replace(HARDWARE.limits, motor_thrust_max=0.07)
     with pytest.raises(InfeasibleError, match="limits"):
-        lower_bound(wiggly, HARDWARE.airframe, limits)
-    solution = plan_convex(wiggly, HARDWARE.airframe, limits)
+        lower_bound(PlanningTask(wiggly, HARDWARE.airframe, limits))
+    solution = plan_convex(PlanningTask(wiggly, HARDWARE.airframe, limits))
     assert solution.status is Status.INFEASIBLE
     assert solution.profile is None
     assert solution.reason
@@ -153,7 +162,7 @@ def test_thrust_below_weight_is_infeasible_in_both_faces(wiggly):
 
 @pytest.mark.parametrize("yaw", list(YawMode))
 def test_min_snap_comes_certified_and_touches_a_limit(yaw, wiggly):
-    solution = plan_min_snap(wiggly, HARDWARE.airframe, HARDWARE.limits, yaw=yaw, yaw_angle=0.3)
+    solution = plan_min_snap(PlanningTask(wiggly, HARDWARE.airframe, HARDWARE.limits, yaw=yaw, yaw_angle=0.3))
     certificate = certify(Trajectory(wiggly, solution.profile, HARDWARE.airframe), HARDWARE.limits)
     assert certificate.passed
     assert certificate.worst.share > 0.98

@@ -13,6 +13,7 @@ from cfplan.planners.baselines import toppquad_nlp
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.solution import Solution, Status
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.vehicle.airframe import GRAVITY
@@ -24,6 +25,12 @@ HARDWARE = LIMIT_SETS["hardware"]
 NODES = 40
 
 
+def task(path: Path, **changes) -> PlanningTask:
+    """The paper's: free yaw."""
+    known = {"airframe": HARDWARE.airframe, "limits": HARDWARE.limits, "nodes": NODES, "yaw": YawMode.FREE}
+    return PlanningTask(path, **known | changes)
+
+
 @pytest.fixture(scope="module")
 def path() -> Path:
     return min_snap([[0, 0, 1], [1.2, 0.6, 1.3], [2.2, -0.3, 1.0]])
@@ -31,7 +38,7 @@ def path() -> Path:
 
 @pytest.fixture(scope="module")
 def free(path) -> Solution:
-    return plan_toppquad(path, HARDWARE.airframe, HARDWARE.limits, nodes=NODES)
+    return plan_toppquad(task(path))
 
 
 @pytest.fixture
@@ -92,14 +99,12 @@ def test_yaw_starts_in_the_first_quarter_turn(free):
 def test_slowed_it_is_certified_and_no_faster_than_the_bound(free, path):
     slowed = slow_until_certified(Trajectory(path, free.profile, HARDWARE.airframe), HARDWARE.limits)
     assert slowed.certificate.passed
-    bound = lower_bound(path, HARDWARE.airframe, HARDWARE.limits)
+    bound = lower_bound(task(path))
     assert bound < slowed.trajectory.duration < 1.5 * bound
 
 
 def test_fixed_yaw_stays_where_it_was_told(path):
-    solution = plan_toppquad(
-        path, HARDWARE.airframe, HARDWARE.limits, nodes=NODES, yaw=YawMode.FIXED, yaw_angle=0.7
-    )  # fmt: skip
+    solution = plan_toppquad(task(path, yaw=YawMode.FIXED, yaw_angle=0.7))
     assert solution.status is Status.SOLVED
     np.testing.assert_allclose(solution.profile.yaw, 0.7, atol=1e-6)
     np.testing.assert_allclose(solution.profile.dyaw, 0.0, atol=1e-6)
@@ -107,7 +112,7 @@ def test_fixed_yaw_stays_where_it_was_told(path):
 
 def test_it_starts_from_the_state_it_is_given(path):
     start = BoundaryState(h=0.5, dh=0.1, ddh=0.0, yaw=0.4, dyaw=0.0)
-    solution = plan_toppquad(path, HARDWARE.airframe, HARDWARE.limits, nodes=NODES, start=start)
+    solution = plan_toppquad(task(path, start=start))
     assert solution.status is Status.SOLVED
     assert solution.profile.h[0] == pytest.approx(0.5, rel=0.05)
     assert solution.profile.yaw[0] == pytest.approx(0.4, abs=0.01)
@@ -115,7 +120,7 @@ def test_it_starts_from_the_state_it_is_given(path):
 
 def test_the_problem_is_built_once_for_a_size(free, path):
     before = toppquad_nlp.program.cache_info().misses
-    again = plan_toppquad(path.placed([1.0, 0.0, 0.0]), HARDWARE.airframe, HARDWARE.limits, nodes=NODES)
+    again = plan_toppquad(task(path.placed([1.0, 0.0, 0.0])))
     assert toppquad_nlp.program.cache_info().misses == before
     np.testing.assert_allclose(again.profile.h, free.profile.h, rtol=1e-4)
 
@@ -123,7 +128,7 @@ def test_the_problem_is_built_once_for_a_size(free, path):
 def test_what_cannot_be_solved_is_an_answer_with_a_reason(path):
     heavy = replace(HARDWARE.limits, motor_thrust_max=0.9 * HARDWARE.airframe.hover_thrust)
     for limits, nodes in ((heavy, NODES), (HARDWARE.limits, 3)):
-        solution = plan_toppquad(path, HARDWARE.airframe, limits, nodes=nodes)
+        solution = plan_toppquad(task(path, limits=limits, nodes=nodes))
         assert solution.status is not Status.SOLVED
         assert solution.profile is None
         assert solution.reason

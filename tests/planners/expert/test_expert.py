@@ -13,6 +13,7 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert import expert as reduced
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.solution import Solution, Status
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import BOXES, LIMIT_SETS
 from cfplan.safety.limits import PlanLimits
@@ -62,7 +63,7 @@ def cut(path: Path, low: float, high: float) -> Path:
 def test_plans_pass_the_dense_certificate_without_slowing(chosen, box):
     for seed in range(3):
         path = min_snap(random_waypoints(seed, box))
-        profile = solved(plan_expert(path, chosen.airframe, chosen.limits))
+        profile = solved(plan_expert(PlanningTask(path, chosen.airframe, chosen.limits)))
         assert certify(Trajectory(path, profile, chosen.airframe), chosen.limits).passed
 
 
@@ -72,7 +73,9 @@ def test_a_long_path_by_windows_is_as_fast_as_at_once_and_certified_across_joint
     path = min_snap(np.concatenate([CORNERED, CORNERED[:2] + 0.4, CORNERED[1:] - 0.3]))
     times = []
     for windows in (True, False):
-        solution = plan_expert(path, HARDWARE.airframe, HARDWARE.limits, nodes=200, yaw=yaw, windows=windows)
+        solution = plan_expert(
+            PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, nodes=200, yaw=yaw), windows=windows
+        )
         assert solution.joints == (pytest.approx((0.3 * path.end, 0.6 * path.end)) if windows else ())
         trajectory = Trajectory(path, solved(solution), HARDWARE.airframe)  # refuses jumps of h, h', h'' and yaw
         assert certify(trajectory, HARDWARE.limits).passed
@@ -83,7 +86,7 @@ def test_a_long_path_by_windows_is_as_fast_as_at_once_and_certified_across_joint
 @pytest.mark.parametrize("yaw", YawMode)
 def test_each_yaw_mode_passes_the_dense_certificate(yaw):
     path = min_snap(CORNERED)
-    profile = solved(plan_expert(path, HARDWARE.airframe, HARDWARE.limits, yaw=yaw, yaw_angle=0.4))
+    profile = solved(plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, yaw=yaw, yaw_angle=0.4)))
     trajectory = Trajectory(path, profile, HARDWARE.airframe)
     assert certify(trajectory, HARDWARE.limits).passed
     ends = trajectory.at(np.array([0.0, trajectory.duration]))
@@ -100,14 +103,14 @@ def test_a_long_straight_line_takes_the_time_of_constant_acceleration():
     )  # fmt: skip
     length = 12.0
     path = min_snap(np.array([[0.0, 0, 1], [length / 2, 0, 1], [length, 0, 1]]))
-    profile = solved(plan_expert(path, airframe, limits, nodes=300))
+    profile = solved(plan_expert(PlanningTask(path, airframe, limits, nodes=300)))
     fastest = length / limits.speed + limits.speed / limits.acceleration
     assert fastest <= duration(path, profile, airframe) <= 1.015 * fastest
 
 
 def test_speed_saturates_on_a_long_line():
     path = min_snap(np.array([[0.0, 0, 1], [10.0, 0, 1], [20.0, 0, 1]]))
-    profile = solved(plan_expert(path, HARDWARE.airframe, HARDWARE.limits))
+    profile = solved(plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits)))
     speed = np.sqrt(profile.h[40:60]) * np.linalg.norm(path(profile.s[40:60], 1), axis=1)
     np.testing.assert_allclose(speed, HARDWARE.limits.speed, rtol=5e-3)
 
@@ -115,7 +118,11 @@ def test_speed_saturates_on_a_long_line():
 def test_twice_the_nodes_change_the_time_by_little():
     path = min_snap(CORNERED)
     times = [
-        duration(path, solved(plan_expert(path, HARDWARE.airframe, HARDWARE.limits, nodes=n)), HARDWARE.airframe)
+        duration(
+            path,
+            solved(plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, nodes=n))),
+            HARDWARE.airframe,
+        )
         for n in (80, 160)
     ]
     assert times[1] == pytest.approx(times[0], rel=0.02)
@@ -124,12 +131,12 @@ def test_twice_the_nodes_change_the_time_by_little():
 def test_looser_limits_are_never_slower():
     path = min_snap(CORNERED)
     airframe, limits = HARDWARE.airframe, HARDWARE.limits
-    slow = duration(path, solved(plan_expert(path, airframe, limits)), airframe)
+    slow = duration(path, solved(plan_expert(PlanningTask(path, airframe, limits))), airframe)
     for looser in (
         replace(limits, speed=2.5), replace(limits, acceleration=6.0), replace(limits, tilt=math.radians(40.0)),
         replace(limits, angular_acceleration=70.0),
     ):  # fmt: skip
-        assert duration(path, solved(plan_expert(path, airframe, looser)), airframe) <= slow * (1 + 1e-3)
+        assert duration(path, solved(plan_expert(PlanningTask(path, airframe, looser))), airframe) <= slow * (1 + 1e-3)
 
 
 @pytest.mark.parametrize("yaw", YawMode)
@@ -137,11 +144,11 @@ def test_a_segment_between_two_states_of_a_plan_is_planned_alike(yaw):
     """Parts of a fastest flight are fastest themselves (Bellman)."""
     path = min_snap(CORNERED)
     airframe, limits = HARDWARE.airframe, HARDWARE.limits
-    whole = solved(plan_expert(path, airframe, limits, yaw=yaw))
+    whole = solved(plan_expert(PlanningTask(path, airframe, limits, yaw=yaw)))
     first, last = 30, 80
     part = cut(path, whole.s[first], whole.s[last])
     start, end = whole.boundary(first), whole.boundary(last)
-    again = solved(plan_expert(part, airframe, limits, nodes=last - first, yaw=yaw, start=start, end=end))
+    again = solved(plan_expert(PlanningTask(part, airframe, limits, nodes=last - first, yaw=yaw, start=start, end=end)))
 
     np.testing.assert_allclose(
         [again.h[0], again.dh[0], again.yaw[0], again.dyaw[0]], [start.h, start.dh, start.yaw, start.dyaw], atol=1e-6
@@ -156,23 +163,23 @@ def test_a_segment_between_two_states_of_a_plan_is_planned_alike(yaw):
 def test_a_free_end_in_motion_is_at_least_as_fast_as_a_given_one():
     path = min_snap(CORNERED)
     airframe, limits = HARDWARE.airframe, HARDWARE.limits
-    whole = solved(plan_expert(path, airframe, limits))
+    whole = solved(plan_expert(PlanningTask(path, airframe, limits)))
     part = cut(path, 0.0, whole.s[50])
-    given = solved(plan_expert(part, airframe, limits, nodes=50, end=whole.boundary(50)))
-    free = solved(plan_expert(part, airframe, limits, nodes=50))
+    given = solved(plan_expert(PlanningTask(part, airframe, limits, nodes=50, end=whole.boundary(50))))
+    free = solved(plan_expert(PlanningTask(part, airframe, limits, nodes=50)))
     assert duration(part, free, airframe) <= duration(part, given, airframe) * (1 + 1e-3)
 
 
 def test_fixed_yaw_stays():
     path = min_snap(CORNERED)
-    profile = solved(plan_expert(path, HARDWARE.airframe, HARDWARE.limits, yaw_angle=-0.7))
+    profile = solved(plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, yaw_angle=-0.7)))
     np.testing.assert_array_equal(profile.yaw, -0.7)
     np.testing.assert_array_equal(profile.ddyaw, 0.0)
 
 
 def test_tangent_yaw_points_along_the_flight():
     path = min_snap(CORNERED)
-    profile = solved(plan_expert(path, HARDWARE.airframe, HARDWARE.limits, yaw=YawMode.TANGENT))
+    profile = solved(plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, yaw=YawMode.TANGENT)))
     inner = slice(10, 91)
     tangent = path(profile.s[inner], 1)
     heading = np.arctan2(tangent[:, 1], tangent[:, 0])
@@ -182,27 +189,29 @@ def test_tangent_yaw_points_along_the_flight():
 
 def test_tangent_yaw_is_defined_where_the_path_goes_straight_up():
     path = min_snap(np.array([[0.0, 0, 0.5], [0, 0, 1.5], [0, 0, 2.5], [2.0, 1.0, 2.5]]))
-    profile = solved(plan_expert(path, HARDWARE.airframe, HARDWARE.limits, yaw=YawMode.TANGENT))
+    profile = solved(plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, yaw=YawMode.TANGENT)))
     assert certify(Trajectory(path, profile, HARDWARE.airframe), HARDWARE.limits).passed
 
 
 def test_free_yaw_starts_within_a_quarter_turn_and_does_not_drift():
     path = min_snap(CORNERED)
-    profile = solved(plan_expert(path, SIMULATION.airframe, SIMULATION.limits, yaw=YawMode.FREE, yaw_angle=1.0))
+    profile = solved(
+        plan_expert(PlanningTask(path, SIMULATION.airframe, SIMULATION.limits, yaw=YawMode.FREE, yaw_angle=1.0))
+    )
     assert 1.0 - 1e-6 <= profile.yaw[0] <= 1.0 + math.pi / 2 + 1e-6
     assert np.ptp(profile.yaw) < math.pi
 
 
 def test_the_same_call_gives_the_same_bytes():
     path = min_snap(CORNERED)
-    one, two = (solved(plan_expert(path, HARDWARE.airframe, HARDWARE.limits, nodes=60)) for _ in range(2))
+    one, two = (solved(plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, nodes=60))) for _ in range(2))
     assert one.h.tobytes() == two.h.tobytes()
 
 
 def test_a_start_too_fast_for_the_limits_is_named():
     path = cut(min_snap(CORNERED), 2.0, 6.0)
     state = BoundaryState(h=25.0, dh=0.0, ddh=0.0, yaw=0.0, dyaw=0.0)
-    solution = plan_expert(path, HARDWARE.airframe, HARDWARE.limits, nodes=40, start=state)
+    solution = plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, nodes=40, start=state))
     assert solution.status is Status.BAD_BOUNDARY
     assert solution.profile is None
     assert "speed" in solution.reason
@@ -211,7 +220,7 @@ def test_a_start_too_fast_for_the_limits_is_named():
 def test_a_state_that_stands_still_is_refused():
     path = cut(min_snap(CORNERED), 2.0, 6.0)
     state = BoundaryState(h=0.0, dh=0.0, ddh=0.0, yaw=0.0, dyaw=0.0)
-    assert plan_expert(path, HARDWARE.airframe, HARDWARE.limits, end=state).status is Status.BAD_BOUNDARY
+    assert plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, end=state)).status is Status.BAD_BOUNDARY
 
 
 def test_a_start_that_cannot_brake_in_time_is_a_result_not_an_exception():
@@ -220,7 +229,7 @@ def test_a_start_that_cannot_brake_in_time_is_a_result_not_an_exception():
     path = cut(whole, whole.end - 0.8, whole.end)
     h = (0.99 * HARDWARE.limits.speed / np.linalg.norm(path(0.0, 1))) ** 2
     state = BoundaryState(h=float(h), dh=0.0, ddh=0.0, yaw=0.0, dyaw=0.0)
-    solution = plan_expert(path, HARDWARE.airframe, HARDWARE.limits, nodes=30, start=state)
+    solution = plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, nodes=30, start=state))
     assert solution.status in (Status.NOT_CONVERGED, Status.BAD_BOUNDARY)
     assert solution.profile is None
     assert solution.reason
@@ -238,7 +247,7 @@ def test_a_start_that_cannot_brake_in_time_is_a_result_not_an_exception():
 )
 def test_limits_that_exclude_hovering_are_named(changes, named):
     limits: PlanLimits = replace(HARDWARE.limits, **changes)
-    solution = plan_expert(min_snap(CORNERED), HARDWARE.airframe, limits)
+    solution = plan_expert(PlanningTask(min_snap(CORNERED), HARDWARE.airframe, limits))
     assert solution.status is Status.INFEASIBLE
     assert named in solution.reason
 
@@ -246,20 +255,24 @@ def test_limits_that_exclude_hovering_are_named(changes, named):
 def test_too_few_nodes_are_refused_with_the_number_needed():
     path = min_snap(random_waypoints(1, (4.5, 8.0, 2.0)).repeat(1, axis=0))
     with pytest.raises(InputError, match="too few") as caught:
-        plan_expert(path, HARDWARE.airframe, HARDWARE.limits, nodes=5)
+        plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, nodes=5))
     assert "at least" in caught.value.hint
 
 
 def test_numbers_that_are_none_are_refused():
     path = min_snap(CORNERED)
     with pytest.raises(InputError, match="yaw"):
-        plan_expert(path, HARDWARE.airframe, HARDWARE.limits, yaw_angle=float("nan"))
+        plan_expert(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, yaw_angle=float("nan")))
     with pytest.raises(InputError, match="start"):
-        plan_expert(path, HARDWARE.airframe, HARDWARE.limits, start=BoundaryState(float("inf"), 0.0, 0.0, 0.0, 0.0))
+        plan_expert(
+            PlanningTask(
+                path, HARDWARE.airframe, HARDWARE.limits, start=BoundaryState(float("inf"), 0.0, 0.0, 0.0, 0.0)
+            )
+        )
 
 
 def test_the_solver_prints_nothing(capfd):
-    plan_expert(min_snap(CORNERED), HARDWARE.airframe, HARDWARE.limits, nodes=40)
+    plan_expert(PlanningTask(min_snap(CORNERED), HARDWARE.airframe, HARDWARE.limits, nodes=40))
     captured = capfd.readouterr()
     assert captured.out == ""
     assert captured.err == ""

@@ -12,6 +12,7 @@ from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.expert.refine import WINDOW, refine
 from cfplan.planners.expert.windows import windows_of
 from cfplan.planners.solution import Status
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.vehicle.profile_spline import h_coefficients, spline_profile
@@ -25,7 +26,11 @@ def planned(limit_set: str, seed: int, nodes: int = 100, waypoints: tuple[int, i
     """(path, limit set, the expert's profile)."""
     chosen = LIMIT_SETS[limit_set]
     path = min_snap(random_waypoints(seed, BOX, waypoints))
-    return path, chosen, plan_expert(path, chosen.airframe, chosen.limits, nodes=nodes, windows=False).profile
+    return (
+        path,
+        chosen,
+        plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes=nodes), windows=False).profile,
+    )
 
 
 def disturbed(profile, end, size, seed=0):
@@ -42,12 +47,12 @@ def test_a_profile_near_the_experts_becomes_as_fast_and_certified_in_fewer_steps
     path, chosen, expert = planned(limit_set, seed)
     near = disturbed(expert, path.end, 0.03, seed)
     assert not certify(Trajectory(path, near, chosen.airframe), chosen.limits).passed
-    solution = refine(path, near, chosen.airframe, chosen.limits)
+    solution = refine(PlanningTask(path, chosen.airframe, chosen.limits), near)
     assert solution.status is Status.SOLVED
     refined = Trajectory(path, solution.profile, chosen.airframe)
     assert certify(refined, chosen.limits).passed
     assert refined.duration == pytest.approx(Trajectory(path, expert, chosen.airframe).duration, rel=5e-3)
-    from_afar = plan_expert(path, chosen.airframe, chosen.limits, nodes=100)
+    from_afar = plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes=100))
     assert solution.stats["iterations"] < from_afar.stats["iterations"]
 
 
@@ -64,7 +69,7 @@ def test_windows_cover_a_path_and_each_looks_ahead():
 def test_a_long_path_by_windows_is_as_fast_as_by_the_whole_and_continuous_at_joints(monkeypatch):
     monkeypatch.setattr(refined, "WINDOW", (96, 32))
     path, chosen, expert = planned("hardware", 5, nodes=320, waypoints=(9, 9))
-    solution = refine(path, disturbed(expert, path.end, 0.02), chosen.airframe, chosen.limits)
+    solution = refine(PlanningTask(path, chosen.airframe, chosen.limits), disturbed(expert, path.end, 0.02))
     assert solution.stats["windows"] == 3
     flown = Trajectory(path, solution.profile, chosen.airframe)  # refuses jumps of h, h', h'' and yaw
     assert certify(flown, chosen.limits).passed
@@ -79,7 +84,7 @@ def test_boundary_states_are_kept():
     cut = spline_profile(
         h_coefficients(expert)[first : last + 3] * 0.98**2, part.end, YawSpline.of(expert).part(first, last)
     )
-    profile = refine(part, cut, chosen.airframe, chosen.limits, start=start, end=end).profile
+    profile = refine(PlanningTask(part, chosen.airframe, chosen.limits, start=start, end=end), cut).profile
     for state, found in ((start, profile.boundary(0)), (end, profile.boundary(-1))):
         assert (found.h, found.dh, found.ddh) == pytest.approx((state.h, state.dh, state.ddh), rel=1e-6, abs=1e-6)
 
@@ -87,7 +92,8 @@ def test_boundary_states_are_kept():
 def test_what_cannot_be_refined_has_a_reason():
     path, chosen, expert = planned("hardware", 2)
     rough = np.random.default_rng(3).uniform(0.01, 400.0, len(expert.s) + 2)
-    solution = refine(path, spline_profile(rough, path.end, YawSpline.of(expert)), chosen.airframe, chosen.limits)
+    rough = spline_profile(rough, path.end, YawSpline.of(expert))
+    solution = refine(PlanningTask(path, chosen.airframe, chosen.limits), rough)
     if solution.profile is None:
         assert solution.status is Status.NOT_CONVERGED
         assert "refining s = " in solution.reason

@@ -18,6 +18,7 @@ from cfplan.planners.expert.program import Program, Shape, layout_of, program
 from cfplan.planners.expert.solvers import Attempt, interior_point, ipopt
 from cfplan.planners.expert.transcription import SplineProblem
 from cfplan.planners.solution import Status
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.vehicle.trajectory import Trajectory
@@ -148,7 +149,8 @@ def test_rows_of_the_program_are_what_the_flatness_map_gives():
 def test_compiled_code_and_virtual_machine_agree():
     assert kernel.backend() is Backend.COMPILED
     profiles = [
-        plan_expert(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=30, backend=backend).profile for backend in Backend
+        plan_expert(PlanningTask(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=30), backend=backend).profile
+        for backend in Backend
     ]
     np.testing.assert_allclose(profiles[0].h, profiles[1].h, rtol=1e-5)
 
@@ -179,7 +181,7 @@ def test_without_a_compiler_the_virtual_machine_plans(monkeypatch, tmp_path):
     kernel.machine_code.cache_clear()
     try:
         assert kernel.backend() is Backend.VIRTUAL_MACHINE
-        solution = plan_expert(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=31)
+        solution = plan_expert(PlanningTask(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=31))
         assert solution.status is Status.SOLVED
         assert solution.stats["backend"] == "virtual machine"
     finally:
@@ -243,7 +245,7 @@ def test_ipopt_takes_over_where_the_first_solver_fails(monkeypatch):
         return Attempt("interior point", problem.table, problem.lbg, False, 3, "gave up")
 
     monkeypatch.setattr(reduced, "interior_point", gives_up)
-    solution = plan_expert(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=40)
+    solution = plan_expert(PlanningTask(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=40))
     assert solution.status is Status.SOLVED
     assert solution.stats["solver"] == "ipopt"
     assert "gave up" in solution.reason
@@ -266,7 +268,7 @@ def test_an_answer_that_is_not_a_flight_is_not_believed(monkeypatch):
 
     monkeypatch.setattr(reduced, "interior_point", claims)
     monkeypatch.setattr(reduced, "ipopt", claims)
-    solution = plan_expert(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=40)
+    solution = plan_expert(PlanningTask(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=40))
     assert solution.status is Status.NOT_CONVERGED
     assert solution.profile is None
     assert "not finite" in solution.reason
@@ -288,7 +290,7 @@ def test_limits_are_lowered_only_around_what_exceeds_them():
 
 def test_many_more_nodes_need_no_other_library():
     before = kernel.machine_code()
-    solution = plan_expert(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=400)
+    solution = plan_expert(PlanningTask(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=400))
     assert solution.status is Status.SOLVED
     assert certify(Trajectory(PATH, solution.profile, HARDWARE.airframe), HARDWARE.limits).passed
     assert kernel.machine_code() == before

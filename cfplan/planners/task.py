@@ -1,0 +1,70 @@
+"""PlanningTask: what every planner is asked, checked once where it is made."""
+
+import math
+from collections.abc import Callable
+from dataclasses import astuple, dataclass, field
+
+from cfplan.errors import InputError
+from cfplan.geometry.path import Path
+from cfplan.geometry.yaw import YawMode
+from cfplan.planners.solution import Solution, Status
+from cfplan.safety.feasibility import infeasible_limit, violated_limit
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.profile import BoundaryState
+
+LEAST_NODES = 12
+NODES_PER_PIECE = 3  # of the path, at least, where a spline is laid over the grid
+
+
+@dataclass(frozen=True, slots=True)
+class PlanningTask:
+    """A path to be flown as fast as the limits allow, from one boundary state to another.
+
+    Raises InputError where a number is not finite. What the limits exclude is no error but an answer: see `refusal`.
+    """
+
+    path: Path
+    airframe: Airframe
+    limits: PlanLimits
+    nodes: int = 100  # intervals of the grid, uniform in s
+    yaw: YawMode = YawMode.FIXED
+    yaw_angle: float = 0.0  # rad: held where yaw is FIXED, else where it begins
+    start: BoundaryState | None = None  # None: free within the limits (a rest end)
+    end: BoundaryState | None = None
+    refusal: Solution | None = field(init=False, compare=False, repr=False)
+    """The answer of a planner that keeps all limits and boundary states, where no search is needed to see that none
+    can be kept: the limits exclude hovering, or a boundary state breaks them. Other planners may answer otherwise."""
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.yaw_angle):
+            raise InputError(f"the yaw angle must be a finite number, not {self.yaw_angle}")
+        for name, boundary in (("start", self.start), ("end", self.end)):
+            if boundary and not all(math.isfinite(value) for value in astuple(boundary)):
+                raise InputError(f"the {name} state is not finite: {boundary}")
+        object.__setattr__(self, "refusal", self._refuse())
+
+    def _refuse(self) -> Solution | None:
+        if reason := infeasible_limit(self.airframe, self.limits):
+            return Solution(Status.INFEASIBLE, None, reason)
+        for name, boundary, s in (("start", self.start, 0.0), ("end", self.end, self.path.end)):
+            if boundary and (reason := violated_limit(boundary, self.path, s, self.airframe, self.limits)):
+                return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
+        return None
+
+    def check_nodes(self) -> None:
+        """Refuse fewer nodes than the path has shape for; for planners that lay a spline over the grid.
+
+        Raises:
+            InputError: too few nodes; says how many are enough.
+        """
+        pieces = len(self.path.breaks) - 1
+        least = max(LEAST_NODES, NODES_PER_PIECE * pieces)
+        if self.nodes < least:
+            raise InputError(
+                f"{self.nodes} nodes are too few for a path of {pieces} pieces",
+                hint=f"take at least {least}; 100 is usual",
+            )
+
+
+Planner = Callable[[PlanningTask], Solution]  # any way to find a speed profile: expert, learned, or baseline
