@@ -10,6 +10,7 @@ from typing import Any
 
 from cfplan.errors import InputError
 from cfplan.geometry.yaw import YawMode
+from cfplan.planners.task import PlanningTask
 from cfplan.safety.limit_sets import BOXES, LIMIT_SETS
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.trials import (
@@ -118,7 +119,7 @@ def dense_feasibility(
     try:
         for number, (box, chosen) in enumerate(pairs):
             warm = random_path(first_seed, box)
-            found.plan(warm, chosen.airframe, chosen.limits, nodes=nodes, yaw=yaw)
+            found.plan(PlanningTask(warm, chosen.airframe, chosen.limits, nodes, yaw))
             trials = measured.setdefault((box, chosen.name), [])
             for count in range(each):
                 seed = first_seed + count

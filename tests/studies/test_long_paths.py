@@ -44,10 +44,10 @@ def test_the_result_is_one_table_compared_with_its_first_row_and_survives_json(s
 def test_a_path_that_cannot_be_flown_is_told_with_its_reason(monkeypatch, short):
     true = study.repair
 
-    def failing(path, *rest):
-        if path.length > 40:
+    def failing(task, *rest):
+        if task.path.length > 40:
             raise CfplanError("no way")
-        return true(path, *rest)
+        return true(task, *rest)
 
     monkeypatch.setattr(study, "repair", failing)
     result = long_paths(lengths=LENGTHS, paths=1, repeats=1)
