@@ -36,8 +36,8 @@ def look_at_hardware(uri: str, mocap_uri: str | None, limits: "PoseLimits", step
     Raises a CfplanError, within 5 s. Says where the body is, which a person can check with a glance.
     """
     from cfplan.flight.mocap.source import pose_source
-    from cfplan.flight.pilot.mission import yaw_of
     from cfplan.flight.radio.crazyradio import check_radio
+    from cfplan.vehicle.rotations import yaw_of
 
     if uri.startswith("radio://"):
         with steps.step("radio") as said:

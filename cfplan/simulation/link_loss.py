@@ -29,6 +29,7 @@ from cfplan.simulation.dynamics.mellinger import (
     level_out,
     step_mellinger,
 )
+from cfplan.vehicle.rotations import yaw_of
 
 LEVEL_AFTER, OFF_AFTER = 0.54, 2.04  # s after the last setpoint; the supervisor looks every 40 ms
 OFF_BY_WATCHDOG = 1.0  # s, where the emergency-stop watchdog is awake
@@ -78,11 +79,10 @@ def swept_when_orphaned(
     arrivals = np.round(np.arange(len(payloads)) / (rate * TIME_STEP)).astype(np.int64)
     steps = np.round(moments / TIME_STEP).astype(np.int64)
     swept = np.empty((len(steps), 2, 3))
-    x, y, z, w = state.quaternion[0]
     _run(
         swept,
         steps,
-        hovering(airframe, state.position[0], float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))),
+        hovering(airframe, state.position[0], float(yaw_of(state.quaternion[0]))),
         rows,
         arrivals,
         gains_for(airframe).pack(),

@@ -10,6 +10,7 @@ from cfplan.geometry.path import Path
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.dense import STATES, flat_states
 from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.rotations import about_z
 from cfplan.vehicle.timing import Timing, measure
 
 _SAME_S = 1e-9  # ends of path and profile nearer than this are the same
@@ -120,5 +121,4 @@ def _hover(state: FullState, ascending: NDArray, airframe: Airframe) -> None:
     state.specific_thrust[rows] = GRAVITY
     state.motor_thrust[rows] = airframe.hover_thrust
     state.thrust_axis[rows] = (0.0, 0.0, 1.0)
-    half = state.yaw[rows] / 2
-    state.quaternion[rows] = np.stack([0.0 * half, 0.0 * half, np.sin(half), np.cos(half)], axis=-1)
+    state.quaternion[rows] = about_z(state.yaw[rows])

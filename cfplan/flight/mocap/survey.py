@@ -14,6 +14,7 @@ from cfplan.flight.mocap.frames import Frame, Scene, TrackedBody
 from cfplan.flight.mocap.pose_classifier import PoseClassifier, Verdict
 from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn
 from cfplan.flight.telemetry import Triple
+from cfplan.vehicle.rotations import tilt_of, yaw_of
 
 FIRST_FRAME_WITHIN = 3.5  # s
 _JUMP = 0.15  # m
@@ -135,14 +136,14 @@ class Surveyor:
         segments = next((subject.segments for subject in subjects if subject.name == name), ())
         counts: Counter[Verdict] = self._classifiers[name].counts if name in self._classifiers else Counter()
         body = self._bodies.get(name)
-        x, y, z, w = body.quaternion if body else (math.nan,) * 4
+        quaternion = body.quaternion if body else (math.nan,) * 4
         return BodyReport(
             name=name,
             segments=segments,
             counts={str(verdict): count for verdict, count in counts.items()},
             position=body.position if body else None,
-            yaw=math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-            tilt=math.acos(max(-1.0, min(1.0, 1 - 2 * (x * x + y * y)))) if body else math.nan,
+            yaw=float(yaw_of(quaternion)),
+            tilt=float(tilt_of(quaternion)),
             quality=body.quality if body else math.nan,
         )
 

@@ -1,6 +1,5 @@
 """Everything that the pilot needs to know, fixed before the vehicle is armed."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +10,7 @@ from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
+from cfplan.vehicle.rotations import yaw_of
 
 # How far the vehicle's filter trusts poses: what Crazyswarm2 flies with. The large one cures yaw trouble.
 EXTERNAL_POSITION_STD = 1e-3  # m
@@ -86,12 +86,6 @@ def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0
 def manoeuvre_time(distance: float, mean_speed: float) -> float:
     """s that the on-board commander is given for a distance, m."""
     return max(_SHORTEST, distance / mean_speed)
-
-
-def yaw_of(quaternion: tuple[float, float, float, float]) -> float:
-    """rad, the heading of the body's x axis."""
-    x, y, z, w = quaternion
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def _place(payload: NDArray) -> tuple[Triple, float]:

@@ -15,7 +15,7 @@ from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.pilot.abort_monitor import Abort
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.flight_loop import REPLY, TRIES, AbortRaised, FlightLoop, LinkLost, OrderSource
-from cfplan.flight.pilot.mission import Mission, manoeuvre_time, yaw_of
+from cfplan.flight.pilot.mission import Mission, manoeuvre_time
 from cfplan.flight.pilot.outcome import Deviation, FlightOutcome, Rung, settle_time
 from cfplan.flight.pilot.prearm import prepare
 from cfplan.flight.pilot.stream import Stream
@@ -24,6 +24,7 @@ from cfplan.flight.radio.supervisor_bits import ARMED, FLYING, HIGH_LEVEL_ACTIVE
 from cfplan.flight.setpoints.hover_to_hover import encode_hover_to_hover
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Level, Phase, Telemetry, Triple
+from cfplan.vehicle.rotations import yaw_of
 
 SETTLED_WITHIN = 0.03  # m, from where the motion ended
 _AT_START_WITHIN = 0.06  # m

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from cfplan.errors import InputError, PreflightError
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.flight_loop import TRIES, FlightLoop
-from cfplan.flight.pilot.mission import yaw_of
 from cfplan.flight.pilot.preflight import PreflightSnapshot, run_checks
 from cfplan.flight.radio.link import Link
 from cfplan.flight.radio.supervisor_bits import ARMED, CAN_BE_ARMED, CAN_FLY
 from cfplan.flight.real_time import uses_fifo_scheduling
 from cfplan.flight.telemetry import Level, Phase
+from cfplan.vehicle.rotations import yaw_of
 
 CONVERGED_WITHIN = 0.03  # m, estimate from pose
 CONVERGED_FOR = 1.0  # s

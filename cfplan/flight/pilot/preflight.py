@@ -9,11 +9,12 @@ import numpy as np
 
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.deadlines import Lateness
-from cfplan.flight.pilot.mission import Mission, yaw_of
+from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Check
 from cfplan.flight.radio.supervisor_bits import FAULTS, FLYING
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Estimate, VehicleStatus
+from cfplan.vehicle.rotations import yaw_of
 
 OLDEST_PROTOCOL = 8  # the first with go-to as it is sent here
 LARGEST_VARIANCE = 1e-3  # m², a standard deviation of 3 cm

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
 from cfplan.flight.telemetry import Triple
+from cfplan.vehicle.rotations import about_z
 
 
 def encode_hover_to_hover(
@@ -22,13 +23,13 @@ def encode_hover_to_hover(
     speed = 30.0 * share**2 * (1.0 - share) ** 2 / duration
     change = 60.0 * share * (1.0 - share) * (1.0 - 2.0 * share) / duration**2
     way, turn = np.subtract(end, begin), math.remainder(end_yaw - yaw, math.tau)
-    half, zero = (yaw + turn * along) / 2, np.zeros_like(share)
+    zero = np.zeros_like(share)
     return encode(
         FullStateSetpoints(
             position=begin + along[:, None] * way,
             velocity=speed[:, None] * way,
             acceleration=change[:, None] * way,
-            quaternion=np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1),
+            quaternion=about_z(yaw + turn * along),
             body_rate=np.stack([zero, zero, turn * speed], axis=1),
         )
     )

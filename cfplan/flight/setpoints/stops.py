@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
 from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import about_z, yaw_of
 
 DURATION = 0.8  # s, from full speed to rest: 3.75 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
@@ -42,10 +43,8 @@ def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION, row
 
     velocity = at(reference.velocity)
     acceleration = clock_rate[:, None] ** 2 * at(reference.acceleration) + slowing[:, None] * velocity
-    turn = at(np.unwrap(_heading(reference.quaternion))[:, None])[..., 0].reshape(-1)
-    zero = np.zeros_like(turn)
-    headed = np.stack([zero, zero, np.sin(turn / 2), np.cos(turn / 2)], axis=1)
-    made = controller_attitude(acceleration.reshape(-1, 3) + _GRAVITY, headed)
+    turn = at(np.unwrap(yaw_of(reference.quaternion.T))[:, None])[..., 0].reshape(-1)
+    made = controller_attitude(acceleration.reshape(-1, 3) + _GRAVITY, about_z(turn))
     attitude = Rotation.from_matrix(made).as_quat()
     shape = (len(begin), steps + 1)
     body_rate = _ahead(_turn_rates(attitude.reshape(*shape, 4), rate), RATE_LEAD * rate)
@@ -59,12 +58,6 @@ def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION, row
             body_rate=body_rate.reshape(-1, 3),
         )
     ).reshape(*shape, -1)
-
-
-def _heading(quaternion: NDArray) -> NDArray:
-    """(N,) rad, all that the controller takes from quaternions (N, 4)."""
-    x, y, z, w = quaternion.T
-    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def _ahead(values: NDArray, by: float) -> NDArray:

@@ -7,6 +7,7 @@ log that is read back lies as the flight did. Quaternions are x y z w here and w
 import math
 
 from cfplan.flight.telemetry import Quaternion, Triple
+from cfplan.vehicle.rotations import roll_pitch_of, yaw_of
 
 _HALF = math.sqrt(0.5)
 
@@ -41,6 +42,5 @@ def in_body(vector: Triple, quaternion: Quaternion) -> Triple:
 def euler(wxyz: Quaternion) -> Triple:
     """rad: roll, pitch, yaw of an attitude as MAVLink has it; yaw is clockwise from north."""
     w, x, y, z = wxyz
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x))))
-    return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    roll, pitch = roll_pitch_of((x, y, z, w))
+    return float(roll), float(pitch), float(yaw_of((x, y, z, w)))

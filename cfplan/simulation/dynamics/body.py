@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.rotations import about_z, matrix_of, product, yaw_of
 
 TIME_STEP = 0.001  # s
 
@@ -60,25 +61,8 @@ def at_rest(position: NDArray, yaw: float = 0.0) -> NDArray:
     """(17,) the state of a vehicle that stands still, level, its motors off."""
     state = np.zeros(STATE_SIZE)
     state[POSITION] = position
-    state[QUATERNION] = 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)
+    state[QUATERNION] = about_z(yaw)
     return state
-
-
-@njit(cache=True)
-def rotation(quaternion: NDArray) -> NDArray:
-    """(3, 3) body→world of a unit quaternion x y z w."""
-    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    matrix = np.empty((3, 3))
-    matrix[0, 0] = 1 - 2 * (y * y + z * z)
-    matrix[0, 1] = 2 * (x * y - z * w)
-    matrix[0, 2] = 2 * (x * z + y * w)
-    matrix[1, 0] = 2 * (x * y + z * w)
-    matrix[1, 1] = 1 - 2 * (x * x + z * z)
-    matrix[1, 2] = 2 * (y * z - x * w)
-    matrix[2, 0] = 2 * (x * z - y * w)
-    matrix[2, 1] = 2 * (y * z + x * w)
-    matrix[2, 2] = 1 - 2 * (x * x + y * y)
-    return matrix
 
 
 @njit(cache=True)
@@ -100,7 +84,7 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
     thrust = push[0] + push[1] + push[2] + push[3]
 
     # On the floor the ground takes all torque and every force that does not lift the body off it.
-    turn = rotation(state[6:10])
+    turn = matrix_of(state[6:10])
     on_floor = state[2] <= body[FLOOR]
     if on_floor and state[5] <= 0.0 and thrust * turn[2, 2] <= body[MASS] * GRAVITY:
         _rest(state, body[FLOOR])
@@ -140,10 +124,9 @@ def _turn(state: NDArray) -> None:
     rx, ry, rz, rw = wx * share, wy * share, wz * share, np.cos(half)
     x, y, z, w = state[6], state[7], state[8], state[9]
     norm = np.sqrt((x * x + y * y + z * z + w * w) * (rx * rx + ry * ry + rz * rz + rw * rw))
-    state[6] = (w * rx + x * rw + y * rz - z * ry) / norm
-    state[7] = (w * ry - x * rz + y * rw + z * rx) / norm
-    state[8] = (w * rz + x * ry - y * rx + z * rw) / norm
-    state[9] = (w * rw - x * rx - y * ry - z * rz) / norm
+    turned = product((x, y, z, w), (rx, ry, rz, rw))
+    for axis in range(4):
+        state[6 + axis] = turned[axis] / norm
 
 
 @njit(cache=True)
@@ -152,7 +135,6 @@ def _rest(state: NDArray, floor: float) -> None:
     state[2] = floor
     state[3:6] = 0.0
     state[10:13] = 0.0
-    x, y, z, w = state[6], state[7], state[8], state[9]
-    half = 0.5 * np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    half = 0.5 * yaw_of(state[6:10])
     state[6:8] = 0.0
     state[8], state[9] = np.sin(half), np.cos(half)

@@ -19,8 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cfplan.simulation.dynamics.body import rotation
 from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import matrix_of, product
 
 PREDICTION_PERIOD = 10  # ticks of 1 ms
 
@@ -131,7 +131,7 @@ def step_filter(
 @njit(cache=True)
 def estimate(kalman: Filter, out: NDArray) -> None:
     """Write position 0:3, velocity 3:6 in world axes and quaternion 6:10 to `out`."""
-    turn = rotation(kalman.quaternion)
+    turn = matrix_of(kalman.quaternion)
     for axis in range(3):
         out[axis] = kalman.state[axis]
         out[3 + axis] = 0.0
@@ -166,7 +166,7 @@ def _predict(kalman: Filter, prior: NDArray, flying: bool) -> None:
     """
     dt = PREDICTION_PERIOD * _TICK
     state, sums = kalman.state, kalman.sums
-    turn = rotation(kalman.quaternion)
+    turn = matrix_of(kalman.quaternion)
     wx, wy, wz = sums[0], sums[1], sums[2]
     fx, fy, fz = sums[3], sums[4], sums[5]
     if flying:
@@ -331,11 +331,9 @@ def _turn_by(quaternion: NDArray, angle_x: float, angle_y: float, angle_z: float
     size = np.sqrt(angle_x**2 + angle_y**2 + angle_z**2) + 1e-9
     share = np.sin(size / 2) / size
     a, b, c, d = share * angle_x, share * angle_y, share * angle_z, np.cos(size / 2)
-    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    quaternion[0] = w * a + x * d + y * c - z * b
-    quaternion[1] = w * b - x * c + y * d + z * a
-    quaternion[2] = w * c + x * b - y * a + z * d
-    quaternion[3] = w * d - x * a - y * b - z * c
+    turned = product(quaternion, (a, b, c, d))
+    for axis in range(4):
+        quaternion[axis] = turned[axis]
     _normalise(quaternion)
 
 

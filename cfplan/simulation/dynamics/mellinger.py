@@ -19,8 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from cfplan.simulation.dynamics.body import rotation
 from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.rotations import matrix_of, yaw_of
 
 CONTROL_PERIOD = 0.002  # s
 
@@ -81,13 +81,6 @@ def gains_for(airframe: Airframe) -> MellingerGains:
 
 
 @njit(cache=True)
-def euler_yaw(quaternion: NDArray) -> float:
-    """Yaw, rad, of the Euler angles ZYX: all that the controller takes from a setpoint's quaternion."""
-    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-@njit(cache=True)
 def level_out(setpoint: NDArray, mode: NDArray) -> None:
     """The supervisor's override when setpoints stop coming, in place: level, no yaw rate, height kept."""
     mode[MODE_X] = mode[MODE_Y] = DISABLE
@@ -112,13 +105,13 @@ def step_mellinger(
 
     yaw = 0.0
     if mode[MODE_YAW] == VELOCITY_MODE:
-        yaw = euler_yaw(state[6:10]) + setpoint[15] * CONTROL_PERIOD
+        yaw = yaw_of(state[6:10]) + setpoint[15] * CONTROL_PERIOD
     elif mode[MODE_YAW] == ABSOLUTE:
         yaw = setpoint[18]
     elif mode[MODE_QUATERNION] == ABSOLUTE:
-        yaw = euler_yaw(setpoint[9:13])
+        yaw = yaw_of(setpoint[9:13])
 
-    turn = rotation(state[6:10])
+    turn = matrix_of(state[6:10])
     by_position = mode[MODE_X] == ABSOLUTE
     manual = mode[MODE_ROLL] == ABSOLUTE and mode[MODE_PITCH] == ABSOLUTE and mode[MODE_Z] == DISABLE
     thrust = 0.0
@@ -132,7 +125,7 @@ def step_mellinger(
             force_z += gains[_MASS] * setpoint[8]
         else:
             # Level out: the firmware keeps height and the direction that it points in.
-            yaw = euler_yaw(state[6:10])
+            yaw = yaw_of(state[6:10])
         thrust = force_x * turn[0, 2] + force_y * turn[1, 2] + force_z * turn[2, 2]
         desired = _thrust_frame(force_x, force_y, force_z, yaw)
 

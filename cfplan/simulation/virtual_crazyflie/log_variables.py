@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.packets import compress_quaternion
-from cfplan.simulation.dynamics.body import rotation
 from cfplan.simulation.dynamics.kalman import Filter
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.localization import Localization
@@ -15,6 +14,7 @@ from cfplan.simulation.virtual_crazyflie.setpoints import PITCH, ROLL, YAW, Setp
 from cfplan.simulation.virtual_crazyflie.stabilizer import Loop
 from cfplan.simulation.virtual_crazyflie.supervisor import Supervisor
 from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import matrix_of, roll_pitch_of, yaw_of
 
 Getter = Callable[[], float]
 
@@ -28,11 +28,8 @@ def _element(array: NDArray, place: int, scale: float = 1.0) -> Getter:
 
 def euler(quaternion: NDArray) -> tuple[float, float, float]:
     """Roll, pitch, yaw in degrees; pitch in the firmware's legacy sign, nose up positive."""
-    x, y, z, w = (float(value) for value in quaternion)
-    roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (x * z - w * y), -1, 1))
-    yaw = np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
-    return float(np.degrees(roll)), float(np.degrees(pitch)), float(np.degrees(yaw))
+    roll, pitch = roll_pitch_of(quaternion)
+    return float(np.degrees(roll)), float(-np.degrees(pitch)), float(np.degrees(yaw_of(quaternion)))
 
 
 def log_variables(
@@ -102,7 +99,7 @@ def _accelerations(loop: Loop) -> dict[str, Getter]:
     """World axes: stateEstimate in g without gravity, stateEstimateZ in mm/s² with it."""
 
     def world(axis: int, scale: float, gravity: float) -> float:
-        return float(rotation(loop.belief[6:10])[axis] @ loop.acceleration - gravity) * scale
+        return float(matrix_of(loop.belief[6:10])[axis] @ loop.acceleration - gravity) * scale
 
     found: dict[str, Getter] = {}
     for place, axis in enumerate(_AXES):

@@ -26,8 +26,8 @@ from cfplan.simulation.dynamics.mellinger import (
     MODE_YAW,
     MODE_Z,
     VELOCITY_MODE,
-    euler_yaw,
 )
+from cfplan.vehicle.rotations import roll_pitch_of, yaw_of
 
 LOOPS, MEMORY_SIZE = 12, 36
 _X, _Y, _Z, _VX, _VY, _VZ, _ROLL, _PITCH, _YAW, _ROLL_RATE, _PITCH_RATE, _YAW_RATE = range(LOOPS)
@@ -77,10 +77,8 @@ def step_pid(
     tick: int,
 ) -> None:
     """One step, every 2 ms: writes `control` and carries `memory` on; the other arrays as in `mellinger`."""
-    x, y, z, w = state[6], state[7], state[8], state[9]
-    roll = np.degrees(np.arctan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y)))
-    pitch = np.degrees(np.arcsin(min(max(2 * (x * z - w * y), -1.0), 1.0)))
-    yaw = np.degrees(euler_yaw(state[6:10]))
+    roll, pitch = roll_pitch_of(state[6:10])
+    roll, pitch, yaw = np.degrees(roll), -np.degrees(pitch), np.degrees(yaw_of(state[6:10]))
 
     changed = memory[35] == 0.0
     for place in range(7):
@@ -135,7 +133,7 @@ def _want_yaw(memory: NDArray, limits: NDArray, setpoint: NDArray, mode: NDArray
     elif mode[MODE_YAW] == ABSOLUTE:
         memory[26] = np.degrees(setpoint[18])
     elif mode[MODE_QUATERNION] == ABSOLUTE:
-        memory[26] = np.degrees(euler_yaw(setpoint[9:13]))
+        memory[26] = np.degrees(yaw_of(setpoint[9:13]))
     memory[26] = _wrapped(memory[26])
 
 

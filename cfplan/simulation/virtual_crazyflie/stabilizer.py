@@ -16,7 +16,6 @@ from cfplan.simulation.dynamics.body import (
     TIME_STEP,
     at_rest,
     pack_body,
-    rotation,
     step_body,
 )
 from cfplan.simulation.dynamics.kalman import Filter, estimate, new_filter, reset, step_filter
@@ -34,6 +33,7 @@ from cfplan.simulation.virtual_crazyflie.pid import OUTPUT_LIMIT, OVERHEAD, defa
 from cfplan.simulation.virtual_crazyflie.setpoints import THRUST, Setpoint
 from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
 from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.rotations import matrix_of
 
 # Where each flag lies in the array that `run` fills.
 OFF_TICKS, OFF_IN_AIR_TICKS, RESETS = range(3)
@@ -188,6 +188,6 @@ def _drive(loop: Loop, body: NDArray, allowed: bool, per_command: float, asked: 
     step_body(loop.truth, command, body, loop.wind, loop.efficiency)
     fx, fy = (loop.truth[3] - vx) / TIME_STEP, (loop.truth[4] - vy) / TIME_STEP
     fz = (loop.truth[5] - vz) / TIME_STEP + GRAVITY
-    turn = rotation(loop.truth[6:10])
+    turn = matrix_of(loop.truth[6:10])
     for axis in range(3):
         loop.acceleration[axis] = turn[0, axis] * fx + turn[1, axis] * fy + turn[2, axis] * fz

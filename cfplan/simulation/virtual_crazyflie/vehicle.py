@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cfplan.simulation.dynamics.body import MASS, THRUST_MAX
-from cfplan.simulation.dynamics.mellinger import euler_yaw
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.commander import Commander, Priority
 from cfplan.simulation.virtual_crazyflie.defaults import (
@@ -38,6 +37,7 @@ from cfplan.simulation.virtual_crazyflie.supervisor import PERIOD as SUPERVISOR_
 from cfplan.simulation.virtual_crazyflie.supervisor import Supervisor
 from cfplan.simulation.virtual_crazyflie.wire import LARGEST_PAYLOAD, Port, pack
 from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.rotations import yaw_of
 
 COMMANDER_PERIOD = 10  # ticks of 1 ms between looks at planner and log blocks
 
@@ -233,7 +233,7 @@ class VirtualCrazyflie:
     def _where(self) -> Goal:
         belief = self.stabilizer.loop.belief
         still = np.zeros(4)
-        return Goal(np.append(belief[0:3], euler_yaw(belief[6:10])), np.append(belief[3:6], 0.0), still, still)
+        return Goal(np.append(belief[0:3], yaw_of(belief[6:10])), np.append(belief[3:6], 0.0), still, still)
 
     def _take_setpoint(self, port: Port, channel: int, payload: bytes) -> None:
         setpoint: Setpoint | None = None

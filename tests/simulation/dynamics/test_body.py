@@ -17,10 +17,10 @@ from cfplan.simulation.dynamics.body import (
     at_rest,
     hovering,
     pack_body,
-    rotation,
     step_body,
 )
 from cfplan.vehicle.airframe import GRAVITY, MOTOR_TORQUE_SIGNS, Airframe
+from cfplan.vehicle.rotations import matrix_of
 
 NO_FLOOR = -np.inf
 
@@ -139,7 +139,7 @@ def test_a_tilted_fall_ends_still_and_level_on_the_floor():
 
 def test_the_rotation_matrix_is_that_of_scipy():
     for quaternion in Rotation.random(20, rng=1).as_quat():
-        assert rotation(quaternion) == pytest.approx(Rotation.from_quat(quaternion).as_matrix())
+        assert matrix_of(quaternion) == pytest.approx(Rotation.from_quat(quaternion).as_matrix())
 
 
 def rotorpy_vehicle(frame: Airframe, hover_speed: float, *, aero: bool) -> tuple[Multirotor, float]:

@@ -19,11 +19,11 @@ from cfplan.simulation.dynamics.mellinger import (
     VELOCITY_MODE,
     MellingerGains,
     distribute_power,
-    euler_yaw,
     level_out,
     step_mellinger,
 )
 from cfplan.vehicle.airframe import GRAVITY, MOTOR_TORQUE_SIGNS
+from cfplan.vehicle.rotations import yaw_of
 
 MASS = 0.0318
 GAINS = MellingerGains(mass=MASS).pack()
@@ -82,7 +82,7 @@ def test_nothing_else_of_the_setpoints_quaternion_than_its_yaw_is_used():
 
 def test_yaw_of_a_quaternion_is_the_first_euler_angle():
     for rotation in Rotation.random(20, rng=2):
-        assert euler_yaw(rotation.as_quat()) == pytest.approx(rotation.as_euler("ZYX")[0])
+        assert yaw_of(rotation.as_quat()) == pytest.approx(rotation.as_euler("ZYX")[0])
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])

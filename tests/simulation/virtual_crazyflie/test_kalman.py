@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cfplan.simulation.dynamics import kalman as estimator
-from cfplan.simulation.dynamics.body import rotation
 from cfplan.simulation.dynamics.kalman import Prior, estimate, new_filter, reset, step_filter
 from cfplan.simulation.lab.room import RoomSettings
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.wire import Port
 from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import matrix_of
 
 NONE = np.zeros((0, 9))
 STILL = np.array([0.0, 0.0, GRAVITY])
@@ -55,7 +55,7 @@ def test_covariance_goes_by_the_derivative_of_the_prediction(drag):
         numeric[6:9, column] = (errors[0] - errors[1]) / (2 * step)
     start = moving_filter()
     prior = Prior(drag_x=drag, drag_y=drag, drag_z=drag).pack()
-    linear = estimator._linearised(start.state, rotation(start.quaternion), start.sums, prior, 0.01, True)
+    linear = estimator._linearised(start.state, matrix_of(start.quaternion), start.sums, prior, 0.01, True)
     assert linear[0:6] == pytest.approx(numeric[0:6], abs=5e-4)  # it leaves out dt² × acceleration
     # The firmware turns the attitude's covariance by half the angle that the attitude turns by.
     half = np.eye(3) + (numeric[6:9, 6:9] - np.eye(3)) / 2
