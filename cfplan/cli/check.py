@@ -19,7 +19,7 @@ def check(
     safety_file: Path | None,
     planner: str,
     nodes: int | None,
-    speed_share: float | None,
+    speed_factor: float | None,
     as_json: bool,
 ) -> int:
     """Check every limit along a path's plan, or along a plan file's, and the bytes that would fly it.
@@ -29,7 +29,7 @@ def check(
     from cfplan.cli.certificate_table import print_certificate
 
     steps = Steps(as_json=as_json)
-    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
+    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_factor), steps)
     if as_json:
         print_json(flight.to_dict())
     else:

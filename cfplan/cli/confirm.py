@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 FIRST_SPEED = 0.3  # share at which a path should be flown first
 
 
-def confirmed(name: str, mission: "Mission", uri: str, records: Path, *, yes: bool, speed_share: float | None) -> bool:
+def confirmed(name: str, mission: "Mission", uri: str, records: Path, *, yes: bool, speed_factor: float | None) -> bool:
     """Whether to fly: always with a virtual vehicle or --yes, else what a person answers.
 
     Raises InputError where there is nobody to ask.
@@ -25,7 +25,7 @@ def confirmed(name: str, mission: "Mission", uri: str, records: Path, *, yes: bo
     if yes or uri.startswith(SIMULATED):
         return True
     click.echo(what_it_does(name, mission, uri), err=True)
-    if not flown_before(name, records) and (speed_share is None or speed_share > FIRST_SPEED):
+    if not flown_before(name, records) and (speed_factor is None or speed_factor > FIRST_SPEED):
         click.echo(
             f"No flight of {name!r} on hardware is in {records}: fly it with --speed {FIRST_SPEED} first.", err=True
         )

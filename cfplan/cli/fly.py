@@ -65,7 +65,7 @@ def fly(
     safety_file: Path | None,
     planner: str,
     nodes: int | None,
-    speed_share: float | None,
+    speed_factor: float | None,
     uri: str,
     mocap_uri: str | None,
     records: Path,
@@ -81,7 +81,7 @@ def fly(
     check_uris(uri, mocap_uri)
     check_watchers(live=live, mavlink=mavlink)
     look_at_hardware(uri, mocap_uri, load_limits(options.find_safety_file(safety_file, path_or_plan)).pose, steps)
-    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
+    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_factor), steps)
     encoded = certify_bytes(flight, steps)
     rehearsed = rehearse(flight, encoded, steps)
 
@@ -100,7 +100,7 @@ def fly(
         said.append(
             f"a certified way to stop from each of {stops.count} setpoints, {stops.as_planned} within the plan's limits"
         )
-    if not confirmed(flight.name, mission, uri, records, yes=yes, speed_share=speed_share):
+    if not confirmed(flight.name, mission, uri, records, yes=yes, speed_factor=speed_factor):
         click.echo("not flown", err=True)
         return int(ExitCode.ENDED_BY_PILOT)
     with vehicle(uri, mocap_uri, flight.limits) as (drivers, pose_source):

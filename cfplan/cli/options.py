@@ -33,7 +33,7 @@ def planning(command: Callable) -> Callable:
             click.option("--nodes", type=click.IntRange(4), help="Grid intervals; else chosen from the path's length."),
             click.option(
                 "--speed",
-                "speed_share",
+                "speed_factor",
                 type=click.FloatRange(0, 1, min_open=True),
                 help="Share of the allowed speed to fly at; else the path file's, else 1.",
             ),

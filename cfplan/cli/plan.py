@@ -23,7 +23,7 @@ def plan(
     safety_file: Path | None,
     planner: str,
     nodes: int | None,
-    speed_share: float | None,
+    speed_factor: float | None,
     output: Path | None,
     force: bool,
     as_json: bool,
@@ -32,7 +32,7 @@ def plan(
     from cfplan.cli.certificate_table import print_certificate
 
     steps = Steps(as_json=as_json)
-    flight = obtain_plan(path_file, PlanOptions(safety_file, planner, nodes, speed_share), steps)
+    flight = obtain_plan(path_file, PlanOptions(safety_file, planner, nodes, speed_factor), steps)
     if output is not None:
         from cfplan.planning.plan_file import save_plan
 

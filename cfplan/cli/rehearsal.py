@@ -24,7 +24,7 @@ class PlanOptions:
     safety_file: Path | None
     planner: str
     nodes: int | None
-    speed_share: float | None
+    speed_factor: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +49,8 @@ class PlannedFlight:
             "lower_bound": self.lower_bound,
             "nodes": plan.nodes,
             "planning_seconds": plan.seconds,
-            "slowed": plan.slowed,
-            "speed_share": plan.speed_share,
+            "slowed": plan.repair_speed_factor,
+            "speed_share": plan.speed_factor,
             "notes": list(plan.notes),
             "certificate": plan.certificate.to_dict(),
         }
@@ -92,7 +92,7 @@ def obtain_plan(path_or_plan: Path, options: PlanOptions, steps: Steps) -> Plann
             nodes=options.nodes,
             yaw=path_file.yaw,
             yaw_angle=path_file.yaw_angle,
-            speed_share=options.speed_share if options.speed_share is not None else path_file.speed,
+            speed_factor=options.speed_factor if options.speed_factor is not None else path_file.speed,
         )
         said.append(f"{plan.trajectory.duration:.2f} s of flight by {plan.planner}")
         said.extend(plan.notes)

@@ -18,12 +18,12 @@ def sim(
     safety_file: Path | None,
     planner: str,
     nodes: int | None,
-    speed_share: float | None,
+    speed_factor: float | None,
     as_json: bool,
 ) -> None:
     """Rehearse a path or a plan file: its very setpoints, the firmware's controller, a body with drag and motor lag."""
     steps = Steps(as_json=as_json)
-    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_share), steps)
+    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_factor), steps)
     encoded = certify_bytes(flight, steps)
     result = rehearse(flight, encoded, steps)
     if as_json:

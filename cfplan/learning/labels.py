@@ -138,14 +138,14 @@ def _label(path: Path, solution: Solution, limits: str) -> dict[str, Any]:
     return label | {
         "travel_time": trajectory.duration,
         "peak_speed": certificate.margins[0].worst,
-        "certified_share": 1.0 if certificate.passed else _certified_share(trajectory, chosen.limits),
+        "certified_share": 1.0 if certificate.passed else _certified_speed_factor(trajectory, chosen.limits),
         "active_limits": [margin.name for margin in certificate.margins if margin.share >= ACTIVE_SHARE],
     }
 
 
-def _certified_share(trajectory: Trajectory, limits: PlanLimits) -> float:
+def _certified_speed_factor(trajectory: Trajectory, limits: PlanLimits) -> float:
     """Of its speed; 0 where no slowing helps."""
     try:
-        return slow_until_certified(trajectory, limits).share
+        return slow_until_certified(trajectory, limits).speed_factor
     except CfplanError:
         return 0.0

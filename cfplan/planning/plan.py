@@ -28,7 +28,7 @@ FEWEST_NODES, MOST_NODES = 60, 3000
 MOST_LEARNED_NODES = 30_000
 NODES_PER_PIECE = 4
 GOOD_SHARE = 0.97  # a plan that had to be slowed further is worth a second try with twice the nodes
-LEAST_SPEED_SHARE = 0.01
+LEAST_SPEED_FACTOR = 0.01
 LAST_RESORTS = ("convex", "minsnap")
 # which hardly ever fail
 EXPERT_GAP = 0.1
@@ -92,7 +92,7 @@ def plan(
     nodes: int | None = None,
     yaw: YawMode = YawMode.FIXED,
     yaw_angle: float = 0.0,
-    speed_share: float = 1.0,
+    speed_factor: float = 1.0,
     start: BoundaryState | None = None,
     end: BoundaryState | None = None,
 ) -> Plan:
@@ -100,7 +100,7 @@ def plan(
 
     "auto" asks the learned planner, where there is a model for the vehicle and the limits, and the convex one, and
     takes the faster of their flights; where that is far above the proven bound, the expert too.
-    `speed_share` slows the whole result: the same motion at that share of its speed, so that accelerations fall with
+    `speed_factor` slows the whole result: the same motion at that share of its speed, so that accelerations fall with
     its square. Where a boundary state is given, nothing may be slowed, or it would no longer hold.
 
     Raises:
@@ -108,7 +108,7 @@ def plan(
         InputError: unknown planner, no model for it, speed share or nodes out of range.
     """
     begun = time.perf_counter()
-    _check_arguments(nodes, speed_share, bound=start is not None or end is not None)
+    _check_arguments(nodes, speed_factor, bound=start is not None or end is not None)
     check_space(path, limits.space)
     question = _Question(path, airframe, limits, nodes, yaw, yaw_angle, start, end)
     notes: list[str] = []
@@ -118,16 +118,16 @@ def plan(
     else:
         found = _best(question, planner, notes)
     slowed = found.repaired
-    if slowed.share < 1.0 and (start is not None or end is not None):
+    if slowed.speed_factor < 1.0 and (start is not None or end is not None):
         raise InfeasibleError(
-            f"the profile passes only at {slowed.share:.2%} of its speed, which would break the boundary state",
+            f"the profile passes only at {slowed.speed_factor:.2%} of its speed, which would break the boundary state",
             hint="start slower, or leave the boundary free",
         )
     if changed := slowed.describe():
         notes.append(f"{found.planner}'s profile was {changed}")
     flown = slowed
-    if speed_share < 1.0:
-        flown = slow(question.task(found.planner), slowed.trajectory.profile.slowed(speed_share), limits.space)
+    if speed_factor < 1.0:
+        flown = slow(question.task(found.planner), slowed.trajectory.profile.slowed(speed_factor), limits.space)
     _check_endurance(flown.trajectory.duration, limits)
     return Plan(
         path=path,
@@ -137,8 +137,8 @@ def plan(
         certificate=flown.certificate,
         planner=found.planner,
         nodes=found.nodes,
-        slowed=slowed.share,
-        speed_share=speed_share,
+        repair_speed_factor=slowed.speed_factor,
+        speed_factor=speed_factor,
         seconds=time.perf_counter() - begun,
         notes=tuple(notes),
         lower_bound=bound,
@@ -161,7 +161,7 @@ def _automatic(question: _Question, notes: list[str]) -> tuple[_Found, float]:
     found = [one for name in names if (one := _ask(question, name, question.nodes_for(name), notes))]
     bound = lower_bound(question.task("convex"))
     best = min(found, key=lambda one: one.duration, default=None)
-    if best is None or best.repaired.share < 1.0 or best.duration > (1.0 + EXPERT_GAP) * bound:
+    if best is None or best.repaired.speed_factor < 1.0 or best.duration > (1.0 + EXPERT_GAP) * bound:
         try:
             expert = _best(question, "expert", notes)
         except InfeasibleError:
@@ -177,24 +177,24 @@ def _automatic(question: _Question, notes: list[str]) -> tuple[_Found, float]:
     return best, bound
 
 
-def _check_arguments(nodes: int | None, speed_share: float, bound: bool) -> None:
+def _check_arguments(nodes: int | None, speed_factor: float, bound: bool) -> None:
     if nodes is not None and not 2 <= nodes <= 10 * MOST_NODES:
         raise InputError(
             f"{nodes} nodes; 2 to {10 * MOST_NODES} make sense",
             where="nodes",
             hint="leave nodes out to have them chosen",
         )
-    if not LEAST_SPEED_SHARE <= speed_share <= 1.0:
+    if not LEAST_SPEED_FACTOR <= speed_factor <= 1.0:
         raise InputError(
-            f"a speed share of {speed_share:g} is not from {LEAST_SPEED_SHARE} to 1",
-            where="speed_share",
+            f"the speed factor must be from {LEAST_SPEED_FACTOR} to 1, not {speed_factor:g}",
+            where="speed_factor",
             hint="0.5 flies at half the speed",
         )
-    if bound and speed_share < 1.0:
+    if bound and speed_factor < 1.0:
         raise InputError(
-            "a speed share would break the boundary state that is given",
-            where="speed_share",
-            hint="leave the share or the boundary state out",
+            "a speed factor would break the boundary state that is given",
+            where="speed_factor",
+            hint="leave the speed factor or the boundary state out",
         )
 
 
@@ -206,7 +206,7 @@ def _best(question: _Question, planner: str, notes: list[str]) -> _Found:
         found = _ask(question, planner, count, notes)
         if found and (best is None or found.duration < best.duration):
             best = found
-        if best and best.repaired.share >= GOOD_SHARE:
+        if best and best.repaired.speed_factor >= GOOD_SHARE:
             return best
     others = (*(("expert",) if planner == "learned" else ()), *LAST_RESORTS)
     for name in others:

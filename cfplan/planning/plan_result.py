@@ -23,10 +23,8 @@ class Plan:
     # the one whose profile it is
     nodes: int
     # intervals of the profile
-    slowed: float
-    # share of the planner's speed at which the plan passed, 1 where nothing had to change
-    speed_share: float
-    # share of that which was asked for
+    repair_speed_factor: float  # on the planner's speed, at which the plan passes; 1: not slowed
+    speed_factor: float  # on that speed, as asked for; 1: not slowed
     seconds: float
     # s that planning took, all tries and certificates included
     notes: tuple[str, ...]

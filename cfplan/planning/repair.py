@@ -29,8 +29,7 @@ class Repaired:
 
     trajectory: Trajectory
     certificate: Certificate
-    share: float
-    # of its speed to which the whole was slowed, 1 where it was not
+    speed_factor: float  # on the whole; 1: not slowed
     before: float
     # s of flight before repair
     slower: float = 0.0
@@ -48,9 +47,9 @@ class Repaired:
         """One sentence, empty where nothing was changed."""
         duration = self.trajectory.duration
         cost = f"{self.before:.3f} s became {duration:.3f} s ({duration / self.before - 1:+.2%})"
-        if self.share < 1.0:
+        if self.speed_factor < 1.0:
             why = f" ({self.failed})" if self.failed else ""
-            return f"slowed to {self.share:.2%} of its speed to pass{why}; {cost}"
+            return f"slowed to {self.speed_factor:.2%} of its speed to pass{why}; {cost}"
         if self.slower:
             most = f"most at s = {self.where:.2f}, by {self.most:.1%}"
             return f"refined; slower along {self.slower:.0%} of it, {most}; {cost}"
@@ -87,7 +86,7 @@ def repair(task: PlanningTask, profile: SpeedProfile, space: Space | None = None
         certified.append(slow_until_certified(Trajectory(path, solution.profile, airframe), limits, space))
     (slowed,) = certified
     return Repaired(
-        slowed.trajectory, slowed.certificate, slowed.share, before, *_where_slower(profile, solution.profile),
+        slowed.trajectory, slowed.certificate, slowed.speed_factor, before, *_where_slower(profile, solution.profile),
         joints=solution.joints,
     )  # fmt: skip
 
@@ -96,7 +95,7 @@ def slow(task: PlanningTask, profile: SpeedProfile, space: Space | None = None, 
     """Slow the profile as a whole until it passes; one that does stays as it is. Raises as repair()."""
     trajectory = Trajectory(task.path, profile, task.airframe)
     slowed = slow_until_certified(trajectory, task.limits, space)
-    return Repaired(slowed.trajectory, slowed.certificate, slowed.share, trajectory.duration, failed=failed)
+    return Repaired(slowed.trajectory, slowed.certificate, slowed.speed_factor, trajectory.duration, failed=failed)
 
 
 def _where_slower(before: SpeedProfile, after: SpeedProfile) -> tuple[float, float, float]:

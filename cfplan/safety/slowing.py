@@ -23,8 +23,7 @@ class Slowed:
 
     trajectory: Trajectory
     certificate: Certificate
-    share: float
-    # of the speed everywhere, 1 where nothing had to change
+    speed_factor: float  # everywhere; 1: not slowed
 
 
 def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Slowed:

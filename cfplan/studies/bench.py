@@ -17,10 +17,10 @@ from cfplan.safety.limit_sets import BOXES, LIMIT_SETS, LimitSet
 from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.trials import (
     BAD_PATH,
-    Entrant,
+    Candidate,
     Trial,
     find_box,
-    find_entrant,
+    find_candidate,
     find_limit_set,
     path_trials,
     quantiles,
@@ -52,7 +52,7 @@ class Row:
     # after repair
     unslowed: int
     # as planned
-    mended: int
+    repaired: int
     # not slowed as a whole: as planned, or refined
     plan_seconds: tuple[float, float, float]
     # median, p90, p99 of the planner's call
@@ -79,7 +79,7 @@ class Row:
     def texts(self) -> list[str]:
         """As COLUMNS has it."""
         return [
-            self.planner, *(f"{count}/{self.paths}" for count in (self.certified, self.unslowed, self.mended)),
+            self.planner, *(f"{count}/{self.paths}" for count in (self.certified, self.unslowed, self.repaired)),
             *(f"{1e3 * value:.1f} ms" for value in (self.plan_seconds[0], self.plan_seconds[2], *self.whole_seconds)),
             *(f"{value:.1f}×" for value in self.speed_up), f"{self.flight:.3f} s",
             *(f"{100 * value:+.2f} %" for value in self.against_expert),
@@ -144,7 +144,7 @@ def bench(
     for box in boxes:
         find_box(box)
     chosen = [find_limit_set(name) for name in limit_sets]
-    found = {name: find_entrant(name) for name in planners}
+    found = {name: find_candidate(name) for name in planners}
     begun, done, total = time.perf_counter(), 0, len(boxes) * len(chosen) * paths
     measured: dict[tuple[str, str], list[Trial]] = {}
     interrupted = False
@@ -183,10 +183,10 @@ def bench(
     )
 
 
-def _warm_up(entrants: dict[str, Entrant], chosen: LimitSet, nodes: int, yaw: YawMode, seed: int) -> None:
+def _warm_up(candidates: dict[str, Candidate], chosen: LimitSet, nodes: int, yaw: YawMode, seed: int) -> None:
     path = random_path(seed, next(iter(BOXES)))
-    for name, entrant in entrants.items():
-        run_trial(name, entrant, path, seed, chosen, nodes=nodes, yaw=yaw, bound=1.0)
+    for name, candidate in candidates.items():
+        run_trial(name, candidate, path, seed, chosen, nodes=nodes, yaw=yaw, bound=1.0)
 
 
 def _row(box: str, limits: str, name: str, trials: Iterable[Trial]) -> Row:
@@ -208,7 +208,7 @@ def _row(box: str, limits: str, name: str, trials: Iterable[Trial]) -> Row:
         paths=len(mine),
         certified=sum(trial.certified for trial in mine),
         unslowed=sum(trial.unslowed for trial in mine),
-        mended=sum(trial.slowed_to == 1.0 for trial in mine),
+        repaired=sum(trial.speed_factor == 1.0 for trial in mine),
         plan_seconds=plan,
         solve_seconds=quantiles([trial.solve_seconds for trial in mine]),
         repair_seconds=quantiles([trial.repair_seconds for trial in mine]),

@@ -17,7 +17,7 @@ from cfplan.studies.trials import (
     BAD_PATH,
     Trial,
     find_box,
-    find_entrant,
+    find_candidate,
     find_limit_set,
     path_trials,
     quantiles,
@@ -113,7 +113,7 @@ def dense_feasibility(
         find_box(box)
     if paths < len(pairs):
         raise InputError(f"{paths} paths do not fill {len(pairs)} groups", where="paths")
-    found = find_entrant(planner)
+    found = find_candidate(planner)
     each, begun, interrupted = paths // len(pairs), time.perf_counter(), False
     measured: dict[tuple[str, str], list[Trial]] = {}
     try:

@@ -42,8 +42,7 @@ class Planned:
     # s
     lower_bound: float
     # s
-    slowed: float
-    # share of the planner's speed at which the plan was certified
+    speed_factor: float  # of repair, on the planner's speed; 1: not slowed
     worst_share: float
     # of a limit, by the certificate
     dry_run: float
@@ -55,7 +54,7 @@ class Planned:
         """As PLANS has it."""
         return [
             self.path, f"{self.length:.1f} m", self.planner, f"{self.planned:.2f} s",
-            f"{100 * (self.planned / self.lower_bound - 1):.1f} %", f"{100 * self.slowed:.2f} %",
+            f"{100 * (self.planned / self.lower_bound - 1):.1f} %", f"{100 * self.speed_factor:.2f} %",
             f"{100 * self.worst_share:.2f} %", _cm(self.dry_run), _cm(self.dry_run_without_drag),
         ]  # fmt: skip
 
@@ -187,7 +186,7 @@ def _rehearsed(name: str, made: PlannedMission) -> Planned:
         planner=plan.planner,
         planned=plan.trajectory.duration,
         lower_bound=plan.lower_bound or lower_bound(PlanningTask(plan.path, plan.airframe, plan.limits.plan)),
-        slowed=plan.slowed,
+        speed_factor=plan.repair_speed_factor,
         worst_share=plan.certificate.worst.share,
         dry_run=rehearsal.deviation,
         dry_run_without_drag=dry_run(_without_drag(made), plan.trajectory, plan.airframe, plan.limits.flight).deviation,

@@ -61,8 +61,7 @@ class Flight:
     worst_share: float
     # of a limit, before repair
     learned: float
-    share: float
-    # of its speed to which the whole was slowed
+    speed_factor: float  # on the whole; 1: not slowed
     seconds: tuple[float, float, float]
     # to plan, to repair and certify, to encode and certify the bytes
     bytes_refused: str
@@ -93,7 +92,7 @@ class LearnedStudy:
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the table, and each flight that is out of the ordinary."""
         rest = {name: value for name, value in asdict(self).items() if name != "flights"}
-        odd = [asdict(f) for f in self.flights if f.reason or f.bytes_refused or f.dry_run or f.share < 1.0]
+        odd = [asdict(f) for f in self.flights if f.reason or f.bytes_refused or f.dry_run or f.speed_factor < 1.0]
         ((_, columns, rows),) = self.tables()
         table = [dict(zip(columns, row, strict=True)) for row in rows]
         return rest | {"table": table, "flights": odd[:MOST_TOLD]}
@@ -146,10 +145,10 @@ def _figures(flights: list[Flight]) -> dict[str, str]:
     certified = [f for f in done if np.isfinite(f.learned)]
     network = _numbers(f.network / f.expert_planned - 1 for f in certified)
     against = _numbers(f.learned / f.expert - 1 for f in certified)
-    mended = _numbers(f.expert / f.expert_planned - 1 for f in done)
+    repair_cost = _numbers(f.expert / f.expert_planned - 1 for f in done)
     flown = [f for f in certified if np.isfinite(f.deviation) or f.dry_run]
     passed = sum(f.worst_share <= 1.0 for f in certified)
-    slowed = sum(f.share < 1.0 for f in certified)
+    slowed = sum(f.speed_factor < 1.0 for f in certified)
     few = [f for f in flown if FEW_METRES[0] <= f.length <= FEW_METRES[1]]
     convex = [
         _numbers(time / f.learned - 1 for f in certified if np.isfinite(time := getattr(f, name)))
@@ -161,7 +160,7 @@ def _figures(flights: list[Flight]) -> dict[str, str]:
         f"{len(flights)}", _percent(np.mean(network)), _percent(np.quantile(np.abs(network), 0.95)),
         f"{len(certified)}", f"{passed}", f"{len(certified) - passed - slowed}", f"{slowed}",
         _percent(np.mean(against)), _percent(np.quantile(against, 0.95)), _percent(np.max(against)),
-        _percent(np.mean(mended)), _percent(np.max(mended)),
+        _percent(np.mean(repair_cost)), _percent(np.max(repair_cost)),
         *(_percent(np.median(share)) for share in convex),
         f"{sum(bool(f.bytes_refused) for f in done)}",
         f"{sum(bool(f.dry_run) for f in flown)} of {len(flown)}",
@@ -225,7 +224,7 @@ def _fly(path: Path, box: str, seed: int, chosen: LimitSet) -> Flight:
     airframe, limits = chosen.airframe, chosen.limits
     values: dict[str, Any] = dict.fromkeys(("expert_planned", "expert", "network", "worst_share", "learned"), np.nan)
     values |= dict.fromkeys(
-        ("share", "deviation", "deviation_at_paper_lag", "convex_refined", "convex_slowed"), np.nan
+        ("speed_factor", "deviation", "deviation_at_paper_lag", "convex_refined", "convex_slowed"), np.nan
     ) | {"seconds": (np.nan,) * 3}
     values |= dict.fromkeys(("reason", "bytes_refused", "dry_run", "dry_run_at_paper_lag"), "")
     values |= {"box": box, "limits": chosen.name, "seed": seed, "length": path.length}
@@ -235,8 +234,8 @@ def _fly(path: Path, box: str, seed: int, chosen: LimitSet) -> Flight:
         expert = plan_expert(task)
         if expert.profile is None:
             return Flight(**values | {"reason": f"expert: {expert.reason or expert.status}"})
-        mended = repair(task, expert.profile)
-        values |= {"expert_planned": mended.before, "expert": mended.trajectory.duration}
+        best = repair(task, expert.profile)
+        values |= {"expert_planned": best.before, "expert": best.trajectory.duration}
 
         begun = time.perf_counter()
         solution = plan_learned(task)
@@ -245,7 +244,7 @@ def _fly(path: Path, box: str, seed: int, chosen: LimitSet) -> Flight:
             return Flight(**values | {"reason": f"learned: {solution.reason or solution.status}"})
         found = repair(task, solution.profile)
         repaired = time.perf_counter()
-        values |= {"network": found.before, "learned": found.trajectory.duration, "share": found.share}
+        values |= {"network": found.before, "learned": found.trajectory.duration, "speed_factor": found.speed_factor}
         raw = certify(Trajectory(path, solution.profile, airframe), limits)
         values["worst_share"] = raw.worst.share
         if seed % CONVEX_EVERY == 0:

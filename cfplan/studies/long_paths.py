@@ -45,8 +45,7 @@ class Walk:
     nodes: int
     reason: str
     # why there are no bytes to send, empty where there are
-    share: float
-    # of its speed to which the whole was slowed
+    speed_factor: float  # on the whole; 1: not slowed
     worst_share: float
     # of a limit, by the certificate, anywhere along the path
     seconds: tuple[float, float, float]
@@ -63,7 +62,7 @@ class Walk:
     @property
     def certified(self) -> bool:
         """As planned and refined: not slowed as a whole."""
-        return not self.reason and self.share == 1.0
+        return not self.reason and self.speed_factor == 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +150,7 @@ def long_paths(
 
 def _walk(path: Path, seed: int, chosen: LimitSet) -> Walk:
     nodes = default_nodes(path, "learned")
-    values: dict[str, Any] = {"seed": seed, "length": path.length, "nodes": nodes, "reason": "", "share": np.nan}
+    values: dict[str, Any] = {"seed": seed, "length": path.length, "nodes": nodes, "reason": "", "speed_factor": np.nan}
     values |= dict.fromkeys(("worst_share", "flight", "expert_flight", "kept", "peak"), np.nan)
     values["seconds"] = (np.nan,) * 3
     try:
@@ -160,7 +159,7 @@ def _walk(path: Path, seed: int, chosen: LimitSet) -> Walk:
         before = _memory("VmRSS")
         found, values["seconds"] = _planned(path, chosen)
         values |= {"kept": _memory("VmRSS") - before, "peak": _memory("VmHWM") - before}
-        values |= {"share": found.share, "flight": found.trajectory.duration}
+        values |= {"speed_factor": found.speed_factor, "flight": found.trajectory.duration}
         values["worst_share"] = found.certificate.worst.share
         expert = plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes), windows=False)
         if expert.profile is not None:

@@ -35,7 +35,7 @@ def planned_mission(path_file: Path, safety_file: Path, *, stream_for: float = 0
         limits,
         yaw=loaded.yaw,
         yaw_angle=loaded.yaw_angle,
-        speed_share=loaded.speed,
+        speed_factor=loaded.speed,
     )
     if not made.certificate.passed:
         raise NotCertifiedError("the plan does not pass its certificate", where=str(path_file))

@@ -50,8 +50,7 @@ class Trial:
     # s of flight, before repair
     certified_time: float
     # s of flight
-    slowed_to: float
-    # of its speed as a whole, 1 where that was not needed
+    speed_factor: float  # on the whole; 1: not slowed
     bound: float
     # s, no flight within speed, acceleration and collective thrust is faster
 
@@ -81,16 +80,16 @@ class Trial:
         return self.certified_time / self.planned_time - 1.0
 
 
-class Entrant(NamedTuple):
+class Candidate(NamedTuple):
     """A planner and what is done to those of its profiles that do not pass."""
 
     plan: Planner
-    mend: Callable[..., Repaired]
+    repair: Callable[..., Repaired]
 
 
-def find_entrant(name: str) -> Entrant:
+def find_candidate(name: str) -> Candidate:
     """The planner of that name, slowed; refined where the name says so. Raises InputError."""
-    return Entrant(find_planner(name.removesuffix(REFINED)), repair if name.endswith(REFINED) else slow)
+    return Candidate(find_planner(name.removesuffix(REFINED)), repair if name.endswith(REFINED) else slow)
 
 
 def random_path(seed: int, box: str, waypoints: tuple[int, int] = WAYPOINTS) -> Path:
@@ -114,7 +113,7 @@ def find_limit_set(name: str) -> LimitSet:
 
 
 def path_trials(
-    entrants: Mapping[str, Entrant], seed: int, box: str, chosen: LimitSet, *, nodes: int, yaw: YawMode
+    candidates: Mapping[str, Candidate], seed: int, box: str, chosen: LimitSet, *, nodes: int, yaw: YawMode
 ) -> list[Trial]:
     """Every planner's trial on the random path of that seed; a path with a cusp is a bad one for all."""
     try:
@@ -122,20 +121,20 @@ def path_trials(
         path.check()
         bound = lower_bound(PlanningTask(path, chosen.airframe, chosen.limits))
     except CfplanError as error:
-        return [failed_trial(name, seed, BAD_PATH, str(error)) for name in entrants]
+        return [failed_trial(name, seed, BAD_PATH, str(error)) for name in candidates]
     return [
-        run_trial(name, entrant, path, seed, chosen, nodes=nodes, yaw=yaw, bound=bound)
-        for name, entrant in entrants.items()
+        run_trial(name, candidate, path, seed, chosen, nodes=nodes, yaw=yaw, bound=bound)
+        for name, candidate in candidates.items()
     ]
 
 
 def run_trial(
-    name: str, entrant: Entrant, path: Path, seed: int, chosen: LimitSet, *, nodes: int, yaw: YawMode, bound: float
+    name: str, candidate: Candidate, path: Path, seed: int, chosen: LimitSet, *, nodes: int, yaw: YawMode, bound: float
 ) -> Trial:
     """Plan, certify, repair. Whatever fails is a trial with a reason."""
     begun = time.perf_counter()
     task = PlanningTask(path, chosen.airframe, chosen.limits, nodes, yaw)
-    solution = entrant.plan(task)
+    solution = candidate.plan(task)
     plan_seconds = time.perf_counter() - begun
     solve_seconds = float(solution.stats.get("solve_seconds", np.nan))
     values = {"plan_seconds": plan_seconds, "solve_seconds": solve_seconds, "bound": bound}
@@ -145,7 +144,7 @@ def run_trial(
         planned = Trajectory(path, solution.profile, chosen.airframe)
         certificate = certify(planned, chosen.limits)
         begun = time.perf_counter()
-        repaired = entrant.mend(task, solution.profile)
+        repaired = candidate.repair(task, solution.profile)
         repair_seconds = time.perf_counter() - begun
     except CfplanError as error:
         return failed_trial(name, seed, Status.SOLVED.name, f"not certified: {error}", **values)
@@ -153,7 +152,7 @@ def run_trial(
         planner=name, seed=seed, status=solution.status.name, reason="", repair_seconds=repair_seconds,
         worst_share=certificate.worst.share, worst_limit=certificate.worst.name, planned_time=planned.duration,
         certified_time=repaired.trajectory.duration,
-        slowed_to=repaired.share, **values,
+        speed_factor=repaired.speed_factor, **values,
     )  # fmt: skip
 
 

@@ -49,8 +49,8 @@ def terminal(monkeypatch):
     return answers
 
 
-def ask(mission, records, uri=RADIO, yes=False, speed_share=None):
-    return confirm.confirmed("eight", mission, uri, records, yes=yes, speed_share=speed_share)
+def ask(mission, records, uri=RADIO, yes=False, speed_factor=None):
+    return confirm.confirmed("eight", mission, uri, records, yes=yes, speed_factor=speed_factor)
 
 
 def record(records, folder, exit_code=0, uri=RADIO):
@@ -103,7 +103,7 @@ def test_a_slow_flight_is_suggested_until_one_has_ended_well_on_hardware(
 
 def test_a_slow_flight_is_not_suggested_to_who_flies_slowly(mission, tmp_path, terminal):
     said = terminal(True)
-    ask(mission, tmp_path, speed_share=0.3)
+    ask(mission, tmp_path, speed_factor=0.3)
     assert not any("--speed" in text for text in said)
 
 

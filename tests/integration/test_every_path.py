@@ -36,7 +36,7 @@ def test_a_path_file_certifies_and_flies_as_planned(file):
         limits,
         yaw=path_file.yaw,
         yaw_angle=path_file.yaw_angle,
-        speed_share=path_file.speed,
+        speed_factor=path_file.speed,
     )
     assert made.certificate.passed
     encoded = encode_trajectory(made.trajectory)

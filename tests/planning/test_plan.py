@@ -37,7 +37,7 @@ def test_a_plan_is_certified_for_its_limits_and_space(path, limits):
     made = plan(path, limits.airframe, limits, planner="minsnap")
     assert made.certificate.passed
     assert made.certificate == certify(made.trajectory, limits.plan, limits.space)
-    assert (made.planner, made.nodes, made.speed_share) == ("minsnap", default_nodes(path), 1.0)
+    assert (made.planner, made.nodes, made.speed_factor) == ("minsnap", default_nodes(path), 1.0)
     assert made.profile is made.trajectory.profile
     assert made.seconds > 0
 
@@ -47,8 +47,8 @@ def test_too_fast_a_profile_is_slowed_and_the_plan_says_by_how_much(path, limits
     calls = stub(monkeypatch, toppquad=lambda path, nodes: Solution(Status.SOLVED, fast))
     made = plan(path, limits.airframe, limits, planner="toppquad")
     assert made.certificate.passed
-    assert 0.1 < made.slowed < 0.9
-    assert f"{made.slowed:.2%}" in made.notes[-1]
+    assert 0.1 < made.repair_speed_factor < 0.9
+    assert f"{made.repair_speed_factor:.2%}" in made.notes[-1]
     # Once more with twice the nodes, in the hope of slowing less.
     assert [nodes for _, nodes, _ in calls] == [default_nodes(path), 2 * default_nodes(path)]
 
@@ -106,7 +106,7 @@ def test_where_every_planner_fails_the_reasons_are_given_in_one_line(path, limit
 
 
 def test_a_speed_share_slows_the_whole_flight(path, limits):
-    whole, half = (plan(path, limits.airframe, limits, planner="minsnap", speed_share=share) for share in (1.0, 0.5))
+    whole, half = (plan(path, limits.airframe, limits, planner="minsnap", speed_factor=share) for share in (1.0, 0.5))
     assert half.trajectory.duration == pytest.approx(2 * whole.trajectory.duration)
     fast, slow = ({margin.name: margin.worst for margin in made.certificate.margins} for made in (whole, half))
     assert slow["speed"] == pytest.approx(fast["speed"] / 2, rel=1e-4)
@@ -114,7 +114,7 @@ def test_a_speed_share_slows_the_whole_flight(path, limits):
     assert half.certificate.passed
 
 
-@pytest.mark.parametrize("arguments", [{"speed_share": s} for s in (0.0, -1.0, 1.1, float("nan"))] + [{"nodes": 1}])
+@pytest.mark.parametrize("arguments", [{"speed_factor": s} for s in (0.0, -1.0, 1.1, float("nan"))] + [{"nodes": 1}])
 def test_arguments_out_of_range_are_refused(path, limits, arguments):
     with pytest.raises(InputError, match=re.escape(next(iter(arguments))[:5])):
         plan(path, limits.airframe, limits, planner="minsnap", **arguments)
@@ -126,7 +126,7 @@ def test_a_boundary_state_is_never_slowed_away(path, limits, make_profile, monke
     with pytest.raises(InfeasibleError, match="break the boundary state"):
         plan(path, limits.airframe, limits, planner="toppquad", start=fast.boundary(0))
     with pytest.raises(InputError, match="break the boundary state"):
-        plan(path, limits.airframe, limits, planner="toppquad", start=fast.boundary(0), speed_share=0.5)
+        plan(path, limits.airframe, limits, planner="toppquad", start=fast.boundary(0), speed_factor=0.5)
 
 
 def test_yaw_and_boundary_states_reach_the_planner(path, limits, make_profile, monkeypatch):
@@ -148,7 +148,7 @@ def test_a_path_outside_the_space_is_refused_before_any_planner_runs(limits, mon
 def test_a_path_longer_than_the_battery_lasts_is_refused(path, limits):
     tired = replace(limits, battery=replace(limits.battery, endurance=15.0))
     with pytest.raises(InfeasibleError, match="the battery is trusted for 15 s"):
-        plan(path, limits.airframe, tired, planner="minsnap", speed_share=0.5)
+        plan(path, limits.airframe, tired, planner="minsnap", speed_factor=0.5)
 
 
 def test_too_fast_a_profile_of_the_learned_planner_is_refined_and_the_plan_says_where(
@@ -159,7 +159,7 @@ def test_too_fast_a_profile_of_the_learned_planner_is_refined_and_the_plan_says_
     stub(monkeypatch, learned=lambda path, nodes: Solution(Status.SOLVED, fast))
     made = plan(path, limits.airframe, limits, planner="learned")
     assert made.certificate.passed
-    assert made.slowed == 1.0
+    assert made.repair_speed_factor == 1.0
     assert made.trajectory.duration == pytest.approx(best.trajectory.duration, rel=5e-3)
     assert re.search(r"refined; slower along .* most at s = .*, by .*%", made.notes[-1])
 
@@ -268,4 +268,4 @@ def test_every_planner_ends_in_a_certified_plan_or_a_typed_error(limits, planner
         pytest.fail(str(error))
     assert made.planner == planner or planner == "auto"
     assert made.certificate.passed
-    assert made.slowed > 0.8
+    assert made.repair_speed_factor > 0.8

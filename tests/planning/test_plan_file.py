@@ -20,7 +20,7 @@ from cfplan.planning.plan_file import load_plan, save_plan
 
 @pytest.fixture(scope="module")
 def made(path, limits):
-    return plan(path, limits.airframe, limits, planner="minsnap", speed_share=0.9)
+    return plan(path, limits.airframe, limits, planner="minsnap", speed_factor=0.9)
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +44,8 @@ def test_what_is_loaded_is_what_was_saved(made, saved):
     assert loaded.limits == made.limits
     assert loaded.airframe == made.airframe
     assert loaded.certificate == made.certificate
-    assert (loaded.planner, loaded.nodes, loaded.slowed, loaded.speed_share, loaded.notes) == (
-        made.planner, made.nodes, made.slowed, made.speed_share, made.notes,
+    assert (loaded.planner, loaded.nodes, loaded.repair_speed_factor, loaded.speed_factor, loaded.notes) == (
+        made.planner, made.nodes, made.repair_speed_factor, made.speed_factor, made.notes,
     )  # fmt: skip
     times = np.linspace(0, made.trajectory.duration, 100)
     for name in ("position", "motor_thrust", "quaternion", "angular_acceleration"):

@@ -38,7 +38,7 @@ def test_what_exceeds_limits_between_points_after_refining_is_refined_on_not_slo
         first = refine(PlanningTask(path, chosen.airframe, chosen.limits), profile, passes=lambda _: True).profile
         between += not certify(Trajectory(path, first, chosen.airframe), chosen.limits).passed
         repaired = repair(PlanningTask(path, chosen.airframe, chosen.limits), profile)
-        assert repaired.share == 1.0
+        assert repaired.speed_factor == 1.0
         assert certify(repaired.trajectory, chosen.limits).passed
         assert repaired.trajectory.duration < 1.01 * Trajectory(path, first, chosen.airframe).duration
     assert between > 0  # else this would test nothing
@@ -59,7 +59,7 @@ def test_what_cannot_be_refined_is_slowed_and_says_why(monkeypatch):
     path = random_path(1, "10x10x10")
     profile = plan_learned(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits)).profile
     repaired = repair(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits), profile)
-    assert repaired.share < 1.0
+    assert repaired.speed_factor < 1.0
     assert repaired.certificate.passed
     assert "no step makes it better" in repaired.describe()
 
@@ -70,4 +70,4 @@ def test_limits_that_the_profile_never_knew_are_kept_too():
     tighter = replace(HARDWARE.limits, speed=1.2, tilt=np.radians(20))
     repaired = repair(PlanningTask(path, HARDWARE.airframe, tighter), profile)
     assert certify(repaired.trajectory, tighter).passed
-    assert repaired.share == 1.0
+    assert repaired.speed_factor == 1.0

@@ -31,9 +31,9 @@ def test_any_profile_ends_certified_and_hardly_slower_than_it_must(make_profile,
     slowed = slow_until_certified(trajectory, LIMITS)
     assert slowed.certificate.passed
     assert certify(slowed.trajectory, LIMITS) == slowed.certificate
-    assert slowed.trajectory.duration == pytest.approx(trajectory.duration / slowed.share, rel=1e-9)
-    if slowed.share < 1.0:
-        faster = trajectory.profile.slowed(slowed.share * (1 + 20 * RESOLUTION))
+    assert slowed.trajectory.duration == pytest.approx(trajectory.duration / slowed.speed_factor, rel=1e-9)
+    if slowed.speed_factor < 1.0:
+        faster = trajectory.profile.slowed(slowed.speed_factor * (1 + 20 * RESOLUTION))
         assert not certify(Trajectory(PATH, faster, AIRFRAME), LIMITS).passed
 
 
@@ -41,14 +41,14 @@ def test_what_passes_stays_as_it_is(make_profile):
     trajectory = Trajectory(PATH, make_profile(PATH.end, np.full(20, 0.3)), AIRFRAME)
     slowed = slow_until_certified(trajectory, LIMITS)
     assert slowed.trajectory is trajectory
-    assert slowed.share == 1.0
+    assert slowed.speed_factor == 1.0
 
 
 def test_a_speed_limit_alone_is_met_by_its_ratio(make_profile):
     trajectory = Trajectory(PATH, make_profile(PATH.end, np.full(20, 1.0)), AIRFRAME)
     speed = certify(trajectory, LIMITS).margins[0].worst
     slowed = slow_until_certified(trajectory, replace(LIMITS, speed=0.4 * speed))
-    assert slowed.share == pytest.approx(0.4, rel=5 * RESOLUTION)
+    assert slowed.speed_factor == pytest.approx(0.4, rel=5 * RESOLUTION)
 
 
 def test_flying_upside_down_is_slowed_too(make_profile):

@@ -18,7 +18,7 @@ def test_every_path_is_counted_and_certified_flights_are_near_the_experts(small)
     assert len(small.flights) == 3
     for flight in small.flights:
         assert not flight.reason
-        assert flight.share == 1.0
+        assert flight.speed_factor == 1.0
         assert flight.learned == pytest.approx(flight.expert, rel=0.01)
         assert flight.network == pytest.approx(flight.expert_planned, rel=0.03)
         assert 0 < flight.deviation < 0.2

@@ -145,7 +145,7 @@ def test_a_refined_planner_is_another_entrant_than_the_same_one_slowed():
     names = ["convex", "convex, refined", "expert, refined"]
     result = bench(paths=2, nodes=60, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=names)
     slowed, refined, expert = result.rows
-    assert refined.mended >= slowed.mended
+    assert refined.repaired >= slowed.repaired
     assert refined.flight <= slowed.flight
     assert expert.against_expert == (0.0, 0.0)
     assert slowed.against_expert[0] > 0

@@ -33,7 +33,7 @@ def plan_min_snap(task: PlanningTask) -> Solution:
         return Solution(Status.INFEASIBLE, None, str(error))
     stats: dict[str, float | int | str] = {
         "solver": "scaling",
-        "share": slowed.share,
+        "speed_factor": slowed.speed_factor,
         "solve_seconds": time.perf_counter() - begun,
     }
     return Solution(Status.SOLVED, slowed.trajectory.profile, stats=stats)

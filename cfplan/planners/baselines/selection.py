@@ -22,14 +22,14 @@ def select_fastest(task: PlanningTask, profiles: Iterable[SpeedProfile]) -> Spee
             certificate = certify(Trajectory(task.path, profile, task.airframe), task.limits)
         except NotCertifiedError:  # h falls to zero somewhere
             continue
-        share = _speed_share(certificate)
-        if share > 0.0 and certificate.duration / share < least:
-            best, least = profile, certificate.duration / share
+        factor = _speed_factor(certificate)
+        if factor > 0.0 and certificate.duration / factor < least:
+            best, least = profile, certificate.duration / factor
     return best
 
 
-def _speed_share(certificate: Certificate) -> float:
-    """The share of its speed at which every limit would hold if each grew as a power of speed; 1 where all hold."""
+def _speed_factor(certificate: Certificate) -> float:
+    """Return the factor on speed at which every limit would hold if each share grew as a power of speed."""
     shares = [
         margin.share if margin.name in PROPORTIONAL else margin.share**0.5
         for margin in certificate.margins

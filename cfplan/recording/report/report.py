@@ -49,8 +49,8 @@ def read_flight(place: Path) -> Flight:
                 ("planner", plan.planner),
                 ("grid", f"{plan.nodes} intervals"),
                 ("planning", f"{plan.seconds:.2f} s"),
-                ("share of the planner's speed", f"{plan.slowed:.4g}"),
-                ("share of the speed asked for", f"{plan.speed_share:.4g}"),
+                ("share of the planner's speed", f"{plan.repair_speed_factor:.4g}"),
+                ("share of the speed asked for", f"{plan.speed_factor:.4g}"),
                 *(("note", note) for note in plan.notes),
             ]
         except CfplanError as error:
