@@ -1,3 +1,3 @@
-"""Files as text: YAML that remembers places, and tables of numbers, whatever they say."""
+"""Files that people write: YAML whose mistakes are reported with their place, and text tables of numbers."""
 
 __all__ = ["text", "yaml_with_places"]

@@ -1,4 +1,4 @@
-"""Text and tables of numbers from files that people write."""
+"""Read text and tables of numbers from files that people write."""
 
 import math
 import pathlib
@@ -9,52 +9,50 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InputError
 
-LARGEST_FILE = 4_000_000
-# bytes; a path or a set of limits is a few kilobytes
-LARGEST_NUMBER = 1e6
-# metres, seconds or coefficients: beyond this it is a slip, and arithmetic would suffer
+MAX_FILE_SIZE = 4_000_000  # bytes; a path or a set of limits is a few kilobytes
+MAX_NUMBER = 1e6  # metres, seconds or coefficients: a larger number is a slip and would cost digits
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 
 
 def read_text(file: pathlib.Path) -> str:
-    """The text of a file of reasonable size.
+    """Read the text of a file of at most MAX_FILE_SIZE.
 
     Raises:
-        InputError: not there, not a file, not readable, too large, empty, not UTF-8 text.
+        InputError: missing, not a file, not readable, too large, empty, not UTF-8 text.
     """
     try:
         if file.is_dir():
             raise InputError("a folder, not a file", where=str(file), hint="name the file in it")
         with file.open("rb") as stream:
-            content = stream.read(LARGEST_FILE + 1)
+            content = stream.read(MAX_FILE_SIZE + 1)
     except FileNotFoundError:
         raise InputError(
             "no such file",
             where=str(file),
-            hint="is the name right? It is taken from the working folder, or from the path file's",
+            hint="check the name; it is relative to the working folder, or to the folder of the path file",
         ) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot be read: {reason}", where=str(file), hint="look at its permissions") from None
-    if len(content) > LARGEST_FILE:
-        raise InputError(f"larger than {LARGEST_FILE // 1_000_000} MB", where=str(file), hint="thin the points out")
+        raise InputError(f"cannot be read: {reason}", where=str(file), hint="check its permissions") from None
+    if len(content) > MAX_FILE_SIZE:
+        raise InputError(f"larger than {MAX_FILE_SIZE // 1_000_000} MB", where=str(file), hint="give fewer points")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise InputError("not UTF-8 text", where=f"{file}:{line}", hint="save the file as UTF-8") from None
     if not text.strip():
-        raise InputError("the file is empty", where=str(file), hint="is it the right file?")
+        raise InputError("the file is empty", where=str(file), hint="check that it is the right file")
     return text
 
 
 def read_table(file: pathlib.Path, columns: int, what: str) -> tuple[NDArray, list[int]]:
-    """Rows of `columns` numbers apart by commas, semicolons or blanks, and the line of each.
+    """Read rows of `columns` numbers separated by commas, semicolons or blanks, and the line number of each.
 
-    Blank lines, lines that start with # and one header line are passed over.
+    Blank lines, lines that start with # and one header line are skipped. `what` describes a row in error messages.
 
     Raises:
-        InputError: a row of another length, or what is not a finite number, with the line; no rows at all.
+        InputError: a row of another length or a number that is not finite, with its line; no rows.
     """
     rows: list[list[float]] = []
     lines: list[int] = []
@@ -89,9 +87,11 @@ def _numbers(cells: list[str], columns: int, what: str, where: str) -> list[floa
             raise InputError(
                 f"column {column} is not a finite number: {cell[:40]}", where=where, hint="write a plain decimal number"
             )
-        if abs(float(cell)) > LARGEST_NUMBER:
+        if abs(float(cell)) > MAX_NUMBER:
             raise InputError(
-                f"column {column} is out of all bounds: {cell[:40]}", where=where, hint="write metres and seconds"
+                f"column {column} is larger than {MAX_NUMBER:g}: {cell[:40]}",
+                where=where,
+                hint="write metres and seconds",
             )
     return [float(cell) for cell in cells]
 

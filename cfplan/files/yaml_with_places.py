@@ -1,7 +1,7 @@
-"""YAML files that people write, read strictly: every mistake is named with its line and column.
+"""Read YAML files strictly: every mistake is reported with its line and column.
 
-What is read is the plain part of YAML: mappings, lists, words and numbers. Anchors, tags and several documents are
-refused, keys may stand once, and numbers are what they look like (no `12:30` in base 60, no `yes` for true).
+Only plain YAML is read: mappings, lists, words and numbers. Anchors, tags and several documents are refused, a key may
+occur once, and numbers are what they look like (no `12:30` in base 60, no `yes` for true).
 """
 
 import difflib
@@ -22,7 +22,7 @@ from cfplan.files.text import read_text
 Model = TypeVar("Model", bound=BaseModel)
 Location = tuple[str | int, ...]
 
-_DEEPEST = 20
+_MAX_DEPTH = 20  # of nested mappings and lists
 _TAGS = {
     f"tag:yaml.org,2002:{name}"
     for name in ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "merge", "value")
@@ -35,19 +35,18 @@ _WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where the values of a YAML file stand."""
+    """The line and column of every value in a YAML file."""
 
     file: str
-    values: dict[Location, tuple[int, int]]
-    # line and column from 1, by the keys and indices that lead there
-    keys: dict[Location, tuple[int, int]]
+    values: dict[Location, tuple[int, int]]  # line and column, from 1, by the keys and indices that lead to the value
+    keys: dict[Location, tuple[int, int]]  # the same of each key
 
     def where(self, *location: str | int) -> str:
-        """`file:line:column` of the value there, or of the nearest thing around it."""
+        """Return `file:line:column` of a value, or of the innermost value around it."""
         return self._place(self.values, location)
 
     def where_key(self, *location: str | int) -> str:
-        """The same of the key that names the value."""
+        """Return `file:line:column` of the key of a value."""
         return self._place(self.keys, location)
 
     def _place(self, places: dict[Location, tuple[int, int]], location: Location) -> str:
@@ -58,16 +57,16 @@ class Places:
 
 
 def read_yaml(file: pathlib.Path | str, model: type[Model]) -> Model:
-    """The content of a YAML file as a pydantic model, which should forbid extra keys.
+    """Read a YAML file as a pydantic model, which should forbid extra keys.
 
     Raises:
-        InputError: whatever is wrong with the file, with `file:line:column`.
+        InputError: a mistake in the file, with `file:line:column`.
     """
     return read_yaml_with_places(file, model)[0]
 
 
 def read_yaml_with_places(file: pathlib.Path | str, model: type[Model]) -> tuple[Model, Places]:
-    """The same, and where each value stands, so that what only a later look finds wrong can be named too."""
+    """Read a YAML file as a pydantic model, and the place of each value, for mistakes that a later check finds."""
     text = read_text(pathlib.Path(file))
     places = Places(str(file), {}, {})
     root = _composed(text, places.file)
@@ -82,17 +81,17 @@ def read_yaml_with_places(file: pathlib.Path | str, model: type[Model]) -> tuple
 
 
 class _Loader(yaml.SafeLoader):
-    """Composes nodes without anchors and aliases, and not too deep."""
+    """A YAML loader that refuses anchors, aliases and deep nesting."""
 
     depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event = self.peek_event()
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
-            raise yaml.MarkedYAMLError(problem="anchors and aliases are not used here", problem_mark=event.start_mark)
+            raise yaml.MarkedYAMLError(problem="anchors and aliases are not allowed", problem_mark=event.start_mark)
         self.depth += 1
-        if self.depth > _DEEPEST:
-            raise yaml.MarkedYAMLError(problem="nested too deep", problem_mark=event.start_mark)
+        if self.depth > _MAX_DEPTH:
+            raise yaml.MarkedYAMLError(problem=f"nested more than {_MAX_DEPTH} deep", problem_mark=event.start_mark)
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
@@ -106,11 +105,11 @@ def _composed(text: str, file: str) -> yaml.Node:
         finally:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
-        said = [part for part in (error.context, error.problem) if part]
+        problems = [part for part in (error.context, error.problem) if part]
         raise InputError(
-            _one_line(", ".join(said) or "not YAML"),
+            _one_line(", ".join(problems) or "not YAML"),
             where=_mark(file, error),
-            hint="a bracket, a comma or an indent is wrong there or just before",
+            hint="check brackets, commas and indents there and just before",
         ) from None
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
@@ -120,7 +119,7 @@ def _composed(text: str, file: str) -> yaml.Node:
             hint="save the file as UTF-8 text",
         ) from None
     if node is None:
-        raise InputError("the file is empty", where=file, hint="flights/ has files to start from")
+        raise InputError("the file is empty", where=file, hint="start from a file in flights/")
     return node
 
 
@@ -134,13 +133,11 @@ def _one_line(text: str) -> str:
 
 
 def _plain(node: yaml.Node, location: Location, places: Places) -> Any:
-    """The node as dicts, lists, words and numbers; notes where each stands."""
+    """Return the node as dicts, lists, words and numbers; enter the place of each into `places`."""
     places.values[location] = (node.start_mark.line + 1, node.start_mark.column + 1)
     where = places.where(*location)
     if node.tag not in _TAGS:
-        raise InputError(
-            f"the tag {node.tag} is not used here", where=where, hint="write the value plainly, without a tag"
-        )
+        raise InputError(f"the tag {node.tag} is not allowed", where=where, hint="write the value without a tag")
     if isinstance(node, yaml.MappingNode):
         return dict(_entries(node, location, places))
     if isinstance(node, yaml.SequenceNode):
@@ -157,7 +154,7 @@ def _entries(node: yaml.MappingNode, location: Location, places: Places) -> Iter
             raise InputError("a key must be a word", where=where, hint="write `key: value`")
         inner = (*location, key.value)
         if inner in places.keys:
-            raise InputError(f"the key {key.value!r} stands twice", where=where, hint="keep one of them")
+            raise InputError(f"the key {key.value!r} occurs twice", where=where, hint="keep one of them")
         places.keys[inner] = place
         yield _checked_text(key.value, where), _plain(value, inner, places)
 
@@ -187,7 +184,7 @@ def _checked_text(text: str, where: str) -> str:
 
 
 def _input_error(error: ValidationError, model: type[BaseModel], places: Places) -> InputError:
-    """The first mistake in the order of the file, unknown keys before what may be missing because of them."""
+    """Return the first mistake in the file, unknown keys before keys that may be missing because of them."""
     found = [_named(details, model, places) for details in error.errors(include_url=False, include_context=False)]
     _, (line, column), what, hint = min(found, key=lambda mistake: mistake[:2])
     more = len(found) - 1
@@ -195,9 +192,9 @@ def _input_error(error: ValidationError, model: type[BaseModel], places: Places)
 
 
 def _named(details: Any, model: type[BaseModel], places: Places) -> tuple[int, tuple[int, int], str, str]:
-    """Rank, place, sentence and hint of one of pydantic's errors."""
+    """Return rank, place, message and hint of one of pydantic's errors."""
     location = _location(details["loc"], places)
-    name = _spoken(location)
+    name = _dotted(location)
     place = places.values.get(location, (1, 1))
     if details["type"] == "extra_forbidden":
         owner = _model_at(model, location[:-1])
@@ -216,7 +213,7 @@ def _named(details: Any, model: type[BaseModel], places: Places) -> tuple[int, t
 
 
 def _location(parts: tuple[str | int, ...], places: Places) -> Location:
-    """pydantic's location without the names of union members, which are not in the file."""
+    """Return pydantic's location without the names of union members, which are not in the file."""
     location: Location = ()
     for part in parts:
         if (*location, part) in places.values:
@@ -224,7 +221,7 @@ def _location(parts: tuple[str | int, ...], places: Places) -> Location:
     return location
 
 
-def _spoken(location: Location) -> str:
+def _dotted(location: Location) -> str:
     text = ""
     for part in location:
         text += f" item {part + 1}" if isinstance(part, int) else f".{part}" if text else part

@@ -1,8 +1,8 @@
 """Minimum-snap paths: degree-7 pieces through waypoints, after Mellinger and Kumar (2011).
 
-What minimises ∫|γ''''|² ds through given points is a spline of degree 7 that is C⁶. Its unknowns are γ', γ'', γ''' at
-the waypoints; their normal equations are block-tridiagonal and positive definite, so a banded Cholesky solves
-them in linear time, scaled to a unit diagonal because segments differ in length.
+The curve through given points with the least ∫|γ''''|² ds is a C⁶ spline of degree 7. Its unknowns are γ', γ'', γ'''
+at the waypoints. Their normal equations are block-tridiagonal and positive definite, so a banded Cholesky solves them
+in linear time, after scaling to a unit diagonal because segments differ in length.
 """
 
 from collections.abc import Callable
@@ -16,16 +16,13 @@ from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import hermite
 from cfplan.geometry.rest import rest_path, with_rest_ends
 
-CLOSEST = 0.01
-# m, waypoints nearer than this to their predecessor are one point mistyped
-FARTHEST = 1e5
-# m, from the origin along each axis: beyond this millimetres are lost to rounding
-CLOSEST_DENSE = 0.001
-# m, the same for lists of points
+MIN_SPACING = 0.01  # m, two waypoints in a row that are closer are one point mistyped
+MIN_DENSE_SPACING = 0.001  # m, the same for lists of points
+MAX_COORDINATE = 1e5  # m from the origin along each axis: beyond this rounding costs millimetres
 
 
 def _snap_energy() -> NDArray:
-    """(8, 8): ∫ of the squared fourth derivative on [0, 1], as a form in the coefficients."""
+    """Return (8, 8), the quadratic form in the coefficients that gives ∫ of the squared fourth derivative on [0, 1]."""
     power = np.arange(8)
     fourth = power * (power - 1) * (power - 2) * (power - 3)
     exponent = np.maximum(power[:, None] + power - 7, 1)
@@ -37,68 +34,66 @@ _ENERGY = _HERMITE.T @ _snap_energy() @ _HERMITE
 
 
 def min_snap(waypoints: ArrayLike, *, nominal_speed: float = 1.0) -> Path:
-    """The path of least snap through waypoints, (K, 3) m, at rest at both ends.
+    """Return the path of least snap through waypoints, (K, 3) m, at rest at both ends.
 
-    Each segment takes its straight distance over the nominal speed, m/s, so at 1 m/s s is in metres flown, nearly.
+    Each segment takes its straight length over the nominal speed, m/s, so at 1 m/s s is roughly the distance flown, m.
 
     Raises:
-        InputError: fewer than two waypoints, two in a row that (nearly) coincide, numbers that are not finite.
+        InputError: fewer than two waypoints, two in a row closer than MIN_SPACING, numbers that are not finite.
     """
-    points, times = _checked(waypoints, nominal_speed, CLOSEST)
+    points, times = _checked(waypoints, nominal_speed, MIN_SPACING)
     return rest_path(times, _pieces(points, times, rest=True))
 
 
 def smooth_through(points: ArrayLike) -> Path:
-    """The path of least snap with free ends, then brought to rest: for dense points, (K, 3) m with K at least 4.
+    """Return the path of least snap with free ends, then brought to rest, through dense points, (K, 3) m, K at least 4.
 
-    Rest imposed on a first segment of centimetres would make the path oscillate; here it is a matter of timing alone.
+    Rest imposed on a first segment of a few centimetres would make the path oscillate; here only the timing changes.
     """
-    points, times = _checked(points, 1.0, CLOSEST_DENSE)
+    points, times = _checked(points, 1.0, MIN_DENSE_SPACING)
     if len(points) < 4:
-        raise InputError(f"a smooth path with free ends needs four points at least, not {len(points)}")
+        raise InputError(f"a smooth path with free ends needs at least four points, not {len(points)}")
     return with_rest_ends(times, _pieces(points, times, rest=False))
 
 
-def check_points(points: NDArray, closest: float = CLOSEST, where: Callable[[int], str] | None = None) -> None:
-    """Refuse too few points, points far off, and neighbours nearer than `closest`, m.
+def check_points(points: NDArray, spacing: float = MIN_SPACING, where: Callable[[int], str] | None = None) -> None:
+    """Refuse too few points, points too far from the origin, and neighbours closer than `spacing`, m.
 
-    `where` names the place of a point by its index in messages.
+    `where` turns the index of a point into the place that error messages name.
     """
     where = where or (lambda index: f"waypoint {index + 1}")
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"waypoints must be x, y, z each, not an array of shape {points.shape}")
+        raise InputError(f"each waypoint must be x, y, z; the array has shape {points.shape}")
     if len(points) < 2:
-        raise InputError(
-            f"a path needs two waypoints at least, not {len(points)}", hint="give at least a start and an end"
-        )
-    bad = ~(np.abs(points) <= FARTHEST).all(axis=1)
+        raise InputError(f"a path needs at least two waypoints, not {len(points)}", hint="give a start and an end")
+    bad = ~(np.abs(points) <= MAX_COORDINATE).all(axis=1)
     if bad.any():
         index = int(np.argmax(bad))
         raise InputError(
-            f"coordinates must be numbers within {FARTHEST:g} m of the origin, not {points[index].tolist()}",
+            f"coordinates must be numbers within {MAX_COORDINATE:g} m of the origin, not {points[index].tolist()}",
             where=where(index),
-            hint="replace it by metres in the frame of the room",
+            hint="give metres in the frame of the room",
         )
     distances = np.linalg.norm(np.diff(points, axis=0), axis=1)
     near = int(np.argmin(distances))
-    if distances[near] < closest:
+    if distances[near] < spacing:
         raise InputError(
-            f"waypoints {near + 1} and {near + 2} are {distances[near]:.4f} m apart, less than {closest} m",
+            f"waypoints {near + 1} and {near + 2} are {distances[near]:.4f} m apart, less than {spacing} m",
             where=where(near + 1),
-            hint="take one of them out",
+            hint="remove one of them",
         )
 
 
-def _checked(waypoints: ArrayLike, nominal_speed: float, closest: float) -> tuple[NDArray, NDArray]:
+def _checked(waypoints: ArrayLike, nominal_speed: float, spacing: float) -> tuple[NDArray, NDArray]:
     points = np.asarray(waypoints, dtype=float)
-    check_points(points, closest)
+    check_points(points, spacing)
     if not (np.isfinite(nominal_speed) and nominal_speed > 0.0):
         raise InputError(f"the nominal speed must be positive, not {nominal_speed}")
     return points, np.linalg.norm(np.diff(points, axis=0), axis=1) / nominal_speed
 
 
 def _pieces(points: NDArray, times: NDArray, rest: bool) -> NDArray:
-    """(K-1, 8, 3): each segment about its left end."""
+    """Return (K-1, 8, 3), the polynomial of each segment about its left end."""
     derivatives = _waypoint_derivatives(points, times, rest)
     powers = times[:, None] ** np.arange(4)
     left = np.concatenate([np.zeros((len(times), 1, 3)), derivatives[:-1]], axis=1)  # (K-1, 4, 3)
@@ -110,9 +105,9 @@ def _pieces(points: NDArray, times: NDArray, rest: bool) -> NDArray:
 
 
 def _waypoint_derivatives(points: NDArray, times: NDArray, rest: bool) -> NDArray:
-    """(K, 3, 3): γ', γ'', γ''' at each waypoint, by minimising snap."""
+    """Return (K, 3, 3), γ', γ'', γ''' at each waypoint with the least snap."""
     count = len(points)
-    # In units of each segment's time the energy is a constant matrix; T^-7 and powers of T bring it back.
+    # In units of each segment's time T the energy is a constant matrix; T^-7 and powers of T scale it back.
     powers = times[:, None] ** np.tile(np.arange(4), 2)
     energy = _ENERGY * powers[:, :, None] * powers[:, None, :] / times[:, None, None] ** 7
 
@@ -135,7 +130,10 @@ def _waypoint_derivatives(points: NDArray, times: NDArray, rest: bool) -> NDArra
 
 
 def _solve_block_tridiagonal(diagonal: NDArray, beside: NDArray, force: NDArray) -> NDArray:
-    """Symmetric positive definite, 3 × 3 blocks: diagonal (n, 3, 3), right neighbour (n-1, 3, 3), force (n, 3, 3)."""
+    """Solve a symmetric positive definite system of 3 × 3 blocks.
+
+    The diagonal is (n, 3, 3), the blocks right of it (n-1, 3, 3), the right-hand side `force` (n, 3, 3).
+    """
     count = 3 * len(diagonal)
     scale = 1.0 / np.sqrt(np.diagonal(diagonal, axis1=1, axis2=2))  # (n, 3)
     diagonal = diagonal * scale[:, :, None] * scale[:, None, :]

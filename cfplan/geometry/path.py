@@ -1,4 +1,4 @@
-"""The path γ(s): where to fly, nothing about how fast."""
+"""The path γ(s): where to fly, with no timing."""
 
 import math
 from dataclasses import dataclass, field
@@ -11,32 +11,25 @@ from cfplan.errors import InputError
 from cfplan.geometry.polynomials import shifted
 
 MAX_ORDER = 5
-STANDSTILL = 0.01
-# |γ'|, 1 where the path is flown at its nominal 1 m/s: below this inside a path the path is taken to stop there
-_SAMPLES = 32
-# a piece, where a path is searched
-_SIDE_BY_SIDE = 256
-# points, as many as stay near the processor with their derivatives
+STANDSTILL = 0.01  # |γ'|, which is 1 at the nominal 1 m/s: where an inner minimum falls below this, the path stops
+_SAMPLES = 32  # per piece, where a path is searched for stops
+_BATCH = 256  # points evaluated together: they and their derivatives fit into the processor's cache
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """γ(s) for s in [0, end], piecewise polynomial, at least C⁴ where it was made by this package.
+    """A curve γ(s) for s in [0, end], piecewise polynomial; at least C⁴ if this package made it.
 
-    s is nominal time at about 1 m/s. At a rest end γ' = γ'' = γ''' = 0 exactly: the first piece is expanded about
-    its left end, so is every other but the last, which is expanded about its right end; a path with two rest ends
-    thus needs two pieces. Beyond its ends a path stays where it ends.
+    s is nominal time, s, at about 1 m/s. At a rest end γ' = γ'' = γ''' = 0 exactly. For that the last piece is expanded
+    about its right end and every other about its left end, so a path with two rest ends needs two pieces. Outside
+    [0, end] the path stays at its ends.
     """
 
-    breaks: NDArray
-    # (M+1,) ascending from 0
-    coefficients: NDArray
-    # (M, D, 3) m, ascending powers of s - breaks[i], in the last piece of s - breaks[-1]
-    origins: NDArray = field(init=False, repr=False)
-    # (M,) s about which each piece is expanded
-    _tables: tuple[NDArray, ...] = field(init=False, repr=False)
-    # one an order: (M, D - order, 3) coefficients of the derivative
+    breaks: NDArray  # (M+1,) ascending from 0
+    coefficients: NDArray  # (M, D, 3) m, ascending powers of s - breaks[i]; of s - breaks[-1] in the last piece
+    origins: NDArray = field(init=False, repr=False)  # (M,) the s about which each piece is expanded
+    _tables: tuple[NDArray, ...] = field(init=False, repr=False)  # per order, (M, D - order, 3) of that derivative
 
     def __post_init__(self) -> None:
         breaks = np.array(self.breaks, dtype=float)
@@ -63,36 +56,36 @@ class Path:
 
     @property
     def end(self) -> float:
-        """The last s."""
+        """Return the last s."""
         return float(self.breaks[-1])
 
     @property
     def length(self) -> float:
-        """Arc length, m, by Gauss quadrature of |γ'| on every piece."""
+        """Return the arc length, m."""
         return float(self.piece_lengths().sum())
 
     def piece_lengths(self) -> NDArray:
-        """(M,) m, the arc length of each piece."""
+        """Return the arc length of each piece, (M,) m, by Gauss-Legendre quadrature of |γ'|."""
         half = np.diff(self.breaks) / 2
         nodes = (self.breaks[:-1] + half)[:, None] + half[:, None] * _GAUSS_NODES
         return half * (np.linalg.norm(self(nodes, 1), axis=-1) @ _GAUSS_WEIGHTS)
 
     def __call__(self, s: ArrayLike, order: int = 0) -> NDArray:
-        """The derivative of that order, 0 to 5, with respect to s: shape s.shape + (3,)."""
+        """Return the derivative of order 0 to 5 with respect to s, of shape s.shape + (3,)."""
         if not 0 <= order <= MAX_ORDER:
             raise ValueError(f"a path has derivatives of order 0 to {MAX_ORDER}, not {order}")
         s = np.array(s, dtype=float)
         return _values(self.breaks, self.origins, self._tables[order], s.ravel()).reshape(*s.shape, 3)
 
     def derivatives(self, s: NDArray) -> NDArray:
-        """(5, 3, N) γ and its first four derivatives at s, (N,): in one pass, for where many are wanted."""
+        """Return γ and its first four derivatives at s, (N,), in one pass, (5, 3, N)."""
         out = np.empty((5, 3, len(s)))
         _trace(self.breaks, self.origins, self.coefficients, np.asarray(s, dtype=float), out)
         return out
 
     def part(self, low: float, high: float) -> "Path":
-        """The path from s = low to s = high, s counted from there; two pieces at least, so that rests stay exact."""
-        high = min(high, float(self.breaks[-1]))  # which may be a rounding error beyond
+        """Return the path from s = low to s = high, in two pieces or more so that rest ends stay exact."""
+        high = min(high, float(self.breaks[-1]))  # it may exceed the end by a rounding error
         first = int(np.searchsorted(self.breaks, low, side="right")) - 1
         last = int(np.searchsorted(self.breaks, high, side="left"))
         piece = np.arange(first, last)
@@ -104,16 +97,16 @@ class Path:
         return Path(breaks - low, shifted(self.coefficients[piece], origins - self.origins[piece]))
 
     def placed(self, offset: ArrayLike, yaw: float = 0.0) -> "Path":
-        """This path turned by `yaw` about the world's z axis, then moved by `offset`, (3,) m."""
+        """Return this path turned by `yaw`, rad, about the world's z axis, then moved by `offset`, (3,) m."""
         table = self.coefficients @ rotation_about_z(yaw).T
         table[:, 0] += np.asarray(offset, dtype=float)
         return Path(self.breaks, table)
 
     def check(self, where: str = "") -> None:
-        """Refuse a path that stands still anywhere but at its ends: a cusp, a reversal, a piece without length.
+        """Refuse a path that stops between its ends: a cusp, a reversal, a piece without length.
 
         Raises:
-            InputError: naming s and the place.
+            InputError: it stops; the message names s and the position.
         """
         s = (self.breaks[:-1, None] + np.diff(self.breaks)[:, None] * np.arange(_SAMPLES) / _SAMPLES).ravel()
         s = np.append(s, self.end)
@@ -123,15 +116,15 @@ class Path:
         if still.any():
             self._refuse("a piece has no length", float(self.breaks[int(np.argmax(still))]), where)
 
-        # |γ'| falls to 0 at a rest end: only what lies between two faster places is a stop inside the path
+        # |γ'| falls to 0 at a rest end as well; a stop inside the path lies between two faster places
         dips = 1 + np.flatnonzero((speed[1:-1] <= speed[:-2]) & (speed[1:-1] <= speed[2:]))
         slowest = self._slowest(s[dips - 1], s[dips + 1])
         stops = slowest[np.linalg.norm(self(slowest, 1), axis=-1) < STANDSTILL]
         if len(stops):
-            self._refuse("the path comes to a stop inside (a cusp or a reversal)", float(stops[0]), where)
+            self._refuse("the path stops between its ends (a cusp or a reversal)", float(stops[0]), where)
 
     def _slowest(self, low: NDArray, high: NDArray) -> NDArray:
-        """Where |γ'| is least between each two s, by golden section."""
+        """Return the s of the least |γ'| in each interval [low, high], by golden-section search."""
         ratio = (math.sqrt(5) - 1) / 2
         for _ in range(45):
             left, right = high - ratio * (high - low), low + ratio * (high - low)
@@ -144,13 +137,13 @@ class Path:
         raise InputError(
             f"{what} at s = {s:.3f} of {self.end:.3f}, position ({x:.3f}, {y:.3f}, {z:.3f}) m",
             where=where,
-            hint="move a waypoint aside there so that the path turns in a curve, or split the flight in two",
+            hint="move a waypoint sideways so that the path turns in a curve, or split the flight in two",
         )
 
 
 @njit(cache=True, fastmath={"contract"})
 def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray, out: NDArray) -> None:
-    """Points of one piece that follow one another are taken side by side, up to _SIDE_BY_SIDE of them."""
+    """Write γ and four derivatives at s into `out`, consecutive points of one piece together, up to _BATCH of them."""
     place = np.minimum(np.maximum(s, 0.0), breaks[-1])
     begin, piece, last = 0, 0, len(origins) - 1
     while begin < len(place):
@@ -158,7 +151,7 @@ def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray,
             piece = 0
         while piece < last and place[begin] >= breaks[piece + 1]:
             piece += 1
-        end, room = begin + 1, min(begin + _SIDE_BY_SIDE, len(place))
+        end, room = begin + 1, min(begin + _BATCH, len(place))
         while end < room and breaks[piece] <= place[end] and (piece == last or place[end] < breaks[piece + 1]):
             end += 1
         x = place[begin:end] - origins[piece]
@@ -181,7 +174,7 @@ def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray,
 
 @njit(cache=True)
 def _values(breaks: NDArray, origins: NDArray, table: NDArray, places: NDArray) -> NDArray:
-    """(N, 3) of piecewise polynomials at each s, (N,)."""
+    """Return piecewise polynomials at each s, (N,), as (N, 3)."""
     out = np.empty((len(places), 3))
     last = len(origins) - 1
     piece = 0
@@ -199,6 +192,6 @@ def _values(breaks: NDArray, origins: NDArray, table: NDArray, places: NDArray) 
 
 
 def rotation_about_z(yaw: float) -> NDArray:
-    """(3, 3): turns vectors by `yaw` about z."""
+    """Return the (3, 3) rotation by `yaw`, rad, about z."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -1,11 +1,11 @@
-"""path.yaml: which curve to fly, where in the room, and which way to point.
+"""Path files, path.yaml: which curve to fly, where in the room, with which yaw.
 
 name: figure eight
 waypoints: [[0, 0, 1], [1, 1, 1], …]    # or  points: file.csv  (x, y, z a row)
                                         # or  polynomials: file.csv  (as Crazyswarm writes them)
 yaw: {mode: fixed, angle_deg: 30}       # or  yaw: tangent,  yaw: free;  fixed at 0 if left out
 laps: 3                                 # of a closed path, flown through without a stop
-speed: 0.5                              # share of the speed that the limits allow
+speed: 0.5                              # speed factor: 1 is as fast as the limits allow
 place: {x: 0, y: 0, z: 0, yaw_deg: 90}  # turned about z through the origin, then moved; a fixed yaw turns too
 """
 
@@ -21,32 +21,26 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from cfplan.errors import InputError
 from cfplan.files.text import read_table
 from cfplan.files.yaml_with_places import Places, read_yaml_with_places
-from cfplan.geometry.min_snap import CLOSEST, CLOSEST_DENSE, check_points, min_snap, smooth_through
+from cfplan.geometry.min_snap import MIN_DENSE_SPACING, MIN_SPACING, check_points, min_snap, smooth_through
 from cfplan.geometry.path import Path, rotation_about_z
 from cfplan.geometry.polynomial_csv import read_polynomials
 from cfplan.geometry.yaw import YawMode
 
-_FEW = 8
-# points: fewer than these are waypoints, with room between them to gather speed
-_MOST = 50_000
-# points over all laps
+_DENSE = 8  # points: fewer are waypoints with room between them to gather speed
+_MAX_POINTS = 50_000  # over all laps
 
 
 @dataclass(frozen=True, slots=True)
 class PathFile:
-    """What a path file asks for."""
+    """A path file's content, checked and placed in the room."""
 
     name: str
-    path: Path
-    # in the room
+    path: Path  # in the frame of the room
     yaw: YawMode
-    yaw_angle: float
-    # rad, in the room; of mode fixed, otherwise 0
-    speed: float
-    # share of the speed limit, in (0, 1]
+    yaw_angle: float  # rad, in the frame of the room, in mode fixed; otherwise 0
+    speed: float  # speed factor in (0, 1]; 1 is not slowed
     laps: int
-    waypoints: NDArray
-    # (K, 3) m, in the room, all laps
+    waypoints: NDArray  # (K, 3) m, in the frame of the room, all laps
     source: pathlib.Path
 
 
@@ -84,10 +78,10 @@ class _Content(BaseModel):
 
 
 def load_path_file(file: pathlib.Path | str) -> PathFile:
-    """The path of a path.yaml, checked to be one that can be flown through without a stop.
+    """Read a path.yaml, and check that its path can be flown without a stop.
 
     Raises:
-        InputError: whatever is wrong with it or with the file that it names, with line and column.
+        InputError: a mistake in it or in the file that it names; names line and column.
     """
     file = pathlib.Path(file)
     content, places = read_yaml_with_places(file, _Content)
@@ -118,7 +112,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
 
 
 def read_points(file: pathlib.Path) -> tuple[NDArray, list[int]]:
-    """(K, 3) m from a file of x, y, z a row, and the line of each."""
+    """Read points, (K, 3) m, from rows of x, y, z, and the line number of each."""
     return read_table(file, 3, "x, y, z")
 
 
@@ -152,11 +146,11 @@ def _from_waypoints(content: _Content, places: Places) -> tuple[Path, NDArray]:
     points = np.array(rows, dtype=float).reshape(-1, 3)
     if len(points) < 2:
         raise InputError(
-            f"a path needs two waypoints at least, not {len(points)}",
+            f"a path needs at least two waypoints, not {len(points)}",
             where=places.where("waypoints"),
-            hint="add a waypoint: a path has at least a start and an end",
+            hint="add a waypoint: a path has a start and an end",
         )
-    check_points(points, CLOSEST, lambda index: places.where("waypoints", index))
+    check_points(points, MIN_SPACING, lambda index: places.where("waypoints", index))
     points = _repeated(points, content.laps, places)
     return min_snap(points), points
 
@@ -166,12 +160,12 @@ def _from_points(content: _Content, places: Places) -> tuple[Path, NDArray]:
     points, lines = read_points(file)
     if len(points) < 2:
         raise InputError(
-            f"a path needs two points at least, not {len(points)}", where=str(file), hint="add rows x, y, z to the file"
+            f"a path needs at least two points, not {len(points)}", where=str(file), hint="add rows x, y, z to the file"
         )
-    few = len(points) < _FEW
-    check_points(points, CLOSEST if few else CLOSEST_DENSE, lambda index: f"{file}:{lines[index]}")
+    dense = len(points) >= _DENSE
+    check_points(points, MIN_DENSE_SPACING if dense else MIN_SPACING, lambda index: f"{file}:{lines[index]}")
     points = _repeated(points, content.laps, places)
-    return (min_snap(points) if few else smooth_through(points)), points
+    return (smooth_through(points) if dense else min_snap(points)), points
 
 
 def _from_polynomials(content: _Content, places: Places) -> tuple[Path, NDArray]:
@@ -186,13 +180,15 @@ def _beside(places: Places, name: str | None) -> pathlib.Path:
 
 
 def _repeated(points: NDArray, laps: int, places: Places) -> NDArray:
-    """The points of all laps: the end of a lap is the start of the next, so it stands once."""
-    if 1 + laps * (len(points) - 1) > _MOST:
-        raise InputError(f"more than {_MOST} points", where=places.where("laps"), hint="give fewer points or laps")
+    """Return the points of all laps; the end of a lap is the start of the next and occurs once."""
+    if 1 + laps * (len(points) - 1) > _MAX_POINTS:
+        raise InputError(
+            f"more than {_MAX_POINTS} points", where=places.where("laps"), hint="give fewer points or laps"
+        )
     if laps == 1:
         return points
     gap = float(np.linalg.norm(points[-1] - points[0]))
-    if gap >= CLOSEST:
+    if gap >= MIN_SPACING:
         raise InputError(
             f"{laps} laps need a closed path, but the last point is {gap:.3f} m from the first",
             where=places.where("laps"),

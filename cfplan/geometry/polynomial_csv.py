@@ -1,4 +1,4 @@
-"""Trajectories as Crazyswarm writes them: rows of a duration and 4 × 8 coefficients."""
+"""Polynomial trajectory files of Crazyswarm: each row a duration and 4 × 8 coefficients."""
 
 import pathlib
 
@@ -9,35 +9,31 @@ from cfplan.errors import InputError
 from cfplan.files.text import read_table
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import end_values
-from cfplan.geometry.rest import mended, with_rest_ends
+from cfplan.geometry.rest import close_joints, with_rest_ends
 
 ROW = "duration, x^0 to x^7, y^0 to y^7, z^0 to z^7, yaw^0 to yaw^7"
 _COLUMNS = 1 + 4 * 8
-_SHORTEST = 0.001
-# s
-_POSITION_STEP = 0.001
-# m, between pieces
-_DERIVATIVE_STEP = 0.02
-# share of the largest derivative of that order: what six decimals in a file cost, and no more
+_MIN_DURATION = 0.001  # s
+_POSITION_STEP = 0.001  # m allowed between pieces
+_DERIVATIVE_STEP = 0.02  # allowed between pieces, of the largest derivative of that order: covers six decimals
 _NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
 _UNITS = ("m", "m/s", "m/s²", "m/s³", "m/s⁴")
 
 
 def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> tuple[Path, NDArray]:
-    """The curve in space of a polynomial file, at rest at both ends and at 1 m/s nominal in the mean.
+    """Return the curve of a polynomial file, at rest at both ends, and the points (K, 3) m where its rows meet.
 
-    With it the points where its rows begin and the last one ends, (K, 3) m.
-    Its own timing and its yaw are left: the planner times the path, and yaw comes from the yaw mode.
+    The file's timing and its yaw are not used: the planner times the path, and the yaw mode gives the yaw.
 
     Raises:
-        InputError: with the line: rows of another length, durations not positive, steps between rows up to snap.
+        InputError: rows of another length, durations too short, jumps up to snap between rows; names the line.
     """
     rows, lines = read_table(file, _COLUMNS, ROW)
     durations = rows[:, 0]
-    if (durations < _SHORTEST).any():
-        bad = int(np.argmax(durations < _SHORTEST))
+    if (durations < _MIN_DURATION).any():
+        bad = int(np.argmax(durations < _MIN_DURATION))
         raise InputError(
-            f"a duration must be at least {_SHORTEST} s, not {durations[bad]:g}",
+            f"a duration must be at least {_MIN_DURATION} s, not {durations[bad]:g}",
             where=f"{file}:{lines[bad]}",
             hint="the first number of a row is the duration of the piece in seconds",
         )
@@ -45,7 +41,7 @@ def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> tuple[Path, NDArra
     durations, table = np.tile(durations, laps), np.tile(table, (laps, 1, 1))
     _check_pieces(file, lines * laps, durations, table)
     corners = np.concatenate([table[:, 0], end_values(durations[-1:], table[-1:])[1][:, 0]])
-    return with_rest_ends(*mended(durations, table)), corners
+    return with_rest_ends(*close_joints(durations, table)), corners
 
 
 def _check_pieces(file: pathlib.Path, lines: list[int], durations: NDArray, table: NDArray) -> None:
@@ -55,7 +51,7 @@ def _check_pieces(file: pathlib.Path, lines: list[int], durations: NDArray, tabl
         raise InputError(
             "the piece stays in one place",
             where=f"{file}:{lines[int(np.argmin(extent))]}",
-            hint="take the row out; a path cannot wait",
+            hint="remove the row; a path cannot wait",
         )
     largest = np.linalg.norm(np.concatenate([left, right]), axis=-1).max(axis=0)
     allowed = np.maximum(_DERIVATIVE_STEP * largest, 1e-6)
@@ -66,5 +62,5 @@ def _check_pieces(file: pathlib.Path, lines: list[int], durations: NDArray, tabl
         raise InputError(
             f"{_NAMES[order]} jumps by {steps[piece, order]:.4g} {_UNITS[order]} between {between}",
             where=f"{file}:{lines[piece + 1]}",
-            hint="make the file again with continuous derivatives up to snap, or give the path as points",
+            hint="export the file with derivatives continuous up to snap, or give the path as points",
         )

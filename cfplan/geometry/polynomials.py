@@ -1,4 +1,4 @@
-"""Arithmetic on polynomials with coefficients in ascending powers, many at a time."""
+"""Polynomial arithmetic on many pieces at a time, coefficients in ascending powers."""
 
 from math import comb, factorial
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 
 def shifted(table: NDArray, offset: NDArray) -> NDArray:
-    """Polynomials in x - offset[i] for polynomials in x: (M, D, 3) and (M,) to (M, D, 3)."""
+    """Return the same polynomials (M, D, 3), each in powers of x - offset[i], with offset (M,)."""
     count = table.shape[1]
     binomials = np.array([[comb(k, j) if k >= j else 0 for k in range(count)] for j in range(count)], dtype=float)
     exponents = np.maximum(np.arange(count) - np.arange(count)[:, None], 0)
@@ -15,25 +15,25 @@ def shifted(table: NDArray, offset: NDArray) -> NDArray:
 
 
 def reversed_pieces(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
-    """The same curve flown backwards, each piece about its new left end."""
+    """Return the same curve flown backwards, each piece about its new left end."""
     signs = (-1.0) ** np.arange(table.shape[1])
     return durations[::-1], (shifted(table, durations) * signs[:, None])[::-1]
 
 
 def end_values(durations: NDArray, table: NDArray, orders: int = 5) -> tuple[NDArray, NDArray]:
-    """(M, orders, 3) twice: derivatives of each piece at its left and its right end."""
+    """Return the derivatives of each piece at its left and at its right end, (M, orders, 3) each."""
     table = padded(table, max(orders, table.shape[1]))
     factorials = np.array([factorial(k) for k in range(orders)], dtype=float)[:, None]
     return table[:, :orders] * factorials, shifted(table, durations)[:, :orders] * factorials
 
 
 def padded(table: NDArray, count: int) -> NDArray:
-    """The same polynomials with `count` coefficients each, (M, count, 3)."""
+    """Return the same polynomials with `count` coefficients each, (M, count, 3)."""
     return np.pad(table, ((0, 0), (0, count - table.shape[1]), (0, 0)))
 
 
 def composed(outer: NDArray, inner: NDArray, count: int) -> NDArray:
-    """outer(inner(x)) to `count` coefficients: outer (D, 3), inner (E,), result (count, 3). By Horner."""
+    """Return the first `count` coefficients of outer(inner(x)) by Horner's rule: outer (D, 3), inner (E,)."""
     inner = inner[:count]
     result = np.zeros((count, 3))
     for coefficient in outer[::-1]:
@@ -44,7 +44,7 @@ def composed(outer: NDArray, inner: NDArray, count: int) -> NDArray:
 
 
 def hermite(orders: int) -> NDArray:
-    """Coefficients on [0, 1] from the value and derivatives, `orders` of them, at 0 and then at 1."""
+    """Return the Hermite matrix: the first `orders` derivatives at 0, then at 1, to coefficients on [0, 1]."""
     rows = np.zeros((2 * orders, 2 * orders))
     for order in range(orders):
         for power in range(order, 2 * orders):

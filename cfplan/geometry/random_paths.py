@@ -1,4 +1,4 @@
-"""Paths from seeds: random waypoints, and paths near a given one."""
+"""Random waypoints and random perturbations of a path, both from a seed."""
 
 from math import factorial
 
@@ -10,17 +10,14 @@ from cfplan.errors import InputError
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import padded, shifted
 
-SPACING = 0.5
-# m, least distance between waypoints in a row
-KNOT_SPACING = 1.0
-# s at 1 m/s nominal, between knots of a perturbation
-_TRIES = 1000
-_DEGREE = 5
-# of a perturbation: C⁴, as a path must be
+SPACING = 0.5  # m, least distance between waypoints in a row
+KNOT_SPACING = 1.0  # s of nominal time between knots of a perturbation
+_TRIES = 1000  # per waypoint
+_DEGREE = 5  # of a perturbation: C⁴, as a path must be
 
 
 def generator(seed: int | np.random.SeedSequence) -> np.random.Generator:
-    """Random numbers that are the same on every machine."""
+    """Return a generator of random numbers that are the same on every machine."""
     sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     return np.random.Generator(np.random.PCG64(sequence))
 
@@ -32,18 +29,18 @@ def random_waypoints(
     *,
     spacing: float = SPACING,
 ) -> NDArray:
-    """(K, 3) m, K uniform in count_range with both ends, uniform in the box (2, 3) of low and high corner.
+    """Draw waypoints, (K, 3) m, uniform in a box (2, 3) of low and high corner.
 
-    Waypoints in a row are at least `spacing`, m, apart.
+    K is uniform in count_range, both ends included. Waypoints in a row are at least `spacing`, m, apart.
 
     Raises:
-        InputError: a box that is none, or too small for the spacing.
+        InputError: not a box, fewer than two waypoints, or a box too small for the spacing.
     """
     low, high = np.asarray(box, dtype=float)
     if not (np.isfinite([low, high]).all() and (low <= high).all()):
         raise InputError(f"a box needs a low and a high corner, not {np.asarray(box).tolist()}")
     if not 2 <= count_range[0] <= count_range[1]:
-        raise InputError(f"a path needs two waypoints at least, not {count_range[0]} to {count_range[1]}")
+        raise InputError(f"a path needs at least two waypoints, not {count_range[0]} to {count_range[1]}")
     random = generator(seed)
     count = int(random.integers(count_range[0], count_range[1], endpoint=True))
     points = [random.uniform(low, high)]
@@ -59,11 +56,12 @@ def random_waypoints(
 
 
 def perturbed(path: Path, epsilon: float, seed: int | np.random.SeedSequence) -> Path:
-    """A path of the family π_ε(γ): piecewise polynomial, C⁴, nowhere farther than ε, m, from γ at the same s.
+    """Return a perturbation of γ from the family π_ε(γ): piecewise polynomial, C⁴, within ε, m, of γ at every s.
 
-    ("Robustness against Perturbations" in the paper asks this of the nodes; here it holds between them too.)
-    To γ is added a quintic B-spline whose control points are uniform in a ball of radius ε. A spline lies in the
-    convex hull of its control points, hence the bound. At the ends four control points coincide, so rest stays rest.
+    (The paper's "Robustness against Perturbations" asks this at the nodes; here it holds between them as well.)
+    The perturbation is a quintic B-spline whose control points are uniform in a ball of radius ε. A B-spline lies in
+    the convex hull of its control points, which gives the bound. Three control points at each end equal a fourth, so
+    a rest end stays at rest.
     """
     if not (np.isfinite(epsilon) and epsilon >= 0.0):
         raise InputError(f"a perturbation must be at least 0, not {epsilon}")
@@ -78,7 +76,7 @@ def perturbed(path: Path, epsilon: float, seed: int | np.random.SeedSequence) ->
 
 
 def _sum(path: Path, knots: NDArray, pieces: NDArray) -> tuple[NDArray, NDArray]:
-    """Breaks and coefficients of γ plus polynomials (M, D, 3), each about its left knot, on the same range of s."""
+    """Return breaks and coefficients of γ plus pieces (M, D, 3), each about its left knot, on the same range of s."""
     breaks = np.union1d(path.breaks, knots)
     breaks = breaks[np.diff(breaks, append=np.inf) > 1e-9 * path.end]  # a knot may be a break but for rounding
     origins = breaks[:-1].copy()
@@ -101,7 +99,7 @@ def _in_ball(random: np.random.Generator, count: int, radius: float) -> NDArray:
 
 
 def _spline_pieces(knots: NDArray, control: NDArray) -> NDArray:
-    """(M, 6, 3): the clamped B-spline's polynomials about their left knots."""
+    """Return (M, 6, 3), the clamped B-spline's polynomials about their left knots."""
     clamped = np.concatenate([np.repeat(knots[0], _DEGREE), knots, np.repeat(knots[-1], _DEGREE)])
     spline = BSpline(clamped, control, _DEGREE)
     return np.stack([spline(knots[:-1], order) / factorial(order) for order in range(_DEGREE + 1)], axis=1)

@@ -1,10 +1,11 @@
-"""Rest at both ends, and continuity, for paths whose source has neither to the letter.
+"""Bring a path to rest at both ends, and make it C⁴ where its pieces join.
 
-A source that moves at its ends, or only stops there, is re-timed: p(σ(s)) with σ = s, shifted, away from the ends and
-σ' = I_u(a, 5) near them, where u = s / L and I is the regularised incomplete beta function. That is a polynomial,
-monotone, C⁵ where it meets σ' = 1, and with σ' ~ s^a at the end; a = 3 takes γ', γ'', γ''' to 0 from any motion and
-a = 1 from rest with an acceleration. The curve in space stays as it is. The composition is again kept as piecewise
-polynomials: on pieces this short its Taylor series reaches the limit of double precision in a few terms.
+A path from a file may move at its ends, or stop there with an acceleration. It is re-timed: p(σ(s)), where away from
+the ends σ is s plus a constant, and near them σ' = I_u(a, 5) with u = s / L and I the regularised incomplete beta
+function. This σ is a monotone polynomial that meets σ' = 1 with C⁵ and behaves as σ' ~ s^a at the end: a = 3 takes γ',
+γ'', γ''' to 0 from any motion, a = 1 from rest with an acceleration. The curve in space does not change. The
+composition is stored as piecewise polynomials again; on short pieces a few terms of its Taylor series reach double
+precision.
 """
 
 from math import comb, factorial
@@ -15,20 +16,18 @@ from numpy.typing import NDArray
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import composed, end_values, hermite, padded, reversed_pieces, shifted
 
-WARP = 1.5
-# s, nominal time that gathering speed takes; half of the path at most
+WARP = 1.5  # s of nominal time in which speed is gathered; at most half of the path
 _WARP_PIECES = 16
-_TERMS = 16
-# Taylor terms kept of the composition
-_NEGLIGIBLE = np.array([1e-3, 1e-2, 1e-1])
-# γ', γ'', γ''' at 1 m/s nominal: an end that moves less is at rest but for rounding in its file
+_TERMS = 16  # Taylor terms kept of the composition
+_NEGLIGIBLE = np.array([1e-3, 1e-2, 1e-1])  # γ', γ'', γ''' at 1 m/s: an end that moves less is at rest but for rounding
 _HERMITE = hermite(5)
 
 
 def with_rest_ends(durations: NDArray, table: NDArray) -> Path:
-    """The path of pieces (M, D, 3), each about its left end and lasting durations[i], brought to rest at both ends.
+    """Return the path of pieces (M, D, 3), brought to rest at both ends.
 
-    s is scaled so that the mean of |γ'| is 1: whatever speed a source had, s is again in nominal seconds at 1 m/s.
+    Piece i is expanded about its left end and lasts durations[i]. s is scaled so that the mean
+    of |γ'| is 1: nominal seconds at 1 m/s, independent of the source's own speed.
     """
     durations, table = _at_nominal_speed(durations, table)
     half = durations.sum() / 2
@@ -39,7 +38,7 @@ def with_rest_ends(durations: NDArray, table: NDArray) -> Path:
 
 
 def rest_path(durations: NDArray, table: NDArray) -> Path:
-    """A Path of pieces that are at rest at both ends but for rounding, which is removed."""
+    """Return a Path of pieces that rest at both ends, with the rounding errors there set to zero."""
     if len(durations) == 1:  # two pieces, so that each end is the origin of one
         durations = np.repeat(durations / 2, 2)
         table = np.concatenate([table, shifted(table, durations[:1])])
@@ -50,10 +49,10 @@ def rest_path(durations: NDArray, table: NDArray) -> Path:
     return Path(np.concatenate([[0.0], np.cumsum(durations)]), table)
 
 
-def mended(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
-    """The same pieces with the steps between them closed to fourth order, half of each step on either side.
+def close_joints(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the pieces made C⁴ where they join, each side moved by half of the step between them.
 
-    The change is the least polynomial that does it, of degree 9 on each piece.
+    What is added to each piece is the Hermite polynomial of degree 9 with these end values.
     """
     left, right = end_values(durations, table)
     step = (left[1:] - right[:-1]) / 2
@@ -63,7 +62,7 @@ def mended(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _changed(durations: NDArray, table: NDArray, left: NDArray, right: NDArray, pieces: slice) -> NDArray:
-    """The pieces with polynomials of degree 9 added that have these end values, (n, 5, 3) each."""
+    """Return the pieces with polynomials of degree 9 added that have these end values, (n, 5, 3) each."""
     times = durations[pieces, None, None]
     powers = times ** np.arange(5)[:, None]
     result = padded(table, max(table.shape[1], 10))
@@ -92,7 +91,7 @@ def _with_rest_start(durations: NDArray, table: NDArray, most: float) -> tuple[N
 
 
 def _warped(durations: NDArray, table: NDArray, flatness: int, most: float) -> tuple[NDArray, NDArray]:
-    """The pieces with their start re-timed by σ, which uses up `most` of their time at most."""
+    """Return the pieces with their start re-timed by σ, which takes at most `most`, s, of their time."""
     sigma = _warp(flatness)
     reach = np.polynomial.polynomial.polyval(1.0, sigma)  # σ(L) / L
     breaks = np.concatenate([[0.0], np.cumsum(durations)])
@@ -123,19 +122,19 @@ def _warped(durations: NDArray, table: NDArray, flatness: int, most: float) -> t
 
 
 def _warp_grid(sigma: NDArray, breaks: NDArray) -> NDArray:
-    """u from 0 to 1 between the pieces of the re-timed stretch, at every break (in units of L) that lies in it."""
+    """Return the u in [0, 1] where pieces of the re-timed part meet: a uniform grid and every break, in units of L."""
     u = np.linspace(0.0, 1.0, _WARP_PIECES + 1)
     reach = np.polynomial.polynomial.polyval(1.0, sigma)
     joints = _inverse(sigma, breaks[(breaks > 0.0) & (breaks < reach * (1 - 1e-9))])
     if not len(joints):
         return u
-    apart = np.abs(u[:, None] - joints).min(axis=1) > 0.25 / _WARP_PIECES  # far shorter pieces would cost digits
+    apart = np.abs(u[:, None] - joints).min(axis=1) > 0.25 / _WARP_PIECES  # far shorter pieces would lose digits
     apart[[0, -1]] = True
     return np.sort(np.concatenate([u[apart], joints]))
 
 
 def _warp(flatness: int) -> NDArray:
-    """Coefficients of σ(u) on [0, 1]: σ'' = u^(a-1) (1-u)^4 / B(a, 5)."""
+    """Return the coefficients of σ(u) on [0, 1], where σ'' = u^(a-1) (1-u)^4 / B(a, 5)."""
     a = flatness
     norm = factorial(a + 4) / (factorial(a - 1) * factorial(4))
     sigma = np.zeros(a + 6)
@@ -145,7 +144,7 @@ def _warp(flatness: int) -> NDArray:
 
 
 def _inverse(sigma: NDArray, values: NDArray) -> NDArray:
-    """u with σ(u) = value, by bisection: σ is monotone."""
+    """Return the u with σ(u) = value, by bisection, since σ is monotone."""
     low, high = np.zeros_like(values), np.ones_like(values)
     for _ in range(60):
         middle = (low + high) / 2

@@ -1,11 +1,11 @@
-"""Which way the vehicle points along a path."""
+"""The yaw modes: how the vehicle's heading along a path is chosen."""
 
 from enum import StrEnum
 
 
 class YawMode(StrEnum):
-    """How yaw is chosen."""
+    """How yaw along a path is chosen."""
 
-    FIXED = "fixed"  # one angle all along
+    FIXED = "fixed"  # one angle on the whole path
     TANGENT = "tangent"  # along the horizontal direction of flight
-    FREE = "free"  # left to the planner
+    FREE = "free"  # chosen by the planner

@@ -141,9 +141,9 @@ def test_segments_of_centimetres_beside_segments_of_metres_do_not_cost_digits():
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        ([[0, 0, 1]], "two waypoints at least, not 1"),
-        (np.zeros((0, 3)), "two waypoints at least, not 0"),
-        ([[0, 0], [1, 1]], "x, y, z each"),
+        ([[0, 0, 1]], "at least two waypoints, not 1"),
+        (np.zeros((0, 3)), "at least two waypoints, not 0"),
+        ([[0, 0], [1, 1]], "must be x, y, z"),
         ([[0, 0, 1], [0, 0, np.nan], [1, 1, 1]], "waypoint 2: coordinates must be numbers"),
         ([[0, 0, 1], [1, 0, 1], [1, 0, 1]], "waypoints 2 and 3 are 0.0000 m apart"),
         ([[0, 0, 1], [0, 0.009, 1]], "waypoints 1 and 2 are 0.0090 m apart"),

@@ -104,7 +104,7 @@ def test_a_good_path_passes_the_check(path):
 
 @pytest.mark.parametrize("sideways", [0.0, 0.7])
 def test_there_and_back_is_a_stop_at_the_turning_point(sideways):
-    with pytest.raises(InputError, match=r"stop inside.*position \(1\.000, "):
+    with pytest.raises(InputError, match=r"stops between its ends.*position \(1\.000, "):
         min_snap([[0, 0, 1], [1, sideways, 1], [0, 0, 1]]).check()
 
 
@@ -121,7 +121,7 @@ def test_a_cusp_is_found_wherever_it_lies():
     shift = np.polynomial.Polynomial([1 - t0, 1.0])  # the last piece counts from its right end
     for axis, power in ((0, 2), (1, 3)):
         polynomial[0, : power + 1, axis] = (shift**power).coef
-    with pytest.raises(InputError, match=r"stop inside.* s = 0\.378"):
+    with pytest.raises(InputError, match=r"stops between its ends.* s = 0\.378"):
         Path(np.array([0.0, 1.0]), polynomial).check()
 
 
