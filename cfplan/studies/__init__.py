@@ -2,6 +2,7 @@
 
 __all__ = [
     "bench",
+    "docs_tables",
     "fault_scenarios",
     "faults",
     "feasibility",
@@ -11,7 +12,9 @@ __all__ = [
     "long_paths",
     "machine",
     "missions",
+    "provenance",
     "random_faults",
     "real_time",
+    "result",
     "scaling",
 ]

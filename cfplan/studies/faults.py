@@ -1,7 +1,7 @@
-"""The fault table: what the pilot makes of each fault, by the truth of the virtual lab.
+"""Fly with one fault a flight and judge what the pilot does about it by the truth of the virtual lab.
 
-Flown in the stepped lab (`cfplan.simulation.lab.stepped_lab`): the pilot, the packets, the pose sorting, the virtual
-Crazyflie and the virtual cameras are those of a flight in real time; processes and sockets are not there.
+In the stepped lab (`cfplan.simulation.lab.stepped_lab`) the pilot, the packets, the pose gate, the virtual Crazyflie
+and the virtual cameras are those of a flight in real time; there are no processes and no sockets.
 """
 
 import math
@@ -29,11 +29,28 @@ from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.studies.fault_scenarios import SCENARIOS, Scenario
-from cfplan.studies.machine import Machine, this_machine
+from cfplan.studies.result import Column, StudyResult, Table, detail_table
 
 COLUMNS = (
-    "fault", "must come to", "rung", "reacts after", "off the path", "from the setpoint", "to the wall", "end",
-    "record",
+    Column("name", "fault"),
+    Column("expected", "must end in", meaning="the rung of the abort ladder that the fault must lead to"),
+    Column("rung", "rung", meaning="the lowest rung that the pilot took; *none*: the flight went on to its end"),
+    Column("reaction", "reacts after", "s", ".2f", meaning="from the fault to the rung"),
+    Column(
+        "off_plan", "off the path", "cm", ".0f",
+        meaning="largest distance of the true position from the planned path, horizontally once landing has begun",
+    ),
+    Column(
+        "off_setpoint", "from the setpoint", "cm", ".0f",
+        meaning="largest distance of the true position from the setpoint of that moment, until landing begins",
+    ),
+    Column(
+        "to_wall", "to the wall", "m", ".2f",
+        meaning="least distance of the true position from walls and ceiling; negative beyond them",
+    ),
+    Column("end", "end", meaning="on the floor, disarmed, and how long all motors were off in the air"),
+    Column("record", "record", meaning="whether it can be read"),
+    Column("why", "why"),
 )  # fmt: skip
 _DOWN = 0.05  # m
 _SETTLING = 0.1  # s in which the supervisor notices that it was disarmed
@@ -43,91 +60,56 @@ _RUNGS = {f"{rung.name.lower()}:": rung for rung in Rung}
 
 
 class PilotKilled(BaseException):
-    """Nothing of the pilot runs any more."""
+    """The pilot's process ends at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaultFlight:
-    """One row, flown."""
+    """One flight with a fault, judged by the truth."""
 
     name: str
     expected: str
     rung: str
-    reaction: float | None
-    # s from the fault to the rung; None where there was none
-    off_plan: float
-    # m, largest distance of the true position from the planned path, from landing on horizontally
-    off_setpoint: float
-    # m, largest distance of the true position from the setpoint of that moment, while some are sent before landing
-    to_wall: float
-    # m, least distance of the true position from the walls and the ceiling; negative beyond them
-    motors_off: int
-    # ms with all motors off in the air
-    landed: bool
-    # on the floor, motors off
+    reaction: float | None  # s from the fault to the rung; None where there was none
+    off_plan: float  # m, largest distance of the true position from the planned path, from landing on horizontally
+    off_setpoint: float  # m, largest distance of the true position from the setpoint, until landing begins
+    to_wall: float  # m, least distance of the true position from walls and ceiling; negative beyond them
+    motors_off: int  # ms with all motors off in the air
+    landed: bool  # on the floor, motors off
     disarmed: bool
-    readable: bool
-    # what was recorded can be read
+    readable: bool  # what was recorded can be read
     reason: str
-    fault: str = ""
-    # what is wrong with that; "" where it is as it must be
 
-    def texts(self) -> list[str]:
-        """As COLUMNS has it."""
-        reaction = "–" if self.reaction is None else f"{self.reaction:.2f} s"
-        end = (
-            ", ".join(text for text, said in (("landed", self.landed), ("disarmed", self.disarmed)) if said)
-            or "in the air"
-        )
-        return [
-            self.name, self.expected, self.rung, reaction, f"{100 * self.off_plan:.0f} cm",
-            f"{100 * self.off_setpoint:.0f} cm", f"{self.to_wall:.2f} m",
-            end + (f", {self.motors_off} ms without motors" if self.motors_off else ""),
-            "readable" if self.readable else "not readable",
-        ]  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class FaultTable:
-    """A whole run."""
-
-    command: str
-    machine: Machine
-    path: str
-    flights: tuple[FaultFlight, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
-
-    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
-        """Title, columns and rows of the one table."""
-        return [("Faults at full speed", list(COLUMNS), [flight.texts() for flight in self.flights])]
+    def row(self) -> dict[str, Any]:
+        """Return it by the keys of COLUMNS, with the fields that those are made of."""
+        ends = [text for text, holds in (("landed", self.landed), ("disarmed", self.disarmed)) if holds]
+        without = f", {self.motors_off} ms without motors" if self.motors_off else ""
+        return asdict(self) | {
+            "end": (", ".join(ends) or "in the air") + without,
+            "record": "readable" if self.readable else "not readable",
+            "why": "" if self.reason == "landed" else self.reason,
+        }
 
 
 @dataclass(slots=True)
-class Orders:
-    """Of the operator."""
+class StudyOrders:
+    """What the operator of a scenario orders."""
 
     worst: Order | None = None
     gone: bool = False
 
 
 @dataclass(slots=True)
-class Flown:
-    """What a flight left behind."""
+class SteppedFlight:
+    """What a flight in the stepped lab left behind."""
 
-    outcome: FlightOutcome | None
-    # None where the pilot was killed, or never flew
+    outcome: FlightOutcome | None  # None where the pilot was killed, or never flew
     reason: str
     truth: Truth
-    struck: float
-    # s, when it went wrong; NaN where it did before anything else, or never
+    struck: float  # s, when the fault began; NaN where it was there from the start, or never began
     events: list[tuple[float, str]] = field(default_factory=list)
-    sent: list[tuple[float, Triple]] = field(default_factory=list)
-    # s, m, each setpoint from the plan's first on
-    landing: float = math.inf
-    # s, when the last phase of landing began
+    sent: list[tuple[float, Triple]] = field(default_factory=list)  # s, m, each setpoint from the plan's first on
+    landing: float = math.inf  # s, when the last phase of landing began
 
 
 def fault_table(
@@ -135,16 +117,16 @@ def fault_table(
     path: str,
     *,
     scenarios: Iterable[Scenario] = SCENARIOS,
-    command: str = "",
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> FaultTable:
+) -> StudyResult:
     """Fly every scenario."""
-    rows, all_of_them = [], tuple(scenarios)
-    for done, scenario in enumerate(all_of_them):
-        progress(done, len(all_of_them))
-        rows.append(fly_scenario(scenario, mission))
-    progress(len(all_of_them), len(all_of_them))
-    return FaultTable(command, this_machine(), path, tuple(rows))
+    flights, chosen = [], tuple(scenarios)
+    for done, scenario in enumerate(chosen):
+        progress(done, len(chosen))
+        flights.append(fly_scenario(scenario, mission))
+    progress(len(chosen), len(chosen))
+    table = Table("faults", "Faults at full speed", COLUMNS, tuple(flight.row() for flight in flights))
+    return StudyResult("faults", {"path": path}, (table,), (detail_table("flights", flights),))
 
 
 def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0) -> FaultFlight:
@@ -167,10 +149,10 @@ def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0) -> FaultFl
 
 def fly_stepped(
     scenario: Scenario, mission: Mission, *, listen: Callable[[Telemetry], None] = lambda _: None, seed: int = 0
-) -> Flown:
+) -> SteppedFlight:
     """Fly one in the stepped lab, and let what is left behind come to rest."""
     lab = SteppedLab(mission.limits.airframe, vehicle=scenario.vehicle, cameras=scenario.cameras, seed=seed)
-    orders, flown = Orders(), Flown(None, "", lab.truth(), math.nan)
+    orders, flown = StudyOrders(), SteppedFlight(None, "", lab.truth(), math.nan)
 
     def strike() -> None:
         flown.struck = lab.now
@@ -220,7 +202,7 @@ def fly_stepped(
     return flown
 
 
-def judge(scenario: Scenario, flown: Flown, mission: Mission, readable: bool) -> FaultFlight:
+def judge(scenario: Scenario, flown: SteppedFlight, mission: Mission, readable: bool) -> FaultFlight:
     """Hold what really happened against what must."""
     truth, outcome = flown.truth, flown.outcome
     rung = outcome.rung if outcome is not None else Rung.NONE
@@ -250,7 +232,7 @@ def _rung_of(text: str) -> Rung | None:
     return next((rung for name, rung in _RUNGS.items() if text.startswith(name)), None)
 
 
-def _off_plan(flown: Flown, mission: Mission) -> float:
+def _off_plan(flown: SteppedFlight, mission: Mission) -> float:
     outcome, truth = flown.outcome, flown.truth
     begin = flown.struck if not math.isnan(flown.struck) else outcome.first_setpoint if outcome is not None else 0.0
     if outcome is not None and (not outcome.first_setpoint or begin < outcome.first_setpoint):
@@ -264,7 +246,7 @@ def _off_plan(flown: Flown, mission: Mission) -> float:
     return float(max(near.max(initial=0.0), beside.max(initial=0.0)))
 
 
-def _off_setpoint(flown: Flown, mission: Mission) -> float:
+def _off_setpoint(flown: SteppedFlight, mission: Mission) -> float:
     """In time: a vehicle that is late on its path is off its setpoint."""
     if not flown.sent:
         return 0.0

@@ -1,18 +1,16 @@
-"""Do the expert's solutions hold between the grid points too? Counted over many random paths.
+"""Count over random paths whether a planner's solutions keep every limit between the grid points too.
 
 Each path is planned, certified as it is, then slowed where it must be. Failures are kept with their seed and reason.
 """
 
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from cfplan.errors import InputError
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.limit_sets import BOXES, LIMIT_SETS
-from cfplan.studies.machine import Machine, this_machine
+from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table, quantile_columns
 from cfplan.studies.trials import (
     BAD_PATH,
     Trial,
@@ -20,75 +18,28 @@ from cfplan.studies.trials import (
     find_candidate,
     find_limit_set,
     path_trials,
-    quantiles,
+    quantile_values,
     random_path,
 )
 
 COLUMNS = (
-    "box", "limits", "paths", "solved", "certified as planned", "after slowing", "worst share", "time lost: mean",
-    "p99", "gap to bound: median", "solve median", "p99 ",
-)  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """One box with one limit set."""
-
-    box: str
-    limits: str
-    paths: int
-    bad_paths: int
-    # random paths with a cusp, drawn and not counted
-    solved: int
-    unslowed: int
-    certified: int
-    worst_share: float
-    # the largest before slowing
-    mean_lost: float
-    # share of flight time that slowing cost, over all paths
-    lost: tuple[float, float, float]
-    # over the slowed ones: median, p90, p99
-    gap: tuple[float, float, float]
-    plan_seconds: tuple[float, float, float]
-
-    def texts(self) -> list[str]:
-        """As COLUMNS has it."""
-        return [
-            self.box, self.limits, f"{self.paths}", f"{self.solved}",
-            f"{self.unslowed} ({self._percent(self.unslowed)})",
-            f"{self.certified} ({self._percent(self.certified)})", f"{self.worst_share:.3f}",
-            f"{100 * self.mean_lost:.4f} %", f"{100 * self.lost[2]:.2f} %", f"{100 * self.gap[0]:.2f} %",
-            f"{1e3 * self.plan_seconds[0]:.1f} ms", f"{1e3 * self.plan_seconds[2]:.1f} ms",
-        ]  # fmt: skip
-
-    def _percent(self, count: int) -> str:
-        return f"{100 * count / max(self.paths, 1):.1f} %"
-
-
-@dataclass(frozen=True, slots=True)
-class Feasibility:
-    """A whole run."""
-
-    command: str
-    machine: Machine
-    planner: str
-    nodes: int
-    yaw: str
-    first_seed: int
-    interrupted: bool
-    seconds: float
-    groups: tuple[Group, ...]
-    failures: tuple[dict[str, Any], ...]
-    # trials that were not certified as planned, with box and limit set
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
-
-    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
-        """Title, columns and rows of the one table."""
-        title = f"{self.planner}, N = {self.nodes}, yaw {self.yaw}: dense feasibility"
-        return [(title, list(COLUMNS), [group.texts() for group in self.groups])]
+    Column("box", "box"),
+    Column("limits", "limits"),
+    Column("paths", "paths"),
+    Column("bad_paths", meaning="random paths with a cusp, drawn and not counted"),
+    Column("solved", "solved", of="paths"),
+    Column("unslowed", "certified as planned", of="paths"),
+    Column("certified", "after slowing", of="paths"),
+    Column("worst_share", "worst share", "", ".3f", meaning="of any limit, before slowing"),
+    Column(
+        "mean_lost", "time lost, mean", "%", ".4f", meaning="share of flight time that slowing cost, over all paths"
+    ),
+    *quantile_columns("lost", "time lost", "%", ".2f", shown=("p99",), meaning="over the slowed paths"),
+    *quantile_columns(
+        "gap", "gap", "%", ".2f", shown=("median",), meaning="certified travel time over the proven bound"
+    ),
+    *quantile_columns("plan_seconds", "plan", "ms", ".1f", meaning="the planner's call"),
+)
 
 
 def dense_feasibility(
@@ -100,10 +51,9 @@ def dense_feasibility(
     nodes: int = 100,
     yaw: YawMode = YawMode.FREE,
     first_seed: int = 10_000,
-    command: str = "",
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Feasibility:
-    """`paths` random paths, shared out evenly over the boxes and limit sets. An interrupt ends it early.
+) -> StudyResult:
+    """Plan `paths` random paths, shared out evenly over the boxes and limit sets. An interrupt ends it early.
 
     Raises:
         InputError: an unknown planner, box or limit set, or fewer paths than groups.
@@ -112,55 +62,46 @@ def dense_feasibility(
     for box in boxes:
         find_box(box)
     if paths < len(pairs):
-        raise InputError(f"{paths} paths do not fill {len(pairs)} groups", where="paths")
-    found = find_candidate(planner)
-    each, begun, interrupted = paths // len(pairs), time.perf_counter(), False
-    measured: dict[tuple[str, str], list[Trial]] = {}
-    try:
+        raise InputError(f"paths must be at least {len(pairs)}, one for each box and limit set", where="paths")
+    candidate, each = find_candidate(planner), paths // len(pairs)
+
+    def measure() -> Iterator[Trial]:
         for number, (box, chosen) in enumerate(pairs):
-            warm = random_path(first_seed, box)
-            found.plan(PlanningTask(warm, chosen.airframe, chosen.limits, nodes, yaw))
-            trials = measured.setdefault((box, chosen.name), [])
+            candidate.plan(PlanningTask(random_path(first_seed, box), chosen.airframe, chosen.limits, nodes, yaw))
             for count in range(each):
-                seed = first_seed + count
-                trials += path_trials({planner: found}, seed, box, chosen, nodes=nodes, yaw=yaw)
+                yield from path_trials({planner: candidate}, first_seed + count, box, chosen, nodes=nodes, yaw=yaw)
                 progress(number * each + count + 1, each * len(pairs))
-    except KeyboardInterrupt:
-        interrupted = True
-    return Feasibility(
-        command=command,
-        machine=this_machine(),
-        planner=planner,
-        nodes=nodes,
-        yaw=yaw.value,
-        first_seed=first_seed,
-        interrupted=interrupted,
-        seconds=time.perf_counter() - begun,
-        groups=tuple(_group(box, limits, trials) for (box, limits), trials in measured.items()),
-        failures=tuple(
-            {"box": box, "limits": limits, **asdict(trial)}
-            for (box, limits), trials in measured.items()
-            for trial in trials
-            if not trial.unslowed
-        ),
+
+    trials, interrupted = collect(measure())
+    return StudyResult(
+        "feasibility",
+        {"planner": planner, "nodes": nodes, "yaw": yaw.value, "first_seed": first_seed, "paths": each * len(pairs)},
+        (_table(trials, f"{planner}, N = {nodes}, yaw {yaw.value}: dense feasibility"),),
+        (detail_table("failures", [trial for trial in trials if not trial.unslowed]),),
+        interrupted,
     )
 
 
-def _group(box: str, limits: str, trials: list[Trial]) -> Group:
+def _table(trials: Sequence[Trial], title: str) -> Table:
+    groups = dict.fromkeys((trial.box, trial.limits) for trial in trials)
+    rows = [_row(box, limits, [t for t in trials if (t.box, t.limits) == (box, limits)]) for box, limits in groups]
+    return Table("groups", title, COLUMNS, tuple(rows))
+
+
+def _row(box: str, limits: str, trials: Sequence[Trial]) -> dict[str, Any]:
     counted = [trial for trial in trials if trial.status != BAD_PATH]
     certified = [trial for trial in counted if trial.certified]
-    shares = [trial.worst_share for trial in certified]
-    return Group(
-        box=box,
-        limits=limits,
-        paths=len(counted),
-        bad_paths=len(trials) - len(counted),
-        solved=sum(trial.status == "SOLVED" for trial in counted),
-        unslowed=sum(trial.unslowed for trial in counted),
-        certified=len(certified),
-        worst_share=max(shares, default=float("nan")),
-        mean_lost=sum(trial.lost for trial in certified) / max(len(certified), 1),
-        lost=quantiles([trial.lost for trial in certified if not trial.unslowed]),
-        gap=quantiles([trial.gap for trial in certified]),
-        plan_seconds=quantiles([trial.plan_seconds for trial in counted]),
-    )
+    return {
+        "box": box,
+        "limits": limits,
+        "paths": len(counted),
+        "bad_paths": len(trials) - len(counted),
+        "solved": sum(trial.status == "SOLVED" for trial in counted),
+        "unslowed": sum(trial.unslowed for trial in counted),
+        "certified": len(certified),
+        "worst_share": max((trial.worst_share for trial in certified), default=float("nan")),
+        "mean_lost": sum(trial.lost for trial in certified) / max(len(certified), 1),
+        **quantile_values("lost", [trial.lost for trial in certified if not trial.unslowed]),
+        **quantile_values("gap", [trial.gap for trial in certified]),
+        **quantile_values("plan_seconds", [trial.plan_seconds for trial in counted]),
+    }

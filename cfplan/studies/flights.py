@@ -1,4 +1,4 @@
-"""Path files flown on the virtual Crazyflie in real time, each several times, and how far from the plan they came."""
+"""Fly path files on the virtual Crazyflie in real time, each several times, and measure how far off the plan."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -15,123 +15,88 @@ from cfplan.geometry.path_file import load_path_file
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.task import PlanningTask
 from cfplan.simulation.dry_run import dry_run
-from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.missions import PlannedMission, planned_mission
-from cfplan.studies.real_time import Conditions, Flight, fly_in_real_time
+from cfplan.studies.real_time import Conditions, RealTimeFlight, fly_in_real_time
+from cfplan.studies.result import Column, StudyResult, Table, detail_table
 
-PLANS = (
-    "path", "length", "planner", "planned", "over bound", "speed kept", "worst share", "dry run",
-    "dry run without drag",
+PLAN_COLUMNS = (
+    Column("path", "path"),
+    Column("length", "length", "m", ".1f"),
+    Column("planner", "planner"),
+    Column("planned", "planned", "s", ".2f"),
+    Column("lower_bound"),
+    Column("over_bound", "over bound", "%", ".1f", meaning="planned time over the proven lower bound"),
+    Column("speed_factor", "speed kept", "%", ".2f", meaning="by repair, of the planner's speed"),
+    Column("worst_share", "worst share", "%", ".2f", meaning="of any limit, by the certificate"),
+    Column("dry_run", "dry run", "cm", ".1f", meaning="largest deviation"),
+    Column(
+        "dry_run_without_drag", "dry run without drag", "cm", ".1f",
+        meaning="the same where the acceleration field does not make up for drag",
+    ),
 )  # fmt: skip
-FLIGHTS = (
-    "path", "landed", "deviation, mean", "max", "rms", "true, mean", "true, max", "time off plan", "settled, max",
-    "late p99", "late max", "refused",
+FLIGHT_COLUMNS = (
+    Column("path", "path"),
+    Column("flights"),
+    Column("landed", "landed", of="flights", meaning="at the end of the plan"),
+    Column(
+        "deviation_mean", "deviation, mean", "cm", ".1f",
+        meaning="of each flight's largest distance from the reference in time, by the poses of motion capture",
+    ),
+    Column("deviation_max", "deviation, max", "cm", ".1f", meaning="the largest of all flights"),
+    Column("deviation_rms", "rms", "cm", ".1f"),
+    Column("true_mean", "true, mean", "cm", ".1f", meaning="the same by the simulated truth"),
+    Column("true_max", "true, max", "cm", ".1f"),
+    Column("off_plan", "time off plan", "%", ".2f", meaning="first setpoint to last, against the plan; the worst"),
+    Column("settled", "settled, max", "s", ".2f", meaning="after the end of the path; *not*: landing began before"),
+    Column("late_p99", "late, p99", "ms", ".2f", meaning="of setpoints, the worst flight's"),
+    Column("late_max", "late, max", "ms", ".2f"),
+    Column("refusals", "refused", meaning="tries that preflight refused because this computer was late"),
 )  # fmt: skip
-FAILURES = ("path", "seed", "ended")
+FAILURE_COLUMNS = (Column("path", "path"), Column("seed", "seed"), Column("reason", "ended"))
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class RehearsedPlan:
     """One path as planned and rehearsed."""
 
     path: str
-    length: float
-    # m
+    length: float  # m
     planner: str
-    planned: float
-    # s
-    lower_bound: float
-    # s
+    planned: float  # s
+    lower_bound: float  # s
     speed_factor: float  # of repair, on the planner's speed; 1: not slowed
-    worst_share: float
-    # of a limit, by the certificate
-    dry_run: float
-    # m, deviation at most
-    dry_run_without_drag: float
-    # m, the same where the acceleration field does not carry what makes up for drag
+    worst_share: float  # of a limit, by the certificate
+    dry_run: float  # m, largest deviation
+    dry_run_without_drag: float  # m, the same where the acceleration field does not make up for drag
 
-    def texts(self) -> list[str]:
-        """As PLANS has it."""
-        return [
-            self.path, f"{self.length:.1f} m", self.planner, f"{self.planned:.2f} s",
-            f"{100 * (self.planned / self.lower_bound - 1):.1f} %", f"{100 * self.speed_factor:.2f} %",
-            f"{100 * self.worst_share:.2f} %", _cm(self.dry_run), _cm(self.dry_run_without_drag),
-        ]  # fmt: skip
+    def row(self) -> dict[str, Any]:
+        """Return it by the keys of PLAN_COLUMNS."""
+        return asdict(self) | {"over_bound": self.planned / self.lower_bound - 1}
 
 
 @dataclass(frozen=True, slots=True)
-class Flown:
+class JudgedFlight:
     """One flight, or why there was none."""
 
     path: str
     seed: int
-    landed: bool
-    # at the end of its plan
-    reason: str
-    # how it ended
-    refusals: int = 0
-    # tries before it that preflight refused because this computer was late
-    planned: float = 0.0
-    # s
-    streamed: float = 0.0
-    # s, from the first setpoint to that of the path's end, as sent
-    deviation_max: float = 0.0
-    # m, from the reference in time, by the poses of motion capture
-    deviation_rms: float = 0.0
-    # m
-    true_deviation_max: float = 0.0
-    # m, by the simulated truth
-    settled_after: float | None = None
-    # s; None where it did not settle
-    lateness_p99: float = 0.0
-    # s, of setpoints
-    lateness_max: float = 0.0
-    # s
+    landed: bool  # at the end of its plan
+    reason: str  # how it ended
+    refusals: int = 0  # tries before it that preflight refused because this computer was late
+    planned: float = 0.0  # s
+    streamed: float = 0.0  # s, from the first setpoint to that of the path's end, as sent
+    deviation_max: float = 0.0  # m, from the reference in time, by the poses of motion capture
+    deviation_rms: float = 0.0  # m
+    true_deviation_max: float = 0.0  # m, by the simulated truth
+    settled_after: float | None = None  # s; None where it did not settle
+    lateness_p99: float = 0.0  # s, of setpoints
+    lateness_max: float = 0.0  # s
     telemetry_dropped: int = 0
 
     @property
     def off_plan(self) -> float:
-        """By how much the time from the first setpoint to the last was another than planned, relative."""
+        """By how much the time from the first setpoint to the last differed from the plan, relative."""
         return abs(self.streamed / self.planned - 1)
-
-
-@dataclass(frozen=True, slots=True)
-class Flights:
-    """A whole run."""
-
-    command: str
-    machine: Machine
-    conditions: Conditions
-    # with the seed of the first flight of each path
-    motor_lag: float
-    # s
-    interrupted: bool
-    plans: tuple[Planned, ...]
-    flights: tuple[Flown, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self) | {"table": [dict(zip(FLIGHTS, row, strict=True)) for row in self._rows()]}
-
-    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
-        """Title, columns and rows: the plans, the flights by path and all together, and what failed."""
-        lab = self.conditions
-        title = (
-            f"Flights: deviation from the reference in time, {100 * lab.loss:g} % of radio packets lost, "
-            f"{1e3 * lab.pose_noise:g} mm of pose noise{' by Vicon' if lab.vicon else ''}, "
-            f"motor lag {self.motor_lag:g} s"
-        )
-        failed = [[f.path, str(f.seed), f.reason] for f in self.flights if not f.landed]
-        return [
-            ("Plans", list(PLANS), [plan.texts() for plan in self.plans]),
-            (title, list(FLIGHTS), self._rows()),
-            *([("Not landed", list(FAILURES), failed)] if failed else []),
-        ]
-
-    def _rows(self) -> list[list[str]]:
-        names = dict.fromkeys(flight.path for flight in self.flights)
-        rows = [_texts(name, [f for f in self.flights if f.path == name]) for name in names]
-        return [*rows, _texts("all", self.flights)]
 
 
 def fly_each(
@@ -140,18 +105,17 @@ def fly_each(
     *,
     repeats: int = 1,
     conditions: Conditions | None = None,
-    command: str = "",
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Flights:
-    """Fly each `repeats` times, with a seed for each. What fails is a row; an interrupt keeps what was flown.
+) -> StudyResult:
+    """Fly each path `repeats` times, with a seed for each. A failure is a row; an interrupt keeps what was flown.
 
     Raises InputError, before anything flies, where a file is no path.
     """
     for file in path_files:
         load_path_file(file)
     conditions = conditions or Conditions()
-    plans: list[Planned] = []
-    flights: list[Flown] = []
+    plans: list[RehearsedPlan] = []
+    flights: list[JudgedFlight] = []
     total, lag, interrupted = repeats * len(path_files), 0.0, False
     try:
         for index, file in enumerate(path_files):
@@ -160,7 +124,7 @@ def fly_each(
                 made = planned_mission(file, find_safety_file(file))
                 plans.append(_rehearsed(file.stem, made))
             except CfplanError as error:
-                flights.append(Flown(file.stem, conditions.seed, landed=False, reason=str(error)))
+                flights.append(JudgedFlight(file.stem, conditions.seed, landed=False, reason=str(error)))
                 continue
             lag = made.plan.airframe.motor_time_constant
             for number in range(repeats):
@@ -173,14 +137,34 @@ def fly_each(
         progress(total, total)
     except KeyboardInterrupt:
         interrupted = True
-    return Flights(command, this_machine(), conditions, lag, interrupted, tuple(plans), tuple(flights))
+    settings = {"repeats": repeats, "conditions": asdict(conditions), "motor_lag": lag}
+    tables = flight_tables(plans, flights, conditions, lag)
+    return StudyResult("flights", settings, tables, (detail_table("flights", flights),), interrupted)
 
 
-def _rehearsed(name: str, made: PlannedMission) -> Planned:
+def flight_tables(
+    plans: Sequence[RehearsedPlan], flights: Sequence[JudgedFlight], lab: Conditions, motor_lag: float
+) -> tuple[Table, ...]:
+    """Return the plans, the flights by path and all together, and those that failed where there are any."""
+    title = (
+        f"Flights: deviation from the reference in time, {100 * lab.loss:g} % of radio packets lost, "
+        f"{1e3 * lab.pose_noise:g} mm of pose noise{' by Vicon' if lab.vicon else ''}, motor lag {motor_lag:g} s"
+    )
+    paths = dict.fromkeys(flight.path for flight in flights)
+    rows = [*(_row(path, [f for f in flights if f.path == path]) for path in paths), _row("all", flights)]
+    failed = tuple(asdict(flight) for flight in flights if not flight.landed)
+    return (
+        Table("plans", "Plans", PLAN_COLUMNS, tuple(plan.row() for plan in plans)),
+        Table("flights-by-path", title, FLIGHT_COLUMNS, tuple(rows)),
+        *([Table("not-landed", "Not landed", FAILURE_COLUMNS, failed)] if failed else []),
+    )
+
+
+def _rehearsed(name: str, made: PlannedMission) -> RehearsedPlan:
     plan, encoded = made.plan, made.encoded
     rehearsal = dry_run(encoded, plan.trajectory, plan.airframe, plan.limits.flight)
     rehearsal.require_passed()
-    return Planned(
+    return RehearsedPlan(
         path=name,
         length=plan.path.length,
         planner=plan.planner,
@@ -194,20 +178,20 @@ def _rehearsed(name: str, made: PlannedMission) -> Planned:
 
 
 def _without_drag(made: PlannedMission) -> EncodedFlight:
-    """The same flight, but the acceleration is that of the motion alone."""
+    """Return the same flight with the acceleration of the motion alone."""
     states = made.plan.trajectory.at(made.encoded.times + made.encoded.lead)
-    told = replace(made.encoded.decoded, acceleration=states.acceleration)
-    return replace(made.encoded, payloads=encode(told), decoded=told)
+    setpoints = replace(made.encoded.decoded, acceleration=states.acceleration)
+    return replace(made.encoded, payloads=encode(setpoints), decoded=setpoints)
 
 
-def _judged(name: str, seed: int, made: PlannedMission, flight: Flight) -> Flown:
+def _judged(name: str, seed: int, made: PlannedMission, flight: RealTimeFlight) -> JudgedFlight:
     outcome, truth, trajectory = flight.outcome, flight.truth, made.plan.trajectory
     if not flight.landed or outcome is None or truth is None:
-        return Flown(name, seed, landed=False, reason=flight.reason, refusals=flight.refusals)
+        return JudgedFlight(name, seed, landed=False, reason=flight.reason, refusals=flight.refusals)
     elapsed = truth.time - outcome.first_setpoint
     moving = (elapsed >= 0) & (elapsed <= trajectory.duration)
     off = np.linalg.norm(truth.position[moving] - trajectory.at(elapsed[moving]).position, axis=1)
-    return Flown(
+    return JudgedFlight(
         path=name,
         seed=seed,
         landed=True,
@@ -225,23 +209,26 @@ def _judged(name: str, seed: int, made: PlannedMission, flight: Flight) -> Flown
     )
 
 
-def _texts(name: str, flights: Sequence[Flown]) -> list[str]:
-    """Of those of one path, or of all, as FLIGHTS has it."""
+def _row(path: str, flights: Sequence[JudgedFlight]) -> dict[str, Any]:
+    """Return the figures of one path's flights, or of all, by the keys of FLIGHT_COLUMNS."""
     landed = [flight for flight in flights if flight.landed]
-    refused = str(sum(flight.refusals for flight in flights))
+    counts = {
+        "path": path,
+        "flights": len(flights),
+        "landed": len(landed),
+        "refusals": sum(flight.refusals for flight in flights),
+    }
     if not landed:
-        return [name, f"0 of {len(flights)}", *["–"] * (len(FLIGHTS) - 3), refused]
-    worst, true = [f.deviation_max for f in landed], [f.true_deviation_max for f in landed]
-    settled = [f.settled_after for f in landed]
-    return [
-        name, f"{len(landed)} of {len(flights)}", _cm(np.mean(worst)), _cm(max(worst)),
-        _cm(np.sqrt(np.mean([f.deviation_rms**2 for f in landed]))), _cm(np.mean(true)), _cm(max(true)),
-        f"{100 * max(f.off_plan for f in landed):.2f} %",
-        "not" if None in settled else f"{max(s for s in settled if s is not None):.2f} s",
-        f"{1e3 * max(f.lateness_p99 for f in landed):.2f} ms", f"{1e3 * max(f.lateness_max for f in landed):.2f} ms",
-        refused,
-    ]  # fmt: skip
-
-
-def _cm(metres: float | np.floating) -> str:
-    return f"{100 * metres:.1f} cm"
+        return dict.fromkeys((column.key for column in FLIGHT_COLUMNS), np.nan) | counts
+    settled = [math.inf if f.settled_after is None else f.settled_after for f in landed]
+    return counts | {
+        "deviation_mean": np.mean([f.deviation_max for f in landed]),
+        "deviation_max": max(f.deviation_max for f in landed),
+        "deviation_rms": np.sqrt(np.mean([f.deviation_rms**2 for f in landed])),
+        "true_mean": np.mean([f.true_deviation_max for f in landed]),
+        "true_max": max(f.true_deviation_max for f in landed),
+        "off_plan": max(f.off_plan for f in landed),
+        "settled": max(settled) if math.isfinite(max(settled)) else "not",
+        "late_p99": max(f.lateness_p99 for f in landed),
+        "late_max": max(f.lateness_max for f in landed),
+    }

@@ -1,4 +1,4 @@
-"""How late setpoints are sent while everything else runs, and how late this computer wakes a process that only sleeps.
+"""Measure how late setpoints are sent while everything else runs, and how late this computer wakes a sleeper.
 
 Each flight is one of the real pilot in the virtual lab, with Vicon's protocol, a record and a live view, all on this
 computer. Before it and meanwhile, a process that only sleeps until deadlines shows what the computer itself adds.
@@ -25,85 +25,70 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.recording.header import RecordHeader
 from cfplan.recording.rerun.live import LiveView, live_blueprint
 from cfplan.recording.rerun.viewer import APPLICATION, free_port, lay_out, viewer_program
-from cfplan.studies.machine import Machine, this_machine
 from cfplan.studies.missions import planned_mission
 from cfplan.studies.real_time import Conditions, fly_in_real_time
+from cfplan.studies.result import Column, StudyResult, Table
 from cfplan.studies.sleeper import Sleeper
 
-COLUMNS = ("what", "priority", "for", "p50", "p99", "p99.9", "max", "above 1 ms", "left out", "stolen")
+COLUMNS = (
+    Column("what", "what"),
+    Column("priority", "priority"),
+    Column("seconds", "for", "s", ".0f"),
+    Column("p50", "p50", "ms", ".3f", meaning="late by, as p99, p99.9 and max"),
+    Column("p99", "p99", "ms", ".3f"),
+    Column("p999", "p99.9", "ms", ".3f"),
+    Column("max", "max", "ms", ".3f"),
+    Column("count"),
+    Column("above", "above 1 ms", of="count"),
+    Column("skipped", "left out", meaning="deadlines that passed altogether"),
+    Column(
+        "stolen", "stolen", "s", ".2f",
+        meaning="what the host of a virtual machine took from all its processors meanwhile",
+    ),
+    Column("remark", "remark"),
+    Column("reason"),
+    Column("refusals"),
+    Column("view_failure"),
+)  # fmt: skip
 FIRST, ORDINARY = "SCHED_FIFO", "ordinary"
-QUEUED = "stream, of that waiting for a processor"
-# behind what else runs on this computer, in each period of the stream, as its system counts it
+QUEUED = "stream, of that waiting for a processor"  # behind other programs, per period, as the system counts it
 _DROP_CAPABILITY, _NICE_CAPABILITY = 24, 23  # PR_CAPBSET_DROP, CAP_SYS_NICE
 _VIEWER_STARTS = 2.0  # s
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class WakeUps:
     """How late one kind of waking was."""
 
     what: str
     priority: str
-    reason: str
-    # why there is no measurement, or why it is short; "" where all went well
+    reason: str  # why there is no measurement, or why it is short; "" where all went well
     seconds: float = 0.0
-    p50: float = 0.0
-    # s, as all that follow
+    p50: float = 0.0  # s, as p99, p999 and max
     p99: float = 0.0
     p999: float = 0.0
     max: float = 0.0
     count: int = 0
-    above: int = 0
-    # by more than 1 ms
-    skipped: int = 0
-    # deadlines that passed altogether
-    stolen: float = 0.0
-    # s that the host took from this virtual machine meanwhile, over all its processors
-    refusals: int = 0
-    # tries before it that preflight refused for lateness
-    view_failure: str = ""
-    # why the live view ended early
+    above: int = 0  # by more than 1 ms
+    skipped: int = 0  # deadlines that passed altogether
+    stolen: float = 0.0  # s that the host took from this virtual machine meanwhile, over all its processors
+    refusals: int = 0  # tries before it that preflight refused for lateness
+    view_failure: str = ""  # why the live view ended early
 
     @staticmethod
-    def of(what: str, priority: str, late: Sequence[float], reason: str = "", **others: Any) -> "Measured":
-        """From s by which each was late."""
+    def of(what: str, priority: str, late: Sequence[float], reason: str = "", **others: Any) -> "WakeUps":
+        """Return the percentiles of the s by which each was late."""
         p50, p99, p999 = np.percentile(late, [50, 99, 99.9])
         above = int(np.sum(np.array(late) > 1e-3))
-        return Measured(
+        return WakeUps(
             what, priority, reason, len(late) / RATE, float(p50), float(p99), float(p999), float(np.max(late)),
             len(late), above, **others,
         )  # fmt: skip
 
-    def texts(self) -> list[str]:
-        """As COLUMNS has it."""
-        if not self.count:
-            return [self.what, self.priority, self.reason, *["–"] * (len(COLUMNS) - 3)]
-        return [
-            self.what, self.priority,
-            "; ".join([f"{self.seconds:.0f} s", *filter(None, (self.reason, self.view_failure))]),
-            *(f"{1e3 * value:.3f} ms" for value in (self.p50, self.p99, self.p999, self.max)),
-            f"{self.above} of {self.count}", str(self.skipped), f"{self.stolen:.2f} s",
-        ]  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class LatenessStudy:
-    """A whole run."""
-
-    command: str
-    machine: Machine
-    path: str
-    window: bool
-    # the live view had a screen; else the viewer ran without a window
-    rows: tuple[Measured, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
-
-    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
-        """Title, columns and rows of the one table."""
-        return [(f"Lateness at {RATE:.0f} Hz", list(COLUMNS), [row.texts() for row in self.rows])]
+    def row(self) -> dict[str, Any]:
+        """Return it by the keys of COLUMNS, with the fields that those are made of."""
+        row = asdict(self) | {"remark": "; ".join(filter(None, (self.reason, self.view_failure)))}
+        return row if self.count else row | dict.fromkeys(("seconds", "p50", "p99", "p999", "max", "above"), np.nan)
 
 
 def lateness_study(
@@ -111,29 +96,34 @@ def lateness_study(
     safety_file: Path,
     seconds: float,
     *,
-    command: str = "",
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> LatenessStudy:
-    """Measure both ways. Afterwards this process and those that it starts cannot go first any more."""
+) -> StudyResult:
+    """Measure with and without SCHED_FIFO. Afterwards this process and its children may not use it any more."""
     mission = _patient(planned_mission(path_file, safety_file, stream_for=seconds).mission)
-    rows: list[Measured] = []
+    rows: list[WakeUps] = []
     with contextlib.suppress(KeyboardInterrupt):
         for step, priority in enumerate((FIRST, ORDINARY)):
             if priority == ORDINARY:
                 give_up_priority()
             elif not may_use_fifo_scheduling():
-                rows.append(Measured("stream", priority, "not permitted here"))
+                rows.append(WakeUps("stream", priority, "not permitted here"))
                 continue
             progress(2 * step, 4)
             rows.append(_asleep(priority, seconds))
             progress(2 * step + 1, 4)
             rows += _streaming(priority, mission)
         progress(4, 4)
-    return LatenessStudy(command, this_machine(), path_file.stem, _has_screen(), tuple(rows))
+    settings = {"path": path_file.stem, "seconds": seconds, "window": _has_screen()}
+    return StudyResult("lateness", settings, (lateness_table(rows),))
+
+
+def lateness_table(measured: Sequence[WakeUps]) -> Table:
+    """Return one row for each kind of waking and each priority."""
+    return Table("lateness", f"Lateness at {RATE:.0f} Hz", COLUMNS, tuple(one.row() for one in measured))
 
 
 def give_up_priority() -> None:
-    """From here on the system refuses it to this process's children, and to this process what it was not given."""
+    """Give up the permission to use SCHED_FIFO, for this process and its children."""
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -143,34 +133,34 @@ def give_up_priority() -> None:
 
 
 def _patient(mission: Mission) -> Mission:
-    """The same, not refused or ended by that which is to be measured."""
+    """Return the same mission, not refused or ended by the lateness that is measured."""
     pose = replace(mission.limits.pose, age_warning=0.15, age_brake=0.5, age_land=1.5)
     return replace(mission, limits=replace(mission.limits, pose=pose, lateness=1.0))
 
 
-def _asleep(priority: str, seconds: float) -> Measured:
-    """Only a sleeper."""
+def _asleep(priority: str, seconds: float) -> WakeUps:
+    """Measure a sleeper alone."""
     stolen = _stolen()
     with Sleeper(RATE, first=priority == FIRST) as sleeper:
         time.sleep(seconds)
-        return Measured.of("asleep, nothing else", priority, sleeper.late(), stolen=_stolen() - stolen)
+        return WakeUps.of("asleep, nothing else", priority, sleeper.late(), stolen=_stolen() - stolen)
 
 
-def _streaming(priority: str, mission: Mission) -> list[Measured]:
-    """A flight, of it the stream; and a sleeper over the same seconds."""
+def _streaming(priority: str, mission: Mission) -> list[WakeUps]:
+    """Measure the stream of a flight, and a sleeper over the same seconds."""
     stolen = _stolen()
     with Sleeper(RATE, first=priority == FIRST) as sleeper:
         flight = fly_in_real_time(mission, Conditions(vicon=True), name="lateness", view=_view, on_stream=sleeper.watch)
         if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT:
             raise KeyboardInterrupt  # who ends the flight ends the study
         if not flight.sent or flight.outcome is None:
-            return [Measured("stream", priority, flight.reason, refusals=flight.refusals)]
+            return [WakeUps("stream", priority, flight.reason, refusals=flight.refusals)]
         begin, end = flight.sent[0].due, flight.sent[-1].due
         queued, asleep = sleeper.queued(begin, end), sleeper.late(begin, end)
     late = [message.time - message.due for message in flight.sent]
     reason, stolen = "" if flight.landed else flight.reason, _stolen() - stolen
     return [
-        Measured.of(
+        WakeUps.of(
             "stream",
             priority,
             late,
@@ -180,14 +170,14 @@ def _streaming(priority: str, mission: Mission) -> list[Measured]:
             refusals=flight.refusals,
             view_failure=flight.view_failure,
         ),
-        *([Measured.of(QUEUED, priority, queued, stolen=stolen)] if queued else []),
-        Measured.of("asleep meanwhile", priority, asleep, stolen=stolen),
+        *([WakeUps.of(QUEUED, priority, queued, stolen=stolen)] if queued else []),
+        WakeUps.of("asleep meanwhile", priority, asleep, stolen=stolen),
     ]
 
 
 @contextlib.contextmanager
 def _view(header: RecordHeader) -> Iterator[LiveView]:
-    """The live view with a viewer of its own that ends with it; without a screen, one without a window."""
+    """Open the live view with its own viewer, which ends with it; without a screen, one without a window."""
     port = free_port()
     with tempfile.TemporaryDirectory(prefix="cfplan-") as folder:
         command = [
@@ -221,7 +211,7 @@ def _has_screen() -> bool:
 
 
 def _stolen() -> float:
-    """s so far in which the host of this virtual machine ran something else; 0 where the system does not tell."""
+    """Return s so far in which the host of this virtual machine ran something else; 0 where the system does not say."""
     try:
         fields = Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()
         return int(fields[8]) / os.sysconf("SC_CLK_TCK")

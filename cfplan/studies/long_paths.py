@@ -1,11 +1,11 @@
-"""What the learned planner needs for paths of any length: time, memory, and flight time against the expert's.
+"""Measure what the learned planner needs for paths of any length: time, memory, flight time against the expert's.
 
 Times are the processor's: planning is one thread, and a ratio of its times holds while others use the machine too.
 """
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path as File
 from typing import Any
 
@@ -20,92 +20,72 @@ from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import default_nodes
 from cfplan.planning.repair import Repaired, repair
 from cfplan.safety.limit_sets import LimitSet
-from cfplan.studies.machine import Machine, this_machine
+from cfplan.studies.result import Column, StudyResult, Table, detail_table
 from cfplan.studies.scaling import path_of_length
 from cfplan.studies.trials import find_box, find_limit_set
 from cfplan.vehicle.trajectory import Trajectory
 
-LENGTHS = (20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
-# m
+LENGTHS = (20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)  # m
 GOAL_RATIO, GOAL_MEGABYTES, GOAL_EXCESS = 60.0, 50.0, 0.01
-# at 1 km: over the time of the first, memory, and flight time over the expert's
+"""At 1 km: over the time of the first length, memory, and flight time over the expert's."""
 COLUMNS = (
-    "length", "nodes", "certified", "network", "certificate", "bytes", "in all", "against the first", "worst share",
-    "flight", "against expert", "memory kept", "at the peak",
-)  # fmt: skip
+    Column("length", "length", "m", ".0f", meaning="mean of the paths"),
+    Column("nodes", "nodes", "", ".0f"),
+    Column("paths"),
+    Column("certified", "certified", of="paths", meaning="as planned or refined, not slowed as a whole"),
+    Column("plan_seconds", "network", "ms", ".1f", meaning="median over the paths, processor time"),
+    Column("repair_seconds", "certificate", "ms", ".1f", meaning="repair and certificate"),
+    Column("encode_seconds", "bytes", "ms", ".1f", meaning="encoded and certified"),
+    Column("seconds", "in all", "ms", ".1f"),
+    Column("against_first", "against the first", "×", ".1f"),
+    Column("worst_share", "worst share", "", ".3f", meaning="of a limit, by the certificate, anywhere along the path"),
+    Column("flight", "flight", "s", ".2f", meaning="mean"),
+    Column("excess", "against expert", "%", "+.2f", meaning="the largest; the expert solves on the whole path"),
+    Column("kept", "memory kept", "MB", ".1f", meaning="how much it had grown with the result still held, at most"),
+    Column("peak", "memory at the peak", "MB", ".1f"),
+)
 
 
 @dataclass(frozen=True, slots=True)
-class Walk:
-    """One path. NaN where there was nothing to measure."""
+class LongPlan:
+    """One path, planned. NaN where there was nothing to measure."""
 
     seed: int
-    length: float
-    # m
+    length: float  # m
     nodes: int
-    reason: str
-    # why there are no bytes to send, empty where there are
-    speed_factor: float  # on the whole; 1: not slowed
-    worst_share: float
-    # of a limit, by the certificate, anywhere along the path
-    seconds: tuple[float, float, float]
-    # of the processor, to plan, to repair and certify, to encode and certify the bytes; the quickest of the repeats
-    flight: float
-    # s
-    expert_flight: float
-    # s, solved on the whole path
-    kept: float
-    # MB by which memory had grown when the first of the repeats was done, its result still held
-    peak: float
-    # MB by which it had at most
+    reason: str = ""  # why there are no bytes to send, empty where there are
+    speed_factor: float = np.nan  # on the whole; 1: not slowed
+    worst_share: float = np.nan  # of a limit, by the certificate, anywhere along the path
+    seconds: tuple[float, float, float] = (np.nan,) * 3
+    """Processor time to plan, to repair and certify, to encode and certify the bytes; the shortest of the repeats."""
+    flight: float = np.nan  # s
+    expert_flight: float = np.nan  # s, solved on the whole path
+    kept: float = np.nan  # MB by which memory had grown after the first of the repeats, its result still held
+    peak: float = np.nan  # MB by which it had grown at most
 
     @property
     def certified(self) -> bool:
-        """As planned and refined: not slowed as a whole."""
+        """Whether it is certified as planned or refined: not slowed as a whole."""
         return not self.reason and self.speed_factor == 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class LongPaths:
-    """A whole run."""
-
-    command: str
-    machine: Machine
-    box: str
-    limits: str
-    interrupted: bool
-    walks: tuple[tuple[Walk, ...], ...]
-    # of each length
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: the table and each path."""
-        document = {name: value for name, value in asdict(self).items() if name != "walks"}
-        walks = [asdict(walk) for group in self.walks for walk in group]
-        return document | {"table": [dict(zip(COLUMNS, row, strict=True)) for row in self._rows()], "walks": walks}
-
-    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
-        """Title, columns and rows of the one table."""
-        goal = f"{GOAL_RATIO:g}× the first at 1 km, {GOAL_EXCESS:+.0%}, {GOAL_MEGABYTES:g} MB"
-        title = f"the learned planner on long paths, box {self.box} m, {self.limits} limits; at most: {goal}"
-        return [(title, list(COLUMNS), self._rows())]
-
-    def _rows(self) -> list[list[str]]:
-        return [_texts(group, self.walks[0]) for group in self.walks]
-
-
-def _texts(walks: Sequence[Walk], first: Sequence[Walk]) -> list[str]:
-    seconds = np.median([walk.seconds for walk in walks], axis=0)
-    ratio = seconds.sum() / np.median([walk.seconds for walk in first], axis=0).sum()
-    excess = max(walk.flight / walk.expert_flight - 1.0 for walk in walks)
-    flight = np.mean([walk.flight for walk in walks])
-    return [
-        f"{np.mean([walk.length for walk in walks]):.0f} m", f"{np.mean([walk.nodes for walk in walks]):.0f}",
-        f"{sum(walk.certified for walk in walks)}/{len(walks)}",
-        *(f"{1e3 * part:.1f} ms" for part in (*seconds, seconds.sum())), f"{ratio:.1f}×",
-        f"{max(walk.worst_share for walk in walks):.3f}", f"{flight:.2f} s",
-        f"{100 * excess:+.2f} %" if np.isfinite(excess) else "–",
-        *(f"{max(values):.1f} MB" for values in ([w.kept for w in walks], [w.peak for w in walks])),
-    ]  # fmt: skip
+def _row(plans: Sequence[LongPlan], first: Sequence[LongPlan]) -> dict[str, Any]:
+    """Return the figures of one length, by the keys of COLUMNS."""
+    seconds = np.median([plan.seconds for plan in plans], axis=0)
+    return {
+        "length": np.mean([plan.length for plan in plans]),
+        "nodes": np.mean([plan.nodes for plan in plans]),
+        "paths": len(plans),
+        "certified": sum(plan.certified for plan in plans),
+        **dict(zip(("plan_seconds", "repair_seconds", "encode_seconds"), seconds, strict=True)),
+        "seconds": seconds.sum(),
+        "against_first": seconds.sum() / np.median([plan.seconds for plan in first], axis=0).sum(),
+        "worst_share": max(plan.worst_share for plan in plans),
+        "flight": np.mean([plan.flight for plan in plans]),
+        "excess": max(plan.flight / plan.expert_flight - 1.0 for plan in plans),
+        "kept": max(plan.kept for plan in plans),
+        "peak": max(plan.peak for plan in plans),
+    }
 
 
 def long_paths(
@@ -116,43 +96,49 @@ def long_paths(
     box: str = "10x10x10",
     limits: str = "hardware",
     first_seed: int = 20_000,
-    command: str = "",
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> LongPaths:
-    """`paths` random paths of each length, each planned `repeats` times. An interrupt keeps the lengths done by then.
+) -> StudyResult:
+    """Plan `paths` random paths of each length, each `repeats` times. An interrupt keeps the lengths done by then.
 
     Raises:
         InputError: an unknown box or limit set, no path or length at all, or no model for the limit set.
     """
     if paths < 1 or repeats < 1 or not lengths or not min(lengths) > 0 or not np.isfinite(max(lengths)):
-        raise InputError("long paths need a length above 0 m, one path of it and one repeat at least", where="lengths")
+        raise InputError("lengths must be above 0 m, paths and repeats at least 1", where="lengths")
     find_box(box)
     chosen, seeds = find_limit_set(limits), range(first_seed, first_seed + paths)
     total, made, interrupted = len(lengths) * paths * repeats, 0, False
-    done: list[list[Walk]] = []
+    done: list[list[LongPlan]] = []
     try:
         _planned(path_of_length(lengths[0], box, first_seed), chosen)  # loads and compiles
         for length in lengths:
-            walks = []
+            plans = []
             for seed in seeds:
-                walks.append(_walk(path_of_length(length, box, seed), seed, chosen))
+                plans.append(_measure(path_of_length(length, box, seed), seed, chosen))
                 progress(made := made + 1, total)
-            done.append(walks)
+            done.append(plans)
         for _ in range(repeats - 1):  # by turns, so that a computer that changes its pace does so for all lengths
-            for length, walks in zip(lengths, done, strict=True):
+            for length, plans in zip(lengths, done, strict=True):
                 for k, seed in enumerate(seeds):
-                    walks[k] = _repeated(walks[k], path_of_length(length, box, seed), chosen)
+                    plans[k] = _repeated(plans[k], path_of_length(length, box, seed), chosen)
                     progress(made := made + 1, total)
     except KeyboardInterrupt:
         interrupted = True
-    return LongPaths(command, this_machine(), box, limits, interrupted, tuple(tuple(walks) for walks in done))
+    settings = {"box": box, "limits": limits, "first_seed": first_seed, "paths": paths, "repeats": repeats}
+    detail = detail_table("plans", [plan for plans in done for plan in plans])
+    return StudyResult("long", settings, (lengths_table(done, box, limits),), (detail,), interrupted)
 
 
-def _walk(path: Path, seed: int, chosen: LimitSet) -> Walk:
+def lengths_table(done: Sequence[Sequence[LongPlan]], box: str, limits: str) -> Table:
+    """Return the figures of each length."""
+    goal = f"{GOAL_RATIO:g}× the first at 1 km, {GOAL_EXCESS:+.0%}, {GOAL_MEGABYTES:g} MB"
+    title = f"The learned planner on long paths, box {box} m, {limits} limits; at most: {goal}"
+    return Table("lengths", title, COLUMNS, tuple(_row(plans, done[0]) for plans in done))
+
+
+def _measure(path: Path, seed: int, chosen: LimitSet) -> LongPlan:
     nodes = default_nodes(path, "learned")
-    values: dict[str, Any] = {"seed": seed, "length": path.length, "nodes": nodes, "reason": "", "speed_factor": np.nan}
-    values |= dict.fromkeys(("worst_share", "flight", "expert_flight", "kept", "peak"), np.nan)
-    values["seconds"] = (np.nan,) * 3
+    values: dict[str, Any] = {"seed": seed, "length": path.length, "nodes": nodes}
     try:
         path.check()
         _forget_peak()
@@ -168,16 +154,16 @@ def _walk(path: Path, seed: int, chosen: LimitSet) -> Walk:
         raise
     except CfplanError as error:
         values["reason"] = str(error)
-    return Walk(**values)
+    return LongPlan(**values)
 
 
-def _repeated(walk: Walk, path: Path, chosen: LimitSet) -> Walk:
-    """With the shorter of its time and that of planning again."""
-    return walk if walk.reason else replace(walk, seconds=min(walk.seconds, _planned(path, chosen)[1], key=sum))
+def _repeated(plan: LongPlan, path: Path, chosen: LimitSet) -> LongPlan:
+    """Return it with the shorter of its time and that of planning again."""
+    return plan if plan.reason else replace(plan, seconds=min(plan.seconds, _planned(path, chosen)[1], key=sum))
 
 
 def _planned(path: Path, chosen: LimitSet) -> tuple[Repaired, tuple[float, float, float]]:
-    """From the path to certified bytes, and the seconds of each part."""
+    """Plan from the path to certified bytes; return the plan and the seconds of each part."""
     begun = time.process_time()
     task = PlanningTask(path, chosen.airframe, chosen.limits, default_nodes(path, "learned"))
     solution = plan_learned(task)
@@ -191,7 +177,7 @@ def _planned(path: Path, chosen: LimitSet) -> tuple[Repaired, tuple[float, float
 
 
 def _memory(name: str) -> float:
-    """MB of this process as Linux counts them; NaN elsewhere."""
+    """Return the MB of this process as Linux counts them; NaN elsewhere."""
     try:
         status = File("/proc/self/status").read_text()
     except OSError:
@@ -200,7 +186,7 @@ def _memory(name: str) -> float:
 
 
 def _forget_peak() -> None:
-    """So that VmHWM tells of what comes."""
+    """Begin VmHWM anew."""
     try:
         File("/proc/self/clear_refs").write_text("5")
     except OSError:

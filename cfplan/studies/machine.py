@@ -1,4 +1,4 @@
-"""What a measurement was made on, and the one thread that it may use. Imports nothing heavy: call one_thread first."""
+"""Describe the machine that measures, and keep it to one thread. Imports nothing heavy: call one_thread first."""
 
 import os
 import platform
@@ -16,24 +16,22 @@ PACKAGES = ("casadi", "copp-py", "numba", "numpy", "scipy", "torch")
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Enough to know what a time means."""
+    """Enough to judge a time by."""
 
     processor: str
-    cores: int
-    # those that this process may use
+    cores: int  # that this process may use
     system: str
     python: str
     cfplan: str
     packages: dict[str, str]
-    threads: dict[str, str]
-    # the environment's word on threads, "" where unset
+    threads: dict[str, str]  # the environment variables of THREADS, "" where unset
 
 
 def one_thread() -> None:
     """Ask numerical libraries for one thread each.
 
     Raises:
-        InputError: one of them is loaded already with another number, and would not listen any more.
+        InputError: one of them is loaded already with another number.
     """
     late = "numpy" in sys.modules and any(os.environ.get(name) != "1" for name in THREADS[:2])
     if late:
@@ -43,7 +41,7 @@ def one_thread() -> None:
 
 
 def this_machine() -> Machine:
-    """The one that runs this."""
+    """Return the one that runs this."""
     packages = {}
     for name in PACKAGES:
         try:

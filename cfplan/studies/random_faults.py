@@ -1,12 +1,12 @@
-"""Faults by chance: kind, moment, length and size drawn by a seed, each flown in the stepped lab. None may leave.
+"""Fly with random faults in the stepped lab: kind, moment, length and size are drawn by a seed. None may leave.
 
-A pilot that is dead is not among them: what the vehicle then does, it does by its own time-outs.
+A dead pilot is not among the faults: the vehicle then acts by its own time-outs.
 """
 
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.studies.fault_scenarios import Scenario
 from cfplan.studies.faults import FaultFlight, fly_stepped, judge
-from cfplan.studies.machine import Machine, this_machine
+from cfplan.studies.result import Column, StudyResult, Table, detail_table
 
 _LENGTH, _SPREAD = 0.5, 1.2  # s and its logarithm's deviation: a twentieth of a second to some seconds
 _WHILE_FLYING = (Phase.TAKE_OFF, Phase.GO_TO_START, Phase.STREAM, Phase.STREAM, Phase.STREAM, Phase.HOLD, Phase.LAND)
@@ -53,47 +53,18 @@ _KINDS: tuple[tuple[Any, float, float], ...] = (
 _LONGEST_STALL = 1.9  # s; what stands still for longer is as good as dead: the vehicle stops its motors after 2 s
 
 
-@dataclass(frozen=True, slots=True)
-class RandomFlights:
-    """A whole run."""
-
-    command: str
-    machine: Machine
-    first_seed: int
-    flights: tuple[tuple[str, FaultFlight], ...]
-    # with the path of each
-
-    @property
-    def outside(self) -> list[str]:
-        """The names of those that left the walls."""
-        return [flight.name for _, flight in self.flights if flight.to_wall < 0]
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
-
-    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
-        """Rungs and distances by kind of fault."""
-        rows = []
-        for kind in dict.fromkeys(flight.name.split(" ", 1)[0] for _, flight in self.flights):
-            of_kind = [flight for _, flight in self.flights if flight.name.split(" ", 1)[0] == kind]
-            rungs = Counter(flight.rung for flight in of_kind)
-            rows.append(
-                [
-                    kind,
-                    str(len(of_kind)),
-                    ", ".join(f"{count} {rung}" for rung, count in rungs.items()),
-                    f"{100 * max(flight.off_plan for flight in of_kind):.0f} cm",
-                    f"{min(flight.to_wall for flight in of_kind):.2f} m",
-                    str(sum(not (flight.landed and flight.disarmed) for flight in of_kind)),
-                ]
-            )
-        title = f"{len(self.flights)} random faults, {len(self.outside)} outside the walls"
-        return [(title, ["fault", "flights", "rungs", "off the plan", "to the wall", "not landed"], rows)]
+COLUMNS = (
+    Column("kind", "fault"),
+    Column("flights", "flights"),
+    Column("rungs", "rungs", meaning="of the abort ladder"),
+    Column("off_plan", "off the path", "cm", ".0f", meaning="the largest of all flights"),
+    Column("to_wall", "to the wall", "m", ".2f", meaning="the least of all flights"),
+    Column("not_landed", "not landed"),
+)
 
 
 def random_scenario(seed: int, duration: float) -> Scenario:
-    """What goes wrong in flight number `seed`, along a path of `duration` s."""
+    """Draw the fault of flight number `seed`, along a path of `duration` s."""
     chance = np.random.default_rng(seed)
     kind, least, most = _KINDS[chance.integers(len(_KINDS))]
     phase = _WHILE_FLYING[chance.integers(len(_WHILE_FLYING))]
@@ -123,7 +94,7 @@ def random_scenario(seed: int, duration: float) -> Scenario:
 
 
 def fly_random(seed: int, missions: Mapping[str, Mission]) -> tuple[str, FaultFlight]:
-    """Flight number `seed`, along one of the paths; which, and what came of it."""
+    """Fly flight number `seed` along one of the paths; return that path's name and the flight."""
     names = sorted(missions)
     name = names[seed % len(names)]
     scenario = random_scenario(seed, missions[name].duration)
@@ -134,10 +105,9 @@ def random_flights(
     missions: Mapping[str, Mission],
     *,
     seeds: Sequence[int],
-    command: str = "",
     jobs: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> RandomFlights:
+) -> StudyResult:
     """Fly a fault for each seed, on `jobs` processes."""
     from joblib import Parallel, delayed
 
@@ -146,4 +116,30 @@ def random_flights(
     for done, flight in enumerate(work):
         progress(done + 1, len(seeds))
         flown.append(flight)
-    return RandomFlights(command, this_machine(), seeds[0] if seeds else 0, tuple(flown))
+    detail = detail_table("flights", [{"path": path} | asdict(flight) for path, flight in flown])
+    settings = {"paths": sorted(missions), "first_seed": seeds[0] if seeds else 0, "flights": len(seeds)}
+    return StudyResult("random-faults", settings, (kinds_table([flight for _, flight in flown]),), (detail,))
+
+
+def kinds_table(flights: Sequence[FaultFlight]) -> Table:
+    """Return rungs and distances by kind of fault."""
+    rows = []
+    for kind in dict.fromkeys(_kind(flight) for flight in flights):
+        of_kind = [flight for flight in flights if _kind(flight) == kind]
+        rungs = Counter(flight.rung for flight in of_kind)
+        rows.append(
+            {
+                "kind": kind,
+                "flights": len(of_kind),
+                "rungs": ", ".join(f"{count} {rung}" for rung, count in rungs.items()),
+                "off_plan": max(flight.off_plan for flight in of_kind),
+                "to_wall": min(flight.to_wall for flight in of_kind),
+                "not_landed": sum(not (flight.landed and flight.disarmed) for flight in of_kind),
+            }
+        )
+    outside = sum(flight.to_wall < 0 for flight in flights)
+    return Table("kinds", f"{len(flights)} random faults, {outside} outside the walls", COLUMNS, tuple(rows))
+
+
+def _kind(flight: FaultFlight) -> str:
+    return flight.name.split(" ", 1)[0]

@@ -1,4 +1,4 @@
-"""A mission flown in real time on the virtual Crazyflie: the pilot's process, cflib, packets, poses and a record."""
+"""Fly a mission in real time on the virtual Crazyflie: the pilot's process, cflib, packets, poses and a record."""
 
 import multiprocessing
 import tempfile
@@ -35,14 +35,10 @@ _MOST_NOISE = 1.0  # m
 class Conditions:
     """What the lab is like."""
 
-    loss: float = 0.0
-    # share of the radio's transmissions
-    pose_noise: float = 0.001
-    # m, standard deviation of each axis
-    vicon: bool = False
-    # poses by Vicon's protocol, through its client in a process of its own; else straight from the room
-    seed: int = 0
-    # of all noise
+    loss: float = 0.0  # share of the radio's transmissions
+    pose_noise: float = 0.001  # m, standard deviation of each axis
+    vicon: bool = False  # poses by Vicon's protocol, through its client in its own process; else straight from the room
+    seed: int = 0  # of all noise
 
     def __post_init__(self) -> None:
         if not (0 <= self.loss < 1 and 0 <= self.pose_noise < _MOST_NOISE):
@@ -53,20 +49,15 @@ class Conditions:
 
 
 @dataclass(slots=True)
-class Flight:
-    """What a flight left behind."""
+class RealTimeFlight:
+    """What a flight in real time left behind."""
 
-    outcome: FlightOutcome | None
-    # None where the vehicle or its poses could not be had
-    reason: str
-    # how it ended, one line
-    refusals: int = 0
-    # tries before it that preflight refused for this computer's lateness alone
-    sent: list[SetpointSent] = field(default_factory=list)
-    # the plan's setpoints
+    outcome: FlightOutcome | None  # None where there was no vehicle, or there were no poses
+    reason: str  # how it ended, one line
+    refusals: int = 0  # tries before it that preflight refused only because this computer was late
+    sent: list[SetpointSent] = field(default_factory=list)  # the plan's setpoints
     truth: Truth | None = None
-    view_failure: str = ""
-    # why the live view ended early
+    view_failure: str = ""  # why the live view ended early
 
     @property
     def landed(self) -> bool:
@@ -74,7 +65,7 @@ class Flight:
         return self.outcome is not None and self.outcome.exit_code is ExitCode.OK
 
     def time_to(self, index: int) -> float:
-        """s, from the first setpoint sent to the first of this number or a later one; 0 where there was none."""
+        """Return s from the first setpoint sent to the first of this number or a later one; 0 where there was none."""
         ended = (message.time for message in self.sent if message.index >= index)
         return next(ended, self.sent[0].time) - self.sent[0].time if self.sent else 0.0
 
@@ -89,8 +80,8 @@ def fly_in_real_time(
     name: str,
     view: View | None = None,
     on_stream: Callable[[int], None] = lambda _: None,
-) -> Flight:
-    """Fly it; again where preflight refused for lateness alone. What goes wrong is told, not raised.
+) -> RealTimeFlight:
+    """Fly it; again where preflight refused for lateness alone. A failure is in the result's reason, not raised.
 
     `on_stream` is called with the number of the pilot's process when the stream begins.
     """
@@ -111,8 +102,8 @@ def _refused_for_lateness(outcome: FlightOutcome | None) -> bool:
 
 def _fly_once(
     mission: Mission, conditions: Conditions, name: str, view: View | None, on_stream: Callable[[int], None]
-) -> Flight:
-    flight = Flight(None, "")
+) -> RealTimeFlight:
+    flight = RealTimeFlight(None, "")
     header, phase = _header(mission, name), Phase.CLOSED
 
     def hear(message: Telemetry) -> None:
@@ -150,7 +141,7 @@ def _fly_once(
 
 
 def _pilot() -> int:
-    """The number of the pilot's process."""
+    """Return the number of the pilot's process."""
     pilots = (child.pid for child in multiprocessing.active_children() if child.name == "pilot")
     return next(pilots, 0) or 0
 

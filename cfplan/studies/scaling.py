@@ -1,9 +1,8 @@
-"""What a planner costs as paths and grids grow together, at the same number of grid intervals a metre."""
+"""Measure what a planner costs as paths and grids grow together, at the same number of grid intervals a metre."""
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,68 +11,34 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.task import Planner, PlanningTask
+from cfplan.planners.task import PlanningTask
 from cfplan.planning.planners import find_planner
-from cfplan.studies.machine import Machine, this_machine
-from cfplan.studies.trials import find_box, find_limit_set, quantiles
+from cfplan.studies.result import Column, StudyResult, Table, collect, quantile_columns
+from cfplan.studies.trials import find_box, find_limit_set, quantile_values, quantiles
 
 SIZES = (100, 200, 500, 1000, 2000, 3000)
 NODES_PER_METRE = 5  # as 100 intervals on a path of 20 m, the paper's mean length
 LENGTH_ERROR = 0.05
 _ATTEMPTS = 1000
-COLUMNS = ("intervals", "length", "solved", "solve median", "per interval", "against the first", "per iteration")
+COLUMNS = (
+    Column("nodes", "intervals"),
+    Column("length", "length", "m", ".0f", meaning="mean of the paths"),
+    Column("repeats"),
+    Column("solved", "solved", of="repeats"),
+    Column("first_seconds", meaning="of the first call at this size, with all that is built for it"),
+    *quantile_columns("plan_seconds", "plan", "ms", ".1f", shown=("median",), meaning="the planner's call"),
+    Column("per_node", "per interval", "µs", ".1f", meaning="median"),
+    Column("against_first", "against the first", "×", ".2f", meaning="time per interval"),
+    Column("per_node_iteration", "per interval and iteration", "µs", ".2f", meaning="median"),
+)
 
 
-@dataclass(frozen=True, slots=True)
-class Size:
-    """All repeats at one number of intervals."""
+class Solve(NamedTuple):
+    """One call of the planner."""
 
-    nodes: int
-    length: float
-    # m, mean
-    repeats: int
-    solved: int
-    first_seconds: float
-    # of the first call at this size, with whatever is built for it
-    plan_seconds: tuple[float, float, float]
-    # median, p90, p99
-    per_node: float
-    # s, median
-    per_node_iteration: float
-    # s, median; NaN where the planner counts no iterations
-    against_first: float
-    # per node, over that of the first size
-
-    def texts(self) -> list[str]:
-        """As COLUMNS has it."""
-        return [
-            f"{self.nodes}", f"{self.length:.0f} m", f"{self.solved}/{self.repeats}",
-            f"{1e3 * self.plan_seconds[0]:.1f} ms", f"{1e6 * self.per_node:.1f} µs", f"{self.against_first:.2f}×",
-            f"{1e6 * self.per_node_iteration:.2f} µs",
-        ]  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Scaling:
-    """A whole run."""
-
-    command: str
-    machine: Machine
-    planner: str
-    box: str
-    limits: str
-    yaw: str
-    interrupted: bool
-    sizes: tuple[Size, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
-
-    def tables(self) -> list[tuple[str, list[str], list[list[str]]]]:
-        """Title, columns and rows of the one table."""
-        title = f"{self.planner}, box {self.box} m, {self.limits} limits, yaw {self.yaw}: cost as the grid grows"
-        return [(title, list(COLUMNS), [size.texts() for size in self.sizes])]
+    seconds: float
+    iterations: int  # 0 where the planner counts none
+    solved: bool
 
 
 def scaling(
@@ -85,43 +50,44 @@ def scaling(
     limits: str = "hardware",
     yaw: YawMode = YawMode.FREE,
     first_seed: int = 20_000,
-    command: str = "",
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Scaling:
+) -> StudyResult:
     """Solve `repeats` random paths at each size. An interrupt ends it with the sizes done by then.
 
     Raises:
         InputError: an unknown planner, box or limit set, no repeats, or a size below 10.
     """
     if repeats < 1 or not sizes or min(sizes) < 10:
-        raise InputError("scaling needs one repeat and sizes of ten intervals at least", where="sizes")
+        raise InputError("repeats must be at least 1, and sizes at least 10 intervals", where="sizes")
     find_box(box)
     chosen, found = find_limit_set(limits), find_planner(planner)
-    done: list[Size] = []
-    interrupted = False
-    try:
+
+    def solve(path: Path, nodes: int) -> Solve:
+        begun = time.perf_counter()
+        solution = found(PlanningTask(path, chosen.airframe, chosen.limits, nodes, yaw))
+        seconds = time.perf_counter() - begun
+        return Solve(seconds, int(solution.stats.get("iterations", 0)), solution.profile is not None)
+
+    def measure() -> Iterator[dict[str, Any]]:
+        per_node = None
         for number, nodes in enumerate(sizes):
             paths = [path_of_length(nodes / NODES_PER_METRE, box, first_seed + repeat) for repeat in range(repeats)]
-
-            def solve(planner: Planner, path: Path, nodes: int = nodes) -> tuple[float, int, bool]:
-                begun = time.perf_counter()
-                solution = planner(PlanningTask(path, chosen.airframe, chosen.limits, nodes, yaw))
-                seconds = time.perf_counter() - begun
-                return seconds, int(solution.stats.get("iterations", 0)), solution.profile is not None
-
-            first = solve(found, paths[0])[0]
-            runs = []
+            first, solves = solve(paths[0], nodes), []
             for repeat, path in enumerate(paths):
-                runs.append(solve(found, path))
+                solves.append(solve(path, nodes))
                 progress(number * repeats + repeat + 1, len(sizes) * repeats)
-            done.append(_size(nodes, paths, first, runs, done))
-    except KeyboardInterrupt:
-        interrupted = True
-    return Scaling(command, this_machine(), planner, box, limits, yaw.value, interrupted, tuple(done))
+            row = _row(nodes, paths, first, solves)
+            per_node = per_node or row["per_node"]
+            yield row | {"against_first": row["per_node"] / per_node}
+
+    rows, interrupted = collect(measure())
+    title = f"{planner}, box {box} m, {limits} limits, yaw {yaw.value}: cost as the grid grows"
+    settings = {"planner": planner, "box": box, "limits": limits, "yaw": yaw.value, "first_seed": first_seed}
+    return StudyResult("scaling", settings, (Table("sizes", title, COLUMNS, tuple(rows)),), interrupted=interrupted)
 
 
 def path_of_length(length: float, box: str, seed: int) -> Path:
-    """A min-snap path through random waypoints in the box, of that length, m, to within LENGTH_ERROR."""
+    """Return a min-snap path through random waypoints in the box, of that length, m, to within LENGTH_ERROR."""
     size = np.array(find_box(box))
     corners = np.stack([np.zeros(3), size])
     most = 3 + int(np.ceil(length / (0.3 * size.max())))
@@ -138,17 +104,17 @@ def path_of_length(length: float, box: str, seed: int) -> Path:
     raise InputError(f"no random path of {length:g} m was found in the box {box}", where="length")
 
 
-def _size(nodes: int, paths: list[Path], first: float, runs: list[tuple[float, int, bool]], before: list[Size]) -> Size:
-    seconds = quantiles([run[0] for run in runs])
-    per_node = seconds[0] / nodes
-    return Size(
-        nodes=nodes,
-        length=float(np.mean([path.length for path in paths])),
-        repeats=len(runs),
-        solved=sum(run[2] for run in runs),
-        first_seconds=first,
-        plan_seconds=seconds,
-        per_node=per_node,
-        per_node_iteration=quantiles([run[0] / nodes / run[1] for run in runs if run[1]])[0],
-        against_first=per_node / before[0].per_node if before else 1.0,
-    )
+def _row(nodes: int, paths: Sequence[Path], first: Solve, solves: Sequence[Solve]) -> dict[str, Any]:
+    seconds = quantile_values("plan_seconds", [solve.seconds for solve in solves])
+    return {
+        "nodes": nodes,
+        "length": float(np.mean([path.length for path in paths])),
+        "repeats": len(solves),
+        "solved": sum(solve.solved for solve in solves),
+        "first_seconds": first.seconds,
+        **seconds,
+        "per_node": seconds["plan_seconds_median"] / nodes,
+        "per_node_iteration": quantiles(
+            [solve.seconds / nodes / solve.iterations for solve in solves if solve.iterations]
+        )[0],
+    }

@@ -1,9 +1,9 @@
-"""One planner on one path: how long it took, how fast its flight is, and what the certificate says of it."""
+"""Run one planner on one path: how long it takes, how fast its flight is, and what the certificate says of it."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,44 +19,37 @@ from cfplan.planning.planners import find_planner
 from cfplan.planning.repair import Repaired, repair, slow
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import BOXES, LIMIT_SETS, LimitSet
+from cfplan.studies.result import LEVELS
 from cfplan.vehicle.trajectory import Trajectory
 
-WAYPOINTS = (3, 6)
-# least and most of a random path
+WAYPOINTS = (3, 6)  # fewest and most of a random path
 BAD_PATH = "bad path"
-REFINED = ", refined"
-# behind a planner's name: its profile is refined where it does not pass, not just slowed
+REFINED = ", refined"  # behind a planner's name: its profile is refined where it does not pass, not only slowed
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What came of it. Numbers are NaN where there was nothing to measure."""
+    """One planner's plan of one path. Numbers are NaN where there was nothing to measure."""
 
+    box: str
+    limits: str
     planner: str
-    seed: int
-    # of the path
+    seed: int  # of the path
     status: str
-    reason: str
-    # "" where a certified flight came out
-    plan_seconds: float
-    # the planner's call, whole
-    solve_seconds: float
-    # its solver alone, as it says itself
+    reason: str  # why there is no certified flight; "" where there is one
+    plan_seconds: float  # of the planner's call
+    solve_seconds: float  # of its solver alone, as the solver says
     repair_seconds: float
-    worst_share: float
-    # of any limit on the dense grid, before repair
+    worst_share: float  # of any limit on the dense grid, before repair
     worst_limit: str
-    planned_time: float
-    # s of flight, before repair
-    certified_time: float
-    # s of flight
+    planned_time: float  # s of flight, before repair
+    certified_time: float  # s of flight
     speed_factor: float  # on the whole; 1: not slowed
-    bound: float
-    # s, no flight within speed, acceleration and collective thrust is faster
+    bound: float  # s, no flight within speed, acceleration and collective thrust is faster
 
     @property
     def certified(self) -> bool:
-        """Whether a certified flight came out."""
+        """Whether there is a certified flight."""
         return bool(np.isfinite(self.certified_time))
 
     @property
@@ -81,32 +74,32 @@ class Trial:
 
 
 class Candidate(NamedTuple):
-    """A planner and what is done to those of its profiles that do not pass."""
+    """A planner, and how those of its profiles are repaired that do not pass."""
 
     plan: Planner
     repair: Callable[..., Repaired]
 
 
 def find_candidate(name: str) -> Candidate:
-    """The planner of that name, slowed; refined where the name says so. Raises InputError."""
+    """Return the planner of that name with slowing; with refining where the name says so. Raises InputError."""
     return Candidate(find_planner(name.removesuffix(REFINED)), repair if name.endswith(REFINED) else slow)
 
 
 def random_path(seed: int, box: str, waypoints: tuple[int, int] = WAYPOINTS) -> Path:
-    """The random path of that seed in one of the named boxes."""
+    """Return the random path of that seed in one of the named boxes."""
     size = np.array(find_box(box))
     return min_snap(random_waypoints(seed, np.stack([np.zeros(3), size]), waypoints))
 
 
 def find_box(name: str) -> tuple[float, float, float]:
-    """m, its sides. Raises InputError."""
+    """Return its sides, m. Raises InputError."""
     if name not in BOXES:
         raise InputError(f"unknown box {name!r}", hint=f"known: {', '.join(BOXES)}")
     return BOXES[name]
 
 
 def find_limit_set(name: str) -> LimitSet:
-    """The limit set of that name. Raises InputError."""
+    """Return the limit set of that name. Raises InputError."""
     if name not in LIMIT_SETS:
         raise InputError(f"unknown limit set {name!r}", hint=f"known: {', '.join(LIMIT_SETS)}")
     return LIMIT_SETS[name]
@@ -115,31 +108,41 @@ def find_limit_set(name: str) -> LimitSet:
 def path_trials(
     candidates: Mapping[str, Candidate], seed: int, box: str, chosen: LimitSet, *, nodes: int, yaw: YawMode
 ) -> list[Trial]:
-    """Every planner's trial on the random path of that seed; a path with a cusp is a bad one for all."""
+    """Return every planner's trial on the random path of that seed; a path with a cusp is a bad one for all."""
     try:
         path = random_path(seed, box)
         path.check()
         bound = lower_bound(PlanningTask(path, chosen.airframe, chosen.limits))
     except CfplanError as error:
-        return [failed_trial(name, seed, BAD_PATH, str(error)) for name in candidates]
+        return [Trial(box, chosen.name, name, seed, BAD_PATH, str(error), **_NOT_MEASURED) for name in candidates]
     return [
-        run_trial(name, candidate, path, seed, chosen, nodes=nodes, yaw=yaw, bound=bound)
+        run_trial(name, candidate, path, seed, box, chosen, nodes=nodes, yaw=yaw, bound=bound)
         for name, candidate in candidates.items()
     ]
 
 
 def run_trial(
-    name: str, candidate: Candidate, path: Path, seed: int, chosen: LimitSet, *, nodes: int, yaw: YawMode, bound: float
+    name: str,
+    candidate: Candidate,
+    path: Path,
+    seed: int,
+    box: str,
+    chosen: LimitSet,
+    *,
+    nodes: int,
+    yaw: YawMode,
+    bound: float,
 ) -> Trial:
-    """Plan, certify, repair. Whatever fails is a trial with a reason."""
+    """Plan, certify, repair. What fails is a trial with a reason."""
     begun = time.perf_counter()
     task = PlanningTask(path, chosen.airframe, chosen.limits, nodes, yaw)
     solution = candidate.plan(task)
     plan_seconds = time.perf_counter() - begun
     solve_seconds = float(solution.stats.get("solve_seconds", np.nan))
-    values = {"plan_seconds": plan_seconds, "solve_seconds": solve_seconds, "bound": bound}
+    values = _NOT_MEASURED | {"plan_seconds": plan_seconds, "solve_seconds": solve_seconds, "bound": bound}
     if solution.profile is None:
-        return failed_trial(name, seed, solution.status.name, solution.reason or str(solution.status), **values)
+        reason = solution.reason or str(solution.status)
+        return Trial(box, chosen.name, name, seed, solution.status.name, reason, **values)
     try:
         planned = Trajectory(path, solution.profile, chosen.airframe)
         certificate = certify(planned, chosen.limits)
@@ -147,35 +150,34 @@ def run_trial(
         repaired = candidate.repair(task, solution.profile)
         repair_seconds = time.perf_counter() - begun
     except CfplanError as error:
-        return failed_trial(name, seed, Status.SOLVED.name, f"not certified: {error}", **values)
-    return Trial(
-        planner=name, seed=seed, status=solution.status.name, reason="", repair_seconds=repair_seconds,
-        worst_share=certificate.worst.share, worst_limit=certificate.worst.name, planned_time=planned.duration,
-        certified_time=repaired.trajectory.duration,
-        speed_factor=repaired.speed_factor, **values,
-    )  # fmt: skip
+        return Trial(box, chosen.name, name, seed, Status.SOLVED.name, f"not certified: {error}", **values)
+    values |= {
+        "repair_seconds": repair_seconds,
+        "worst_share": certificate.worst.share,
+        "worst_limit": certificate.worst.name,
+        "planned_time": planned.duration,
+        "certified_time": repaired.trajectory.duration,
+        "speed_factor": repaired.speed_factor,
+    }
+    return Trial(box, chosen.name, name, seed, solution.status.name, "", **values)
 
 
-def failed_trial(
-    name: str,
-    seed: int,
-    status: str,
-    reason: str,
-    *,
-    plan_seconds: float = np.nan,
-    solve_seconds: float = np.nan,
-    bound: float = np.nan,
-) -> Trial:
-    """A trial without a certified flight."""
-    return Trial(
-        name, seed, status, reason, plan_seconds, solve_seconds, np.nan, np.nan, "", np.nan, np.nan, np.nan, bound
-    )  # fmt: skip
-
-
-def quantiles(values: Iterator[float] | list[float]) -> tuple[float, float, float]:
-    """Median, p90, p99 of those that are finite; NaN where none is."""
+def quantiles(values: Iterable[float]) -> tuple[float, float, float]:
+    """Return median, p90 and p99 of those that are finite; NaN where there is none."""
     finite = [value for value in values if np.isfinite(value)]
     if not finite:
         return (float("nan"),) * 3
-    median, p90, p99 = (float(np.quantile(finite, level)) for level in (0.5, 0.9, 0.99))
+    median, p90, p99 = (float(np.quantile(finite, level)) for level in LEVELS.values())
     return median, p90, p99
+
+
+def quantile_values(key: str, values: Iterable[float]) -> dict[str, float]:
+    """Return the same by the keys of `quantile_columns`."""
+    return {f"{key}_{level}": value for level, value in zip(LEVELS, quantiles(values), strict=True)}
+
+
+_NOT_MEASURED: dict[str, Any] = dict.fromkeys(
+    ("plan_seconds", "solve_seconds", "repair_seconds", "worst_share", "planned_time", "certified_time", "speed_factor",
+     "bound"),
+    np.nan,
+) | {"worst_limit": ""}  # fmt: skip

@@ -13,7 +13,7 @@ from cfplan.flight.pilot.outcome import Check, Deviation, FlightOutcome, Rung
 from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent
 from cfplan.simulation.lab.lab import Truth
 from cfplan.studies import flights, real_time
-from cfplan.studies.flights import fly_each
+from cfplan.studies.flights import JudgedFlight, fly_each
 from cfplan.studies.real_time import LATENESS_CHECK, RETRIES, Conditions
 
 pytestmark = pytest.mark.unit
@@ -83,18 +83,22 @@ def study(files=(LINE,), **options):
     return fly_each(files, lambda _: REPOSITORY / "safety.yaml", **options)
 
 
+def flown_of(result):
+    return [JudgedFlight(**row) for row in result.table("flights").rows]
+
+
 def test_each_flight_of_a_path_has_noise_of_its_own_under_the_same_conditions(flown):
     ends, labs = flown
     ends += [outcome(), outcome()]
     result = study(repeats=2, conditions=Conditions(loss=0.05, seed=7))
     assert labs == [Conditions(loss=0.05, seed=7), Conditions(loss=0.05, seed=8)]
-    assert [flight.seed for flight in result.flights] == [7, 8]
+    assert [flight.seed for flight in flown_of(result)] == [7, 8]
 
 
 def test_deviation_is_by_poses_and_by_the_truth_and_time_is_that_of_the_setpoints(flown):
     ends, _ = flown
     ends.append(outcome(deviation=0.05))
-    (flight,) = study().flights
+    (flight,) = flown_of(study())
     assert flight.deviation_max == 0.05
     assert flight.true_deviation_max == pytest.approx(OFF, abs=1e-3)
     assert flight.streamed == pytest.approx(flight.planned, abs=0.011)
@@ -105,21 +109,21 @@ def test_mean_and_worst_are_over_the_flights_that_landed_and_the_others_are_told
     ends, _ = flown
     ends += [outcome(deviation=0.02), outcome(deviation=0.06), outcome(ExitCode.ENDED_BY_SAFETY), LinkError("gone")]
     result = study(repeats=4)
-    plans, table, failures = result.tables()
-    assert all(len(row) == len(columns) for _, columns, rows in (plans, table, failures) for row in rows)
-    assert table[2][-1][:4] == ["all", "2 of 4", "4.0 cm", "6.0 cm"]
-    assert failures[2] == [["line", "2", "ended_by_safety"], ["line", "3", "gone"]]
-    json.dumps(result.to_dict())
+    plans, table, failures = (table.cells() for table in result.tables)
+    assert all(len(row) == len(titles) for titles, rows in (plans, table, failures) for row in rows)
+    assert table[1][-1][:4] == ["all", "2/4", "4.0 cm", "6.0 cm"]
+    assert failures[1] == [["line", "2", "ended_by_safety"], ["line", "3", "gone"]]
+    json.dumps(result.to_json(), allow_nan=False)
 
 
 def test_what_preflight_refuses_for_lateness_alone_is_tried_again_at_most_twice(flown):
     ends, _ = flown
     late = outcome(ExitCode.PREFLIGHT, failed=[LATENESS_CHECK])
     ends += [late, late, outcome()]
-    (flight,) = study().flights
+    (flight,) = flown_of(study())
     assert (flight.landed, flight.refusals) == (True, 2)
     ends += [late] * (RETRIES + 1)
-    (flight,) = study().flights
+    (flight,) = flown_of(study())
     assert (flight.landed, flight.refusals) == (False, RETRIES)
     assert not ends
 
@@ -127,7 +131,7 @@ def test_what_preflight_refuses_for_lateness_alone_is_tried_again_at_most_twice(
 def test_any_other_refusal_is_final(flown):
     ends, _ = flown
     ends.append(outcome(ExitCode.PREFLIGHT, failed=[LATENESS_CHECK, "battery at rest"]))
-    (flight,) = study().flights
+    (flight,) = flown_of(study())
     assert (flight.landed, flight.refusals) == (False, 0)
 
 
@@ -137,8 +141,8 @@ def test_a_path_that_cannot_be_planned_does_not_end_the_study(flown, tmp_path):
     outside = tmp_path / "outside.yaml"
     outside.write_text("waypoints: [[0, 0, 1], [0, 50, 1]]\n")
     result = study((outside, LINE))
-    assert [(flight.path, flight.landed) for flight in result.flights] == [("outside", False), ("line", True)]
-    assert "outside" in result.tables()[2][2][0][0]
+    assert [(flight.path, flight.landed) for flight in flown_of(result)] == [("outside", False), ("line", True)]
+    assert "outside" in result.tables[2].cells()[1][0][0]
 
 
 def test_a_file_that_is_no_path_is_an_error_before_anything_flies(flown, tmp_path):
@@ -154,20 +158,20 @@ def test_the_operators_stop_ends_the_study_and_keeps_what_was_flown(flown):
     ends += [outcome(), outcome(ExitCode.ENDED_BY_PILOT), outcome()]
     result = study(repeats=3)
     assert result.interrupted
-    assert [flight.landed for flight in result.flights] == [True, False]
+    assert [flight.landed for flight in flown_of(result)] == [True, False]
 
 
 def test_without_what_makes_up_for_drag_the_dry_run_is_farther_off(flown):
     ends, _ = flown
     ends.append(outcome())
-    (plan,) = study().plans
-    assert plan.dry_run_without_drag > 2 * plan.dry_run
+    (plan,) = study().table("plans").rows
+    assert plan["dry_run_without_drag"] > 2 * plan["dry_run"]
 
 
 def test_no_flight_at_all_is_a_table_too(flown):
     ends, _ = flown
     ends.append(outcome(ExitCode.LINK_LOST))
-    assert study().tables()[1][2][-1][1] == "0 of 1"
+    assert study().table("flights-by-path").cells()[1][-1][1] == "0/1"
 
 
 @pytest.mark.parametrize("wrong", [["--loss", "1"], ["--pose-noise", "-1"], ["--repeats", "0"]])

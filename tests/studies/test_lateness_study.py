@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -15,8 +15,8 @@ from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.outcome import Deviation, FlightOutcome, Rung
 from cfplan.flight.telemetry import SetpointSent
 from cfplan.studies import lateness
-from cfplan.studies.lateness import FIRST, ORDINARY, Measured, lateness_study
-from cfplan.studies.real_time import Flight
+from cfplan.studies.lateness import FIRST, ORDINARY, WakeUps, lateness_study, lateness_table
+from cfplan.studies.real_time import RealTimeFlight
 from cfplan.studies.sleeper import Sleeper
 
 REPOSITORY = Path(__file__).parents[2]
@@ -31,8 +31,13 @@ sys.exit(subprocess.run([sys.executable, "-c",
 """
 
 
+def measured(result):
+    names = [field.name for field in fields(WakeUps)]
+    return [WakeUps(**{name: row[name] for name in names if name in row}) for row in result.table("lateness").rows]
+
+
 def refused(reason):
-    return lambda: Flight(None, reason)
+    return lambda: RealTimeFlight(None, reason)
 
 
 def streamed(late):
@@ -45,7 +50,7 @@ def streamed(late):
         ExitCode.OK, "landed", Rung.NONE, (), (), begin, 0.2, Lateness(late, late, late, 20, 3),
         Deviation(0.0, 0.0, 0.0, 0), 0.0, STILL,
     )  # fmt: skip
-    return Flight(outcome, "landed", sent=sent)
+    return RealTimeFlight(outcome, "landed", sent=sent)
 
 
 @pytest.fixture
@@ -67,7 +72,7 @@ def study(monkeypatch):
 
 def test_percentiles_are_those_of_the_setpoints():
     late = [1e-4] * 990 + [2e-3] * 10
-    row = Measured.of("stream", FIRST, late)
+    row = WakeUps.of("stream", FIRST, late)
     assert (row.count, row.above, row.max) == (1000, 10, 2e-3)
     assert row.p50 == 1e-4
     assert row.p999 == pytest.approx(2e-3)
@@ -76,18 +81,19 @@ def test_percentiles_are_those_of_the_setpoints():
 
 def test_a_sleeper_stands_before_each_stream_and_beside_it_over_the_same_seconds(study):
     result = study(lambda: streamed(1e-3), lambda: streamed(2e-3))
-    assert [(row.what, row.priority) for row in result.rows] == [
+    assert [(row.what, row.priority) for row in measured(result)] == [
         (what, priority)
         for priority in (FIRST, ORDINARY)
         for what in ("asleep, nothing else", "stream", "asleep meanwhile")
     ]
-    alone, stream, meanwhile = result.rows[:3]
+    alone, stream, meanwhile = measured(result)[:3]
     assert stream.p50 == pytest.approx(1e-3)
     assert stream.skipped == 3
     assert 5 <= alone.count <= 100
     assert 15 <= meanwhile.count <= 20
-    assert all(len(row) == len(columns) for _, columns, rows in result.tables() for row in rows)
-    json.dumps(result.to_dict())
+    titles, cells = result.table("lateness").cells()
+    assert all(len(row) == len(titles) for row in cells)
+    json.dumps(result.to_json(), allow_nan=False)
 
 
 @pytest.mark.skipif(not Path("/proc/self/schedstat").is_file(), reason="this system does not tell who waits")
@@ -111,14 +117,15 @@ def test_a_process_that_waits_for_its_processor_is_seen_to_wait():
 
 def test_what_did_not_fly_is_told(study):
     result = study(refused("the vehicle is gone"), refused("too late"))
-    assert [row.reason for row in result.rows] == ["", "the vehicle is gone", "", "too late"]
-    assert all(len(row) == len(columns) for _, columns, rows in result.tables() for row in rows)
+    assert [row.reason for row in measured(result)] == ["", "the vehicle is gone", "", "too late"]
+    titles, cells = result.table("lateness").cells()
+    assert all(len(row) == len(titles) for row in cells)
 
 
 def test_where_it_is_not_permitted_to_go_first_the_rest_is_measured(study):
     result = study(refused("too late"), permitted=False)
-    assert result.rows[0].reason == "not permitted here"
-    assert [row.priority for row in result.rows[1:]] == [ORDINARY, ORDINARY]
+    assert measured(result)[0].reason == "not permitted here"
+    assert [row.priority for row in measured(result)[1:]] == [ORDINARY, ORDINARY]
 
 
 def test_after_giving_priority_up_no_child_can_have_it():
@@ -126,13 +133,13 @@ def test_after_giving_priority_up_no_child_can_have_it():
 
 
 def test_a_stream_that_ends_early_is_measured_as_far_as_it_came():
-    row = replace(Measured.of("stream", ORDINARY, [1e-4] * 300), reason="poses stopped")
-    assert "3 s; poses stopped" in row.texts()
+    row = replace(WakeUps.of("stream", ORDINARY, [1e-4] * 300), reason="poses stopped")
+    assert {"3 s", "poses stopped"} <= set(lateness_table([row]).cells()[1][0])
 
 
 def test_a_live_view_that_ended_early_is_told():
-    row = replace(Measured.of("stream", ORDINARY, [1e-4] * 300), view_failure="the live view ended: closed")
-    assert "3 s; the live view ended: closed" in row.texts()
+    row = replace(WakeUps.of("stream", ORDINARY, [1e-4] * 300), view_failure="the live view ended: closed")
+    assert {"3 s", "the live view ended: closed"} <= set(lateness_table([row]).cells()[1][0])
 
 
 def test_a_viewer_that_does_not_run_is_an_error_and_no_quieter_computer(monkeypatch):

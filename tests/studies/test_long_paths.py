@@ -8,37 +8,49 @@ import pytest
 from cfplan.errors import CfplanError, InputError
 from cfplan.studies import long_paths as study
 from cfplan.studies.long_paths import COLUMNS, long_paths
+from cfplan.studies.result import Table
 
 LENGTHS = (20.0, 60.0)
 
 
 @pytest.fixture(scope="module")
 def short():
-    return long_paths(lengths=LENGTHS, paths=1, repeats=2, command="cfplan study long")
+    return long_paths(lengths=LENGTHS, paths=1, repeats=2)
+
+
+def plans(result):
+    return [study.LongPlan(**row) for row in result.table("plans").rows]
+
+
+def shown(result, title):
+    """The cells under this title."""
+    titles, rows = result.tables[0].cells()
+    return [row[titles.index(title)] for row in rows]
 
 
 def test_flights_are_certified_and_near_the_experts(short):
-    for length, (walk,) in zip(LENGTHS, short.walks, strict=True):
-        assert walk.length == pytest.approx(length, rel=0.05)
-        assert walk.certified
-        assert walk.worst_share <= 1.0
-        assert 0.0 < walk.flight / walk.expert_flight - 1.0 < 0.01
-        assert all(part > 0 for part in walk.seconds)
+    for length, plan in zip(LENGTHS, plans(short), strict=True):
+        assert plan.length == pytest.approx(length, rel=0.05)
+        assert plan.certified
+        assert plan.worst_share <= 1.0
+        assert 0.0 < plan.flight / plan.expert_flight - 1.0 < 0.01
+        assert all(part > 0 for part in plan.seconds)
 
 
 def test_memory_is_measured_where_linux_tells_it(short):
-    for (walk,) in short.walks:
-        assert walk.peak >= walk.kept
-        assert walk.peak < study.GOAL_MEGABYTES
+    for plan in plans(short):
+        assert plan.peak >= plan.kept
+        assert plan.peak < study.GOAL_MEGABYTES
 
 
 def test_the_result_is_one_table_compared_with_its_first_row_and_survives_json(short):
-    ((_, columns, rows),) = short.tables()
-    assert columns == list(COLUMNS)
-    assert rows[0][COLUMNS.index("against the first")] == "1.0×"
-    document = json.loads(json.dumps(short.to_dict()))
-    assert [walk["length"] for walk in document["walks"]] == [walk.length for (walk,) in short.walks]
-    assert document["table"][1]["certified"] == "1/1"
+    (table,) = short.tables
+    assert table.cells()[0] == [column.title for column in COLUMNS if column.title]
+    assert shown(short, "against the first")[0] == "1.0×"
+    document = json.loads(json.dumps(short.to_json(), allow_nan=False))
+    again = Table.from_json(document["details"][0])
+    assert [row["length"] for row in again.rows] == [plan.length for plan in plans(short)]
+    assert shown(short, "certified")[1] == "1/1"
 
 
 def test_a_path_that_cannot_be_flown_is_told_with_its_reason(monkeypatch, short):
@@ -51,11 +63,11 @@ def test_a_path_that_cannot_be_flown_is_told_with_its_reason(monkeypatch, short)
 
     monkeypatch.setattr(study, "repair", failing)
     result = long_paths(lengths=LENGTHS, paths=1, repeats=1)
-    ((first,), (second,)) = result.walks
+    first, second = plans(result)
     assert first.certified
     assert second.reason == "no way"
     assert math.isnan(second.flight)
-    assert result.tables()[0][2][1][COLUMNS.index("certified")] == "0/1"
+    assert shown(result, "certified")[1] == "0/1"
 
 
 def test_an_interrupt_keeps_the_lengths_that_are_done(monkeypatch, short):
@@ -69,7 +81,7 @@ def test_an_interrupt_keeps_the_lengths_that_are_done(monkeypatch, short):
     monkeypatch.setattr(study, "path_of_length", stopping)
     result = long_paths(lengths=LENGTHS, paths=1, repeats=1)
     assert result.interrupted
-    assert len(result.walks) == len(result.tables()[0][2]) == 1
+    assert len(plans(result)) == len(result.tables[0].rows) == 1
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,98 @@
+"""The tables in docs/ are what `cfplan study docs` makes of results/, and a result survives its file."""
+
+from pathlib import Path
+
+import pytest
+
+from cfplan.errors import InputError
+from cfplan.studies.docs_tables import with_tables
+from cfplan.studies.provenance import provenance
+from cfplan.studies.result import Column, StudyResult, Table, collect, read_result
+
+pytestmark = pytest.mark.unit
+REPOSITORY = Path(__file__).parents[2]
+PAGES = sorted((REPOSITORY / "docs").rglob("*.md"))
+COLUMNS = (
+    Column("path", "path"),
+    Column("landed", "landed", of="flights", meaning="at the end of its plan"),
+    Column("flights"),
+    Column("deviation", "deviation", "cm", ".1f"),
+)
+
+
+def result(deviation=0.0314):
+    row = {"path": "line", "landed": 4, "flights": 5, "deviation": deviation}
+    return StudyResult("flights", {"seed": 7}, (Table("all", "Flights", COLUMNS, (row,)),))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_the_tables_of_a_page_are_those_of_the_results(page):
+    text = page.read_text(encoding="utf-8")
+    assert with_tables(text, REPOSITORY) == text, "cfplan study docs writes the tables anew"
+
+
+def test_every_result_has_its_tables_on_a_page():
+    pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    for file in (REPOSITORY / "results").glob("*.json"):
+        for table in read_result(file).tables:
+            assert f"<!-- table: results/{file.name}#{table.name} -->" in pages
+
+
+def test_every_result_says_of_which_commit_it_is():
+    for file in (REPOSITORY / "results").glob("*.json"):
+        made = read_result(file).provenance
+        assert len(made.commit) == 40
+        assert made.command.startswith("cfplan ")
+
+
+def test_a_result_survives_its_file(tmp_path):
+    result().write(tmp_path / "flights.json")
+    assert read_result(tmp_path / "flights.json") == result()
+
+
+def test_a_block_is_replaced_by_title_and_cells_and_nothing_else_changes(tmp_path):
+    result().write(tmp_path / "flights.json")
+    page = "before\n<!-- table: flights.json#all -->\nold\n<!-- end -->\nafter\n"
+    text = with_tables(page, tmp_path)
+    assert "| path | landed | deviation |" in text
+    assert "| line | 4/5 | 3.1 cm |" in text
+    assert "old" not in text
+    assert text.startswith("before\n<!-- table")
+    assert text.endswith("<!-- end -->\nafter\n")
+    assert with_tables(text, tmp_path) == text
+
+
+def test_meanings_and_provenance_have_blocks_too(tmp_path):
+    result().write(tmp_path / "flights.json")
+    page = "<!-- columns: flights.json#all -->\n<!-- end -->\n<!-- measured: flights.json -->\n<!-- end -->\n"
+    text = with_tables(page, tmp_path)
+    assert "- *landed*: at the end of its plan" in text
+    assert f"    {provenance().command}" in text
+    assert provenance().commit[:12] in text
+
+
+def test_what_was_not_measured_is_a_dash():
+    assert result(float("nan")).tables[0].cells()[1] == [["line", "4/5", "–"]]
+    assert result(float("nan")).to_json()["tables"][0]["rows"] == [["line", 4, 5, None]]
+
+
+def test_a_table_that_is_not_in_the_result_is_an_input_error(tmp_path):
+    result().write(tmp_path / "flights.json")
+    with pytest.raises(InputError, match="no table 'any'"):
+        with_tables("<!-- table: flights.json#any -->\n<!-- end -->", tmp_path)
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", '{"study": "bench"}'])
+def test_a_file_that_is_no_result_is_an_input_error(tmp_path, content):
+    (tmp_path / "bench.json").write_text(content)
+    with pytest.raises(InputError, match="not the result of a study"):
+        read_result(tmp_path / "bench.json")
+
+
+def test_an_interrupt_keeps_what_was_yielded():
+    def items():
+        yield from (1, 2)
+        raise KeyboardInterrupt
+
+    assert collect(items()) == ([1, 2], True)
+    assert collect(iter([3])) == ([3], False)
