@@ -2,10 +2,10 @@
 
 import json
 from dataclasses import fields, replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
+from certificate_oracle import AIRFRAME, LIMITS, SPACE, worst_values
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,49 +17,12 @@ from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.flatness import flat_state
-from cfplan.vehicle.trajectory import Trajectory, state_at
-
-AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
-LIMITS = PlanLimits(
-    speed=2.0, acceleration=5.0, angular_velocity=8.0, tilt=np.radians(30), motor_thrust_min=0.024,
-    motor_thrust_max=0.109, specific_thrust_min=4.905,
-)  # fmt: skip
-SPACE = Space(low=(-2.25, -4.0, 0.0), high=(2.25, 4.0, 2.0), margin=0.2)
+from cfplan.vehicle.trajectory import Trajectory
 
 points = st.tuples(st.floats(-2, 2), st.floats(-3.5, 3.5), st.floats(0.3, 1.7))
 gentle = st.floats(0.5, 2.0)
 rough = st.floats(0.02, 6.0)
-
-
-def finely(trajectory, parts=20):
-    """The worst of every quantity on a grid 20 times as fine as the certificate's, both sides of breaks included."""
-    path, profile = trajectory.path, trajectory.profile
-    edges = np.union1d(profile.s, path.breaks)
-    worst = {}
-    for left, right in pairwise(edges):
-        if right - left < 1e-11:
-            continue
-        duration = float(trajectory.time_at(right) - trajectory.time_at(left))
-        count = parts * max(10, int(np.ceil(duration / 1e-3)))
-        s = np.append(np.linspace(left, right, count, endpoint=False), np.nextafter(right, 0))
-        interval = np.full(len(s), int(profile.interval(np.array((left + right) / 2))))
-        state = state_at(path, profile, trajectory.airframe, s, time=s, interval=interval)
-        inside = np.minimum(state.position - SPACE.low, np.array(SPACE.high) - state.position)
-        for name, value in {
-            "speed": np.linalg.norm(state.velocity, axis=1).max(),
-            "acceleration": np.linalg.norm(state.acceleration, axis=1).max(),
-            "angular velocity": np.linalg.norm(state.body_rate, axis=1).max(),
-            # not by the cosine, which makes 1e-8 rad of a rounding error
-            "tilt": np.arctan2(np.hypot(*state.thrust_axis[:, :2].T), state.thrust_axis[:, 2]).max(),
-            "motor thrust, most": state.motor_thrust.max(),
-            "motor thrust, least": -state.motor_thrust.min(),
-            "specific thrust, least": -state.specific_thrust.min(),
-            "distance to the walls": -inside.min(),
-        }.items():
-            worst[name] = max(worst.get(name, -np.inf), value)
-    return worst
 
 
 def make(make_profile, waypoints, coefficients, turns, scale):
@@ -71,7 +34,7 @@ def make(make_profile, waypoints, coefficients, turns, scale):
 
 
 def as_upper(margin):
-    """The worst value with the sign of `finely`: larger is worse."""
+    """The worst value with the sign of `worst_values`: larger is worse."""
     return -margin.worst if "least" in margin.name or "walls" in margin.name else margin.worst
 
 
@@ -85,7 +48,7 @@ def as_upper(margin):
 def test_nothing_between_the_samples_is_worse_than_the_certificate_says(make_profile, waypoints, rates, turns, scale):
     trajectory = make(make_profile, waypoints, rates, turns, scale)
     certificate = certify(trajectory, LIMITS, SPACE)
-    true = finely(trajectory)
+    true = worst_values(trajectory, SPACE)
     for margin in certificate.margins:
         # Far beyond the limits thrust can vanish and the attitude flip within a millisecond; failed is failed then.
         if margin.share < 3.0 and certificate.worst.share < 100.0:
@@ -101,7 +64,7 @@ def test_nothing_between_the_samples_is_worse_than_the_certificate_says(make_pro
 )
 def test_what_just_passes_keeps_every_limit_on_a_far_finer_grid(make_profile, waypoints, rates, turns):
     slowed = slow_until_certified(make(make_profile, waypoints, rates, turns, 4.0), LIMITS)
-    true = finely(slowed.trajectory)
+    true = worst_values(slowed.trajectory, SPACE)
     assert true["speed"] <= LIMITS.speed
     assert true["acceleration"] <= LIMITS.acceleration
     assert true["angular velocity"] <= LIMITS.angular_velocity
@@ -323,4 +286,4 @@ def test_a_break_in_the_snap_of_a_path_is_seen_from_both_sides(make_profile, ste
     # Fast where the snap is, fastest at the break, where the profile has no grid point of its own.
     trajectory = Trajectory(path, make_profile(2.0, np.full(6, 2.0)), AIRFRAME)
     most = {margin.name: margin for margin in certify(trajectory, LIMITS).margins}["motor thrust, most"]
-    assert most.worst >= finely(trajectory)["motor thrust, most"]
+    assert most.worst >= worst_values(trajectory, SPACE)["motor thrust, most"]

@@ -4,23 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certificate_oracle import AIRFRAME, LIMITS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.safety.certificate import certify
-from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import RESOLUTION, slow_until_certified
 from cfplan.safety.space import Space
-from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.trajectory import Trajectory
 
-AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
-LIMITS = PlanLimits(
-    speed=2.0, acceleration=5.0, angular_velocity=8.0, tilt=np.radians(30), motor_thrust_min=0.024,
-    motor_thrust_max=0.109, specific_thrust_min=4.905,
-)  # fmt: skip
 PATH = min_snap([[0, 0, 1], [1, 1.5, 1.3], [-1, 2, 0.7]])
 
 
