@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
@@ -144,7 +145,9 @@ class Path:
 @njit(cache=True, fastmath={"contract"})
 def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray, out: NDArray) -> None:
     """Write γ and four derivatives at s into `out`, consecutive points of one piece together, up to _BATCH of them."""
-    place = np.minimum(np.maximum(s, 0.0), breaks[-1])
+    place, x = np.empty(len(s)), np.empty(_BATCH)
+    for n in range(len(s)):
+        place[n] = min(max(s[n], 0.0), breaks[-1])
     begin, piece, last = 0, 0, len(origins) - 1
     while begin < len(place):
         if place[begin] < breaks[piece]:
@@ -154,22 +157,37 @@ def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray,
         end, room = begin + 1, min(begin + _BATCH, len(place))
         while end < room and breaks[piece] <= place[end] and (piece == last or place[end] < breaks[piece + 1]):
             end += 1
-        x = place[begin:end] - origins[piece]
+        for n in range(end - begin):
+            x[n] = place[begin + n] - origins[piece]
         for axis in range(3):
             p, d1, d2 = out[0, axis, begin:end], out[1, axis, begin:end], out[2, axis, begin:end]
             d3, d4 = out[3, axis, begin:end], out[4, axis, begin:end]
-            p[:], d1[:], d2[:], d3[:], d4[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+            for n in range(end - begin):
+                p[n], d1[n], d2[n], d3[n], d4[n] = 0.0, 0.0, 0.0, 0.0, 0.0
             for power in range(coefficients.shape[1] - 1, -1, -1):  # Horner, for derivatives over factorials
                 term = coefficients[piece, power, axis]
-                for n in range(len(x)):
+                for n in range(end - begin):
                     d4[n] = d4[n] * x[n] + d3[n]
                     d3[n] = d3[n] * x[n] + d2[n]
                     d2[n] = d2[n] * x[n] + d1[n]
                     d1[n] = d1[n] * x[n] + p[n]
                     p[n] = p[n] * x[n] + term
-            for n in range(len(x)):
+            for n in range(end - begin):
                 d2[n], d3[n], d4[n] = 2.0 * d2[n], 6.0 * d3[n], 24.0 * d4[n]
         begin = end
+
+
+@register_jitable
+def _piece_at(breaks: NDArray, s: float) -> int:
+    """Return the piece that holds s by bisection; a break belongs to the piece on its right."""
+    piece, above = 0, len(breaks) - 1
+    while above - piece > 1:
+        middle = (piece + above) // 2
+        if breaks[middle] <= s:
+            piece = middle
+        else:
+            above = middle
+    return piece
 
 
 @njit(cache=True)
@@ -182,7 +200,12 @@ def _values(breaks: NDArray, origins: NDArray, table: NDArray, places: NDArray) 
         s = places[n]
         s = 0.0 if s < 0.0 else breaks[-1] if s > breaks[-1] else s
         if not (breaks[piece] <= s and (s < breaks[piece + 1] or piece == last)):
-            piece = min(max(int(np.searchsorted(breaks, s, side="right")) - 1, 0), last)
+            # Points mostly come in order: the next piece is tried first.
+            after = piece + 1
+            if after <= last and breaks[after] <= s and (after == last or s < breaks[after + 1]):
+                piece = after
+            else:
+                piece = _piece_at(breaks, s)
         terms, x = table[piece], s - origins[piece]
         a, b, c = terms[-1, 0], terms[-1, 1], terms[-1, 2]
         for power in range(len(terms) - 2, -1, -1):

@@ -142,7 +142,8 @@ def _run(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, ce
         column = direction * hidden
         for n in range(steps):
             t = n if direction == 0 else steps - 1 - n
-            gates[:] = projected[t, 4 * column : 4 * column + 4 * hidden]
+            for k in range(4 * hidden):
+                gates[k] = projected[t, 4 * column + k]
             whole = hidden - hidden % 8
             for j in range(0, whole, 8):
                 h0, h1, h2, h3, h4, h5, h6, h7 = (
@@ -163,7 +164,8 @@ def _run(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, ce
                 value = keep * c[k] + let_in * _tanh(gates[2 * hidden + k])
                 c[k] = value
                 h[k] = (_HALF + _HALF * _tanh(_HALF * gates[3 * hidden + k])) * _tanh(value)
-            out[t, column : column + hidden] = h
+            for k in range(hidden):
+                out[t, column + k] = h[k]
 
 
 def shapes(architecture: str, hidden: int, layers: int) -> dict[str, tuple[int, ...]]:

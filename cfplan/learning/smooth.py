@@ -58,7 +58,9 @@ def smoothed(rates: NDArray, settled: NDArray, begin: int, rest_end: bool, durat
         for k in range(1, _BAND + 1):
             if n + k >= held and n + k < size:
                 right[n + k] -= band[n, k] * settled[n]
-        band[n, 0], band[n, 1:] = 1.0, 0.0
+        band[n, 0] = 1.0
+        for k in range(1, _BAND + 1):
+            band[n, k] = 0.0
         right[n] = settled[n]
     _solve(band, right)
     out = np.empty(count)
@@ -73,7 +75,8 @@ def _solve(band: NDArray, right: NDArray) -> None:
     size = len(right)
     for n in range(size):
         pivot = np.sqrt(band[n, 0])
-        band[n] /= pivot
+        for k in range(_BAND + 1):
+            band[n, k] /= pivot
         for i in range(1, _BAND + 1):
             if n + i < size:
                 for j in range(i, _BAND + 1):

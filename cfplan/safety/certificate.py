@@ -221,16 +221,15 @@ def _margin(quantity: _Quantity, peak: float, time: float, s: float, position: S
 def _stretches(trajectory: Trajectory) -> Stretches:
     """Cut at the grid points, at the breaks of the path, and where the timing was refined because h changes fast."""
     timing, path = trajectory.timing, trajectory.path
-    return Stretches(*_cut(timing.s, timing.interval, timing.nodes, path.breaks))
+    every = np.sort(np.concatenate((timing.s, path.breaks)))
+    return Stretches(*_cut(timing.s, timing.interval, timing.nodes, path.breaks, every))
 
 
 @njit(cache=True, error_model="numpy")
 def _cut(
-    s: NDArray, intervals: NDArray, nodes: NDArray, breaks: NDArray
+    s: NDArray, intervals: NDArray, nodes: NDArray, breaks: NDArray, every: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
     """What `_stretches` gives, of the timing's pieces, which end at `s`, and its profile's table."""
-    every = np.concatenate((s, breaks))
-    every.sort()
     edges, count = every.copy(), 1
     for n in range(1, len(every)):
         if every[n] - every[n - 1] > 1e-12 * every[-1]:
@@ -238,7 +237,8 @@ def _cut(
             count += 1
     edges = edges[:count]
     edges[-1] = s[-1]
-    interval, piece, counts = np.empty((3, count - 1), np.int64)
+    interval, piece = np.empty(count - 1, np.int64), np.empty(count - 1, np.int64)
+    counts = np.empty(count - 1, np.int64)
     at, on = 0, 0
     for k in range(count - 1):
         width = edges[k + 1] - edges[k]
@@ -266,7 +266,10 @@ def _compile(sources: int) -> Callable[..., tuple[NDArray, NDArray, int]]:
     ) -> tuple[NDArray, NDArray, int]:  # fmt: skip
         """Peak of each of the table's quantities, and s there; about `batch` samples at a time."""
         values, places = np.full(len(table), -np.inf), np.zeros(len(table))
-        rows = np.empty((dense.SAMPLED_ROWS, batch + counts.max()))
+        most = 0
+        for n in range(len(counts)):
+            most = max(most, counts[n])
+        rows = np.empty((dense.SAMPLED_ROWS, batch + most))
         begin = 0
         while begin < len(counts):
             end, samples = begin, 0
@@ -295,11 +298,17 @@ def _raise_peaks(values: NDArray, places: NDArray, table: NDArray, rows: NDArray
 
     Stretches have `counts` samples each, at least three, one stretch behind the other.
     """
-    behind = np.cumsum(counts)
-    lift = np.zeros(behind[-1])  # infinite at the ends of stretches
-    lift[behind - counts], lift[behind - 1] = np.inf, np.inf
+    total = 0
+    for n in range(len(counts)):
+        total += counts[n]
+    lift = np.zeros(total)  # infinite at the ends of stretches
+    at = 0
+    for n in range(len(counts)):
+        lift[at] = np.inf
+        at += counts[n]
+        lift[at - 1] = np.inf
     for k in range(len(table)):
-        first, count, sign = table[k]
+        first, count, sign = table[k, 0], table[k, 1], table[k, 2]
         for which in range(first, first + count):
             row = rows[which]
             for begin in range(0, len(lift) - 2, BLOCK):

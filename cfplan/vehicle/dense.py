@@ -171,10 +171,13 @@ def sample(
         _flatten_stretch(panel, body, profile, lanes)
         count = min(WIDTH, last + 1 - done)
         for row in range(ROWS):
-            out[row, done : done + count] = panel[(_RESULT + row) * WIDTH : (_RESULT + row) * WIDTH + count]
+            for n in range(count):
+                out[row, done + n] = panel[(_RESULT + row) * WIDTH + n]
         for row in range(3):
-            out[POSITION + row, done : done + count] = panel[row * WIDTH : row * WIDTH + count]
-        out[PLACE, done : done + count] = s[:count]
+            for n in range(count):
+                out[POSITION + row, done + n] = panel[row * WIDTH + n]
+        for n in range(count):
+            out[PLACE, done + n] = s[n]
 
 
 @register_jitable(fastmath=ROUNDING)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import NotCertifiedError
@@ -123,7 +124,8 @@ def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
     for k in range(count + 1):
         for j in range(5):
             allowed[j] = max(allowed[j], abs(nodes[k, _CONTINUOUS[j]]))
-    allowed[:] = _JUMP * (1.0 + allowed)
+    for j in range(5):
+        allowed[j] = _JUMP * (1.0 + allowed[j])
     for k in range(count):
         node, after = nodes[k], nodes[k + 1]
         slope, bend, jerk, x = node[2], node[3], node[4], after[0] - node[0]
@@ -138,8 +140,14 @@ def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
         jumps[k, 2] = abs(bend + x * jerk - after[3])
         jumps[k, 3] = abs(node[5] + x * (node[6] + x * node[7] / 2) - after[5])
         jumps[k, 4] = abs(node[6] + x * node[7] - after[6])
-    ascends = (nodes[1:, 0] > nodes[:-1, 0]).all()
-    sound = bool(ascends and np.isfinite(nodes).all() and (least > 0.0).all() and (jumps <= allowed).all())
+    sound = True
+    for k in range(count):
+        sound = sound and nodes[k + 1, 0] > nodes[k, 0] and least[k] > 0.0
+        for j in range(5):
+            sound = sound and jumps[k, j] <= allowed[j]
+    for k in range(count + 1):
+        for j in range(nodes.shape[1]):
+            sound = sound and np.isfinite(nodes[k, j])
     return sound, least, jumps, allowed
 
 
@@ -157,9 +165,12 @@ def _split(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
         while waiting:
             right, depth = ends[waiting - 1], depths[waiting - 1]
             if count == len(starts):
-                starts, durations = np.append(starts, starts), np.append(durations, durations)
-                intervals = np.append(intervals, intervals)
-                polynomials = np.concatenate((polynomials, polynomials))
+                starts, durations, intervals = _longer(starts), _longer(durations), _longer(intervals)
+                more = np.empty((2 * len(polynomials), 8))
+                for row in range(count):
+                    for column in range(8):
+                        more[row, column] = polynomials[row, column]
+                polynomials = more
             middle = (left + right) / 2.0
             duration = _quadrature(node, left, right)
             halves = _quadrature(node, left, middle) + _quadrature(node, middle, right)
@@ -177,6 +188,15 @@ def _split(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
                 ends[waiting], depths[waiting] = middle, depth + 1
                 waiting += 1
     return starts[:count], durations[:count], intervals[:count], polynomials[:count], np.nan
+
+
+@register_jitable
+def _longer(array: NDArray) -> NDArray:
+    """Return a copy, (2 N,), whose second half is to be filled in."""
+    out = np.empty(2 * len(array), array.dtype)
+    for n in range(len(array)):
+        out[n] = array[n]
+    return out
 
 
 @njit(cache=True, error_model="numpy")
@@ -218,7 +238,14 @@ def _piece(edges: NDArray, value: float, guess: int) -> int:
         for piece in range(guess, min(guess + 4, last)):
             if value < edges[piece + 1]:
                 return piece
-    return min(max(int(np.searchsorted(edges, value, side="right")) - 1, 0), last)
+    below, above = 0, last + 1
+    while above - below > 1:
+        middle = (below + above) // 2
+        if edges[middle] <= value:
+            below = middle
+        else:
+            above = middle
+    return below
 
 
 @njit(error_model="numpy")

@@ -196,7 +196,8 @@ def _parameters(
         x = place[n] * step
         data[14] = yaw[k] + x * (dyaw[k] + x * ddyaw[k] / 2)
         data[15], data[16] = (dyaw[k] + x * ddyaw[k]) * step, ddyaw[k] * step**2
-    p[len(p) - len(behind) :] = behind
+    for n in range(len(behind)):
+        p[len(p) - len(behind) + n] = behind[n]
     return p
 
 
