@@ -4,12 +4,12 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
 from cfplan.geometry.polynomials import shifted
+from cfplan.machine_code import njit
 
 MAX_ORDER = 5
 STANDSTILL = 0.01  # |γ'|, which is 1 at the nominal 1 m/s: where an inner minimum falls below this, the path stops
@@ -142,7 +142,7 @@ class Path:
         )
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray, out: NDArray) -> None:
     """Write γ and four derivatives at s into `out`, consecutive points of one piece together, up to _BATCH of them."""
     place, x = np.empty(len(s)), np.empty(_BATCH)
@@ -190,7 +190,7 @@ def _piece_at(breaks: NDArray, s: float) -> int:
     return piece
 
 
-@njit(cache=True)
+@njit
 def _values(breaks: NDArray, origins: NDArray, table: NDArray, places: NDArray) -> NDArray:
     """Return piecewise polynomials at each s, (N,), as (N, 3)."""
     out = np.empty((len(places), 3))

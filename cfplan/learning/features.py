@@ -11,10 +11,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
+from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile import BoundaryState
@@ -76,7 +76,7 @@ def start_logs(state: BoundaryState, step: float) -> tuple[float, float, float]:
     return coefficient_logs(state.h, state.dh * step, state.ddh * step * step, step)
 
 
-@njit(cache=True)
+@njit
 def coefficient_logs(h: float, slope: float, bend: float, step: float) -> tuple[float, float, float]:
     """log √u/Δs of u₋₁, u₀, u₁ from h, h'Δs, h''Δs²; what would be hardly positive is raised."""
     least, unit = LEAST_SHARE * h, math.log(step)
@@ -87,7 +87,7 @@ def coefficient_logs(h: float, slope: float, bend: float, step: float) -> tuple[
     )
 
 
-@njit(cache=True)
+@njit
 def told(before: float, first: float, after: float) -> tuple[float, float, float]:
     """The start of a window as the network hears of it: a log rate, and its first and second difference."""
     return first, after - before, after + before - 2.0 * first
@@ -123,7 +123,7 @@ def window_inputs(
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def fill_nodes(out: NDArray, breaks: NDArray, coefficients: NDArray, first: float, step: float, bound: Bounds) -> None:
     """See node_table. Beyond its end a path stays where it ends, by the derivatives that it has there."""
     pieces, powers = coefficients.shape[0], coefficients.shape[1]
@@ -162,7 +162,7 @@ def fill_nodes(out: NDArray, breaks: NDArray, coefficients: NDArray, first: floa
             row[13 + k] = min(row[13 + k] - row[REFERENCE], ROOM)
 
 
-@njit(cache=True)
+@njit
 def fill_inputs(
     out: NDArray, table: NDArray, rest_start: bool, rest_end: bool, known: bool, start: tuple[float, float, float],
     yaw: float, turning: float,
@@ -192,7 +192,7 @@ def fill_inputs(
         out[n, COLUMNS + 8] = turning
 
 
-@njit(cache=True)
+@njit
 def turn(yaw: NDArray, first: float, answer: NDArray) -> None:
     """Write yaw at a window's first nodes, (K,) rad, not wrapped: `first`, then as the network's answer turns."""
     before = math.atan2(answer[0, 2], answer[0, 1])

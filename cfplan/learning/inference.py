@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.learning.features import INPUTS, OUTPUTS
+from cfplan.machine_code import njit
 
 # tanh as a rational function of degree 13 over 6 (the minimax fit that Eigen uses), within 2e-7 where it is not ±1.
 _REACH = np.float32(7.90531)
@@ -124,7 +124,7 @@ def _normalise(layer: Layer, weights: Mapping[str, NDArray]) -> None:
     layer.inward = inward.astype(np.float32)
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy")
 def _tanh(x: np.float32) -> np.float32:
     x = max(min(x, _REACH), -_REACH)
     y = x * x
@@ -132,7 +132,7 @@ def _tanh(x: np.float32) -> np.float32:
     return above / (_B0 + y * (_B2 + y * (_B4 + y * _B6)))
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy")
 def _run(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, cell: NDArray) -> None:
     """An LSTM layer over all steps; gates in torch's order: input, forget, cell, output."""
     steps, hidden = out.shape[0], last.shape[1]

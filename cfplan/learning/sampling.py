@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
@@ -30,6 +29,7 @@ from cfplan.learning.features import (
     fill_nodes,
     told,
 )
+from cfplan.machine_code import njit
 from cfplan.planners.solution import Status
 from cfplan.safety.limit_sets import LIMIT_SETS
 
@@ -194,7 +194,7 @@ def draw(labels: Labels, bound: Bounds, rows: NDArray, window: int, random: np.r
     return batch
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _fill(
     inputs: NDArray, targets: NDArray, weights: NDArray, times: NDArray, labels: Labels, bound: Bounds, rows: NDArray,
     first: NDArray, share: NDArray, knows: NDArray, noise: NDArray,

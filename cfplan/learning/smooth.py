@@ -9,9 +9,9 @@ equal, so that h stays constant over the first or last interval (see planners/ex
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
 from cfplan.vehicle.profile_spline import weights_at
 
 DURATION = 0.07
@@ -30,7 +30,7 @@ class Begin(IntEnum):
     FREE = 2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def smoothed(rates: NDArray, settled: NDArray, begin: int, rest_end: bool, duration: float = DURATION) -> NDArray:
     """(W+3,) log √u/Δs at nodes -1 … W+1 from answers, (W+1,), and what is settled, (3,)."""
     count = len(rates) + 2
@@ -69,7 +69,7 @@ def smoothed(rates: NDArray, settled: NDArray, begin: int, rest_end: bool, durat
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _solve(band: NDArray, right: NDArray) -> None:
     """Cholesky in place of a banded matrix, then both substitutions."""
     size = len(right)

@@ -1,8 +1,9 @@
 """How far points lie from a path."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from cfplan.machine_code import njit
 
 BLOCK = 32  # segments that are passed over at once where the box around them is farther away than what is found
 
@@ -18,7 +19,7 @@ def distance_to_path(points: NDArray, path: NDArray) -> NDArray:
     return np.sqrt(_squares(np.ascontiguousarray(points, dtype=float), corners, low, high))
 
 
-@njit(cache=True)
+@njit
 def _squares(points: NDArray, path: NDArray, low: NDArray, high: NDArray) -> NDArray:
     """Block by block, each point beginning with the block in which the point before it found its place."""
     found = np.empty(len(points))
@@ -42,7 +43,7 @@ def _squares(points: NDArray, path: NDArray, low: NDArray, high: NDArray) -> NDA
     return found
 
 
-@njit(cache=True)
+@njit
 def _to_segment(point: NDArray, begin: NDArray, end: NDArray) -> float:
     """m², from a point to a straight line between two others."""
     along = length = 0.0

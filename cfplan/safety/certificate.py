@@ -13,10 +13,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.space import Space
 from cfplan.vehicle import dense
@@ -133,7 +133,7 @@ def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = No
     stretches, (quantities, table) = _stretches(trajectory), _quantities(trajectory.airframe, limits, space)
     walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
     arrays = dense.arrays_of(trajectory.airframe, trajectory.path, trajectory.profile)
-    values, places, _ = _search(table, walls, BATCH, *arrays, *stretches)
+    values, places = _search(table, walls, BATCH, *arrays, *stretches)
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     peaks = zip(quantities, values.tolist(), when, places.tolist(), where, strict=True)
     return Certificate(
@@ -225,7 +225,7 @@ def _stretches(trajectory: Trajectory) -> Stretches:
     return Stretches(*_cut(timing.s, timing.interval, timing.nodes, path.breaks, every))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _cut(
     s: NDArray, intervals: NDArray, nodes: NDArray, breaks: NDArray, every: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
@@ -256,43 +256,38 @@ def _cut(
     return edges[:-1], edges[1:], interval, piece, counts
 
 
-def _compile(sources: int) -> Callable[..., tuple[NDArray, NDArray, int]]:
-    """The search, which returns `sources` too: a checksum of what it calls, as numba's cache does not look there."""
-
-    @njit(cache=True, error_model="numpy")
-    def search(
-        table: NDArray, walls: NDArray, batch: int, body: Body, coefficients: NDArray, origins: NDArray, nodes: NDArray,
-        left: NDArray, right: NDArray, interval: NDArray, piece: NDArray, counts: NDArray,
-    ) -> tuple[NDArray, NDArray, int]:  # fmt: skip
-        """Peak of each of the table's quantities, and s there; about `batch` samples at a time."""
-        values, places = np.full(len(table), -np.inf), np.zeros(len(table))
-        most = 0
-        for n in range(len(counts)):
-            most = max(most, counts[n])
-        rows = np.empty((dense.SAMPLED_ROWS, batch + most))
-        begin = 0
-        while begin < len(counts):
-            end, samples = begin, 0
-            while end < len(counts) and samples < batch:
-                dense.sample(
-                    rows[:, samples : samples + counts[end]], body, coefficients[piece[end]], origins[piece[end]],
-                    nodes[interval[end]], left[end], right[end],
-                )  # fmt: skip
-                samples += counts[end]
-                end += 1
-            for axis in range(walls.shape[1]):  # in place of positions, how far from the walls they are
-                middle, half = (walls[0, axis] + walls[1, axis]) / 2, (walls[1, axis] - walls[0, axis]) / 2
-                position = rows[dense.POSITION + axis]
-                for n in range(samples):
-                    position[n] = half - abs(position[n] - middle)
-            _raise_peaks(values, places, table, rows, rows[dense.PLACE], counts[begin:end])
-            begin = end
-        return values, places, sources
-
-    return search
+@njit(error_model="numpy")
+def _search(
+    table: NDArray, walls: NDArray, batch: int, body: Body, coefficients: NDArray, origins: NDArray, nodes: NDArray,
+    left: NDArray, right: NDArray, interval: NDArray, piece: NDArray, counts: NDArray,
+) -> tuple[NDArray, NDArray]:  # fmt: skip
+    """Peak of each of the table's quantities, and s there; about `batch` samples at a time."""
+    values, places = np.full(len(table), -np.inf), np.zeros(len(table))
+    most = 0
+    for n in range(len(counts)):
+        most = max(most, counts[n])
+    rows = np.empty((dense.SAMPLED_ROWS, batch + most))
+    begin = 0
+    while begin < len(counts):
+        end, samples = begin, 0
+        while end < len(counts) and samples < batch:
+            dense.sample(
+                rows[:, samples : samples + counts[end]], body, coefficients[piece[end]], origins[piece[end]],
+                nodes[interval[end]], left[end], right[end],
+            )  # fmt: skip
+            samples += counts[end]
+            end += 1
+        for axis in range(walls.shape[1]):  # in place of positions, how far from the walls they are
+            middle, half = (walls[0, axis] + walls[1, axis]) / 2, (walls[1, axis] - walls[0, axis]) / 2
+            position = rows[dense.POSITION + axis]
+            for n in range(samples):
+                position[n] = half - abs(position[n] - middle)
+        _raise_peaks(values, places, table, rows, rows[dense.PLACE], counts[begin:end])
+        begin = end
+    return values, places
 
 
-@njit(cache=True)
+@njit
 def _raise_peaks(values: NDArray, places: NDArray, table: NDArray, rows: NDArray, s: NDArray, counts: NDArray) -> None:
     """Take over the peaks of these samples where they are higher. `table`, (Q, 3): first row, how many, and sign.
 
@@ -319,7 +314,7 @@ def _raise_peaks(values: NDArray, places: NDArray, table: NDArray, rows: NDArray
                         places[k] = s[begin + index]
 
 
-@njit(cache=True)
+@njit
 def _peak(row: NDArray, sign: int, lift: NDArray, peak: float) -> tuple[int, float]:
     """Index of the largest of `sign` times (N,), and that with what may rise above it between samples.
 
@@ -347,6 +342,3 @@ def _bound(before: float, here: float, after: float) -> float:
     sag = 2.0 * here - before - after
     higher = before if before > after else after
     return (here if here > higher else higher) + _ALLOWANCE * (0.0 if sag <= 0.0 else sag)
-
-
-_search = _compile(dense.SOURCES)

@@ -5,17 +5,14 @@ out, the controller goes on with the body rates of that last setpoint, so a vehi
 quite level and may speed up; where it comes down depends on the moment, and is found by flying it.
 """
 
-import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
+from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dynamics.body import ALL_WELL, STILL_AIR, THRUST_MAX, TIME_STEP, hovering, pack_body, step_body
 from cfplan.simulation.dynamics.mellinger import (
@@ -95,67 +92,68 @@ def swept_when_orphaned(
     return state.position[last], swept
 
 
-def _compile(sources: int) -> Callable[..., int]:
-    """The loop, which returns `sources`: numba's cache notices a change there only if the loop closes over them."""
-
-    @njit(cache=True)
-    def control_and_move(
-        step: int,
-        state: NDArray,
-        memory: NDArray,
-        thrusts: NDArray,
-        gains: NDArray,
-        setpoint: NDArray,
-        mode: NDArray,
-        body: NDArray,
-    ) -> None:
-        if step % _STEPS_A_CONTROL == 0:
-            control, motors = np.zeros(4), np.zeros(4)
-            step_mellinger(control, memory, gains, setpoint, mode, state)
-            distribute_power(control, motors)
-            thrusts[:] = motors * (body[THRUST_MAX] / FULL_COMMAND)
-        step_body(state, thrusts, body, STILL_AIR, ALL_WELL)
-
-    @njit(cache=True)
-    def run(
-        swept: NDArray,
-        moments: NDArray,
-        start: NDArray,
-        setpoints: NDArray,
-        arrivals: NDArray,
-        gains: NDArray,
-        body: NDArray,
-        level_after: int,
-        off_after: int,
-        longest: int,
-    ) -> int:
-        state, memory, thrusts = start.copy(), np.zeros(MEMORY_SIZE), np.zeros(4)
-        newest, step = 0, 0
-        for number in range(len(moments)):
-            while step < moments[number]:
-                while newest + 1 < len(arrivals) and arrivals[newest + 1] <= step:
-                    newest += 1
-                control_and_move(step, state, memory, thrusts, gains, setpoints[newest], FULL_STATE, body)
-                step += 1
-            alone, mode, last = state.copy(), FULL_STATE.copy(), setpoints[newest].copy()
-            its_memory, its_thrusts = memory.copy(), thrusts.copy()
-            swept[number, 0], swept[number, 1] = alone[0:3], alone[0:3]
-            for after in range(longest):
-                if after == level_after:
-                    level_out(last, mode)
-                if after < off_after:
-                    control_and_move(step + after, alone, its_memory, its_thrusts, gains, last, mode, body)
-                else:
-                    its_thrusts[:] = 0.0
-                    step_body(alone, its_thrusts, body, STILL_AIR, ALL_WELL)
-                swept[number, 0] = np.minimum(swept[number, 0], alone[0:3])
-                swept[number, 1] = np.maximum(swept[number, 1], alone[0:3])
-                if after > off_after and alone[2] <= 0.0:
-                    break
-        return sources
-
-    return run
+@njit
+def _control_and_move(
+    step: int,
+    state: NDArray,
+    memory: NDArray,
+    thrusts: NDArray,
+    gains: NDArray,
+    setpoint: NDArray,
+    mode: NDArray,
+    body: NDArray,
+    wind: NDArray,
+    efficiency: NDArray,
+) -> None:
+    if step % _STEPS_A_CONTROL == 0:
+        control, motors = np.zeros(4), np.zeros(4)
+        step_mellinger(control, memory, gains, setpoint, mode, state)
+        distribute_power(control, motors)
+        for k in range(4):
+            thrusts[k] = motors[k] * (body[THRUST_MAX] / FULL_COMMAND)
+    step_body(state, thrusts, body, wind, efficiency)
 
 
-_CALLED = [(Path(__file__).parent / "dynamics" / name).read_bytes() for name in ("body.py", "mellinger.py")]
-_run = _compile(zlib.crc32(b"".join(_CALLED)))
+@njit
+def _run(
+    swept: NDArray,
+    moments: NDArray,
+    start: NDArray,
+    setpoints: NDArray,
+    arrivals: NDArray,
+    gains: NDArray,
+    body: NDArray,
+    level_after: int,
+    off_after: int,
+    longest: int,
+) -> None:
+    state, memory, thrusts = start.copy(), np.zeros(MEMORY_SIZE), np.zeros(4)
+    flying, wind, efficiency = FULL_STATE.copy(), STILL_AIR.copy(), ALL_WELL.copy()
+    newest, step = 0, 0
+    for number in range(len(moments)):
+        while step < moments[number]:
+            while newest + 1 < len(arrivals) and arrivals[newest + 1] <= step:
+                newest += 1
+            _control_and_move(step, state, memory, thrusts, gains, setpoints[newest], flying, body, wind, efficiency)
+            step += 1
+        alone, mode, last = state.copy(), flying.copy(), setpoints[newest].copy()
+        its_memory, its_thrusts = memory.copy(), thrusts.copy()
+        for k in range(3):
+            swept[number, 0, k], swept[number, 1, k] = alone[k], alone[k]
+        for after in range(longest):
+            if after == level_after:
+                level_out(last, mode)
+            if after < off_after:
+                now = step + after
+                _control_and_move(now, alone, its_memory, its_thrusts, gains, last, mode, body, wind, efficiency)
+            else:
+                for k in range(4):
+                    its_thrusts[k] = 0.0
+                step_body(alone, its_thrusts, body, wind, efficiency)
+            for k in range(3):
+                if not swept[number, 0, k] <= alone[k]:  # so that what is no number is taken over
+                    swept[number, 0, k] = alone[k]
+                if not swept[number, 1, k] >= alone[k]:
+                    swept[number, 1, k] = alone[k]
+            if after > off_after and alone[2] <= 0.0:
+                break

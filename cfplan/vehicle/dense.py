@@ -5,17 +5,14 @@ the other in one array: so the compiler knows that they do not overlap, and work
 instruction. How many places of the rows are in use is known at run time only, else it would write the loops out.
 """
 
-import zlib
-from collections.abc import Callable
-from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
+from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.flatness import ROUNDING, Body, Flat, compiled_body, flat_state
 from cfplan.vehicle.profile import SpeedProfile, h_within, yaw_within
@@ -115,41 +112,35 @@ def arrays_of(airframe: Airframe, path: Path, profile: SpeedProfile) -> tuple[Bo
     return compiled_body(airframe), coefficients, path.origins, profile.table()
 
 
-def _compile(sources: int) -> tuple[Callable[..., int], Callable[..., int]]:
-    """The loops, which return `sources`: a checksum of what they call, as numba's cache does not look there."""
+@njit(error_model="numpy", fastmath=ROUNDING)
+def _at_points(
+    out: NDArray, body: Body, derivatives: NDArray, nodes: NDArray, places: NDArray, interval: NDArray
+) -> None:
+    panel = np.empty(_SIZE)
+    for start in range(0, len(places), WIDTH):
+        lanes = min(WIDTH, _whole(len(places) - start))
+        begin = min(start, len(places) - lanes)
+        _place(panel, 3, derivatives, nodes, places, interval, begin, lanes)
+        _flatten(panel, body, lanes)
+        for row in range(ROWS):
+            for n in range(lanes):
+                out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
 
-    @njit(cache=True, error_model="numpy", fastmath=ROUNDING)
-    def at_points(
-        out: NDArray, body: Body, derivatives: NDArray, nodes: NDArray, places: NDArray, interval: NDArray
-    ) -> int:
-        panel = np.empty(_SIZE)
-        for start in range(0, len(places), WIDTH):
-            lanes = min(WIDTH, _whole(len(places) - start))
-            begin = min(start, len(places) - lanes)
-            _place(panel, 3, derivatives, nodes, places, interval, begin, lanes)
-            _flatten(panel, body, lanes)
-            for row in range(ROWS):
-                for n in range(lanes):
-                    out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
-        return sources
 
-    @njit(cache=True, error_model="numpy", fastmath=ROUNDING)
-    def states(out: NDArray, body: Body, curves: NDArray, nodes: NDArray, places: NDArray, interval: NDArray) -> int:
-        panel = np.empty(_SIZE)
-        for start in range(0, len(places), WIDTH):
-            lanes = min(WIDTH, _whole(len(places) - start))
-            begin = min(start, len(places) - lanes)
-            _place(panel, 0, curves, nodes, places, interval, begin, lanes)
-            _flatten_whole(panel, body, lanes)
-            for row in range(3):
-                for n in range(lanes):
-                    out[row, begin + n] = panel[(_CURVE + row) * WIDTH + n]
-            for row in range(3, STATE_ROWS):
-                for n in range(lanes):
-                    out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
-        return sources
-
-    return at_points, states
+@njit(error_model="numpy", fastmath=ROUNDING)
+def _states(out: NDArray, body: Body, curves: NDArray, nodes: NDArray, places: NDArray, interval: NDArray) -> None:
+    panel = np.empty(_SIZE)
+    for start in range(0, len(places), WIDTH):
+        lanes = min(WIDTH, _whole(len(places) - start))
+        begin = min(start, len(places) - lanes)
+        _place(panel, 0, curves, nodes, places, interval, begin, lanes)
+        _flatten_whole(panel, body, lanes)
+        for row in range(3):
+            for n in range(lanes):
+                out[row, begin + n] = panel[(_CURVE + row) * WIDTH + n]
+        for row in range(3, STATE_ROWS):
+            for n in range(lanes):
+                out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
 
 
 @register_jitable(fastmath=ROUNDING)
@@ -346,10 +337,3 @@ def _vector(panel: NDArray, row: int, n: int) -> tuple[float, float, float]:
 @register_jitable(forceinline=True, fastmath=ROUNDING)
 def _squared(vector: tuple[float, float, float]) -> float:
     return vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]
-
-
-_NAMES = ("flatness.py", "profile.py", "rotations.py", "trigonometry.py")
-_CALLED = [FilePath(__file__).with_name(name).read_bytes() for name in _NAMES]
-SOURCES = zlib.crc32(b"".join([*_CALLED, FilePath(__file__).read_bytes()]))
-# a checksum of what compiled samples come from, for those that compile this in; numba's cache does not look there
-_at_points, _states = _compile(zlib.crc32(b"".join(_CALLED)))

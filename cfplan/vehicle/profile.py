@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
 from cfplan.vehicle.rotations import Scalar
 
 # Compiled into the loop that calls it; without fast arithmetic, so that all callers get the same to the last bit.
@@ -96,7 +96,7 @@ def yaw_within(x: Scalar, yaw: Scalar, dyaw: Scalar, ddyaw: Scalar) -> tuple[Sca
     return yaw + x * (dyaw + x * ddyaw / 2), dyaw + x * ddyaw, ddyaw
 
 
-@njit(cache=True)
+@njit
 def _table(
     s: NDArray, h: NDArray, dh: NDArray, ddh: NDArray, dddh: NDArray, yaw: NDArray, dyaw: NDArray, ddyaw: NDArray
 ) -> NDArray:

@@ -9,13 +9,13 @@ quadratic spline on the same grid, yaw_spline.py has the same.
 """
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
+from cfplan.machine_code import njit
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.rotations import Scalar
 from cfplan.vehicle.yaw_spline import YawSpline
@@ -29,7 +29,7 @@ def spline_profile(coefficients: NDArray, end: float, yaw: YawSpline) -> SpeedPr
     return SpeedProfile(*_on_grid(coefficients, end), yaw.yaw, yaw.dyaw, yaw.ddyaw)
 
 
-@njit(cache=True)
+@njit
 def _on_grid(cubic: NDArray, end: float) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
     """Return s, and h with two derivatives, at nodes; the third in intervals."""
     count = len(cubic) - 3

@@ -11,9 +11,10 @@ yaw (ZYX), which `yaw_of` gives, differs from it by a little that vanishes with 
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
+
+from cfplan.machine_code import njit
 
 Scalar = Any  # float, NDArray or casadi.SX
 Vector = tuple[Scalar, Scalar, Scalar]
@@ -75,7 +76,7 @@ def product(first: Quaternion, second: Quaternion) -> tuple[Scalar, Scalar, Scal
     )
 
 
-@njit(cache=True)
+@njit
 def matrix_of(quaternion: NDArray) -> NDArray:
     """Return the (3, 3) matrix of a unit quaternion, (4,): its columns are the body's axes."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]

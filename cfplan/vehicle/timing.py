@@ -7,11 +7,11 @@ and until a polynomial of degree 7 in time, which matches s and three time deriv
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import NotCertifiedError
+from cfplan.machine_code import njit
 from cfplan.vehicle.profile import SpeedProfile
 
 TOLERANCE = 1e-12  # s, of each piece
@@ -115,7 +115,7 @@ def _node(nodes: NDArray, bad: NDArray) -> str:
     return f"node {index}, s = {nodes[index, 0]:.6g}"
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
     """Whether nothing is wrong; the least h in each interval, (N,); by how much h, h', h'', yaw and yaw' jump at its
     end, (N, 5), and by how much they may, (5,)."""
@@ -151,7 +151,7 @@ def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
     return sound, least, jumps, allowed
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _split(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
     """Start, duration, interval and inverse of each piece; and where pieces never get short enough, else NaN."""
     room = 2 * len(nodes) + 100
@@ -199,7 +199,7 @@ def _longer(array: NDArray) -> NDArray:
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _duration(nodes: NDArray) -> float:
     total = 0.0
     for k in range(len(nodes) - 1):
@@ -207,7 +207,7 @@ def _duration(nodes: NDArray) -> float:
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _times(edges: NDArray, time: NDArray, interval: NDArray, nodes: NDArray, places: NDArray) -> NDArray:
     out = np.empty(len(places))
     piece = 0
@@ -218,7 +218,7 @@ def _times(edges: NDArray, time: NDArray, interval: NDArray, nodes: NDArray, pla
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _places(edges: NDArray, time: NDArray, polynomial: NDArray, times: NDArray) -> NDArray:
     out = np.empty(len(times))
     piece = 0

@@ -12,13 +12,13 @@ smoothly across. This is the yaw of the Hopf fibration; heading differs from it 
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import bmat, csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
+from cfplan.machine_code import njit
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 
 SMOOTHING_LENGTH = 0.15  # s of nominal time, over which a sudden turn is spread
@@ -121,7 +121,7 @@ def end_coefficients(yaw: float, turn: float) -> tuple[float, float]:
     return yaw - turn / 2, yaw + turn / 2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _smooth(yaw: NDArray) -> NDArray:
     """Return (N+2,) coefficients of smoothed angles, (N+1,): means of neighbours, level at both ends."""
     last = len(yaw) - 1

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, encode, joined
+from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.trajectory import Trajectory
@@ -246,7 +246,7 @@ def _require(good: NDArray, what: str, values: NDArray, first: int = 0) -> None:
         raise NotCertifiedError(f"{what} {values[row]:.4g}", where=f"setpoint {first + row}")
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _inspected(
     position: NDArray, velocity: NDArray, acceleration: NDArray, quaternion: NDArray, body_rate: NDArray,
     meant_position: NDArray, meant_velocity: NDArray, meant_acceleration: NDArray, meant_quaternion: NDArray,
@@ -290,7 +290,7 @@ def _norm(x: float, y: float, z: float) -> float:
     return math.sqrt(x * x + y * y + z * z)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _angles(first: NDArray, second: NDArray) -> NDArray:
     """(N,) rad between attitudes (N, 3, 3)."""
     out = np.empty(len(first))
@@ -304,7 +304,7 @@ def _angles(first: NDArray, second: NDArray) -> NDArray:
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _frames(quaternions: NDArray) -> NDArray:
     """(N, 3, 3) whose columns are the body axes of attitudes (N, 4), not zero."""
     out = np.empty((len(quaternions), 3, 3))
@@ -319,7 +319,7 @@ def _frames(quaternions: NDArray) -> NDArray:
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _attitudes(thrusts: NDArray, quaternions: NDArray) -> NDArray:
     """What controller_attitude gives: z along the thrust, y along z × [cos yaw, sin yaw, 0]."""
     out = np.empty((len(thrusts), 3, 3))
@@ -338,7 +338,7 @@ def _attitudes(thrusts: NDArray, quaternions: NDArray) -> NDArray:
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _commands(quaternions: NDArray) -> NDArray:
     """What command_quaternion gives: z as planned, x above [cos yaw, sin yaw]."""
     out = np.empty((len(quaternions), 4))

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
+from cfplan.machine_code import njit
 
 CRTP_PORT = 7
 FULL_STATE_TYPE = 6
@@ -108,7 +108,7 @@ def decompress_quaternion(compressed: NDArray) -> NDArray:
     return _decompressed(np.array(compressed, dtype=np.int64))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _compressed(quaternions: NDArray) -> tuple[NDArray, int]:
     """And the first row that is zero or not finite, else -1."""
     out = np.empty(len(quaternions), dtype=np.uint32)
@@ -132,7 +132,7 @@ def _compressed(quaternions: NDArray) -> tuple[NDArray, int]:
     return out, -1
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _decompressed(compressed: NDArray) -> NDArray:
     out = np.empty((len(compressed), 4))
     for n in range(len(compressed)):

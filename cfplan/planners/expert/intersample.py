@@ -4,10 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
+from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle import dense
@@ -124,7 +124,7 @@ def _as_shares(at: NDArray, limits: PlanLimits) -> NDArray:
     return _scaled(at, middle, scales)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _scaled(at: NDArray, middle: float, scales: NDArray) -> NDArray:
     rows = np.empty((COLUMNS, at.shape[1]))
     for n in range(at.shape[1]):

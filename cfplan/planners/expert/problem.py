@@ -4,10 +4,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
+from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.initial_guess import guess_spline
 from cfplan.planners.expert.intersample import SPEED, Excess, spread
@@ -178,7 +178,7 @@ def profile_of(table: NDArray, unit: float, track: YawSpline, end: float) -> Spe
     return spline_profile(table[:, 0] * unit, end, track)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _parameters(
     curve: NDArray, interval: NDArray, place: NDArray, weight: NDArray, yaw: NDArray, dyaw: NDArray, ddyaw: NDArray,
     step: float, behind: NDArray,
@@ -201,7 +201,7 @@ def _parameters(
     return p
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _bounds(
     velocity: NDArray, margin: NDArray, speed: float, unit: float, block: int, variables: int, constraints: int,
     interval: NDArray, row: NDArray, point: NDArray, point_rows: NDArray, speed_rows: NDArray,

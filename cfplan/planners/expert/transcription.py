@@ -12,10 +12,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.compiled import Backend
 from cfplan.planners.expert.kernel import H_SPLINE, LANES, YAW_SPLINE, Points, coefficients
@@ -215,7 +215,7 @@ def _linear_rows(layout: Layout, positive: NDArray) -> tuple[NDArray, NDArray, i
     return np.ascontiguousarray(np.concatenate(weights).T), np.concatenate(interval), int(layout.shape.free_yaw)
 
 
-@njit(cache=True)
+@njit
 def _by_quantity(of_points, order):
     """(POINT_DATA, P) from (points, POINT_DATA). What is there to fill the lanes costs nothing."""
     data = np.empty((of_points.shape[1], len(order)))
@@ -226,7 +226,7 @@ def _by_quantity(of_points, order):
     return data
 
 
-@njit(cache=True)
+@njit
 def _smallest(table, of, size):
     v = np.full(size, np.inf)
     for n in range(table.shape[0]):
@@ -240,7 +240,7 @@ def _smallest(table, of, size):
     return v
 
 
-@njit(cache=True)
+@njit
 def _limits(
     lbx, ubx, lbg, ubg, point_rows, selected, speed_rows, block, positive, of_yaw, yaw_held, count
 ):  # fmt: skip
@@ -278,7 +278,7 @@ def _weigh(linear, linear_interval, of_yaw, local, result):
         result[j] = value + linear[2, j] * local[i, first + 2] + linear[3, j] * local[i, first + 3]
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FREELY)
+@njit(error_model="numpy", fastmath=_FREELY)
 def _place(v, slots, interval, local, at_points, linear, linear_interval, of_yaw, g, places, weights):
     """Each interval's coefficients, (N, k), where they are free; all of them at its points; and what is linear in them.
 
@@ -302,7 +302,7 @@ def _place(v, slots, interval, local, at_points, linear, linear_interval, of_yaw
     return total
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FREELY)
+@njit(error_model="numpy", fastmath=_FREELY)
 def _sum_by_interval(at_points, interval, by_interval):
     for a in range(len(by_interval)):
         row, result = at_points[a], by_interval[a]
@@ -316,7 +316,7 @@ def _entry(column, row, size):
     return column * size - column * (column - 1) // 2 + row - column
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FREELY)
+@njit(error_model="numpy", fastmath=_FREELY)
 def _assemble(
     at_gradients, at_hessian, interval, slots, entries, linear, linear_interval, of_yaw, pulls, local, scale, places,
     weights, gradients, matrix,
@@ -365,7 +365,7 @@ def _assemble(
                 flat[entries[i, e, 0]] += entries[i, e, 1] * of_hessian[e, i]
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FREELY)
+@njit(error_model="numpy", fastmath=_FREELY)
 def _along(jacobian, interval, slots, linear, linear_interval, of_yaw, dv, result):
     count, k = slots.shape
     points = jacobian.shape[1]

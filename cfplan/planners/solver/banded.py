@@ -2,13 +2,13 @@
 
 import math
 
-from numba import njit
+from cfplan.machine_code import njit
 
 REGULARISED, REGULARISED_MOST = 1e-4, 1e14
 # added to a diagonal where it must, at first and at most
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def factorise(matrix, added, factor):
     """The Cholesky factor of the matrix plus `added` on its diagonal, into `factor`; False where there is none.
 
@@ -34,7 +34,7 @@ def factorise(matrix, added, factor):
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy", fastmath={"contract"})
 def solve(factor, x):
     """Solve for the right side x, in place."""
     size, width = factor.shape
@@ -50,7 +50,7 @@ def solve(factor, x):
             x[r - d] -= factor[r, d] * value
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def solve_regularised(matrix, regularised, factor, x):
     """Solve for the right side x, in place, with as much added to the diagonal as makes the matrix positive definite.
 

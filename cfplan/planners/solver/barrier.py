@@ -8,9 +8,10 @@ arithmetic, several at a time.
 import math
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
+
+from cfplan.machine_code import njit
 
 PULLS = ("stiffness", "multiplier", "wall", "missing")
 # of each constraint, by row: Σ of its slack; y; the slope of a barrier of 1 there; Σ times what it is off its slack
@@ -22,7 +23,7 @@ _SUMS = {"contract", "reassoc", "nsz", "arcp"}  # freedom that what is not a num
 _LANES = 16  # numbers that the compiler may want to compare at once
 
 
-@njit(cache=True)
+@njit
 def bounds_of(lower: NDArray, upper: NDArray) -> NDArray:
     """(5, m) lower and upper bound, whether each is there, and whether either is."""
     bounds = np.empty((5, len(lower)))
@@ -33,7 +34,7 @@ def bounds_of(lower: NDArray, upper: NDArray) -> NDArray:
     return bounds
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def first(g, bounds, barrier, push, state, pulls):
     """Slacks where the constraints are, but inside by `push` of the span between bounds at least; multipliers that the
     barrier makes of them. Fills in the pulls too.
@@ -68,7 +69,7 @@ def _largest(values):
     return largest
 
 
-@njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@njit(error_model="numpy", fastmath=_SUMS)
 def errors(g, bounds, state, barrier):
     """The largest |g - s|, and the largest difference of a slack's product from the barrier. For finite numbers."""
     lower, upper, has_low, has_high, active = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
@@ -82,7 +83,7 @@ def errors(g, bounds, state, barrier):
     return _largest(infeasible), _largest(off)
 
 
-@njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@njit(error_model="numpy", fastmath=_SUMS)
 def steps(g, along, bounds, state, barrier, most, step):
     """Fill in the step, where g changes by `along`.
 
@@ -112,7 +113,7 @@ def steps(g, along, bounds, state, barrier, most, step):
     return barrier * slope, min(1.0, share), min(1.0, share_dual)
 
 
-@njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@njit(error_model="numpy", fastmath=_SUMS)
 def standing(g, bounds, state, step, share, barrier, rows):
     """How infeasible the slacks are after a share of the step, as a sum, and what the barrier adds to the cost.
 
@@ -141,7 +142,7 @@ def standing(g, bounds, state, step, share, barrier, rows):
     return infeasible, -barrier * total
 
 
-@njit(cache=True, error_model="numpy", fastmath=_SUMS)
+@njit(error_model="numpy", fastmath=_SUMS)
 def advance(g, bounds, state, step, share, share_dual, barrier, pulls):
     """Take the step, in place, and fill in the pulls where g is now; gives the errors there.
 

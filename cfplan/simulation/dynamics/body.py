@@ -10,9 +10,9 @@ The floor is inelastic and holds: a body on it that the rotors do not lift stand
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import about_z, matrix_of, product, yaw_of
 
@@ -65,7 +65,7 @@ def at_rest(position: NDArray, yaw: float = 0.0) -> NDArray:
     return state
 
 
-@njit(cache=True)
+@njit
 def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, efficiency: NDArray) -> None:
     """Carry `state` on by one TIME_STEP, in place.
 
@@ -114,7 +114,7 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
         _rest(state, body[FLOOR])
 
 
-@njit(cache=True)
+@njit
 def _turn(state: NDArray) -> None:
     """Turn the attitude by the body rate over one TIME_STEP, exactly for a constant rate."""
     wx, wy, wz = state[10], state[11], state[12]
@@ -129,7 +129,7 @@ def _turn(state: NDArray) -> None:
         state[6 + axis] = turned[axis] / norm
 
 
-@njit(cache=True)
+@njit
 def _rest(state: NDArray, floor: float) -> None:
     """Stand on the floor: still and level, yaw kept."""
     state[2] = floor

@@ -4,16 +4,13 @@ At each millisecond, in this order: the newest setpoint that has arrived; every 
 estimate as it is now; the body. So the firmware's recorded flights were made.
 """
 
-import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.packets import FullStateSetpoints
+from cfplan.machine_code import njit
 from cfplan.simulation.dynamics.body import (
     ALL_WELL,
     BODY_RATE,
@@ -139,51 +136,44 @@ def fly_setpoints(
         noise,
         np.asarray(wind, dtype=float),
         np.asarray(efficiency, dtype=float),
+        FULL_STATE,
     )
     return ClosedLoop(np.arange(steps + 1) * TIME_STEP, states, commands)
 
 
-def _compile_loop(sources: int) -> Callable[..., int]:
-    """The loop, which returns `sources`.
-
-    numba's cache compares a function's own file and what it closes over, not the files of the functions that it calls:
-    closing over a checksum of those keeps a changed body from flying as it was when the loop was compiled.
-    """
-
-    @njit(cache=True)
-    def run(
-        states: NDArray,
-        commands: NDArray,
-        setpoints: NDArray,
-        arrivals: NDArray,
-        gains: NDArray,
-        body: NDArray,
-        latency: int,
-        noise: NDArray,
-        wind: NDArray,
-        efficiency: NDArray,
-    ) -> int:
-        memory, control = np.zeros(MEMORY_SIZE), np.zeros(4)
-        motors, thrusts = np.zeros(4), np.zeros(4)
-        believed, state = np.empty(STATE_SIZE), states[0].copy()
-        newest = 0
-        scale = body[THRUST_MAX] / FULL_COMMAND
-        for step in range(len(states)):
-            states[step] = state
-            while newest + 1 < len(arrivals) and arrivals[newest + 1] <= step:
-                newest += 1
-            if step % _STEPS_A_CONTROL == 0:
-                believed[:] = state
-                believed[0:6] = states[max(step - latency, 0), 0:6] + noise[step]
-                step_mellinger(control, memory, gains, setpoints[newest], FULL_STATE, believed)
-                distribute_power(control, motors)
-                thrusts[:] = motors * scale
-            commands[step] = motors
-            step_body(state, thrusts, body, wind, efficiency)
-        return sources
-
-    return run
-
-
-_CALLED = [Path(__file__).with_name(name).read_bytes() for name in ("body.py", "mellinger.py")]
-_run = _compile_loop(zlib.crc32(b"".join(_CALLED)))
+@njit
+def _run(
+    states: NDArray,
+    commands: NDArray,
+    setpoints: NDArray,
+    arrivals: NDArray,
+    gains: NDArray,
+    body: NDArray,
+    latency: int,
+    noise: NDArray,
+    wind: NDArray,
+    efficiency: NDArray,
+    mode: NDArray,
+) -> None:
+    memory, control = np.zeros(MEMORY_SIZE), np.zeros(4)
+    motors, thrusts = np.zeros(4), np.zeros(4)
+    believed, state = np.empty(STATE_SIZE), states[0].copy()
+    newest = 0
+    scale = body[THRUST_MAX] / FULL_COMMAND
+    for step in range(len(states)):
+        for k in range(STATE_SIZE):
+            states[step, k] = state[k]
+        while newest + 1 < len(arrivals) and arrivals[newest + 1] <= step:
+            newest += 1
+        if step % _STEPS_A_CONTROL == 0:
+            for k in range(STATE_SIZE):
+                believed[k] = state[k]
+            for k in range(6):
+                believed[k] = states[max(step - latency, 0), k] + noise[step, k]
+            step_mellinger(control, memory, gains, setpoints[newest], mode, believed)
+            distribute_power(control, motors)
+            for k in range(4):
+                thrusts[k] = motors[k] * scale
+        for k in range(4):
+            commands[step, k] = motors[k]
+        step_body(state, thrusts, body, wind, efficiency)

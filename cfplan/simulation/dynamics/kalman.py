@@ -16,9 +16,10 @@ from dataclasses import astuple, dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import matrix_of, product
 
@@ -81,7 +82,7 @@ def new_filter(prior: NDArray) -> Filter:
     return made
 
 
-@njit(cache=True)
+@njit
 def reset(kalman: Filter, prior: NDArray) -> None:
     """Forget everything: stand still at the prior's place, quite unsure where that is."""
     for row in range(_SIZE):
@@ -96,7 +97,7 @@ def reset(kalman: Filter, prior: NDArray) -> None:
     _clear(kalman.sums)
 
 
-@njit(cache=True)
+@njit
 def step_filter(
     kalman: Filter, prior: NDArray, gyro: NDArray, acceleration: NDArray, poses: NDArray, tick: int, flying: bool
 ) -> bool:
@@ -128,7 +129,7 @@ def step_filter(
     return True
 
 
-@njit(cache=True)
+@njit
 def estimate(kalman: Filter, out: NDArray) -> None:
     """Write position 0:3, velocity 3:6 in world axes and quaternion 6:10 to `out`."""
     turn = matrix_of(kalman.quaternion)
@@ -141,13 +142,13 @@ def estimate(kalman: Filter, out: NDArray) -> None:
         out[6 + axis] = kalman.quaternion[axis]
 
 
-@njit(cache=True)
+@njit
 def _clear(values: NDArray) -> None:
     for place in range(len(values)):
         values[place] = 0.0
 
 
-@njit(cache=True)
+@njit
 def _within_bounds(kalman: Filter, prior: NDArray) -> bool:
     for axis in range(3):
         # Written so that NaN is out of bounds.
@@ -158,7 +159,7 @@ def _within_bounds(kalman: Filter, prior: NDArray) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit
 def _predict(kalman: Filter, prior: NDArray, flying: bool) -> None:
     """One step of PREDICTION_PERIOD with the means in `sums`.
 
@@ -194,7 +195,7 @@ def _predict(kalman: Filter, prior: NDArray, flying: bool) -> None:
         _normalise(kalman.quaternion)
 
 
-@njit(cache=True)
+@njit
 def _linearised(state: NDArray, turn: NDArray, gyro: NDArray, prior: NDArray, dt: float, flying: bool) -> NDArray:
     """(9, 9) how small changes of the state go through one prediction."""
     step = np.zeros((_SIZE, _SIZE))
@@ -215,7 +216,7 @@ def _linearised(state: NDArray, turn: NDArray, gyro: NDArray, prior: NDArray, dt
     return step
 
 
-@njit(cache=True)
+@register_jitable
 def _add_cross(step: NDArray, row: int, column: int, scale: float, x: float, y: float, z: float) -> None:
     """Add scale · [vector ×] to the block of 3 × 3 that begins there."""
     step[row, column + 1] -= scale * z
@@ -226,7 +227,7 @@ def _add_cross(step: NDArray, row: int, column: int, scale: float, x: float, y: 
     step[row + 2, column + 1] += scale * x
 
 
-@njit(cache=True)
+@njit
 def _rotate_error(step: NDArray, x: float, y: float, z: float) -> None:
     """Write the block that turns the attitude error when the attitude turns by twice (x, y, z), to second order."""
     step[6, 6], step[6, 7], step[6, 8] = 1 - y * y / 2 - z * z / 2, z + x * y / 2, -y + x * z / 2
@@ -234,7 +235,7 @@ def _rotate_error(step: NDArray, x: float, y: float, z: float) -> None:
     step[8, 6], step[8, 7], step[8, 8] = y + x * z / 2, -x + y * z / 2, 1 - x * x / 2 - y * y / 2
 
 
-@njit(cache=True)
+@njit
 def _carry(covariance: NDArray, step: NDArray) -> None:
     """P ← A P Aᵀ."""
     half = np.zeros((_SIZE, _SIZE))
@@ -250,7 +251,7 @@ def _carry(covariance: NDArray, step: NDArray) -> None:
             covariance[row, column] = value
 
 
-@njit(cache=True)
+@njit
 def _add_noise(kalman: Filter, prior: NDArray) -> None:
     for axis in range(3):
         acceleration = prior[_ACC_Z] if axis == 2 else prior[_ACC_XY]
@@ -261,7 +262,7 @@ def _add_noise(kalman: Filter, prior: NDArray) -> None:
     _bound(kalman.covariance)
 
 
-@njit(cache=True)
+@njit
 def _bound(covariance: NDArray) -> None:
     for row in range(_SIZE):
         for column in range(row, _SIZE):
@@ -274,7 +275,7 @@ def _bound(covariance: NDArray) -> None:
             covariance[column, row] = value
 
 
-@njit(cache=True)
+@njit
 def _fuse_pose(kalman: Filter, poses: NDArray, row: int) -> None:
     x, y, z, w = poses[row, 3], poses[row, 4], poses[row, 5], poses[row, 6]
     for axis in range(3):
@@ -293,7 +294,7 @@ def _fuse_pose(kalman: Filter, poses: NDArray, row: int) -> None:
         _fuse(kalman, 6 + axis, error[axis], poses[row, 8])
 
 
-@njit(cache=True)
+@njit
 def _fuse(kalman: Filter, measured: int, error: float, deviation: float) -> None:
     """A direct measurement of one state: with c = P e and k = c / (eᵀc + σ²), P ← P − k cᵀ."""
     covariance = kalman.covariance
@@ -309,7 +310,7 @@ def _fuse(kalman: Filter, measured: int, error: float, deviation: float) -> None
     _bound(covariance)
 
 
-@njit(cache=True)
+@njit
 def _absorb_attitude_error(kalman: Filter) -> None:
     x, y, z = kalman.state[6], kalman.state[7], kalman.state[8]
     most = max(abs(x), abs(y), abs(z))
@@ -325,7 +326,7 @@ def _absorb_attitude_error(kalman: Filter) -> None:
     _bound(kalman.covariance)
 
 
-@njit(cache=True)
+@njit
 def _turn_by(quaternion: NDArray, angle_x: float, angle_y: float, angle_z: float) -> None:
     """Turn an attitude by a rotation vector, rad, in body axes."""
     size = np.sqrt(angle_x**2 + angle_y**2 + angle_z**2) + 1e-9
@@ -337,7 +338,7 @@ def _turn_by(quaternion: NDArray, angle_x: float, angle_y: float, angle_z: float
     _normalise(quaternion)
 
 
-@njit(cache=True)
+@njit
 def _normalise(quaternion: NDArray) -> None:
     size = 0.0
     for axis in range(4):

@@ -16,9 +16,10 @@ integrators and its term on the change of body rates. Runs at 500 Hz inside numb
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import matrix_of, yaw_of
 
@@ -80,7 +81,7 @@ def gains_for(airframe: Airframe) -> MellingerGains:
     return MellingerGains(mass=airframe.mass, mass_thrust=airframe.command_per_thrust)
 
 
-@njit(cache=True)
+@njit
 def level_out(setpoint: NDArray, mode: NDArray) -> None:
     """The supervisor's override when setpoints stop coming, in place: level, no yaw rate, height kept."""
     mode[MODE_X] = mode[MODE_Y] = DISABLE
@@ -90,7 +91,7 @@ def level_out(setpoint: NDArray, mode: NDArray) -> None:
     setpoint[15] = 0.0
 
 
-@njit(cache=True)
+@njit
 def step_mellinger(
     control: NDArray, memory: NDArray, gains: NDArray, setpoint: NDArray, mode: NDArray, state: NDArray
 ) -> None:
@@ -158,7 +159,7 @@ def step_mellinger(
         memory[0:6] = 0.0
 
 
-@njit(cache=True)
+@njit
 def distribute_power(control: NDArray, motors: NDArray) -> None:
     """Motor commands (4,) in [0, FULL_COMMAND] of a control: mixing, then all lowered by what the most has too much."""
     half_roll, half_pitch = np.trunc(control[1] / 2), np.trunc(control[2] / 2)
@@ -166,23 +167,25 @@ def distribute_power(control: NDArray, motors: NDArray) -> None:
     motors[1] = np.trunc(control[0] - half_roll - half_pitch - control[3])
     motors[2] = np.trunc(control[0] + half_roll - half_pitch + control[3])
     motors[3] = np.trunc(control[0] + half_roll + half_pitch - control[3])
-    excess = max(np.max(motors) - FULL_COMMAND, 0.0)
+    excess = 0.0
+    for motor in range(4):
+        excess = max(excess, motors[motor] - FULL_COMMAND)
     for motor in range(4):
         motors[motor] = max(motors[motor] - excess, 0.0)
 
 
-@njit(cache=True)
+@register_jitable
 def _clamp(value: float, limit: float) -> float:
     return min(max(value, -limit), limit)
 
 
-@njit(cache=True)
+@register_jitable
 def _along(a: NDArray, i: int, b: NDArray, j: int) -> float:
     """Column i of `a` times column j of `b`."""
     return a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
 
 
-@njit(cache=True)
+@njit
 def _attitude(roll: float, pitch: float, yaw: float) -> NDArray:
     """Rotation of Euler angles ZYX."""
     cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
@@ -193,7 +196,7 @@ def _attitude(roll: float, pitch: float, yaw: float) -> NDArray:
     return frame
 
 
-@njit(cache=True)
+@njit
 def _thrust_frame(x: float, y: float, z: float, yaw: float) -> NDArray:
     """Rotation whose z axis is along a force and whose x axis lies over the direction of yaw."""
     norm = np.sqrt(x * x + y * y + z * z)

@@ -11,9 +11,10 @@ fast plan. Runs inside numba on flat arrays:
 """
 
 import numpy as np
-from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
 from cfplan.simulation.dynamics.mellinger import (
     ABSOLUTE,
     DISABLE,
@@ -64,7 +65,7 @@ def default_limits() -> NDArray:
     return np.array([20.0, 20.0, 36000.0, 20000.0, 0.0])
 
 
-@njit(cache=True)
+@njit
 def step_pid(
     control: NDArray,
     memory: NDArray,
@@ -114,7 +115,7 @@ def step_pid(
         memory[26] = yaw
 
 
-@njit(cache=True)
+@njit
 def _begin_anew(memory: NDArray, state: NDArray, roll: float, pitch: float, yaw: float) -> None:
     for place in range(2 * LOOPS):
         memory[place] = 0.0
@@ -123,7 +124,7 @@ def _begin_anew(memory: NDArray, state: NDArray, roll: float, pitch: float, yaw:
     memory[24], memory[25] = roll, pitch
 
 
-@njit(cache=True)
+@njit
 def _want_yaw(memory: NDArray, limits: NDArray, setpoint: NDArray, mode: NDArray, yaw: float) -> None:
     if mode[MODE_YAW] == VELOCITY_MODE:
         memory[26] = _wrapped(memory[26] + np.degrees(setpoint[15]) * _FAST)
@@ -137,7 +138,7 @@ def _want_yaw(memory: NDArray, limits: NDArray, setpoint: NDArray, mode: NDArray
     memory[26] = _wrapped(memory[26])
 
 
-@njit(cache=True)
+@njit
 def _position(
     memory: NDArray,
     gains: NDArray,
@@ -168,12 +169,12 @@ def _position(
     memory[27] = min(max(thrust, limits[_THRUST_MIN]), FULL_COMMAND)
 
 
-@njit(cache=True)
+@register_jitable
 def _rate(memory: NDArray, gains: NDArray, loop: int, wanted: float, measured: float) -> float:
     return min(max(_pid(memory, gains, loop, wanted, measured, _FAST, False), -_LARGEST), _LARGEST)
 
 
-@njit(cache=True)
+@register_jitable
 def _pid(memory: NDArray, gains: NDArray, loop: int, wanted: float, measured: float, dt: float, angle: bool) -> float:
     error, change = wanted - measured, memory[LOOPS + loop] - measured
     if angle:
@@ -186,7 +187,7 @@ def _pid(memory: NDArray, gains: NDArray, loop: int, wanted: float, measured: fl
     return min(max(output, -most), most) if most != 0.0 else output
 
 
-@njit(cache=True)
+@register_jitable
 def _wrapped(angle: float) -> float:
     """Into ±180 degrees."""
     return angle - 360.0 * np.floor((angle + 180.0) / 360.0)

@@ -6,9 +6,9 @@ Nothing but the sensors and the recorder sees the true state; the controller fli
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
 from cfplan.simulation.dynamics.body import (
     ALL_WELL,
     FLOOR,
@@ -124,7 +124,7 @@ def _sensor_noise(sensors: Sensors, seed: int) -> NDArray:
     return noise
 
 
-@njit(cache=True)
+@njit
 def _run(
     loop: Loop,
     body: NDArray,
@@ -167,7 +167,7 @@ def _run(
         _drive(loop, body, allowed, per_command, asked)
 
 
-@njit(cache=True)
+@njit
 def _drive(loop: Loop, body: NDArray, allowed: bool, per_command: float, asked: bool) -> None:
     """Turn the motors, move the body, and note what an accelerometer there feels.
 

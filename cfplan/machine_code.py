@@ -1,0 +1,303 @@
+"""Machine code, by numba and LLVM, and the folder in which it is kept for the next process.
+
+Modules take `njit` from here. What a function is compiled to is kept in a file whose name hashes everything that it
+depends on: the module's source, the sources of all cfplan modules that it imports, directly or not, the versions of the
+compilers, the processor, and the types of the arguments. So no file can be out of date, and none is ever changed.
+Where two processes need the same function, one compiles it and the other waits. Where the folder cannot be written,
+each process compiles for itself.
+"""
+
+import ctypes
+import gc
+import hashlib
+import os
+import pickle
+import platform
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import llvmlite.binding as llvm
+import numba
+import numpy as np
+from numba.core import event
+from numba.core.caching import _Cache
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
+
+PACKAGE = Path(__file__).parent
+_IMPORT = re.compile(r"^\s*from (cfplan[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
+_KEPT_DAYS = 60.0  # after which files that no process has read are deleted
+_PLACES = 2**30  # bytes of the lock file, of which each function locks one
+
+
+def cache_folder() -> Path:
+    """Return where compiled code is kept: CFPLAN_CACHE, or the platform's cache folder."""
+    if chosen := os.environ.get("CFPLAN_CACHE"):
+        return Path(chosen)
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "cfplan"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cfplan"
+
+
+@lru_cache(maxsize=8)
+def _writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+        return True
+    except OSError:
+        return False
+
+
+def kept() -> bool:
+    """Return whether the cache folder can be written."""
+    return _writable(cache_folder())
+
+
+@lru_cache(maxsize=1)
+def _machine() -> bytes:
+    """Return what machine code depends on besides sources; a cache folder may be shared by machines that differ."""
+    versions = (numba.__version__, llvmlite.__version__, np.__version__, platform.python_version())
+    return repr((versions, llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())).encode()
+
+
+@lru_cache(maxsize=512)
+def _source(module: str) -> tuple[str, tuple[str, ...]]:
+    """Return a module's hash, and the cfplan modules that it imports; none where the name is no module."""
+    parts = module.split(".")[1:]
+    file = PACKAGE.joinpath(*parts[:-1], f"{parts[-1]}.py") if parts else PACKAGE / "__init__.py"
+    try:
+        text = file.read_bytes()
+    except OSError:
+        return "", ()
+    imported: list[str] = []
+    for package, names in _IMPORT.findall(text.decode()):
+        members = (name.split()[0] for name in names.strip("()").split(",") if name.strip())
+        imported += [package, *(f"{package}.{member}" for member in members)]
+    return hashlib.sha256(text).hexdigest(), tuple(imported)
+
+
+@lru_cache(maxsize=512)
+def key(module: str) -> str:
+    """Return the hash of a module, of all that it imports of this package, of the compilers and of the processor."""
+    found, waiting = {}, [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found[name], imported = _source(name)
+            waiting += imported
+    return hashlib.sha256(_machine() + repr(sorted(found.items())).encode()).hexdigest()
+
+
+def _name(title: str, *parts: str) -> str:
+    return f"{title}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:20]}"
+
+
+def _read(name: str) -> bytes | None:
+    """Return a file of the cache folder, if it is there."""
+    file = cache_folder() / name
+    try:
+        data = file.read_bytes()
+        if time.time() - file.stat().st_mtime > 86400:
+            os.utime(file)  # not to be deleted: it is in use
+        return data
+    except OSError:
+        return None
+
+
+def _write(name: str, data: bytes) -> None:
+    """Put a file into the cache folder, whole or not at all; a full disk is no error."""
+    folder = cache_folder()
+    try:
+        handle, made = tempfile.mkstemp(dir=folder, prefix="making-")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+            os.replace(made, folder / name)
+        except BaseException:
+            os.unlink(made)
+            raise
+    except OSError:
+        pass
+
+
+class _Locks:
+    """Which process compiles what: a lock on one byte of a file for each function. It ends with the process."""
+
+    def __init__(self) -> None:
+        self.folder: Path | None = None
+        self.file: Any = None
+
+    def take(self, name: str, *, wait: bool = True) -> bool:
+        """Return whether this process may compile; where another does, wait until it has, or do not."""
+        import fcntl
+
+        try:
+            if self.folder != cache_folder():
+                self.folder, self.file = cache_folder(), (cache_folder() / "locks").open("a+b")
+            fcntl.lockf(self.file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB), 1, self._place(name))
+        except BlockingIOError:
+            return False
+        except OSError:
+            pass  # a file system without locks: the same may be compiled twice
+        return True
+
+    def give_back(self, name: str) -> None:
+        import fcntl
+
+        if self.file is not None:
+            with suppress(OSError):
+                fcntl.lockf(self.file, fcntl.LOCK_UN, 1, self._place(name))
+
+    @staticmethod
+    def _place(name: str) -> int:
+        return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") % _PLACES
+
+
+_locks = _Locks()
+
+
+class _Compiling(event.Listener):
+    """Keeps the garbage collector from walking through a compiler's millions of objects again and again."""
+
+    depth = 0
+    collector_was_on = False
+
+    def on_start(self, event: Any) -> None:
+        if self.depth == 0:
+            self.collector_was_on = gc.isenabled()
+            gc.disable()
+        self.depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self.depth -= 1
+        if self.depth == 0 and self.collector_was_on:
+            gc.enable()
+
+
+event.register("numba:compile", _Compiling())
+
+
+class _Kept(_Cache):
+    """numba's cache of one function, with one file for each set of argument types."""
+
+    def __init__(self, function: Callable[..., Any]):
+        self._module, self._title = function.__module__, f"{function.__module__}.{function.__qualname__}"
+        self._line = str(function.__code__.co_firstlineno)
+
+    @property
+    def cache_path(self) -> str:
+        return str(cache_folder())
+
+    def file_name(self, signature: Any) -> str:
+        """Return the name of the file for these types of arguments."""
+        return _name(self._title, self._line, key(self._module), str(signature)) + ".numba"
+
+    def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
+        """Return the compiled function, waiting if another process compiles it; None if that is ours to do."""
+        if not kept():
+            return None
+        name = self.file_name(sig)
+        result = self._load(name, sig, target_context)
+        if result is None:
+            _locks.take(name)
+            result = self._load(name, sig, target_context)
+            if result is not None:
+                _locks.give_back(name)
+        return result
+
+    def _load(self, name: str, signature: Any, target_context: Any) -> CompileResult | None:
+        data = _read(name)
+        if data is None:
+            return None
+        target_context.refresh()
+        written_for, payload = pickle.loads(data)
+        return CompileResult._rebuild(target_context, *payload) if written_for == str(signature) else None
+
+    def save_overload(self, sig: Any, data: CompileResult) -> None:
+        """Keep a compiled function for other processes."""
+        if not kept():
+            return
+        name = self.file_name(sig)
+        if not data.library.has_dynamic_globals:
+            _write(name, dumps((str(sig), data._reduce())))
+        _locks.give_back(name)
+
+    def enable(self) -> None: ...
+
+    def disable(self) -> None: ...
+
+    def flush(self) -> None: ...
+
+
+def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Compile a function at its first call for each set of argument types, as numba.njit does, and keep the result."""
+    if function is None:
+        return lambda each: njit(each, **options)
+    made = numba.njit(no_cfunc_wrapper=True, **options)(function)
+    if hasattr(made, "_cache"):  # else numba is switched off
+        made._cache = _Kept(function)
+    return made
+
+
+def llvm_functions(title: str, module: str, source: Callable[[], str], names: tuple[str, ...]) -> dict[str, Any]:
+    """Return functions of LLVM source, to be called through ctypes; compiled now if they were never.
+
+    `source` is asked only then, and depends on nothing but the module and what that imports.
+    """
+    name = _name(title, key(module)) + ".o"
+    target = _target_machine()
+    data = _read(name) if kept() else None
+    if data is None:
+        if kept():
+            _locks.take(name)
+            data = _read(name)
+        if data is None:
+            data = target.emit_object(_optimised(source(), target))
+            if kept():
+                _write(name, data)
+        if kept():
+            _locks.give_back(name)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(data))
+    engine.finalize_object()
+    _engines.append(engine)
+    return {each: ctypes.CFUNCTYPE(None)(engine.get_function_address(each)) for each in names}
+
+
+_engines: list[Any] = []  # that own the code of functions handed out
+
+
+def _target_machine() -> Any:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2, jit=True
+    )
+
+
+def _optimised(source: str, target: Any) -> Any:
+    module = llvm.parse_assembly(source)
+    module.verify()
+    passes = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=2))
+    passes.getModulePassManager().run(module, passes)
+    return module
+
+
+def delete_unused() -> None:
+    """Delete from the cache folder what no process has read for a long time."""
+    oldest = time.time() - _KEPT_DAYS * 86400
+    for file in cache_folder().glob("*-*"):
+        try:
+            if file.stat().st_mtime < oldest:
+                file.unlink()
+        except OSError:
+            pass
