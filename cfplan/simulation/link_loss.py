@@ -129,13 +129,13 @@ def _run(
 ) -> None:
     state, memory, thrusts = start.copy(), np.zeros(MEMORY_SIZE), np.zeros(4)
     flying, wind, efficiency = FULL_STATE.copy(), STILL_AIR.copy(), ALL_WELL.copy()
-    newest, step = 0, 0
+    newest, flown = 0, 0
     for number in range(len(moments)):
-        while step < moments[number]:
+        for step in range(flown, moments[number]):
             while newest + 1 < len(arrivals) and arrivals[newest + 1] <= step:
                 newest += 1
             _control_and_move(step, state, memory, thrusts, gains, setpoints[newest], flying, body, wind, efficiency)
-            step += 1
+        flown = moments[number]
         alone, mode, last = state.copy(), flying.copy(), setpoints[newest].copy()
         its_memory, its_thrusts = memory.copy(), thrusts.copy()
         for k in range(3):
@@ -144,7 +144,7 @@ def _run(
             if after == level_after:
                 level_out(last, mode)
             if after < off_after:
-                now = step + after
+                now = flown + after
                 _control_and_move(now, alone, its_memory, its_thrusts, gains, last, mode, body, wind, efficiency)
             else:
                 for k in range(4):
