@@ -17,7 +17,7 @@ from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import PlanningTask
-from cfplan.planning.plan import default_nodes
+from cfplan.planning.planners import default_nodes
 from cfplan.planning.repair import Repaired, repair
 from cfplan.safety.limit_sets import LimitSet
 from cfplan.studies.result import Column, StudyResult, Table, detail_table

@@ -12,24 +12,24 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert import refine as refined
 from cfplan.planners.solution import Solution, Status
-from cfplan.planning.plan import FEWEST_NODES, LAST_RESORTS, MOST_NODES, default_nodes, plan
-from cfplan.planning.planners import PLANNERS, find_planner
+from cfplan.planning.plan import plan
+from cfplan.planning.planners import FEWEST_NODES, MOST_NODES, PLANNERS, default_nodes, find_planner
 from cfplan.safety.certificate import certify
 
 
 def stub(monkeypatch, **answers):
-    """Replace planners by functions of (path, nodes) that give a Solution; returns the calls made."""
+    """Replace planners by functions of (path, nodes) that give a Solution, others by failures; return the calls."""
     calls = []
 
     def find(name):
         def planner(task):
             calls.append((name, task.nodes, task))
-            return answers[name](task.path, task.nodes)
+            answer = answers.get(name, lambda path, nodes: Solution(Status.NOT_CONVERGED, None))
+            return answer(task.path, task.nodes)
 
         return planner
 
-    monkeypatch.setattr("cfplan.planning.plan.find_planner", find)
-    monkeypatch.setattr("cfplan.planning.plan.LAST_RESORTS", [name for name in LAST_RESORTS if name in answers])
+    monkeypatch.setattr("cfplan.planning.policy.find_planner", find)
     return calls
 
 
@@ -197,8 +197,8 @@ def automatic(monkeypatch, make_profile, model=True, **rates):
         for name, rate in rates.items()
     }
     known = SimpleNamespace(differences=lambda limits: ("speed is tighter",))
-    monkeypatch.setattr("cfplan.planning.plan.find_model", lambda airframe, limits: known if model else None)
-    monkeypatch.setattr("cfplan.planning.plan.lower_bound", lambda task: task.path.end / 0.4**0.5)
+    monkeypatch.setattr("cfplan.planning.policy.find_model", lambda airframe, limits: known if model else None)
+    monkeypatch.setattr("cfplan.planning.policy.lower_bound", lambda task: task.path.end / 0.4**0.5)
     return stub(monkeypatch, **answers)
 
 
@@ -237,7 +237,7 @@ def test_auto_says_that_a_model_is_damaged_and_goes_on(path, limits, make_profil
     def damaged(airframe, limits):
         raise InputError("damaged", where="models/x")
 
-    monkeypatch.setattr("cfplan.planning.plan.find_model", damaged)
+    monkeypatch.setattr("cfplan.planning.policy.find_model", damaged)
     assert any("no learned plan: models/x: damaged" in n for n in plan(path, limits.airframe, limits).notes)
 
 

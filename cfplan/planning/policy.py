@@ -1,0 +1,167 @@
+"""The policy of planning as a table: which planners are asked, when, in which order and on which grids."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+from typing import NamedTuple
+
+from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
+from cfplan.learning.model_files import find_model
+from cfplan.planners.baselines.convex import lower_bound
+from cfplan.planners.solution import Solution
+from cfplan.planners.task import PlanningTask
+from cfplan.planning.planners import AUTO, PLANNERS, default_nodes, find_planner
+from cfplan.planning.repair import Repaired, repair, slow
+from cfplan.safety.space import Space
+
+GOOD_SPEED_FACTOR = 0.97  # a profile that repair slows further than this is worth a try on the next grid
+EXPERT_GAP = 0.1  # of the flight over the proven bound, above which the expert is asked too
+
+
+class Found(NamedTuple):
+    """A planner's profile, repaired."""
+
+    repaired: Repaired
+    planner: str
+    nodes: int  # intervals of the profile
+    joints: tuple[float, ...]  # s, where the windows of the profile meet
+
+    @property
+    def duration(self) -> float:
+        """Return the flight's duration, s."""
+        return self.repaired.trajectory.duration
+
+
+class Choice(NamedTuple):
+    """The fastest flight that a policy found."""
+
+    best: Found
+    bound: float | None  # s, proven: no flight takes less; None where the policy needs no bound
+    notes: tuple[str, ...]  # what a reader should know, one sentence each
+
+
+class Due(NamedTuple):
+    """Whether a step is taken, and what a reader should know of that."""
+
+    due: bool
+    notes: tuple[str, ...] = ()
+
+
+def always(_task: PlanningTask, _found: Sequence[Found], _bound: float | None) -> Due:
+    """Take the step."""
+    return Due(True)
+
+
+def a_model_fits(task: PlanningTask, _found: Sequence[Found], _bound: float | None) -> Due:
+    """Take the step if a network was trained for this vehicle and these limits."""
+    try:
+        model = find_model(task.airframe, task.limits)
+    except InputError as error:
+        return Due(False, (f"no learned plan: {error}",))
+    if model is None:
+        return Due(False, ("no model is for this vehicle and these limits: `cfplan train` makes one",))
+    return Due(True, tuple(model.differences(task.limits)))
+
+
+def far_above_bound(_task: PlanningTask, found: Sequence[Found], bound: float | None) -> Due:
+    """Take the step unless a flight was found that needed no slowing and takes little more than the proven bound."""
+    best = min(found, key=lambda one: one.duration, default=None)
+    if best is None or bound is None:
+        return Due(True, ("the expert was asked too: the other planners found nothing",))
+    gap = best.duration / bound - 1.0
+    if best.repaired.speed_factor == 1.0 and gap <= EXPERT_GAP:
+        return Due(False)
+    return Due(True, (f"the expert was asked too: {gap:.1%} above the bound",))
+
+
+class Step(NamedTuple):
+    """One line of a policy."""
+
+    planners: tuple[str, ...]  # asked in turn until one finds a profile
+    when: Callable[[PlanningTask, Sequence[Found], float | None], Due] = always
+    grids: tuple[int, ...] = (1,)  # factors on the first planner's nodes, in turn until its profile is hardly slowed
+
+
+# Convex and min-snap hardly ever fail, so every policy ends with one of them. Of all that was found the fastest is
+# taken. Whether a planner's profile is refined where it does not pass, or only slowed, stands in PLANNERS.
+POLICIES = MappingProxyType(
+    {
+        AUTO: (
+            Step(("learned",), when=a_model_fits),
+            Step(("convex",)),
+            Step(("expert", "minsnap"), when=far_above_bound, grids=(1, 2)),
+        ),
+        "learned": (Step(("learned", "expert", "convex", "minsnap")),),
+        "expert": (Step(("expert", "convex", "minsnap"), grids=(1, 2)),),
+        "toppquad": (Step(("toppquad", "convex", "minsnap"), grids=(1, 2)),),
+        "convex": (Step(("convex", "minsnap"), grids=(1, 2)),),
+        "minsnap": (Step(("minsnap", "convex"), grids=(1, 2)),),
+    }
+)
+
+
+def choose(policy: str, task: PlanningTask, nodes: int | None, space: Space) -> Choice:
+    """Return the fastest flight that the policy's steps find.
+
+    `nodes` is the number of intervals where it is given, else each planner's own is taken.
+
+    Raises:
+        InfeasibleError: no planner finds a flight; says why of each.
+        InputError: the learned planner is asked and there is no model, or there are too few nodes.
+    """
+    bound = lower_bound(task) if policy == AUTO else None
+    found: list[Found] = []
+    notes: list[str] = []
+    for step in POLICIES[policy]:
+        due = step.when(task, found, bound)
+        notes += due.notes
+        if due.due:
+            one, failures = _take(step, task, nodes, space)
+            found += [one] if one else []
+            notes += failures
+    if not found:
+        raise InfeasibleError(
+            f"no plan. {'; '.join(notes)}", hint="loosen the plan's limits, or make the path gentler or longer"
+        )
+    best = min(found, key=lambda one: one.duration)
+    if bound is not None:
+        times = ", ".join(f"{one.planner} {one.duration:.3f} s" for one in found)
+        notes.append(f"{times}; the proven bound is {bound:.3f} s, the plan {best.duration / bound - 1:.1%} above it")
+    return Choice(best, bound, tuple(notes))
+
+
+def _take(step: Step, task: PlanningTask, nodes: int | None, space: Space) -> tuple[Found | None, list[str]]:
+    """Return the fastest profile of the first of the step's planners that finds one, and why others found none."""
+    notes: list[str] = []
+    for place, planner in enumerate(step.planners):
+        own_nodes = default_nodes(task.path, planner) if nodes is None else nodes
+        found: list[Found] = []
+        for factor in step.grids if place == 0 and nodes is None else (1,):
+            answer = ask(planner, replace(task, nodes=factor * own_nodes), space)
+            if isinstance(answer, str):
+                notes.append(answer)
+                continue
+            found.append(answer)
+            if answer.repaired.speed_factor >= GOOD_SPEED_FACTOR:
+                break
+        if found:
+            return min(found, key=lambda one: one.duration), notes
+    return None, notes
+
+
+def ask(planner: str, task: PlanningTask, space: Space) -> Found | str:
+    """Return a planner's profile, repaired; or why nothing came of it."""
+    solution = find_planner(planner)(task)
+    if solution.profile is None:
+        return _failure(planner, task.nodes, solution)
+    nodes = len(solution.profile.s) - 1
+    try:
+        repaired = (repair if PLANNERS[planner].refined else slow)(task, solution.profile, space)
+    except (InfeasibleError, NotCertifiedError) as error:
+        return f"{planner} with {nodes} nodes: {error}"
+    return Found(repaired, planner, nodes, solution.joints if repaired.joints is None else repaired.joints)
+
+
+def _failure(planner: str, nodes: int, solution: Solution) -> str:
+    message = f" ({' '.join(solution.reason.split())})" if solution.reason else ""
+    return f"{planner} with {nodes} nodes: {solution.status}{message}"
