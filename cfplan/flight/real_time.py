@@ -1,4 +1,4 @@
-"""How the operating system schedules a thread, and keeps its pages in memory."""
+"""Real-time scheduling: give a thread priority, and keep its pages in memory."""
 
 import contextlib
 import ctypes

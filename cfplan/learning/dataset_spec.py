@@ -1,4 +1,7 @@
-"""What a dataset is made of: everything that decides its rows, kept beside them as dataset.json."""
+"""What a dataset is made of: everything that decides its rows, kept beside them as dataset.json.
+
+A path's perturbed copies with the clean path's label are the paper's noise injection.
+"""
 
 import json
 from dataclasses import asdict, dataclass, fields

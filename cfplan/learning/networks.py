@@ -1,6 +1,7 @@
-"""The networks, in torch: from what a window shows to three numbers a node (see sampling.Batch.targets).
+"""The networks, in torch: a bidirectional LSTM, and the paper's encoder-decoder LSTM with attention.
 
-Both normalise their inputs by numbers that belong to their weights. How they compute without torch is in inference.py.
+From the features of a window they compute three numbers for each node (see sampling.Batch.targets). Both normalise
+their inputs by numbers that belong to their weights. How they compute without torch is in inference.py.
 """
 
 from enum import StrEnum

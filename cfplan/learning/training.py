@@ -1,4 +1,4 @@
-"""From a dataset to a model folder.
+"""Train a model by imitation: from a dataset of the expert's profiles to a model folder.
 
 Every epoch draws its windows by a seed of its own and is followed by a checkpoint, so that a training that was killed
 goes on as if it had not been. Under torchrun each process takes its share of the windows, and the first one writes.

@@ -1,4 +1,4 @@
-"""Windows: the one length of path that networks take, and how a chain of them covers a path of any length."""
+"""Windows, the fixed length of path that networks take, and chaining, by which they cover a path of any length."""
 
 from collections.abc import Iterator
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Writes a record while the flight goes on; whatever happens to the disk, the flight never hears of it.
+"""Write a record's MCAP file while the flight goes on, without ever holding the flight up.
 
 `write` only puts a message into a queue. A thread of its own takes what has gathered, four times a second, and writes
 it as one chunk, so that a process killed at any moment leaves all but its last instant behind.

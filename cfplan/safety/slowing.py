@@ -1,4 +1,4 @@
-"""Slowing as a whole: the last resort, which ends certified because motion tends to hover as h tends to 0."""
+"""Slow a whole profile by one speed factor, the last resort: as h tends to 0 motion tends to hover and is certified."""
 
 from dataclasses import dataclass
 

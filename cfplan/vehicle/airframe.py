@@ -1,4 +1,4 @@
-"""What a vehicle can do: mass, inertia, motors, drag."""
+"""An airframe: mass, inertia, motors and motor mixing, drag."""
 
 from dataclasses import dataclass
 

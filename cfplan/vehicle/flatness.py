@@ -1,8 +1,8 @@
-"""The flatness map: path derivatives, speed profile and yaw to the full state and the motor thrusts.
+"""Differential flatness: path derivatives, speed profile and yaw to the full state and the motor thrusts.
 
 Written once, in plain arithmetic on the components of vectors, so that numbers compiled by numba (trajectory,
-certificate) and CasADi symbols (expert) go through the same equations. Equations:
-DESIGN section 4; body rates of the Hopf fibration after Watterson and Kumar, "Control of quadrotors using the Hopf
+certificate) and CasADi symbols (expert) go through the same equations. Equations: docs/architecture.md, "The
+mathematics"; body rates of the Hopf fibration after Watterson and Kumar, "Control of quadrotors using the Hopf
 fibration on SO(3)" (2017); drag after Faessler, Franchi and Scaramuzza (2018), exact here because drag is equal along
 body x and y.
 """

@@ -1,4 +1,4 @@
-"""The speed profile of a path: h(s) = (ds/dt)², how fast it is flown, and yaw ψ(s), where the vehicle points."""
+"""The speed profile of a path, h(s) = (ds/dt)² with yaw ψ(s), and the boundary state where two segments meet."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Where the vehicle is by the time that a pose reaches it.
+"""Latency compensation: predict where the vehicle is when a pose reaches it.
 
 A pose is some 15 ms old when it is sent on: the latency of motion capture and the wait for the next tick. The
 vehicle's filter takes it as the truth of the moment in which it arrives, so at 2 m/s its estimate would trail by 3 cm

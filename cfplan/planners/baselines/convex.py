@@ -1,9 +1,10 @@
-"""The best possible time with speed, acceleration and collective thrust alone, and a planner that goes for it.
+"""Convex time-optimal path parameterisation (TOPP): the lower bound on any flight time, and a planner.
 
-Without attitude the problem is convex in b = (ds/dt)² by arc length and is solved by reachability analysis
-(copp-py). From outside its polygons and its steps only ever allow more than a flight may do, so its time is a lower
-bound; from inside it gives a profile that is made smooth enough to fly. Motors and body rates are not asked: where the
-acceleration jumps the profile breaks them, and is as slow after repair as that costs.
+Limits are those on speed, acceleration and collective thrust. Without attitude the problem is convex in b = (ds/dt)² by
+arc length and is solved by reachability analysis (copp-py). From outside its polygons and its steps only ever allow
+more than a flight may do, so its time is a lower bound; from inside it gives a profile that is made smooth enough to
+fly. Motors and body rates are not asked: where the acceleration jumps the profile breaks them, and is as slow after
+repair as that costs.
 """
 
 import time

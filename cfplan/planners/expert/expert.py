@@ -1,7 +1,7 @@
 """The expert: the fastest profile that keeps every limit, by the reduced formulation.
 
 State (h, h', h'', ψ, ψ') and control (h''', ψ''), constant in each interval, so the dynamics are linear and exact
-and everything physical follows point by point through the flatness map (DESIGN section 4). Minimised is the time of
+and everything physical follows point by point through the flatness map (docs/architecture.md). Minimised is the time of
 flight, by Gauss quadrature, with small penalties on angular acceleration, yaw rate and roughness. Limits hold at both
 ends of every interval, where the controls jump, and at points inside.
 

@@ -1,6 +1,6 @@
-"""A profile that is nearly right made right: its limits kept everywhere, as fast as they allow, its yaw left alone.
+"""Refine a near-feasible profile on its grid, keeping its yaw, until every limit holds.
 
-Searched from near, the expert's problem takes a fraction of its steps.
+A warm start: from a near-feasible profile the search of the expert's problem takes a fraction of its steps.
 """
 
 import math

@@ -1,4 +1,7 @@
-"""Symmetric banded matrices: (size, width) arrays whose entry [r, d] is the matrix's (r, r - d)."""
+"""Banded Cholesky factors, solutions and products of symmetric matrices.
+
+A matrix is a (size, width) array whose entry [r, d] is the matrix's (r, r - d).
+"""
 
 import math
 

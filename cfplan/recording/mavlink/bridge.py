@@ -1,4 +1,4 @@
-"""MAVLink to and from ground stations while a flight goes on; whatever happens here, the flight never hears of it.
+"""The MAVLink bridge: to and from ground stations during a flight, without ever holding the flight up.
 
 A thread of the main process, never of the pilot's, sends what the main process was told of the flight and listens for
 commands to stop. Those come out of `orders`, on the same way into the pilot as the keys. All packets of both

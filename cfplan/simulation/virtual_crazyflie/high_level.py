@@ -1,4 +1,4 @@
-"""The on-board planner (CRTP port 8): take-off, landing and go-to as septics, and uploaded polynomials.
+"""The high-level commander (CRTP port 8): take-off, landing and go-to as septics, and uploaded polynomials.
 
 Idle, it asks for nothing, which is motors off, every 10 ms at the lowest priority: the null-setpoint gap. Spirals,
 take-off and landing by speed, and compressed curves are not simulated; they answer ENOEXEC.
