@@ -15,7 +15,7 @@ from cfplan.cli.rehearsal import PLAN_SUFFIX, PlanOptions, obtain_plan
 from cfplan.errors import InputError
 
 if TYPE_CHECKING:
-    from cfplan.recording.importers.mocap_log import Subject
+    from cfplan.recording.importers.mocap_log import LoggedSubject
     from cfplan.recording.overlay import Reference, Trial
 
 EPILOG = """\b
@@ -176,8 +176,8 @@ def _trials(
 
 def _read_log(
     place: Path, names: tuple[str, ...], angles: str | None, steps: Steps
-) -> "tuple[tuple[Subject, ...], dict[str, Any]]":
-    from cfplan.recording.importers.table import read_log
+) -> "tuple[tuple[LoggedSubject, ...], dict[str, Any]]":
+    from cfplan.recording.importers.formats import read_log
     from cfplan.recording.importers.vicon_header import Rotations
 
     with steps.step("read") as said:
@@ -194,7 +194,7 @@ def _read_log(
 
 
 def _laid(
-    subject: "Subject", reference: "Reference", about: dict[str, Any], steps: Steps
+    subject: "LoggedSubject", reference: "Reference", about: dict[str, Any], steps: Steps
 ) -> "tuple[Trial, dict[str, Any]]":
     from dataclasses import asdict
 

@@ -21,20 +21,13 @@ Triple = tuple[float, float, float]
 class FlightBounds:
     """Where a flight is judged and the plots draw their lines; NaN where there is no such limit."""
 
-    speed: float = math.nan
-    # m/s
-    acceleration: float = math.nan
-    # m/s², gravity not counted
-    body_rate: float = math.nan
-    # rad/s, norm
-    deviation: float = math.nan
-    # m, from the reference in time
-    lateness: float = math.nan
-    # s, of a setpoint
-    pose_age: float = math.nan
-    # s
-    battery_voltage: float = math.nan
-    # V, least
+    speed: float = math.nan  # m/s
+    acceleration: float = math.nan  # m/s², gravity not counted
+    body_rate: float = math.nan  # rad/s, norm
+    deviation: float = math.nan  # m, from the reference in time
+    lateness: float = math.nan  # s, of a setpoint
+    pose_age: float = math.nan  # s
+    battery_voltage: float = math.nan  # V, least
 
 
 _NO_BOUNDS = FlightBounds()
@@ -45,25 +38,19 @@ class RecordHeader:
     """Known before take-off; enough to draw and judge the flight without any other file."""
 
     name: str
-    version: str
-    # of cfplan
+    version: str  # of cfplan
     uri: str
     planner: str
     vehicle: Airframe
-    thrust_at_full_command: float
-    # N, one motor's thrust at the 16-bit command 65535
+    thrust_at_full_command: float  # N, one motor's thrust at the 16-bit command 65535
     plan_limits: PlanLimits
     bounds: FlightBounds
-    travel_time: float
-    # s, planned
-    path: NDArray
-    # (M, 3) m, samples for drawing and for the distance to the path
-    fence: tuple[Triple, Triple]
-    # m, lower and upper corner
-    wall_time_at_zero: float
-    # s since 1970, when time.monotonic() was zero
+    travel_time: float  # s, planned
+    path: NDArray  # (M, 3) m, samples for drawing and for the distance to the path
+    fence: tuple[Triple, Triple]  # m, lower and upper corner
+    wall_time_at_zero: float  # s since 1970, when time.monotonic() was zero
     provenance: Mapping[str, str] = field(default_factory=dict)
-    # whatever else tells where the plan came from: file, model hash, …
+    """Where the plan came from: file, model hash, …"""
 
 
 def header_under(

@@ -10,7 +10,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 
 from cfplan.errors import InputError
-from cfplan.recording.importers.mocap_log import Subject
+from cfplan.recording.importers.mocap_log import LoggedSubject
 from cfplan.recording.record import Record
 from cfplan.recording.summary import reference_span, reference_times
 from cfplan.vehicle.trajectory import Trajectory
@@ -27,10 +27,8 @@ class Reference:
     """Where a vehicle should have been."""
 
     name: str
-    time: NDArray
-    # (M,) s from the begin of the path
-    position: NDArray
-    # (M, 3) m
+    time: NDArray  # (M,) s from the begin of the path
+    position: NDArray  # (M, 3) m
 
     def at(self, time: NDArray) -> NDArray:
         """(N, 3) m; NaN before its begin and after its end."""
@@ -43,12 +41,9 @@ class Trial:
     """One flight of the overlay."""
 
     name: str
-    time: NDArray
-    # (N,) s from the begin of the path, or of the log where there is no reference
-    position: NDArray
-    # (N, 3) m, NaN where it was not seen
-    quaternion: NDArray
-    # (N, 4) body→world, x y z w, NaN where not known
+    time: NDArray  # (N,) s from the begin of the path, or of the log where there is no reference
+    position: NDArray  # (N, 3) m, NaN where it was not seen
+    quaternion: NDArray  # (N, 4) body→world, x y z w, NaN where not known
     reference: Reference | None
 
     @property
@@ -74,18 +69,12 @@ class Trial:
 class Alignment:
     """How a log was laid over a plan: moved in time, in space as given."""
 
-    offset: float
-    # s of the log's clock at which the plan begins
-    covered: float
-    # share of the plan's time in which the subject was seen
-    aside: tuple[float, float, float]
-    # m, mean of the log minus the plan
-    max_deviation: float
-    # m
-    rms_deviation: float
-    # m
-    alike: bool
-    # whether the log looks like a flight of the plan at all
+    offset: float  # s of the log's clock at which the plan begins
+    covered: float  # share of the plan's time in which the subject was seen
+    aside: tuple[float, float, float]  # m, mean of the log minus the plan
+    max_deviation: float  # m
+    rms_deviation: float  # m
+    alike: bool  # whether the log looks like a flight of the plan at all
 
     def __str__(self) -> str:
         x, y, z = (round(100 * value, 1) + 0.0 for value in self.aside)  # no -0.0
@@ -114,18 +103,18 @@ def trial_of_record(record: Record, name: str) -> Trial:
     return Trial(name, poses.time - begin, poses.position, poses.quaternion, reference)
 
 
-def subject_of_record(record: Record, name: str) -> Subject:
+def subject_of_record(record: Record, name: str) -> LoggedSubject:
     """A recorded flight as motion capture saw it."""
     poses = record.poses
-    return Subject(name, poses.time - record.start, poses.position, poses.quaternion)
+    return LoggedSubject(name, poses.time - record.start, poses.position, poses.quaternion)
 
 
-def trial_of_subject(subject: Subject, reference: Reference | None = None, offset: float = 0.0) -> Trial:
+def trial_of_subject(subject: LoggedSubject, reference: Reference | None = None, offset: float = 0.0) -> Trial:
     """A subject of a log; time 0 at `offset` of its clock."""
     return Trial(subject.name, subject.time - offset, subject.position, subject.quaternion, reference)
 
 
-def align(subject: Subject, reference: Reference) -> Alignment:
+def align(subject: LoggedSubject, reference: Reference) -> Alignment:
     """Where in the log the plan was flown, by correlation.
 
     Looked for is the time at which the difference of log and plan varies least, so that neither a shift of the

@@ -16,6 +16,7 @@ FLOWN: Colour = (86, 180, 233)
 WANTED: Colour = (230, 159, 0)
 LIMIT: Colour = (226, 74, 74)
 FOUR: tuple[Colour, ...] = ((86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))
+# The titles of all plots, in the order in which they are shown.
 TITLES = {
     "deviation": "Deviation, m",
     "motor_thrust": "Motor thrust, N",
@@ -26,7 +27,6 @@ TITLES = {
     "age": "Age of poses and of the vehicle's log, ms",
     "lateness": "Lateness of setpoints, ms",
 }
-# of all plots, in the order in which they are shown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,12 +34,9 @@ class Line:
     """One curve, or several that share their times."""
 
     name: str
-    time: NDArray
-    # (N,) s, on the record's clock
-    values: NDArray
-    # (N,) or (N, K)
-    labels: tuple[str, ...]
-    # K of them
+    time: NDArray  # (N,) s, on the record's clock
+    values: NDArray  # (N,) or (N, K)
+    labels: tuple[str, ...]  # K of them
     colours: tuple[Colour, ...]
 
 
@@ -47,11 +44,9 @@ class Line:
 class Plot:
     """One set of axes."""
 
-    name: str
-    # one of TITLES
+    name: str  # one of TITLES
     lines: tuple[Line, ...]
-    limits: tuple[float, ...]
-    # drawn as level lines; those that are not finite are left out
+    limits: tuple[float, ...]  # drawn as level lines; those that are not finite are left out
 
     @property
     def title(self) -> str:

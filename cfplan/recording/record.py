@@ -19,90 +19,63 @@ PLAN_FILE = "plan.parquet"
 class Setpoints:
     """The setpoints as sent; see telemetry.SetpointSent."""
 
-    time: NDArray
-    # (N,) s, when each was handed to the link
-    due: NDArray
-    # (N,) s, its deadline
-    index: NDArray
-    # (N,) int, row of the encoded flight
-    position: NDArray
-    # (N, 3) m
-    velocity: NDArray
-    # (N, 3) m/s
-    acceleration: NDArray
-    # (N, 3) m/s²
-    quaternion: NDArray
-    # (N, 4) body→world, x y z w
-    body_rate: NDArray
-    # (N, 3) rad/s
+    time: NDArray  # (N,) s, when each was handed to the link
+    due: NDArray  # (N,) s, its deadline
+    index: NDArray  # (N,) int, row of the encoded flight
+    position: NDArray  # (N, 3) m
+    velocity: NDArray  # (N, 3) m/s
+    acceleration: NDArray  # (N, 3) m/s²
+    quaternion: NDArray  # (N, 4) body→world, x y z w
+    body_rate: NDArray  # (N, 3) rad/s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
     """The poses from motion capture; see telemetry.PoseReceived."""
 
-    time: NDArray
-    # (N,) s, when the vehicle was there
-    received: NDArray
-    # (N,) s
-    position: NDArray
-    # (N, 3) m
-    quaternion: NDArray
-    # (N, 4) body→world, x y z w
+    time: NDArray  # (N,) s, when the vehicle was there
+    received: NDArray  # (N,) s
+    position: NDArray  # (N, 3) m
+    quaternion: NDArray  # (N, 4) body→world, x y z w
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimates:
     """The vehicle's own estimates; see telemetry.Estimate."""
 
-    time: NDArray
-    # (N,) s
-    position: NDArray
-    # (N, 3) m
-    velocity: NDArray
-    # (N, 3) m/s
-    acceleration: NDArray
-    # (N, 3) m/s²
-    quaternion: NDArray
-    # (N, 4) body→world, x y z w
+    time: NDArray  # (N,) s
+    position: NDArray  # (N, 3) m
+    velocity: NDArray  # (N, 3) m/s
+    acceleration: NDArray  # (N, 3) m/s²
+    quaternion: NDArray  # (N, 4) body→world, x y z w
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Status:
+class StatusReports:
     """Rates, motors, battery and supervisor; see telemetry.VehicleStatus."""
 
-    time: NDArray
-    # (N,) s
-    body_rate: NDArray
-    # (N, 3) rad/s
-    motor: NDArray
-    # (N, 4) int, 16-bit commands
-    battery_voltage: NDArray
-    # (N,) V
-    supervisor: NDArray
-    # (N,) int, bits of supervisor.info
+    time: NDArray  # (N,) s
+    body_rate: NDArray  # (N, 3) rad/s
+    motor: NDArray  # (N, 4) int, 16-bit commands
+    battery_voltage: NDArray  # (N,) V
+    supervisor: NDArray  # (N,) int, bits of supervisor.info
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Phases:
     """When the pilot went into which phase."""
 
-    time: NDArray
-    # (N,) s
-    phase: NDArray
-    # (N,) str, a value of telemetry.Phase
+    time: NDArray  # (N,) s
+    phase: NDArray  # (N,) str, a value of telemetry.Phase
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Events:
     """What a reader should know."""
 
-    time: NDArray
-    # (N,) s
-    level: NDArray
-    # (N,) str, a value of telemetry.Level
-    text: NDArray
-    # (N,) str
+    time: NDArray  # (N,) s
+    level: NDArray  # (N,) str, a value of telemetry.Level
+    text: NDArray  # (N,) str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,13 +87,11 @@ class Record:
     setpoints: Setpoints
     poses: Poses
     estimates: Estimates
-    status: Status
+    status: StatusReports
     phases: Phases
     events: Events
-    summary: Mapping[str, Any]
-    # as written at the end of the flight; empty where there is none
-    truncated: bool
-    # the file ends before its time; the streams hold all that can be read
+    summary: Mapping[str, Any]  # as written at the end of the flight; empty where there is none
+    truncated: bool  # the file ends before its time; the streams hold all that can be read
 
     @property
     def start(self) -> float:

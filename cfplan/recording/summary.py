@@ -5,7 +5,9 @@ compared with the reference at the pose's own time (deviation in time) and with 
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +17,7 @@ from cfplan.flight.telemetry import Phase
 from cfplan.recording.path_distance import distance_to_path
 from cfplan.recording.record import Record, Setpoints
 
+UNKNOWN = "–"
 SETTLED = 0.05  # m from the end of the path: close enough to call the flight settled
 DROPOUT = 3.0  # usual intervals between poses: a longer gap is a dropout
 
@@ -23,41 +26,25 @@ DROPOUT = 3.0  # usual intervals between poses: a longer gap is a dropout
 class FlightSummary:
     """NaN where the record cannot tell."""
 
-    travel_time_planned: float
-    # s
+    travel_time_planned: float  # s
     travel_time_flown: float
-    # s, from the first setpoint of the path until the vehicle stays at its end; NaN where the path was not finished
-    settling: float
-    # s, from the end of the reference until the vehicle stays within SETTLED of the path's end
-    max_deviation: float
-    # m, from the reference in time
-    rms_deviation: float
-    # m
-    max_deviation_to_path: float
-    # m, from the nearest point of the path
-    rms_deviation_to_path: float
-    # m
-    peak_speed: float
-    # m/s, by the vehicle's estimate, along the path
-    peak_acceleration: float
-    # m/s², gravity not counted, by the vehicle's estimate, along the path
-    peak_body_rate: float
-    # rad/s, norm, along the path
-    lateness_p50: float
-    # s, of all setpoints sent
-    lateness_p99: float
-    # s
-    lateness_max: float
-    # s
+    """s, from the path's first setpoint until the vehicle stays at its end; NaN where the path was not finished."""
+    settling: float  # s, from the end of the reference until the vehicle stays within SETTLED of the path's end
+    max_deviation: float  # m, from the reference in time
+    rms_deviation: float  # m
+    max_deviation_to_path: float  # m, from the nearest point of the path
+    rms_deviation_to_path: float  # m
+    peak_speed: float  # m/s, by the vehicle's estimate, along the path
+    peak_acceleration: float  # m/s², gravity not counted, by the vehicle's estimate, along the path
+    peak_body_rate: float  # rad/s, norm, along the path
+    lateness_p50: float  # s, of all setpoints sent
+    lateness_p99: float  # s
+    lateness_max: float  # s
     pose_dropouts: int
-    longest_pose_gap: float
-    # s
-    battery_start: float
-    # V
-    battery_end: float
-    # V
-    duration: float
-    # s, of the whole record
+    longest_pose_gap: float  # s
+    battery_start: float  # V
+    battery_end: float  # V
+    duration: float  # s, of the whole record
     truncated: bool
 
     def to_json(self) -> dict[str, float | int | bool | None]:
@@ -66,15 +53,12 @@ class FlightSummary:
         return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in values.items()}
 
 
-class Deviation(NamedTuple):
+class PoseDeviations(NamedTuple):
     """How far the vehicle was from where it should have been."""
 
-    time: NDArray
-    # (N,) s, of the poses
-    in_time: NDArray
-    # (N,) m, from the reference at that time
-    to_path: NDArray
-    # (N,) m, from the nearest point of the path
+    time: NDArray  # (N,) s, of the poses
+    in_time: NDArray  # (N,) m, from the reference at that time
+    to_path: NDArray  # (N,) m, from the nearest point of the path
 
 
 def summarise(record: Record) -> FlightSummary:
@@ -139,18 +123,18 @@ def reference_times(setpoints: Setpoints) -> NDArray:
     return setpoints.due + np.round((setpoints.time - setpoints.due) / period) * period
 
 
-def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -> Deviation:
+def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -> PoseDeviations:
     """Of every pose between begin and end that falls in the time of the setpoints."""
     wanted = reference_times(record.setpoints)
     if len(wanted) == 0:
-        return Deviation(np.empty(0), np.empty(0), np.empty(0))
+        return PoseDeviations(np.empty(0), np.empty(0), np.empty(0))
     time, position = record.poses.time, record.poses.position
     inside = (time >= max(begin, wanted[0])) & (time <= min(end, wanted[-1])) & np.all(np.isfinite(position), axis=1)
     time, position = time[inside], position[inside]
     reference = np.stack([np.interp(time, wanted, axis) for axis in record.setpoints.position.T], axis=1)
     path = record.header.path[np.all(np.isfinite(record.header.path), axis=1)]
     path = path if len(path) else record.setpoints.position
-    return Deviation(time, np.linalg.norm(position - reference, axis=1), distance_to_path(position, path))
+    return PoseDeviations(time, np.linalg.norm(position - reference, axis=1), distance_to_path(position, path))
 
 
 def settling(record: Record) -> float:
@@ -190,6 +174,56 @@ def pose_gaps(times: NDArray) -> NDArray:
 def dropouts(gaps: NDArray) -> NDArray:
     """Indices of the gaps that are longer than DROPOUT usual ones."""
     return np.flatnonzero(gaps > DROPOUT * np.median(gaps)) if len(gaps) else np.empty(0, dtype=int)
+
+
+def summary_rows(summary: FlightSummary, shares: Mapping[str, float] | None = None) -> list[tuple[str, str]]:
+    """Return what each number is and its value as people read it; peaks with their share of the limit where given."""
+
+    def peak(name: str, unit: str) -> str:
+        share = (shares or {}).get(name, math.nan)
+        of_limit = f" ({100 * share:.0f} % of the limit)" if math.isfinite(share) else ""
+        return _text(getattr(summary, name), unit, 2) + of_limit
+
+    return [
+        ("travel time, planned", _text(summary.travel_time_planned, "s", 2)),
+        ("travel time, flown", _text(summary.travel_time_flown, "s", 2)),
+        ("settling", _text(summary.settling, "s", 2)),
+        ("deviation in time, max", _text(100 * summary.max_deviation, "cm", 1)),
+        ("deviation in time, rms", _text(100 * summary.rms_deviation, "cm", 1)),
+        ("deviation from the path, max", _text(100 * summary.max_deviation_to_path, "cm", 1)),
+        ("deviation from the path, rms", _text(100 * summary.rms_deviation_to_path, "cm", 1)),
+        ("peak speed", peak("peak_speed", "m/s")),
+        ("peak acceleration", peak("peak_acceleration", "m/s²")),
+        ("peak body rate", peak("peak_body_rate", "rad/s")),
+        ("lateness of setpoints, p99", _text(1e3 * summary.lateness_p99, "ms", 2)),
+        ("lateness of setpoints, worst", _text(1e3 * summary.lateness_max, "ms", 2)),
+        ("pose dropouts", str(summary.pose_dropouts)),
+        ("longest pose gap", _text(1e3 * summary.longest_pose_gap, "ms", 0)),
+        ("battery", f"{_text(summary.battery_start, 'V', 2)} → {_text(summary.battery_end, 'V', 2)}"),
+    ]
+
+
+def summary_text(record: Record) -> str:
+    """Return a heading, a table of the numbers, and what flew, in Markdown; a dash where the record cannot tell."""
+    header = record.header
+    begun = datetime.fromtimestamp(header.wall_time_at_zero + record.start, UTC)
+    cut = ["**The record ends early: what follows its last whole chunk is lost.**", ""] if record.truncated else []
+    lines = [
+        f"## {header.name}",
+        "",
+        *cut,
+        f"{begun:%Y-%m-%d %H:%M:%S} UTC · {header.vehicle.name} · {header.uri} · {header.planner}",
+        "",
+        "| | |",
+        "|---|---|",
+        *(f"| {name} | {value} |" for name, value in summary_rows(summarise(record))),
+    ]
+    return "\n".join(lines)
+
+
+def _text(value: float, unit: str, digits: int) -> str:
+    """Return the number with its unit; a dash where it is not known."""
+    return f"{value:.{digits}f} {unit}" if math.isfinite(value) else UNKNOWN
 
 
 def _peak(time: NDArray, vectors: NDArray, begin: float, end: float) -> float:

@@ -15,13 +15,10 @@ from pyarrow import json as pa_json
 from cfplan.flight import telemetry
 from cfplan.recording import record
 
-PROFILE = "cfplan"
-# the profile that our MCAP files name; a file with another is not a record
-METADATA = "cfplan"
-# the metadata entry that holds format and header
+PROFILE = "cfplan"  # the profile that our MCAP files name; a file with another is not a record
+METADATA = "cfplan"  # the metadata entry that holds format and header
 _BLOCK = 1 << 21  # bytes of JSON that one core reads at a time
-FORMAT = "1"
-# raised when older versions can no longer read a record
+FORMAT = "1"  # raised when older versions can no longer read a record
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,15 +28,14 @@ class Topic:
     name: str
     message: type
     columns: type
-    stream: str
-    # its field in Record
+    stream: str  # its field in Record
 
 
 TOPICS = (
     Topic("/setpoint", telemetry.SetpointSent, record.Setpoints, "setpoints"),
     Topic("/pose", telemetry.PoseReceived, record.Poses, "poses"),
     Topic("/estimate", telemetry.Estimate, record.Estimates, "estimates"),
-    Topic("/status", telemetry.VehicleStatus, record.Status, "status"),
+    Topic("/status", telemetry.VehicleStatus, record.StatusReports, "status"),
     Topic("/phase", telemetry.PhaseEntered, record.Phases, "phases"),
     Topic("/event", telemetry.Event, record.Events, "events"),
 )

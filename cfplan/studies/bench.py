@@ -16,7 +16,7 @@ from cfplan.studies.result import Column, StudyResult, Table, collect, detail_ta
 from cfplan.studies.trials import (
     BAD_PATH,
     Candidate,
-    Trial,
+    PlannerTrial,
     find_box,
     find_candidate,
     find_limit_set,
@@ -89,7 +89,7 @@ def bench(
     chosen = [find_limit_set(name) for name in limit_sets]
     candidates = {name: find_candidate(name) for name in planners}
 
-    def measure() -> Iterator[list[Trial]]:
+    def measure() -> Iterator[list[PlannerTrial]]:
         done, total = 0, len(boxes) * len(chosen) * paths
         for limit_set in chosen:
             _warm_up(candidates, limit_set, nodes, yaw, first_seed)
@@ -107,7 +107,7 @@ def bench(
     )
 
 
-def bench_tables(trials: Sequence[Trial], settings: Mapping[str, Any]) -> tuple[Table, ...]:
+def bench_tables(trials: Sequence[PlannerTrial], settings: Mapping[str, Any]) -> tuple[Table, ...]:
     """Return two tables for each box and limit set: time to plan, and the flights that were planned."""
     tables = []
     for box, limits in dict.fromkeys((trial.box, trial.limits) for trial in trials):
@@ -128,7 +128,7 @@ def _warm_up(candidates: Mapping[str, Candidate], chosen: LimitSet, nodes: int, 
         run_trial(name, candidate, path, seed, box, chosen, nodes=nodes, yaw=yaw, bound=1.0)
 
 
-def _row(name: str, group: Sequence[Trial]) -> dict[str, Any]:
+def _row(name: str, group: Sequence[PlannerTrial]) -> dict[str, Any]:
     """Return one planner's figures. Times in s, shares and gaps as fractions."""
     mine = [trial for trial in group if trial.planner == name and trial.status != BAD_PATH]
     reference = {trial.seed: trial for trial in group if trial.planner == REFERENCE}

@@ -22,30 +22,22 @@ class Scenario:
     """One row."""
 
     name: str
-    rung: Rung
-    # that it must come to, and no graver one
-    faults: tuple[Fault, ...] = ()
-    # their starts count from the moment
+    rung: Rung  # that it must come to, and no graver one
+    faults: tuple[Fault, ...] = ()  # their starts count from the moment
     phase: Phase = Phase.STREAM
-    moment: float = FULL_SPEED
-    # s after the phase began
-    stall: float = 0.0
-    # s for which the pilot's computer stands still
-    order: Order | None = None
-    # of the operator
+    moment: float = FULL_SPEED  # s after the phase began
+    stall: float = 0.0  # s for which the pilot's computer stands still
+    order: Order | None = None  # of the operator
     main_killed: bool = False
     pilot_killed: bool = False
     disk_full: bool = False
-    from_start: bool = False
-    # the faults are there before anything is connected
+    from_start: bool = False  # the faults are there before anything is connected
     vehicle: VehicleSettings = field(default_factory=lambda: VehicleSettings(auto_arming=False))
-    # armed by request alone, so that one can see whether it was disarmed
-    cameras: ViconSettings | None = None
-    # None: those of the lab
+    """Armed by request alone, so that a test can see whether it was disarmed."""
+    cameras: ViconSettings | None = None  # None: those of the lab
     falls: bool = False
-    # motors stop in the air: the vehicle's own supervisor stops them, or a take-off ends a hand above the floor
-    grounded: bool = False
-    # it must never take off
+    """Motors stop in the air: the vehicle's supervisor stops them, or a take-off ends a hand above the floor."""
+    grounded: bool = False  # it must never take off
 
 
 def _poses(name: str, kind: FaultKind, rung: Rung, duration: float, size: float | None = None) -> Scenario:

@@ -13,7 +13,7 @@ from cfplan.safety.limit_sets import BOXES, LIMIT_SETS
 from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table, quantile_columns
 from cfplan.studies.trials import (
     BAD_PATH,
-    Trial,
+    PlannerTrial,
     find_box,
     find_candidate,
     find_limit_set,
@@ -65,7 +65,7 @@ def dense_feasibility(
         raise InputError(f"paths must be at least {len(pairs)}, one for each box and limit set", where="paths")
     candidate, each = find_candidate(planner), paths // len(pairs)
 
-    def measure() -> Iterator[Trial]:
+    def measure() -> Iterator[PlannerTrial]:
         for number, (box, chosen) in enumerate(pairs):
             candidate.plan(PlanningTask(random_path(first_seed, box), chosen.airframe, chosen.limits, nodes, yaw))
             for count in range(each):
@@ -82,13 +82,13 @@ def dense_feasibility(
     )
 
 
-def _table(trials: Sequence[Trial], title: str) -> Table:
+def _table(trials: Sequence[PlannerTrial], title: str) -> Table:
     groups = dict.fromkeys((trial.box, trial.limits) for trial in trials)
     rows = [_row(box, limits, [t for t in trials if (t.box, t.limits) == (box, limits)]) for box, limits in groups]
     return Table("groups", title, COLUMNS, tuple(rows))
 
 
-def _row(box: str, limits: str, trials: Sequence[Trial]) -> dict[str, Any]:
+def _row(box: str, limits: str, trials: Sequence[PlannerTrial]) -> dict[str, Any]:
     counted = [trial for trial in trials if trial.status != BAD_PATH]
     certified = [trial for trial in counted if trial.certified]
     return {

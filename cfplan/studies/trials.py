@@ -28,7 +28,7 @@ REFINED = ", refined"  # behind a planner's name: its profile is refined where i
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class PlannerTrial:
     """One planner's plan of one path. Numbers are NaN where there was nothing to measure."""
 
     box: str
@@ -107,14 +107,16 @@ def find_limit_set(name: str) -> LimitSet:
 
 def path_trials(
     candidates: Mapping[str, Candidate], seed: int, box: str, chosen: LimitSet, *, nodes: int, yaw: YawMode
-) -> list[Trial]:
+) -> list[PlannerTrial]:
     """Return every planner's trial on the random path of that seed; a path with a cusp is a bad one for all."""
     try:
         path = random_path(seed, box)
         path.check()
         bound = lower_bound(PlanningTask(path, chosen.airframe, chosen.limits))
     except CfplanError as error:
-        return [Trial(box, chosen.name, name, seed, BAD_PATH, str(error), **_NOT_MEASURED) for name in candidates]
+        return [
+            PlannerTrial(box, chosen.name, name, seed, BAD_PATH, str(error), **_NOT_MEASURED) for name in candidates
+        ]
     return [
         run_trial(name, candidate, path, seed, box, chosen, nodes=nodes, yaw=yaw, bound=bound)
         for name, candidate in candidates.items()
@@ -132,7 +134,7 @@ def run_trial(
     nodes: int,
     yaw: YawMode,
     bound: float,
-) -> Trial:
+) -> PlannerTrial:
     """Plan, certify, repair. What fails is a trial with a reason."""
     begun = time.perf_counter()
     task = PlanningTask(path, chosen.airframe, chosen.limits, nodes, yaw)
@@ -142,7 +144,7 @@ def run_trial(
     values = _NOT_MEASURED | {"plan_seconds": plan_seconds, "solve_seconds": solve_seconds, "bound": bound}
     if solution.profile is None:
         reason = solution.reason or str(solution.status)
-        return Trial(box, chosen.name, name, seed, solution.status.name, reason, **values)
+        return PlannerTrial(box, chosen.name, name, seed, solution.status.name, reason, **values)
     try:
         planned = Trajectory(path, solution.profile, chosen.airframe)
         certificate = certify(planned, chosen.limits)
@@ -150,7 +152,7 @@ def run_trial(
         repaired = candidate.repair(task, solution.profile)
         repair_seconds = time.perf_counter() - begun
     except CfplanError as error:
-        return Trial(box, chosen.name, name, seed, Status.SOLVED.name, f"not certified: {error}", **values)
+        return PlannerTrial(box, chosen.name, name, seed, Status.SOLVED.name, f"not certified: {error}", **values)
     values |= {
         "repair_seconds": repair_seconds,
         "worst_share": certificate.worst.share,
@@ -159,7 +161,7 @@ def run_trial(
         "certified_time": repaired.trajectory.duration,
         "speed_factor": repaired.speed_factor,
     }
-    return Trial(box, chosen.name, name, seed, solution.status.name, "", **values)
+    return PlannerTrial(box, chosen.name, name, seed, solution.status.name, "", **values)
 
 
 def quantiles(values: Iterable[float]) -> tuple[float, float, float]:

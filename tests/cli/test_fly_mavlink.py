@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common
 
-from cfplan.recording.importers.table import read_log
+from cfplan.recording.importers.formats import read_log
 from cfplan.recording.mavlink.bridge import messages_in
 
 REPOSITORY = Path(__file__).parents[2]

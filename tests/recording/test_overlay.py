@@ -22,7 +22,7 @@ from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import save_plan
-from cfplan.recording.importers.mocap_log import Subject
+from cfplan.recording.importers.mocap_log import LoggedSubject
 from cfplan.recording.overlay import Reference, align, extent, trial_of_record, trial_of_subject
 from cfplan.recording.reader import is_record
 from cfplan.recording.rerun import layout
@@ -56,7 +56,7 @@ def log(offset, *, length=30.0, rate=300.0, noise=0.0, aside=(0, 0, 0), gaps=(),
     position += np.random.default_rng(seed).normal(0, noise, position.shape)
     for begin, end in gaps:
         position[(time - 100.0 >= begin) & (time - 100.0 < end)] = np.nan
-    return Subject("cf1", time, position, np.full((len(time), 4), np.nan))
+    return LoggedSubject("cf1", time, position, np.full((len(time), 4), np.nan))
 
 
 @settings(deadline=None, max_examples=12)
@@ -88,7 +88,7 @@ def test_noise_and_gaps_leave_the_offset_where_it_is():
 def test_a_log_that_begins_in_the_middle_of_the_flight_is_laid_there():
     whole = log(5.0)
     late = whole.time > 107.0
-    found = align(Subject("cf1", whole.time[late], whole.position[late], whole.quaternion[late]), PLAN)
+    found = align(LoggedSubject("cf1", whole.time[late], whole.position[late], whole.quaternion[late]), PLAN)
     assert found.offset == pytest.approx(105.0, abs=1e-3)
     assert found.covered == pytest.approx(0.75, abs=0.01)
 
@@ -96,14 +96,14 @@ def test_a_log_that_begins_in_the_middle_of_the_flight_is_laid_there():
 def test_a_constant_lag_is_taken_for_time_and_a_growing_one_is_deviation():
     assert align(log(5.0 + 0.08), PLAN).rms_deviation < 1e-3
     time = log(5.0).time
-    slower = Subject("cf1", time, path((time - 105.0) * 0.97), np.full((len(time), 4), np.nan))
+    slower = LoggedSubject("cf1", time, path((time - 105.0) * 0.97), np.full((len(time), 4), np.nan))
     assert align(slower, PLAN).rms_deviation > 0.02
 
 
 def test_another_flight_hardly_looks_like_the_plan():
     time = np.arange(0, 30, 0.01)
     circle = np.stack([np.cos(time), np.sin(time), 1 + 0 * time], axis=1)
-    assert not align(Subject("cf1", time, circle, np.full((len(time), 4), np.nan)), PLAN).alike
+    assert not align(LoggedSubject("cf1", time, circle, np.full((len(time), 4), np.nan)), PLAN).alike
 
 
 def test_a_subject_that_was_hardly_seen_cannot_be_laid():
@@ -156,7 +156,7 @@ def test_stretches_are_what_was_seen():
 
 
 def test_an_overlay_of_nothing_seen_still_has_an_extent():
-    nothing = Subject("cf1", np.arange(3.0), np.full((3, 3), np.nan), np.full((3, 4), np.nan))
+    nothing = LoggedSubject("cf1", np.arange(3.0), np.full((3, 3), np.nan), np.full((3, 4), np.nan))
     low, high = extent([trial_of_subject(nothing)])
     assert np.all(high > low)
 

@@ -14,9 +14,8 @@ from cfplan.recording import record as columns
 from cfplan.recording.path_distance import BLOCK, distance_to_path
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import Record
-from cfplan.recording.states import supervisor_states
-from cfplan.recording.summary import deviation, dropouts, pose_gaps, settling, summarise
-from cfplan.recording.summary_text import summary_text
+from cfplan.recording.rerun.states import supervisor_states
+from cfplan.recording.summary import deviation, dropouts, pose_gaps, settling, summarise, summary_text
 from cfplan.recording.writer import RecordWriter
 
 BEGIN, TRAVEL, HELD = 100.0, 4.0, 2.0  # s
@@ -51,7 +50,7 @@ def straight_flight(
         estimates=columns.Estimates(
             due, np.zeros((len(due), 3)), np.tile([0.3, 0.4, 0.0], (len(due), 1)), np.zeros((len(due), 3)), still
         ),
-        status=columns.Status(
+        status=columns.StatusReports(
             due, np.tile([1.0, 2.0, 2.0], (len(due), 1)), np.zeros((len(due), 4), int), 4.0 - 0.1 * (due - BEGIN),
             np.zeros(len(due), int),
         ),

@@ -7,7 +7,7 @@ import numpy as np
 
 from cfplan.errors import InputError
 from cfplan.recording.importers.csv_numbers import Lines, numbers
-from cfplan.recording.importers.mocap_log import MocapLog, Subject, ascending, unit_quaternions
+from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, ascending, unit_quaternions
 
 FORMAT = "crazyswarm2 CSV"
 COLUMNS = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -39,7 +39,7 @@ def read(file: Path) -> MocapLog:
     except ValueError as error:
         row, length = error.args
         raise InputError(f"the quaternion has length {length:.3g} at {values[row, 0]:.3f} s", where=str(file)) from None
-    subject = Subject(file.stem, values[:, 0], values[:, 1:4], quaternion)
+    subject = LoggedSubject(file.stem, values[:, 0], values[:, 1:4], quaternion)
     return MocapLog(FORMAT, (subject,), tuple(notes), truncated=cut)
 
 

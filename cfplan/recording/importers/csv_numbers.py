@@ -22,17 +22,12 @@ _NO_NUMBER = ["", " ", "NaN", "nan", "-nan", "NA", "-nan(ind)"]  # what a cell w
 class Lines:
     """Where the numbers stand."""
 
-    begin: int
-    # byte of the first line
-    end: int
-    # byte behind the last line
+    begin: int  # byte of the first line
+    end: int  # byte behind the last line
     delimiter: str
-    width: int
-    # cells of every line
-    wanted: Sequence[int]
-    # the cells to read
-    point: str = "."
-    # of the decimals
+    width: int  # cells of every line
+    wanted: Sequence[int]  # the cells to read
+    point: str = "."  # of the decimals
 
 
 def numbers(data: mmap.mmap, lines: Lines, file: Path) -> tuple[NDArray, bool]:

@@ -12,16 +12,13 @@ _LISTED = 12  # names that an error tells at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Subject:
+class LoggedSubject:
     """One tracked object: poses on a clock of the log's own, NaN where it was not seen."""
 
     name: str
-    time: NDArray
-    # (N,) s, ascending
-    position: NDArray
-    # (N, 3) m
-    quaternion: NDArray
-    # (N, 4) body→world, x y z w; NaN where only the position is known
+    time: NDArray  # (N,) s, ascending
+    position: NDArray  # (N, 3) m
+    quaternion: NDArray  # (N, 4) body→world, x y z w; NaN where only the position is known
 
     @property
     def seen(self) -> NDArray:
@@ -39,13 +36,11 @@ class MocapLog:
     """All subjects of one file."""
 
     format: str
-    subjects: tuple[Subject, ...]
-    notes: tuple[str, ...]
-    # what was assumed and what is missing, one sentence each
-    truncated: bool
-    # the file ends before its time; the subjects hold all that can be read
+    subjects: tuple[LoggedSubject, ...]
+    notes: tuple[str, ...]  # what was assumed and what is missing, one sentence each
+    truncated: bool  # the file ends before its time; the subjects hold all that can be read
 
-    def select(self, names: Sequence[str], *, where: str = "") -> tuple[Subject, ...]:
+    def select(self, names: Sequence[str], *, where: str = "") -> tuple[LoggedSubject, ...]:
         """The subjects of these names, all where none is given. Raises InputError that lists what there is."""
         by_name = {subject.name: subject for subject in self.subjects}
         missing = [name for name in names if name not in by_name]

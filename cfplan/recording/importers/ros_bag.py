@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import InputError
-from cfplan.recording.importers.mocap_log import MocapLog, Subject, ascending, unit_quaternions
+from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, ascending, unit_quaternions
 
 FORMAT = "ROS bag"
 _MCAP, _SQLITE, _ROS1 = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG V"
@@ -113,17 +113,17 @@ def _row(time: float, place: Any, turn: Any) -> _Row:
     return time, place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
 
 
-def _subject(name: str, table: list[_Row], start: float, notes: list[str]) -> Subject:
+def _subject(name: str, table: list[_Row], start: float, notes: list[str]) -> LoggedSubject:
     values = np.array(table)
-    # Sorted first: a topic may have several writers, and a bag holds messages as they came.
+    # Sorted first: a topic may have several writers, and a bag holds messages in the order in which they arrived.
     values = values[np.argsort(values[:, 0], kind="stable")]
     keep = ascending(values[:, 0])
     if not keep.all():
         notes.append(f"{np.sum(~keep)} poses of {name} left out, as their stamps repeat")
     values = values[keep]
-    # A NaN orientation is how motion_capture_tracking marks a lone point.
+    # motion_capture_tracking marks a lone point by an orientation of NaN.
     quaternion = unit_quaternions(values[:, 4:], tolerance=np.inf)
-    return Subject(name, values[:, 0] - start, values[:, 1:4], quaternion)
+    return LoggedSubject(name, values[:, 0] - start, values[:, 1:4], quaternion)
 
 
 def _one_line(error: Exception) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from cfplan.errors import InputError
-from cfplan.recording.importers.mocap_log import MocapLog, Subject, ascending, unit_quaternions
+from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, ascending, unit_quaternions
 
 FORMAT = "MAVLink .tlog"
 V1, V2 = 0xFE, 0xFD  # first bytes of a packet
@@ -138,7 +138,7 @@ def _grown(table: NDArray, start: float) -> NDArray:
 
 def _subjects(
     system: int, tables: dict[tuple[int, int], NDArray], frames: dict[tuple[int, int], int]
-) -> Iterator[Subject]:
+) -> Iterator[LoggedSubject]:
     odometry = tables.get((system, _ODOMETRY))
     if odometry is not None:
         world = _FRD if frames[system, _ODOMETRY] == _LOCAL_FRD else _NED
@@ -155,12 +155,12 @@ def _subjects(
         yield _subject(f"vehicle {system} setpoint", world, setpoint[:, 0], setpoint[:, 1:4], unknown)
 
 
-def _subject(name: str, world: Rotation, time: NDArray, position: NDArray, quaternion: NDArray) -> Subject:
+def _subject(name: str, world: Rotation, time: NDArray, position: NDArray, quaternion: NDArray) -> LoggedSubject:
     turn = unit_quaternions(quaternion, tolerance=np.inf)
     known = np.isfinite(turn).all(axis=1)
     if known.any():
         turn[known] = (world * Rotation.from_quat(turn[known]) * _FRD).as_quat()
-    return Subject(name, time, position @ world.as_matrix().T, turn)
+    return LoggedSubject(name, time, position @ world.as_matrix().T, turn)
 
 
 def _at(time: NDArray, attitude: NDArray) -> NDArray:

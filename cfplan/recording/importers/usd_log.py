@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
-from cfplan.recording.importers.mocap_log import MocapLog, Subject, ascending, unit_quaternions
+from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, ascending, unit_quaternions
 
 FORMAT = "Crazyflie microSD log"
 MAGIC = 0xBC
@@ -33,11 +33,9 @@ class _Source:
 
     name: str
     position: tuple[str, ...]
-    scale: float
-    # to m
+    scale: float  # to m
     quaternion: tuple[str, ...] = ()
-    angles: tuple[str, ...] = ()
-    # roll, pitch, yaw in degrees, pitch positive nose up as the firmware logs it
+    angles: tuple[str, ...] = ()  # roll, pitch, yaw in degrees, pitch positive nose up as the firmware logs it
 
 
 def _axes(group: str, names: str) -> tuple[str, ...]:
@@ -189,7 +187,7 @@ def _table(rows: NDArray, names: tuple[str, ...]) -> NDArray:
     return np.stack([rows[name].astype(float) for name in names], axis=1)
 
 
-def _subject(source: _Source, rows: NDArray, start: float, scale: float) -> Subject:
+def _subject(source: _Source, rows: NDArray, start: float, scale: float) -> LoggedSubject:
     time = (rows["time"].astype(float) - start) * scale
     keep = ascending(time)
     rows = rows[keep]
@@ -203,8 +201,8 @@ def _subject(source: _Source, rows: NDArray, start: float, scale: float) -> Subj
         known = np.isfinite(roll + pitch + yaw)
         turn = np.stack([yaw, -pitch, roll], axis=1)[known]  # the firmware's pitch counts the other way
         quaternion[known] = Rotation.from_euler("ZYX", turn, degrees=True).as_quat()
-    return Subject(source.name, time[keep], position, quaternion)
+    return LoggedSubject(source.name, time[keep], position, quaternion)
 
 
-def _renamed(subject: Subject, event: str) -> Subject:
-    return Subject(f"{subject.name} at {event}", subject.time, subject.position, subject.quaternion)
+def _renamed(subject: LoggedSubject, event: str) -> LoggedSubject:
+    return LoggedSubject(f"{subject.name} at {event}", subject.time, subject.position, subject.quaternion)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
 from cfplan.recording.importers.csv_numbers import Lines, is_cut_off, numbers, place
-from cfplan.recording.importers.mocap_log import MocapLog, Subject, ascending, unit_quaternions
+from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, ascending, unit_quaternions
 from cfplan.recording.importers.vicon_header import Group, Rotations, Section, read_head
 
 FORMAT = "Vicon CSV"
@@ -123,7 +123,7 @@ def _columns(section: Section) -> list[int]:
 
 
 def _log(parts: list[_Rows], reading: _Reading, file: Path) -> MocapLog:
-    subjects: dict[str, Subject] = {}
+    subjects: dict[str, LoggedSubject] = {}
     notes: list[str] = []
     origin: float | None = None
     for part in parts:
@@ -160,7 +160,7 @@ def _log(parts: list[_Rows], reading: _Reading, file: Path) -> MocapLog:
     return MocapLog(FORMAT, tuple(subjects.values()), tuple(dict.fromkeys(notes)), reading.truncated)
 
 
-def _subject(group: Group, time: NDArray, values: NDArray, file: Path) -> Subject:
+def _subject(group: Group, time: NDArray, values: NDArray, file: Path) -> LoggedSubject:
     """One subject's poses; a row of nothing but zeros is an occlusion, as some exports write it."""
     count = len(group.rotation_columns)
     unseen = np.isnan(values[:, count:]).any(axis=1) | (values == 0).all(axis=1)
@@ -180,7 +180,7 @@ def _subject(group: Group, time: NDArray, values: NDArray, file: Path) -> Subjec
         raise InputError(
             f"the quaternion of {group.name!r} has length {length:.3g} at {time[row]:.3f} s", where=str(file)
         ) from None
-    return Subject(group.name, time, position, quaternion)
+    return LoggedSubject(group.name, time, position, quaternion)
 
 
 def _quaternion(kind: Rotations, rotation: NDArray) -> NDArray:

@@ -27,8 +27,8 @@ class Rotations(StrEnum):
 
 LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 ANGLES = {"rad": 1.0, "deg": math.pi / 180}
+# The sections that hold poses or points; the others are forces, joint angles and the like.
 READ = ("objects", "segments", "trajectories")
-# the sections that hold poses or points; the others are forces, joint angles and the like
 _QUATERNION, _ANGLES, _POSITION, _POINT = (
     ("RX", "RY", "RZ", "RW"), ("RX", "RY", "RZ"), ("TX", "TY", "TZ"), ("X", "Y", "Z"),
 )  # fmt: skip
@@ -42,13 +42,10 @@ class Group:
     name: str
     rotations: Rotations
     rotation_columns: tuple[int, ...]
-    rotation_scale: float
-    # to rad
+    rotation_scale: float  # to rad
     position_columns: tuple[int, ...]
-    position_scale: float
-    # to m
-    assumed: bool
-    # the header does not say what its angles are
+    position_scale: float  # to m
+    assumed: bool  # the header does not say what its angles are
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,16 +53,13 @@ class Section:
     """One head, read."""
 
     name: str
-    rate: float
-    # Hz, of the rows
+    rate: float  # Hz, of the rows
     delimiter: str
     frame_column: int
     sub_frame_column: int | None
     groups: tuple[Group, ...]
-    left_out: tuple[str, ...]
-    # names over columns that are neither a pose nor a point
-    headings: int
-    # columns that it names
+    left_out: tuple[str, ...]  # names over columns that are neither a pose nor a point
+    headings: int  # columns that it names
 
 
 def read_head(lines: list[str], *, where: str, rotations: Rotations | None) -> Section:

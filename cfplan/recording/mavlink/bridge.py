@@ -95,10 +95,8 @@ class GroundStation:
                     f"cannot be written ({error.strerror or error})", where=str(log), hint="choose another folder"
                 ) from error
         self._flushed = 0.0
-        self.failure = ""
-        # why the log is not whole, one line; empty where it is
-        self.heard = 0
-        # packets from ground stations
+        self.failure = ""  # why the log is not whole, one line; empty where it is
+        self.heard = 0  # packets from ground stations
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
 

@@ -33,12 +33,9 @@ class Answer:
     """To one command."""
 
     result: Result
-    order: Order | None = None
-    # for the pilot
-    says: str = ""
-    # what is told to all ground stations
-    message: int | None = None
-    # that was asked for
+    order: Order | None = None  # for the pilot
+    says: str = ""  # what is told to all ground stations
+    message: int | None = None  # that was asked for
 
 
 def answer(command: int, parameters: tuple[float, ...]) -> Answer:

@@ -26,8 +26,7 @@ _LANDED_STATES = {Phase.TAKE_OFF: _TAKING_OFF, Phase.LAND: _LANDING}
 class Latest:
     """The newest of each kind; None where there was none yet."""
 
-    start: float
-    # s on the pilot's clock, counted as the vehicle's boot
+    start: float  # s on the pilot's clock, counted as the vehicle's boot
     estimate: Estimate | None = None
     status: VehicleStatus | None = None
     setpoint: SetpointSent | None = None
@@ -41,8 +40,8 @@ class Latest:
         return self.status.supervisor if self.status is not None else 0
 
 
+# From the dialect's encoder and the newest state to a message; None where nothing is known yet.
 Make = Callable[[Any, Latest], Any]
-# from the dialect's encoder and the newest state to a message; None where there is nothing to tell yet
 
 
 def heartbeat(mav: Any, latest: Latest) -> Any:
@@ -142,8 +141,7 @@ def status_texts(mav: Any, severity: int, text: str, number: int) -> list[Any]:
     return [mav.statustext_encode(severity, piece, number, index) for index, piece in enumerate(pieces[:255])]
 
 
-RATES: tuple[tuple[Make, float], ...] = (
-    # Hz
+RATES: tuple[tuple[Make, float], ...] = (  # with Hz
     (heartbeat, 1.0),
     (landed_state, 2.0),
     (local_position, 25.0),

@@ -28,10 +28,8 @@ class Curve:
     """One line of a chart; NaN breaks it."""
 
     label: str
-    x: NDArray
-    # (N,)
-    y: NDArray
-    # (N,)
+    x: NDArray  # (N,)
+    y: NDArray  # (N,)
     colour: Colour
     dashed: bool = False
 

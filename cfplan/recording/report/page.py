@@ -12,7 +12,7 @@ from cfplan.errors import InputError
 from cfplan.recording.overlay import Trial, trial_of_record
 from cfplan.recording.plots import FLOWN, Colour, finite_limits, plots
 from cfplan.recording.report.charts import Curve, place_chart, time_chart
-from cfplan.recording.report.report import Flight, rows
+from cfplan.recording.report.report import ReportedFlight, rows
 from cfplan.recording.rerun.overlay_view import COLOURS, references
 from cfplan.recording.summary import reference_span
 
@@ -31,7 +31,7 @@ td.n, th.n { text-align: right; } .note { background: #fff6e0; padding: .4em .8e
 """
 
 
-def page(flights: Sequence[Flight]) -> str:
+def page(flights: Sequence[ReportedFlight]) -> str:
     """The whole page; of several flights a comparison first."""
     title = flights[0].record.header.name if len(flights) == 1 else f"{len(flights)} flights"
     parts = [f"<h1>{html.escape(title)}</h1>", _summary(flights)]
@@ -48,7 +48,7 @@ def page(flights: Sequence[Flight]) -> str:
     )
 
 
-def write_page(flights: Sequence[Flight], file: Path, *, overwrite: bool = False) -> None:
+def write_page(flights: Sequence[ReportedFlight], file: Path, *, overwrite: bool = False) -> None:
     """Write the page; whole or not at all. Raises InputError where the file cannot be."""
     if file.exists() and not overwrite:
         raise InputError("there is a file already", where=str(file), hint="name another with -o, or add --force")
@@ -68,7 +68,7 @@ def write_page(flights: Sequence[Flight], file: Path, *, overwrite: bool = False
         ) from error
 
 
-def _summary(flights: Sequence[Flight]) -> str:
+def _summary(flights: Sequence[ReportedFlight]) -> str:
     """One row a number, one column a flight."""
     columns = [rows(flight) for flight in flights]
     head = "" if len(flights) == 1 else "".join(f'<th class="n">{html.escape(f.name)}</th>' for f in flights)
@@ -82,7 +82,7 @@ def _summary(flights: Sequence[Flight]) -> str:
     return f'<div class="scroll"><table>{heading}{"".join(body)}</table></div>'
 
 
-def _comparison(flights: Sequence[Flight]) -> str:
+def _comparison(flights: Sequence[ReportedFlight]) -> str:
     trials = [trial_of_record(flight.record, flight.name) for flight in flights]
     over = [_along(trial) for trial in trials]
     charts = _views(trials)
@@ -124,7 +124,7 @@ def _places(trials: Sequence[Trial], title: str, across: int, up: int) -> str:
     return place_chart(title, curves, ("xyz"[across], "xyz"[up]))
 
 
-def _flight(flight: Flight) -> str:
+def _flight(flight: ReportedFlight) -> str:
     record = flight.record
     begin, end = (moment - record.start for moment in reference_span(record))
     band = (begin, end) if np.isfinite(begin) else None
@@ -150,7 +150,7 @@ def _flight(flight: Flight) -> str:
     )
 
 
-def _events(flight: Flight) -> str:
+def _events(flight: ReportedFlight) -> str:
     record = flight.record
     said = [
         (time, str(level), str(text))
@@ -167,7 +167,7 @@ def _events(flight: Flight) -> str:
     return f"<h3>Events</h3><table>{''.join(lines)}</table>"
 
 
-def _certificate(flight: Flight) -> str:
+def _certificate(flight: ReportedFlight) -> str:
     if flight.certificate is None:
         return ""
     heads = ("limit", "worst", "allowed", "share", "at", "where")
@@ -185,6 +185,6 @@ def _certificate(flight: Flight) -> str:
     )
 
 
-def _provenance(flight: Flight) -> str:
+def _provenance(flight: ReportedFlight) -> str:
     lines = [f"<tr><td>{html.escape(what)}</td><td>{html.escape(value)}</td></tr>" for what, value in flight.provenance]
     return f"<h3>Where it comes from</h3><table>{''.join(lines)}</table>"

@@ -11,30 +11,24 @@ from cfplan.errors import CfplanError
 from cfplan.planning.plan_file import load_plan
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE, Record
-from cfplan.recording.summary import FlightSummary, summarise
+from cfplan.recording.summary import UNKNOWN, FlightSummary, summarise, summary_rows
 from cfplan.safety.certificate import Certificate
-
-UNKNOWN = "–"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Flight:
+class ReportedFlight:
     """One record with all that is derived from it."""
 
-    name: str
-    # of its folder
+    name: str  # of its folder
     record: Record
     summary: FlightSummary
-    shares: Mapping[str, float]
-    # of the limit, of each peak; NaN where there is no such limit
-    certificate: Certificate | None
-    # of its plan; None where the record has none that can be read
+    shares: Mapping[str, float]  # of the limit, of each peak; NaN where there is no such limit
+    certificate: Certificate | None  # of its plan; None where the record has none that can be read
     provenance: tuple[tuple[str, str], ...]
-    notes: tuple[str, ...]
-    # what is missing, one sentence each
+    notes: tuple[str, ...]  # what is missing, one sentence each
 
 
-def read_flight(place: Path) -> Flight:
+def read_flight(place: Path) -> ReportedFlight:
     """A record, with the plan that lies beside it. Raises InputError where it is no record."""
     record = read_record(place)
     summary, header = summarise(record), record.header
@@ -57,7 +51,7 @@ def read_flight(place: Path) -> Flight:
             notes.append(f"Its plan cannot be read: {error.what}.")
     else:
         notes.append("There is no plan beside it, so no certificate either.")
-    return Flight(
+    return ReportedFlight(
         name=record.folder.resolve().name,
         record=record,
         summary=summary,
@@ -86,43 +80,19 @@ def _provenance(record: Record) -> list[tuple[str, str]]:
     ]
 
 
-def outcome(flight: Flight) -> str:
+def outcome(flight: ReportedFlight) -> str:
     """How it ended, as the pilot said."""
     said = flight.record.summary.get("outcome")
     return str(said.get("reason") or UNKNOWN) if isinstance(said, Mapping) else UNKNOWN
 
 
-def rows(flight: Flight) -> list[tuple[str, str]]:
-    """The summary table: what it is, and its value as people read it."""
-    s = flight.summary
+def rows(flight: ReportedFlight) -> list[tuple[str, str]]:
+    """Return the summary table: what each number is, and its value as people read it."""
     return [
-        ("travel time, planned", _number(s.travel_time_planned, "s", 2)),
-        ("travel time, flown", _number(s.travel_time_flown, "s", 2)),
-        ("settling", _number(s.settling, "s", 2)),
-        ("deviation in time, max", _number(100 * s.max_deviation, "cm", 1)),
-        ("deviation in time, rms", _number(100 * s.rms_deviation, "cm", 1)),
-        ("deviation from the path, max", _number(100 * s.max_deviation_to_path, "cm", 1)),
-        ("deviation from the path, rms", _number(100 * s.rms_deviation_to_path, "cm", 1)),
-        ("peak speed", _peak(flight, "peak_speed", "m/s")),
-        ("peak acceleration", _peak(flight, "peak_acceleration", "m/s²")),
-        ("peak body rate", _peak(flight, "peak_body_rate", "rad/s")),
-        ("lateness of setpoints, p99", _number(1e3 * s.lateness_p99, "ms", 2)),
-        ("lateness of setpoints, worst", _number(1e3 * s.lateness_max, "ms", 2)),
-        ("pose dropouts", str(s.pose_dropouts)),
-        ("longest pose gap", _number(1e3 * s.longest_pose_gap, "ms", 0)),
-        ("battery", f"{_number(s.battery_start, 'V', 2)} → {_number(s.battery_end, 'V', 2)}"),
+        *summary_rows(flight.summary, flight.shares),
         ("certificate", _verdict(flight.certificate)),
         ("ended", outcome(flight)),
     ]
-
-
-def _number(value: float, unit: str, digits: int) -> str:
-    return f"{value:.{digits}f} {unit}" if math.isfinite(value) else UNKNOWN
-
-
-def _peak(flight: Flight, name: str, unit: str) -> str:
-    value, share = getattr(flight.summary, name), flight.shares[name]
-    return _number(value, unit, 2) + (f" ({100 * share:.0f} % of the limit)" if math.isfinite(share) else "")
 
 
 def _verdict(certificate: Certificate | None) -> str:
@@ -132,7 +102,7 @@ def _verdict(certificate: Certificate | None) -> str:
     return f"{'passed' if certificate.passed else 'FAILED'}, {worst.name} {100 * worst.share:.1f} %"
 
 
-def flight_to_dict(flight: Flight) -> dict[str, Any]:
+def flight_to_dict(flight: ReportedFlight) -> dict[str, Any]:
     """For JSON: all numbers in SI."""
     record = flight.record
     events = zip(record.events.time - record.start, record.events.level, record.events.text, strict=True)

@@ -35,8 +35,8 @@ from cfplan.recording.topics import TOPICS, columns_of
 
 PERIOD = 0.1  # s between batches
 CAPACITY = 50_000  # messages that wait at most; more are left out of the view, never of the record
+# Of these the last of a batch begins the next, so that lines have no gaps.
 _CARRIED = (SetpointSent, PoseReceived, VehicleStatus)
-# of which the last of a batch begins the next, so that lines have no gaps
 _GOODBYE = 3.0  # s
 
 
@@ -71,13 +71,10 @@ class LiveView:
     def __init__(self, stream: rr.RecordingStream, header: RecordHeader, folder: Path = Path()):
         self._stream, self._header, self._folder = stream, header, folder
         self._waiting: deque[Telemetry] = deque(maxlen=CAPACITY)
-        self._start: float | None = None
-        # s, of the first message: 0 on the timeline
+        self._start: float | None = None  # s, of the first message: 0 on the timeline
         self._carried: dict[type, Telemetry] = {}
-        self._drawn: set[str] = set()
-        # the outlines that stand already
-        self.failure = ""
-        # why the view ends early, one line
+        self._drawn: set[str] = set()  # the outlines that stand already
+        self.failure = ""  # why the view ends early, one line
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="live view", daemon=True)
 

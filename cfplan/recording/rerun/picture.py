@@ -28,8 +28,7 @@ class View:
     """One view of the window."""
 
     name: str
-    reports: tuple[str, ...]
-    # what could not be drawn
+    reports: tuple[str, ...]  # what could not be drawn
     identity: str
 
 

@@ -38,12 +38,9 @@ LIMIT_COLOURS: dict[str, Colour] = {
 class ActiveLimits:
     """Which limit holds the plan back, and where."""
 
-    time: NDArray
-    # (N,) s from the begin of the path
-    position: NDArray
-    # (N, 3) m
-    name: NDArray
-    # (N,) str: the limit that is used most, where that is at least ACTIVE of it, else FREE
+    time: NDArray  # (N,) s from the begin of the path
+    position: NDArray  # (N, 3) m
+    name: NDArray  # (N,) str: the limit that is used most, where that is at least ACTIVE of it, else FREE
 
     def stretches(self) -> list[tuple[str, slice]]:
         """Each run of samples with one name, in order; neighbours share a sample, so that lines meet."""

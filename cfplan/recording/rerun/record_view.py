@@ -22,10 +22,9 @@ from cfplan.recording.record import Record
 from cfplan.recording.rerun import layout
 from cfplan.recording.rerun.picture import write_png
 from cfplan.recording.rerun.plan_view import log_plan
+from cfplan.recording.rerun.states import PHASE_COLOURS, SUPERVISOR_COLOURS, supervisor_states
 from cfplan.recording.rerun.viewer import open_viewer, save
-from cfplan.recording.states import PHASE_COLOURS, SUPERVISOR_COLOURS, supervisor_states
-from cfplan.recording.summary import dropouts, pose_gaps, reference_span
-from cfplan.recording.summary_text import summary_text
+from cfplan.recording.summary import dropouts, pose_gaps, reference_span, summary_text
 from cfplan.vehicle.airframe import GRAVITY
 
 AXIS_LENGTH = 0.25  # m, of the body axes as drawn

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
-from cfplan.recording.importers.table import find_importer, read_log
+from cfplan.recording.importers.formats import find_importer, read_log
 
 COUNT = 30
 TIMES = np.arange(COUNT) * 0.01

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
-from cfplan.recording.importers.table import read_log
+from cfplan.recording.importers.formats import read_log
 from cfplan.recording.importers.vicon_header import Rotations
 
 RATE = 300.0

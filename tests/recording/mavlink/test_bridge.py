@@ -20,7 +20,7 @@ from cfplan.errors import InputError
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.radio.supervisor_bits import ARMED, FLYING, LOCKED
 from cfplan.flight.telemetry import Estimate, Event, Level, Phase, PhaseEntered, SetpointSent, VehicleStatus
-from cfplan.recording.importers.table import read_log
+from cfplan.recording.importers.formats import read_log
 from cfplan.recording.mavlink.bridge import GroundStation, Place, messages_in, parse_place
 from cfplan.recording.mavlink.commands import FORCE, Result, answer
 from cfplan.recording.mavlink.frames import attitude, euler, frd, in_body, ned

@@ -17,8 +17,7 @@ class Importer:
     """One format."""
 
     name: str
-    recognises: Callable[[Path, bytes], bool]
-    # from the place and its first bytes; none where the place is a folder
+    recognises: Callable[[Path, bytes], bool]  # from the place and its first bytes; none where the place is a folder
     read: Callable[[Path], MocapLog]
 
 
