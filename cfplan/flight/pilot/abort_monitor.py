@@ -1,4 +1,4 @@
-"""What ends a flight early: every trigger of the abort ladder in one place, looked at a hundred times a second."""
+"""The abort monitor: every trigger of the abort ladder in one place, checked a hundred times a second."""
 
 import math
 from collections.abc import Iterator
@@ -12,10 +12,10 @@ from cfplan.flight.radio.supervisor_bits import FAULTS
 from cfplan.flight.telemetry import Estimate, Triple, VehicleStatus
 from cfplan.safety.limits import Ladder, Limits
 
-LATEST_SETPOINT = 0.25  # s; the vehicle gives up following after 0.5 s
+LATEST_SETPOINT = 0.25  # s that a setpoint may be late; the vehicle stops following after 0.5 s
 OLDEST_LOG = 0.5  # s without the vehicle's log
-LINK_GONE = 10.0  # s without it, after which the link counts as lost; until then the vehicle may be hovering
-DISAGREEMENT_FACTOR = 5.0  # in the air estimate and pose may be apart by so many times what preflight allows
+LINK_GONE = 10.0  # s without a log, after which the link counts as lost; until then the vehicle may be hovering
+DISAGREEMENT_FACTOR = 5.0  # times preflight's limit that estimate and pose may be apart in the air
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class Abort:
 
 @dataclass(slots=True)
 class Observation:
-    """What the pilot knows at one moment."""
+    """What the pilot knows at one moment, in s on the clock of time.monotonic(), m, and radians."""
 
     now: float  # s
     order: Order | None = None
@@ -45,7 +45,7 @@ class Observation:
 
 
 class AbortMonitor:
-    """Finds the gravest reason to leave the plan. Keeps the battery's and the motion's short history."""
+    """Finds the gravest reason to leave the plan; keeps a short history of battery and motion."""
 
     def __init__(self, limits: Limits):
         self._limits = limits
@@ -54,7 +54,7 @@ class AbortMonitor:
         self._since: dict[str, float] = {}
 
     def ordered(self, observation: Observation) -> Abort | None:
-        """What the operator wants, or what became of him; holds on the ground too."""
+        """Return an abort for an operator command or the loss of the main process; also checked on the ground."""
         if observation.order is Order.CUT:
             return Abort(Rung.CUT, ExitCode.ENDED_BY_PILOT, "the operator cut the motors")
         if observation.order is Order.LAND:
@@ -64,7 +64,7 @@ class AbortMonitor:
         return None
 
     def gravest(self, observation: Observation) -> Abort | None:
-        """The gravest abort of all that holds in the air."""
+        """Return the gravest abort of all, None where there is no reason for one; checked in the air."""
         aborts = [abort for abort in self._aborts(observation) if abort.rung]
         ordered = self.ordered(observation)
         if ordered is not None:
@@ -76,34 +76,34 @@ class AbortMonitor:
         yield from self._vehicle(observation)
         yield from self._motion(observation)
         if observation.late > LATEST_SETPOINT:
-            yield _safety(Rung.BRAKE, f"a setpoint was {observation.late:.2f} s late")
+            yield safety_abort(Rung.BRAKE, f"a setpoint was {observation.late:.2f} s late")
 
     def _pose(self, observation: Observation) -> Iterator[Abort]:
         limits = self._limits.pose
         if observation.pose is None:
-            yield _safety(Rung.LAND, "there is no pose")
+            yield safety_abort(Rung.LAND, "there is no pose")
             return
         age = observation.now - observation.pose.time
         if age > limits.age_brake:
             rung = Rung.LAND if age > limits.age_land else Rung.BRAKE
             why = f" ({observation.pose_fault})" if observation.pose_fault else ""
-            yield _safety(rung, f"the last good pose is {age:.2f} s old{why}")
+            yield safety_abort(rung, f"the last good pose is {age:.2f} s old{why}")
 
     def _vehicle(self, observation: Observation) -> Iterator[Abort]:
         if observation.estimate is None or observation.status is None:
             return
         silent = observation.now - max(observation.estimate.time, observation.status.time)
         if silent > OLDEST_LOG:
-            yield _safety(Rung.LAND, f"the vehicle's log has been silent for {silent:.1f} s")
+            yield safety_abort(Rung.LAND, f"the vehicle's log has been silent for {silent:.1f} s")
         for bit, fault in FAULTS.items():
             if observation.status.supervisor & bit:
-                yield _safety(Rung.CUT, f"the vehicle {fault}")
+                yield safety_abort(Rung.CUT, f"the vehicle {fault}")
         voltage = self._loaded_voltage(observation.status)
         if voltage < self._limits.battery.under_load:
-            yield _safety(Rung.LAND, f"the battery is down to {voltage:.2f} V")
+            yield safety_abort(Rung.LAND, f"the battery is down to {voltage:.2f} V")
 
     def _loaded_voltage(self, status: VehicleStatus) -> float:
-        """V, averaged with a time constant of under_load_seconds."""
+        """Return the voltage, V, averaged with a time constant of under_load_seconds."""
         if self._voltage is None:
             self._voltage = status.battery_voltage
         elapsed = max(status.time - self._voltage_time, 0.0) if self._voltage_time else 0.0
@@ -129,7 +129,7 @@ class AbortMonitor:
         ):
             apart = math.dist(observation.pose.position, observation.estimate.position)
             if apart > DISAGREEMENT_FACTOR * self._limits.pose.agreement:
-                yield _safety(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")
+                yield safety_abort(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")
         for name, ladder, vector, unit in (
             ("speed", limits.speed, observation.estimate.velocity, "m/s"),
             ("acceleration", limits.acceleration, observation.estimate.acceleration, "m/s²"),
@@ -139,13 +139,13 @@ class AbortMonitor:
             yield self._lasting(name, observation.now, _rung(ladder, value, f"a {name} of {value:.1f} {unit}"))
 
     def _beyond_fence(self, position: Triple) -> float:
-        """m beyond the space less its margin; the floor does not count."""
+        """Return how far, m, a position is beyond the space less its margin; the floor does not count."""
         space = self._limits.space
         (x, y, z), low, high, margin = position, space.low, space.high, space.margin
         return margin + max(low[0] - x, x - high[0], low[1] - y, y - high[1], z - high[2])
 
     def _lasting(self, name: str, now: float, abort: Abort) -> Abort:
-        """The abort if it has lasted; a single noisy value is no reason."""
+        """Return the abort if its reason has lasted; a single noisy value is no reason."""
         if not abort.rung:
             self._since.pop(name, None)
             return abort
@@ -153,16 +153,17 @@ class AbortMonitor:
         return abort if now - since >= self._limits.flight.patience else Abort(Rung.NONE, abort.exit_code, abort.text)
 
 
-def _safety(rung: Rung, text: str) -> Abort:
+def safety_abort(rung: Rung, text: str) -> Abort:
+    """Return an abort that counts as ended by a safety rule."""
     return Abort(rung, ExitCode.ENDED_BY_SAFETY, text)
 
 
 def _rung(ladder: Ladder, value: float, text: str) -> Abort:
-    """The rung of a measured value; what is not a number says that the measurement cannot be trusted: land."""
+    """Return the abort of a measured value; not a number means that the measurement cannot be trusted: land."""
     if math.isnan(value):
-        return _safety(Rung.LAND, text)
+        return safety_abort(Rung.LAND, text)
     if value > ladder.cut:
-        return _safety(Rung.CUT, text)
+        return safety_abort(Rung.CUT, text)
     if value > ladder.land:
-        return _safety(Rung.LAND, text)
-    return _safety(Rung.BRAKE if value > ladder.brake else Rung.NONE, text)
+        return safety_abort(Rung.LAND, text)
+    return safety_abort(Rung.BRAKE if value > ladder.brake else Rung.NONE, text)

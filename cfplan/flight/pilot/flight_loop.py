@@ -1,8 +1,9 @@
-"""What the pilot does over and over, whatever phase it is in.
+"""The pilot's tick loop, the same in every phase.
 
-Everything happens in ticks at the rate of the setpoints. A tick waits for its deadline, sends what is due, forwards
-the newest good pose, and looks at what could end the flight; so whatever the pilot waits for, poses flow and the watch
-is kept. A reason to leave the plan arrives as `AbortRaised`, out of any wait.
+Everything happens in ticks at the rate of the setpoints. A tick waits for its deadline, sends the setpoint that is due,
+forwards the newest good pose, and looks for reasons to end the flight. Whatever the pilot waits for, it waits in ticks,
+so poses flow and the abort monitor watches meanwhile. A reason to leave the plan arrives as `AbortRaised` out of any
+wait.
 """
 
 import math
@@ -16,23 +17,25 @@ from cfplan.flight.mocap.pose_predictor import PosePredictor
 from cfplan.flight.mocap.poses import Pose, PoseSource
 from cfplan.flight.pilot.abort_monitor import LINK_GONE, Abort, AbortMonitor, Observation
 from cfplan.flight.pilot.deadlines import Deadlines
+from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
-from cfplan.flight.pilot.outcome import Check, Rung
+from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.radio.link import Link
-from cfplan.flight.telemetry import Event, Level, Phase, PhaseEntered, PoseReceived, Quaternion, Telemetry, Triple
+from cfplan.flight.telemetry import Level, PoseReceived, Quaternion, Triple
 
-REPLY = 0.2  # s that the on-board commander has to answer; setpoints may stay out for 0.5 s
+REPLY = 0.2  # s in which the on-board commander must answer; setpoints may be missing for 0.5 s
 TRIES = 3
-_SIGN_OF_LIFE = 0.1  # s between those for the vehicle's watchdog, which waits for 1 s
+_KEEP_ALIVE_PERIOD = 0.1  # s; the vehicle's watchdog stops the motors after 1 s without a keep-alive packet
+_RECENT = 1.0  # s of good poses that are kept
 
 
 class OrderSource(Protocol):
-    """Where the operator's orders come from."""
+    """The operator's orders and the state of the main process."""
 
-    worst: Order | None
-    gone: bool
+    worst: Order | None  # the gravest order so far
+    gone: bool  # the main process has ended
 
 
 class AbortRaised(Exception):
@@ -48,94 +51,155 @@ class LinkLost(Exception):
 
 
 class FlightLoop:
-    """The link, the poses and the watch of one flight, ticking."""
+    """Serves one flight's link, poses, orders and abort monitor at every deadline.
+
+    Its attributes are for reading; methods change them.
+    """
 
     def __init__(
         self,
         mission: Mission,
         source: PoseSource,
-        report: Callable[[Telemetry], None],
         orders: OrderSource,
+        history: FlightHistory,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ):
-        self.mission, self.limits, self.source = mission, mission.limits, source
-        self.report, self.now = report, clock
-        self._orders, self._sleep = orders, sleep
-        self._monitor = AbortMonitor(mission.limits)
-        self._pose_gate, self._predictor = PoseGate(mission.limits.pose.jump), PosePredictor()
+        self.mission, self.limits, self.history, self.now = mission, mission.limits, history, clock
+        self._source, self._orders, self._sleep = source, orders, sleep
+        self._monitor, self._pose_gate = AbortMonitor(mission.limits), PoseGate(mission.limits.pose.jump)
+        self._predictor = PosePredictor()
+        self._deadlines = Deadlines(mission.rate, clock, sleep)
+        self._link: Link | None = None
+        self._feeding = False  # poses are read and forwarded
+        self.airborne = False
+        self._tolerated = Rung.NONE  # an abort of this rung or a lesser one changes nothing
         self.plan = Stream(mission.payloads, mission.rate, stop_from=mission.stops.__getitem__)
         self.stream: Stream | None = None  # what each tick sends; None while the on-board commander flies
-        self.sending_paused = False  # sends nothing for a moment
-        self.link: Link
-        self.connected = self.feeding = self.airborne = False
-        self.floor = 0.0  # m, height of the tracked body before take-off
-        self.rung = Rung.NONE  # an abort of this rung or a lesser one changes nothing
-        self.deadlines: Deadlines
-        self.phases: list[tuple[Phase, float]] = []
-        self.checks: tuple[Check, ...] = ()
+        self._sending_paused = False
         self.pose_fault = ""  # why the last pose was not good
         self._source_fault = ""
-        self._sign_of_life = -math.inf  # s, when the vehicle's watchdog last had one
+        self._kept_alive = -math.inf  # s, when the vehicle's watchdog was last sent a keep-alive packet
         self.recent: deque[Pose] = deque()  # the good poses of the last second
         self.waking: deque[float] = deque(maxlen=200)  # s by which the last ticks were late
-        self.late: list[float] = []  # the same of the plan's setpoints
-        # (s from the first setpoint, m) of each pose in the stream and the hover behind it
-        self.off_plan: list[tuple[float, float]] = []
+
+    # Connecting, and what the loop serves.
+
+    def connect(self, connect: Callable[[Callable[[], None]], Link]) -> None:
+        """Connect to the vehicle; orders count meanwhile. Raises AbortRaised, and what `connect` raises."""
+        self._link = connect(self._obey_orders)
+
+    @property
+    def connected(self) -> bool:
+        return self._link is not None
+
+    @property
+    def link(self) -> Link:
+        """The link to the vehicle, after `connect`."""
+        assert self._link is not None
+        return self._link
+
+    def open_poses(self) -> None:
+        """Open the pose source; from now on each tick forwards the newest good pose. Raises what the source raises."""
+        self._source.open()
+        self._feeding = True
+        self.restart_deadlines()
+
+    def close_poses(self) -> None:
+        """Close the pose source if it is open."""
+        if self._feeding:
+            self._source.close()
+
+    def lift_off(self) -> None:
+        """From now on every trigger of the abort ladder counts, not only orders."""
+        self.airborne = True
+
+    def touch_down(self) -> None:
+        """From now on only orders count again."""
+        self.airborne = False
+
+    def tolerate(self, rung: Rung) -> None:
+        """Ignore aborts of this rung and of lesser ones from now on."""
+        self._tolerated = rung
+
+    # The stream.
+
+    def begin(self, stream: Stream) -> Stream:
+        """Send this stream from the next deadline on; return it with its start."""
+        self.stream, self._sending_paused = stream.starting_at(self._deadlines.upcoming), False
+        return self.stream
+
+    def begin_plan(self) -> None:
+        """Send the plan from the next deadline on."""
+        self.plan = self.begin(self.plan)
+        self.history.first_setpoint = self.plan.start
+
+    def pause_sending(self) -> None:
+        """Send no setpoint until `resume_sending`; the stream's clock runs on."""
+        self._sending_paused = True
+
+    def resume_sending(self) -> None:
+        self._sending_paused = False
+
+    def end_stream(self) -> None:
+        """Send no setpoints any more."""
+        self.stream, self._sending_paused = None, False
+
+    # Ticks.
 
     def tick(self) -> float:
-        """One deadline: the setpoint, then the pose, then the look-out. The time after it, s."""
-        due = self.deadlines.wait()
+        """Serve one deadline: the setpoint, then the pose, then the abort monitor. Return the time after it, s."""
+        due = self._deadlines.wait()
         now = self.now()
         stream = self.stream
-        if stream is not None and not self.sending_paused:
+        if stream is not None and not self._sending_paused:
             index = stream.index(now)
             self.link.send(stream.packets[index])
-            if self.plan.start:
-                self.report(stream.sent(index, now, due))
+            if self.history.first_setpoint:
+                self.history.report(stream.sent(index, now, due))
             if stream is self.plan and now < stream.end:
-                self.late.append(now - due)
-        if self.airborne and self.limits.firmware.watchdog and now - self._sign_of_life > _SIGN_OF_LIFE:
-            self._sign_of_life = now
+                self.history.late.append(now - due)
+        if self.airborne and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
+            self._kept_alive = now
             self.link.keep_alive()
         self.waking.append(now - due)
-        if self.feeding:
+        if self._feeding:
             self._forward_poses()
-        self._keep_watch(now, now - due)
+        self._monitor_flight(now, now - due)
         return now
 
     def _forward_poses(self) -> None:
         newest, estimate = None, self.link.estimate
         if self.airborne and estimate is not None and self.now() - estimate.time <= self.limits.pose.age_warning:
-            self.source.tell_attitude(estimate.quaternion)
-        for pose in self.source.poses():
-            self.report(PoseReceived(pose.time, pose.received, pose.position, pose.quaternion))
+            self._source.tell_attitude(estimate.quaternion)
+        for pose in self._source.poses():
+            self.history.report(PoseReceived(pose.time, pose.received, pose.position, pose.quaternion))
             fault = self._pose_gate.fault(pose)
             if fault != self.pose_fault:
                 self.pose_fault = fault
-                self.say(Level.WARNING, f"pose: {fault}" if fault else "pose: good again")
+                self.history.say(Level.WARNING, f"pose: {fault}" if fault else "pose: good again")
             if not fault:
                 newest = pose
                 self.recent.append(pose)
                 self._predictor.add(pose)
                 self._note_deviation(pose)
-        if self.source.fault != self._source_fault:
-            self._source_fault = self.source.fault
-            self.say(Level.WARNING, f"motion capture: {self._source_fault or 'good again'}")
+        if self._source.fault != self._source_fault:
+            self._source_fault = self._source.fault
+            self.history.say(Level.WARNING, f"motion capture: {self._source_fault or 'good again'}")
         now = self.now()
         if newest is not None and now - newest.time < self.limits.pose.age_brake:
             self.link.send_pose(self._predictor.position(now), newest.quaternion)
-        while len(self.recent) > 1 and self.recent[0].time < self.recent[-1].time - 1.0:
+        while len(self.recent) > 1 and self.recent[0].time < self.recent[-1].time - _RECENT:
             self.recent.popleft()
 
     def _note_deviation(self, pose: Pose) -> None:
         if self.stream is not self.plan or pose.time < self.plan.start:
             return
-        elapsed = pose.time - self.plan.start
         distance = math.dist(pose.position, self.plan.position(pose.time - self.mission.lead))
-        self.off_plan.append((elapsed, distance))
+        self.history.off_plan.append((pose.time - self.plan.start, distance))
 
-    def _keep_watch(self, now: float, late: float) -> None:
+    def _monitor_flight(self, now: float, late: float) -> None:
+        """Raise LinkLost or AbortRaised where there is a reason to."""
         link = self.link
         if link.lost or (self.airborne and link.estimate is not None and now - link.estimate.time > LINK_GONE):
             raise LinkLost
@@ -145,28 +209,35 @@ class FlightLoop:
             order=self._orders.worst,
             main_gone=self._orders.gone,
             pose=pose,
-            pose_fault=self.source.fault or self.pose_fault,
+            pose_fault=self._source.fault or self.pose_fault,
             wanted=stream.position(pose.time - self.mission.lead) if stream is not None and pose is not None else None,
             estimate=link.estimate,
             status=link.status,
             late=late if stream is not None else 0.0,
         )
         abort = self._monitor.gravest(observation) if self.airborne else self._monitor.ordered(observation)
-        if abort is not None and abort.rung > self.rung:
+        if abort is not None and abort.rung > self._tolerated:
             raise AbortRaised(abort)
 
-    def look_at_orders(self) -> None:
-        """What a tick does before there is a link."""
+    def _obey_orders(self) -> None:
+        """Do what a tick does while there is no link: raise AbortRaised for an order."""
         abort = self._monitor.ordered(Observation(self.now(), self._orders.worst, self._orders.gone))
         if abort is not None:
             raise AbortRaised(abort)
 
+    # Waiting.
+
     def restart_deadlines(self) -> None:
-        """Deadlines from now on; those that something slow on the ground has missed do not count."""
-        self.deadlines = Deadlines(self.mission.rate, self.now, self._sleep)
+        """Count deadlines from now on; those that something slow on the ground has missed do not count."""
+        self._deadlines = Deadlines(self.mission.rate, self.now, self._sleep)
+
+    @property
+    def skipped(self) -> int:
+        """How many deadlines have passed altogether since `restart_deadlines`."""
+        return self._deadlines.skipped
 
     def until(self, done: Callable[[], bool], patience: float) -> bool:
-        """Tick until it is done; whether it was, in time."""
+        """Tick until `done`, at most for `patience`, s; return whether it was done in time."""
         end = self.now() + patience
         while self.tick() < end:
             if done():
@@ -174,36 +245,33 @@ class FlightLoop:
         return done()
 
     def pause(self, duration: float) -> None:
+        """Tick for `duration`, s."""
         self.until(lambda: False, duration)
 
     def ask(self, command: Callable[[], None], number: int, tries: int = TRIES) -> int | None:
-        """Command the on-board commander; its answer, or None where there is none."""
+        """Send a command to the on-board commander; return its answer, None where there is none."""
         for _ in range(tries):
             command()
             if self.until(lambda: number in self.link.replies, REPLY):
                 return self.link.replies[number]
         return None
 
+    # The vehicle's state.
+
     def pose(self) -> Pose:
+        """Return the last good pose; there is one once the feed has begun."""
         pose = self._pose_gate.last
-        assert pose is not None  # nothing asks before the feed has begun
+        assert pose is not None
         return pose
 
     def resting(self) -> tuple[Triple, Quaternion]:
-        """Where the vehicle is asked to hover: at the stream's end, or without one where it is."""
+        """Return where the vehicle is asked to hover: at the stream's end, or where it is if there is no stream."""
         if self.stream is None:
             return self.pose().position, self.pose().quaternion
         position, _, _, quaternion, _ = self.stream.states[self.stream.last]
         return position, quaternion
 
     def bits(self, mask: int) -> int:
+        """Return the bits of `mask` that are set in the log variable supervisor.info; 0 without a log."""
         status = self.link.status
         return status.supervisor & mask if status is not None else 0
-
-    def enter(self, phase: Phase) -> None:
-        now = self.now()
-        self.phases.append((phase, now))
-        self.report(PhaseEntered(now, phase))
-
-    def say(self, level: Level, text: str) -> None:
-        self.report(Event(self.now(), level, text))

@@ -1,4 +1,4 @@
-"""From nothing to an armed vehicle: the phases that a flight goes through on the ground."""
+"""The phases before take-off: connect, configure, converge, check and arm."""
 
 import math
 from collections.abc import Callable
@@ -19,26 +19,24 @@ CONVERGED_FOR = 1.0  # s
 
 def prepare(
     loop: FlightLoop, connect: Callable[[Callable[[], None]], Link], enter_real_time: Callable[[], None] = lambda: None
-) -> None:
-    """All phases on the ground, to an armed vehicle. `enter_real_time` is called before anything is measured.
+) -> float:
+    """Go through all phases on the ground, to an armed vehicle. `enter_real_time` is called before measurements begin.
 
     Raises a CfplanError where the vehicle or its poses cannot be had, or a check fails, and what a tick raises.
     """
     mission = loop.mission
-    loop.enter(Phase.CONNECT)
-    loop.restart_deadlines()
-    loop.link = connect(loop.look_at_orders)
-    loop.connected = True
-    loop.enter(Phase.RELEASE)
+    loop.history.enter(Phase.CONNECT)
+    loop.connect(connect)
+    loop.history.enter(Phase.RELEASE)
     loop.link.release_priority()
-    loop.enter(Phase.CONFIGURE)
+    loop.history.enter(Phase.CONFIGURE)
     loop.restart_deadlines()
     wanted = mission.parameters
     for name, value in mission.parameters_if_known.items():
         if loop.link.has_parameter(name):
             wanted[name] = value
         else:
-            loop.say(Level.WARNING, f"the vehicle has no {name}: expect it some centimetres off at speed")
+            loop.history.say(Level.WARNING, f"the vehicle has no {name}: expect it some centimetres off at speed")
     read_back = {name: loop.link.set_parameter(name, value) for name, value in wanted.items()}
     loop.link.start_logs()
     loop.until(lambda: loop.link.estimate is not None and loop.link.status is not None, 3.0)
@@ -48,22 +46,19 @@ def prepare(
     _feed(loop)
     _converge(loop)
     _preflight(loop, wanted, read_back)
-    loop.enter(Phase.ARM)
+    loop.history.enter(Phase.ARM)
     loop.restart_deadlines()
-    loop.floor = loop.pose().position[2]
+    floor = loop.pose().position[2]
     for _ in range(TRIES):  # a busy radio may give one up
         loop.link.arm(True)
         if loop.until(lambda: loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, 1.0):
-            break
-    else:
-        raise PreflightError("the vehicle does not arm", hint="restart the vehicle")
+            return floor
+    raise PreflightError("the vehicle does not arm", hint="restart the vehicle")
 
 
 def _feed(loop: FlightLoop) -> None:
-    loop.enter(Phase.FEED)
-    loop.source.open()
-    loop.feeding = True
-    loop.restart_deadlines()
+    loop.history.enter(Phase.FEED)
+    loop.open_poses()
     if not loop.until(lambda: len(loop.recent) >= 20, 5.0):
         raise InputError(
             f"no good pose comes: {loop.pose_fault}" if loop.pose_fault else "no pose comes",
@@ -74,7 +69,7 @@ def _feed(loop: FlightLoop) -> None:
 
 def _converge(loop: FlightLoop) -> None:
     """Set the vehicle's filter to where motion capture sees it, and wait until both agree."""
-    loop.enter(Phase.CONVERGE)
+    loop.history.enter(Phase.CONVERGE)
     pose = loop.pose()
     for name, value in zip(("X", "Y", "Z"), pose.position, strict=True):
         loop.link.set_parameter(f"kalman.initial{name}", value)
@@ -99,20 +94,20 @@ def _converge(loop: FlightLoop) -> None:
         return now - agreed_since >= CONVERGED_FOR
 
     if not loop.until(agreed, 10.0):
-        loop.say(Level.WARNING, "the vehicle's estimate does not settle")
+        loop.history.say(Level.WARNING, "the vehicle's estimate does not settle")
 
 
 def _preflight(loop: FlightLoop, wanted: dict[str, float], read_back: dict[str, float]) -> None:
     """The table. An auto-arming vehicle is not ready for moments, so a table that fails gets two more tries."""
-    loop.enter(Phase.PREFLIGHT)
+    loop.history.enter(Phase.PREFLIGHT)
     for _ in range(TRIES):
-        loop.checks = run_checks(_look_around(loop, wanted, read_back))
-        if all(check.passed for check in loop.checks):
+        loop.history.checks = run_checks(_look_around(loop, wanted, read_back))
+        if all(check.passed for check in loop.history.checks):
             break
-    for check in loop.checks:
+    for check in loop.history.checks:
         text = f"{check.name}: {check.value} ({check.threshold})"
-        loop.say(Level.INFO if check.passed else Level.ERROR, text)
-    failed = [check for check in loop.checks if not check.passed]
+        loop.history.say(Level.INFO if check.passed else Level.ERROR, text)
+    failed = [check for check in loop.history.checks if not check.passed]
     if failed:
         raise PreflightError(
             "; ".join(f"{check.name}: {check.value}, must be {check.threshold}" for check in failed),

@@ -1,5 +1,6 @@
 """A run of encoded setpoints, sampled by the clock."""
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +14,9 @@ from cfplan.flight.telemetry import SetpointSent, Triple
 class Stream:
     """Setpoints at a fixed rate from a start on; before it the first, after its end the last.
 
-    Everything slow is done here at once, so that sending is a look-up.
+    `payloads` (N, 29) uint8, the last of them at rest; `rate` in Hz; `start` in s on the clock of time.monotonic();
+    `stop_from` returns (M, 29) uint8, a way to stop from one of the setpoints, and is None for a stop. Everything slow
+    is done when the stream is made, so that sending is a look-up.
     """
 
     def __init__(
@@ -23,15 +26,19 @@ class Stream:
         start: float = 0.0,
         stop_from: Callable[[int], NDArray] | None = None,
     ):
-        # payloads (N, 29) uint8, the last of them at rest; start in s on the clock of time.monotonic();
-        # stop_from gives (M, 29) uint8, a way to stop from one of them; None where it is a stop itself
         self.start, self.rate, self.stop_from = start, rate, stop_from
         self.packets: list[Any] = [packet(GENERIC_PORT, 0, row.tobytes()) for row in payloads]
         state = decode(payloads)
         fields = (state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate)
-        # (position, velocity, acceleration, quaternion, body rate) of each, as the vehicle decodes them
         self.states = list(zip(*([tuple(row) for row in field.tolist()] for field in fields), strict=True))
+        """(position, velocity, acceleration, quaternion, body rate) of each setpoint, as the vehicle decodes them."""
         self.last = len(self.packets) - 1
+
+    def starting_at(self, start: float) -> "Stream":
+        """Return the same setpoints with another start, s."""
+        started = copy.copy(self)
+        started.start = start
+        return started
 
     @property
     def end(self) -> float:
@@ -39,11 +46,11 @@ class Stream:
         return self.start + self.last / self.rate
 
     def index(self, time: float) -> int:
-        """The setpoint that belongs to a time: a late packet carries the right state."""
+        """Return the index of the setpoint that belongs to a time, s, so that a late packet carries the right state."""
         return min(max(round((time - self.start) * self.rate), 0), self.last)
 
     def position(self, time: float) -> Triple:
-        """Where the vehicle is asked to be at a time."""
+        """Return where the vehicle is asked to be, m, at a time, s."""
         place = min(max((time - self.start) * self.rate, 0.0), float(self.last))
         row = min(int(place), self.last - 1) if self.last else 0
         share = place - row
@@ -51,4 +58,5 @@ class Stream:
         return x + share * (x1 - x), y + share * (y1 - y), z + share * (z1 - z)
 
     def sent(self, index: int, time: float, due: float) -> SetpointSent:
+        """Return the telemetry of a setpoint sent at `time` and due at `due`, s."""
         return SetpointSent(time, due, index, *self.states[index])

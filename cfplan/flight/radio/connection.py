@@ -82,14 +82,9 @@ def connect(
         threading.Thread(target=crazyflie.close_link, daemon=True).start()
         raise
 
-    link = Link(crazyflie, uri, report)
-    link.radio_lock = lock
-
-    def note_loss(_: str, reason: str = "the link was closed") -> None:
-        link.lost = link.lost or reason
-
-    crazyflie.disconnected.callbacks.insert(0, note_loss)
-    crazyflie.connection_lost.add_callback(note_loss)
+    link = Link(crazyflie, uri, report, radio_lock=lock)
+    crazyflie.disconnected.callbacks.insert(0, link.note_loss)
+    crazyflie.connection_lost.add_callback(link.note_loss)
     link.release_priority()
     link.ask_firmware()
     return link

@@ -9,7 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -45,15 +45,16 @@ class Link:
         uri: str,
         report: Callable[[Telemetry], None],
         clock: Callable[[], float] = time.monotonic,
+        radio_lock: IO[str] | None = None,  # keeps other pilots from the radio until the link closes
     ):
         self._crazyflie, self.uri, self._report, self._clock = crazyflie, uri, report, clock
+        self._radio_lock = radio_lock
         self.lost = ""  # why the link is gone; empty while it stands
         self.estimate: Estimate | None = None
         self.status: VehicleStatus | None = None
         self.position_variance: Triple | None = None  # m² along x, y, z
         self.replies: dict[int, int] = {}  # command of the on-board commander: the code that it answered, 0 for done
         self.firmware = ""
-        self.radio_lock: Any = None  # keeps others from the radio until it is closed
         self._variance_block: Any = None
         # s, when the vehicle's clock of ms was zero, as the quickest messages have it; the last message
         self._log_zero, self._log_heard = math.inf, 0.0
@@ -194,8 +195,12 @@ class Link:
         closing = threading.Thread(target=self._crazyflie.close_link, daemon=True)
         closing.start()
         closing.join(timeout=2.0)
-        if self.radio_lock is not None:
-            self.radio_lock.close()
+        if self._radio_lock is not None:
+            self._radio_lock.close()
+
+    def note_loss(self, _: str, reason: str = "the link was closed") -> None:
+        """Remember why the link is gone; a callback of cflib."""
+        self.lost = self.lost or reason
 
     # What comes in: these run in cflib's thread and must be quick.
 
