@@ -48,8 +48,9 @@ def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Spac
             square = (low + high) / 2.0
         try:
             slower = Trajectory(trajectory.path, trajectory.profile.slowed(square**0.5), trajectory.airframe)
-        except NotCertifiedError:  # longer than any flight, so there is none
-            break
+        except NotCertifiedError:  # longer than any flight: too slow
+            low = square
+            continue
         certificate = certify(slower, limits, space)
         if certificate.passed:
             low, low_excess = square, _excess(certificate)
