@@ -1,4 +1,4 @@
-"""The proof before take-off: no limit is exceeded anywhere on a trajectory, between samples included.
+"""The certificate: that no limit is exceeded anywhere on a trajectory, between samples included.
 
 The trajectory is cut at the grid points of its profile and at the breaks of its path, so that every piece is smooth,
 and each piece is sampled from end to end, closed: at least ten points, and never further apart than a millisecond of
@@ -7,10 +7,10 @@ the larger of them by at most an eighth of its second difference there; that is 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
@@ -18,12 +18,15 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
+from cfplan.safety.quantities import AT_LEAST, QUANTITIES, Quantity
 from cfplan.safety.space import Space
 from cfplan.vehicle import dense
-from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.dense import Stretches
 from cfplan.vehicle.flatness import Body
-from cfplan.vehicle.trajectory import FullState, Trajectory
+from cfplan.vehicle.measures import measures_of
+from cfplan.vehicle.profile import h_within
+from cfplan.vehicle.trajectory import Trajectory
 
 TIME_STEP = 1e-3  # s, the most between two samples
 BATCH = 1_000  # samples at a time, about: as many as stay near the processor
@@ -39,16 +42,12 @@ class Margin:
 
     name: str
     unit: str
-    worst: float
-    # with the allowance for what lies between samples
+    worst: float  # with the allowance for what lies between samples
     limit: float
-    share: float
-    # of the limit; for a least thrust, of the way from hover down to it; NaN where a value is not finite
-    time: float
-    # s
+    share: float  # of the limit; for a least thrust, of the way from hover down to it; NaN where a value is not finite
+    time: float  # s
     s: float
-    position: tuple[float, float, float]
-    # m
+    position: tuple[float, float, float]  # m
 
     @property
     def passed(self) -> bool:
@@ -61,8 +60,7 @@ class Certificate:
     """Every limit with its margin. Holds for this trajectory and these limits, nothing else."""
 
     margins: tuple[Margin, ...]
-    duration: float
-    # s
+    duration: float  # s
     samples: int
 
     @property
@@ -102,40 +100,22 @@ class Certificate:
         }
 
 
-def _itself(value: Any) -> Any:
-    return value
+class _Bound(NamedTuple):
+    """A quantity and its limit; `unused` is the value that counts as share 0."""
 
-
-def _tilt(squared_tangent_of_half: Any) -> Any:
-    return 2.0 * np.arctan(np.sqrt(squared_tangent_of_half))
-
-
-@dataclass(frozen=True, slots=True)
-class _Quantity:
-    """What must not rise above 1 as a share; `sign` is -1 where the limit is a least value."""
-
-    name: str
-    unit: str
-    sign: int
-    row: int
-    # of dense.sample()
-    count: int
-    # of rows, all of which must keep the same limit
+    quantity: Quantity
     limit: float
-    at_rest: float
-    # what it is in hover, which counts as share 0
-    of_row: Callable[[Any], Any] = _itself
-    # what it is where the row has a value; rises with that
+    unused: float
 
 
 def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Certificate:
     """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
-    stretches, (quantities, table) = _stretches(trajectory), _quantities(trajectory.airframe, limits, space)
+    stretches, (bounds, table) = _stretches(trajectory), _bounds(trajectory.airframe, limits, space)
     walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
     arrays = dense.arrays_of(trajectory.airframe, trajectory.path, trajectory.profile)
     values, places = _search(table, walls, BATCH, *arrays, *stretches)
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
-    peaks = zip(quantities, values.tolist(), when, places.tolist(), where, strict=True)
+    peaks = zip(bounds, values.tolist(), when, places.tolist(), where, strict=True)
     return Certificate(
         margins=tuple(_margin(*each) for each in peaks),
         duration=trajectory.duration,
@@ -144,74 +124,44 @@ def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = No
 
 
 def shares(trajectory: Trajectory, limits: PlanLimits, time: NDArray) -> dict[str, NDArray]:
-    """How much of each limit is used at each time, (N,) each; counted as in the certificate, the walls left out."""
-    rows = _rows(trajectory.at(time))
-    return {
-        quantity.name: (
-            (quantity.of_row(rows[quantity.row : quantity.row + quantity.count]) - quantity.at_rest)
-            / (quantity.limit - quantity.at_rest)
-        ).max(axis=0)
-        for quantity in _quantities(trajectory.airframe, limits, None)[0]
-    }
-
-
-def _rows(state: FullState) -> NDArray:
-    """What dense.sample() gives, of full states."""
-    rows = np.empty((dense.SAMPLED_ROWS, len(state.s)))
-    x, y, z = state.thrust_axis.T
-    rows[dense.SPEED] = np.square(state.velocity).sum(axis=1)
-    rows[dense.ACCELERATION] = np.square(state.acceleration).sum(axis=1)
-    rows[dense.BODY_RATE] = np.square(state.body_rate).sum(axis=1)
-    rows[dense.ANGULAR_ACCELERATION] = np.square(state.angular_acceleration).sum(axis=1)
-    rows[dense.AXIS_HEIGHT], rows[dense.HALF_TILT] = z, (x * x + y * y) / (1.0 + z) ** 2
-    rows[dense.SPECIFIC_THRUST] = state.specific_thrust
-    rows[dense.MOTOR_THRUST : dense.MOTOR_THRUST + 4] = state.motor_thrust.T
-    rows[dense.POSITION : dense.POSITION + 3] = state.position.T
-    rows[dense.PLACE] = state.s
-    return rows
+    """Return the share of each limit at each time, (N,) each; counted as in the certificate, without the walls."""
+    state = trajectory.at(time)
+    measured = measures_of(
+        state.velocity, state.acceleration, state.body_rate, state.thrust_axis, state.specific_thrust,
+        state.angular_acceleration, state.motor_thrust,
+    )  # fmt: skip
+    bounds, _ = _bounds(trajectory.airframe, limits, None)
+    return {q.name: (q.worst(measured) - unused) / (limit - unused) for q, limit, unused in bounds}
 
 
 @lru_cache(maxsize=16)
-def _quantities(airframe: Airframe, limits: PlanLimits, space: Space | None) -> tuple[tuple[_Quantity, ...], NDArray]:
-    """What is limited; and for compiled code, (Q, 3), the first row of each, how many, and its sign."""
-    turning = limits.angular_acceleration
-    quantities = [
-        _Quantity("speed", "m/s", 1, dense.SPEED, 1, limits.speed, 0.0, np.sqrt),
-        _Quantity("acceleration", "m/s²", 1, dense.ACCELERATION, 1, limits.acceleration, 0.0, np.sqrt),
-        _Quantity("angular velocity", "rad/s", 1, dense.BODY_RATE, 1, limits.angular_velocity, 0.0, np.sqrt),
-        _Quantity("angular acceleration", "rad/s²", 1, dense.ANGULAR_ACCELERATION, 1, turning, 0.0, np.sqrt),
-        _Quantity("tilt", "rad", 1, dense.HALF_TILT, 1, limits.tilt, 0.0, _tilt),
-        _Quantity("motor thrust, most", "N", 1, dense.MOTOR_THRUST, 4, limits.motor_thrust_max, 0.0),
-        _Quantity(
-            "motor thrust, least", "N", -1, dense.MOTOR_THRUST, 4, limits.motor_thrust_min, airframe.hover_thrust
-        ),
-        _Quantity("specific thrust, least", "m/s²", -1, dense.SPECIFIC_THRUST, 1, limits.specific_thrust_min, GRAVITY),
-    ]
+def _bounds(airframe: Airframe, limits: PlanLimits, space: Space | None) -> tuple[tuple[_Bound, ...], NDArray]:
+    """Return the limits that bind; and for compiled code, (Q, 3), the first row of each, how many, and its side."""
+    bounds = [_Bound(q, q.allowed(limits), q.unused(airframe)) for q in QUANTITIES if q.allowed(limits) != math.inf]
     if space is not None:
         half = float((np.array(space.high) - np.array(space.low)).min()) / 2
-        quantities.append(_Quantity(WALLS, "m", -1, dense.POSITION, 3, space.margin, half))
-    limited = tuple(
-        quantity for quantity in quantities if quantity.row != dense.ANGULAR_ACCELERATION or turning != math.inf
-    )
-    return limited, np.array([(quantity.row, quantity.count, quantity.sign) for quantity in limited])
+        walls = Quantity(WALLS, "m", "", "", AT_LEAST, dense.POSITION, 3)  # in place of the position itself
+        bounds.append(_Bound(walls, space.margin, half))
+    return tuple(bounds), np.array([(q.measure, q.count, q.side) for q, _, _ in bounds])
 
 
 def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _margin(quantity: _Quantity, peak: float, time: float, s: float, position: Sequence[float]) -> Margin:
-    """`peak` is the sign times the row's value."""
-    worst = float(quantity.of_row(quantity.sign * peak))
-    room = quantity.limit - quantity.at_rest
-    share = (worst - quantity.at_rest) / room if room * quantity.sign > 0 else math.inf
+def _margin(bound: _Bound, peak: float, time: float, s: float, position: Sequence[float]) -> Margin:
+    """`peak` is the side times the measure."""
+    quantity, limit, unused = bound
+    worst = float(quantity.value(quantity.side * peak))
+    room = limit - unused
+    share = (worst - unused) / room if room * quantity.side > 0 else math.inf
     x, y, z = position
     return Margin(
         name=quantity.name,
         unit=quantity.unit,
         worst=worst,
-        limit=float(quantity.limit),
-        share=max(0.0, float(share)) if math.isfinite(worst) and math.isfinite(quantity.limit) else math.nan,
+        limit=limit,
+        share=max(0.0, float(share)) if math.isfinite(worst) and math.isfinite(limit) else math.nan,
         time=time,
         s=s,
         position=(x, y, z),
@@ -251,7 +201,7 @@ def _cut(
         node, slowest = nodes[intervals[at]], np.inf
         for quarter in range(5):
             x = edges[k] + quarter / 4 * width - node[0]
-            slowest = min(slowest, node[1] + x * (node[2] + x * (node[3] / 2 + x * node[4] / 6)))
+            slowest = min(slowest, h_within(x, node[1], node[2], node[3], node[4])[0])
         counts[k] = max(int(np.ceil(width / (TIME_STEP * np.sqrt(slowest)))) + 1, LEAST_POINTS)
     return edges[:-1], edges[1:], interval, piece, counts
 
@@ -289,7 +239,7 @@ def _search(
 
 @njit
 def _raise_peaks(values: NDArray, places: NDArray, table: NDArray, rows: NDArray, s: NDArray, counts: NDArray) -> None:
-    """Take over the peaks of these samples where they are higher. `table`, (Q, 3): first row, how many, and sign.
+    """Update the running maxima with this batch. `table`, (Q, 3): first row, how many, and side.
 
     Stretches have `counts` samples each, at least three, one stretch behind the other.
     """

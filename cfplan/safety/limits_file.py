@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
 
 from cfplan.errors import CfplanError, InputError
 from cfplan.files.yaml_with_places import Places, read_yaml_with_places
+from cfplan.safety.feasibility import describe_hover, hover_violation
 from cfplan.safety.limits import (
     BatteryLimits,
     FirmwareSettings,
@@ -20,6 +21,7 @@ from cfplan.safety.limits import (
     PlanLimits,
     PoseLimits,
 )
+from cfplan.safety.quantities import ON_LADDER
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.airframes import load_airframe
@@ -61,6 +63,11 @@ class _Flight(_Section):
     acceleration: _Ladder
     angular_velocity: _Ladder
     patience: Annotated[float, Field(gt=0.0, le=1.0)]
+
+    @classmethod
+    def ladders(cls) -> list[str]:
+        """Return the names of the ladders."""
+        return [name for name, field in cls.model_fields.items() if field.annotation is _Ladder]
 
 
 class _Space(_Section):
@@ -176,19 +183,19 @@ def _plan_limits(plan: _Plan, airframe: Airframe) -> PlanLimits:
 
 
 def _check_order(content: _SafetyFile, places: Places) -> None:
-    """What must be less than what, within the file alone."""
-    for name in ("deviation", "fence", "speed", "acceleration", "angular_velocity"):
+    """Check the order of values within the file alone."""
+    for name in _Flight.ladders():
         ladder = getattr(content.flight, name)
         if not ladder.brake < ladder.land < ladder.cut:
             raise InputError(
                 f"flight.{name} must rise from brake over land to cut", where=places.where("flight", name, "brake")
             )
-    for name in ("speed", "acceleration", "angular_velocity"):
-        planned, abort = getattr(content.plan, name), getattr(content.flight, name).brake
+    for quantity in ON_LADDER:
+        planned, abort = getattr(content.plan, quantity.key), getattr(content.flight, quantity.ladder).brake
         if planned >= abort:
             raise InputError(
-                f"plan.{name} ({planned:g}) is not below flight.{name}.brake ({abort:g})",
-                where=places.where("plan", name),
+                f"plan.{quantity.key} ({planned:g}) is not below flight.{quantity.ladder}.brake ({abort:g})",
+                where=places.where("plan", quantity.key),
                 hint="a flight as planned would be broken off; plan slower",
             )
     for axis, (low, high) in enumerate(zip(content.space.low, content.space.high, strict=True)):
@@ -220,22 +227,13 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
 
 
 def _check_vehicle_can(limits: Limits, places: Places) -> None:
-    """The vehicle must hover within the limits, and no limit may allow more than the vehicle can do."""
+    """Refuse limits within which the vehicle cannot hover, and limits that allow more than it can do."""
     airframe, plan = limits.airframe, limits.plan
-    hover = airframe.hover_thrust
-    if not plan.motor_thrust_min < hover < plan.motor_thrust_max:
+    if violated := hover_violation(airframe, plan):
         raise InputError(
-            f"{airframe.name} cannot hover: each motor needs {hover:.3f} N, plan.motor_reserve leaves it "
-            f"{plan.motor_thrust_min:.3f} to {plan.motor_thrust_max:.3f} N",
-            where=places.where("plan", "motor_reserve"),
-            hint="lower the reserve, or choose a stronger vehicle",
-        )
-    if not plan.specific_thrust_min < GRAVITY:
-        raise InputError(
-            f"hovering is impossible with a specific thrust of at least {plan.specific_thrust_min:g} m/s²; it is "
-            f"{GRAVITY} m/s² in hover",
-            where=places.where("plan", "specific_thrust"),
-            hint="half of that keeps clear of the firmware's tumble rule",
+            f"{airframe.name} cannot hover: {describe_hover(violated, airframe, plan)}",
+            where=places.where("plan", violated.key),
+            hint=violated.remedy,
         )
     strongest = 4 * plan.motor_thrust_max / airframe.mass
     steepest = math.acos(GRAVITY / strongest)

@@ -6,9 +6,11 @@ import numpy as np
 
 from cfplan.errors import InfeasibleError, NotCertifiedError
 from cfplan.safety.certificate import WALLS, Certificate, certify
+from cfplan.safety.feasibility import describe_hover, hover_violation
 from cfplan.safety.limits import PlanLimits
+from cfplan.safety.quantities import QUANTITIES
 from cfplan.safety.space import Space
-from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
 RESOLUTION = 1e-4  # of the share that is sought
@@ -35,11 +37,11 @@ def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Spac
     certificate = certify(trajectory, limits, space)
     if certificate.passed:
         return Slowed(trajectory, certificate, 1.0)
-    _check_hover(trajectory, limits)
+    _check_hover(trajectory.airframe, limits)
     _check_place(certificate)
 
     # False position between hover and what failed, in the square of the share: so rise accelerations.
-    low, low_excess = 0.0, _hover_share(trajectory, limits) - 1.0
+    low, low_excess = 0.0, _hover_share(trajectory.airframe, limits) - 1.0
     high, high_excess = 1.0, _excess(certificate)
     best: Slowed | None = None
     for trial in range(_TRIALS):
@@ -76,26 +78,14 @@ def _excess(certificate: Certificate) -> float:
     return np.inf if np.isnan(share) else share - 1.0
 
 
-def _hover_share(trajectory: Trajectory, limits: PlanLimits) -> float:
-    """The worst share that remains as the speed tends to 0; as Margin counts, only the most thrust has any."""
-    return trajectory.airframe.hover_thrust / limits.motor_thrust_max
+def _hover_share(airframe: Airframe, limits: PlanLimits) -> float:
+    """Return the worst share that remains as the speed tends to 0."""
+    return max((q.hover(airframe) - (zero := q.unused(airframe))) / (q.allowed(limits) - zero) for q in QUANTITIES)
 
 
-def _check_hover(trajectory: Trajectory, limits: PlanLimits) -> None:
-    hover = trajectory.airframe.hover_thrust
-    if not limits.motor_thrust_min < hover < limits.motor_thrust_max:
-        raise InfeasibleError(
-            f"hovering takes {hover:.3g} N a motor, allowed are {limits.motor_thrust_min:.3g} to "
-            f"{limits.motor_thrust_max:.3g} N",
-            where="motor thrust",
-            hint="choose a stronger vehicle or a smaller reserve",
-        )
-    if not limits.specific_thrust_min < GRAVITY:
-        raise InfeasibleError(
-            f"hovering gives {GRAVITY} m/s², at least {limits.specific_thrust_min:g} are asked",
-            where="specific thrust",
-            hint="half of that keeps clear of the firmware's tumble rule",
-        )
+def _check_hover(airframe: Airframe, limits: PlanLimits) -> None:
+    if violated := hover_violation(airframe, limits):
+        raise InfeasibleError(describe_hover(violated, airframe, limits), where=violated.noun, hint=violated.remedy)
 
 
 def _check_place(certificate: Certificate) -> None:

@@ -17,6 +17,7 @@ from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.flight.setpoints.packets import decode
 from cfplan.safety.limits import FlightLimits
+from cfplan.safety.quantities import ON_LADDER
 from cfplan.simulation.dynamics.body import TIME_STEP, hovering
 from cfplan.simulation.dynamics.closed_loop import PERFECT, ClosedLoop, EstimateErrors, fly_setpoints
 from cfplan.simulation.dynamics.mellinger import FULL_COMMAND, gains_for
@@ -185,13 +186,10 @@ def _fault(run: DryRun, limits: FlightLimits) -> str:
             f"the vehicle strays {run.deviation:.2f} m from the trajectory at {run.deviation_time:.2f} s; "
             f"from {limits.deviation.brake:g} m on the pilot brakes"
         )
-    for name, value, unit, limit in (
-        ("speed", run.speed, "m/s", limits.speed.brake),
-        ("acceleration", run.acceleration, "m/s²", limits.acceleration.brake),
-        ("angular velocity", run.angular_velocity, "rad/s", limits.angular_velocity.brake),
-    ):
+    for quantity in ON_LADDER:
+        value, limit, unit = getattr(run, quantity.ladder), getattr(limits, quantity.ladder).brake, quantity.unit
         if not value < limit:
-            return f"{name} reaches {value:.2f} {unit}; from {limit:g} {unit} on the pilot brakes"
+            return f"{quantity.name} reaches {value:.2f} {unit}; from {limit:g} {unit} on the pilot brakes"
     if not run.final_error <= ARRIVED:
         return f"the vehicle is {run.final_error:.2f} m from the end of the path {SETTLING:g} s after the last setpoint"
     return ""

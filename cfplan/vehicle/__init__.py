@@ -5,6 +5,7 @@ __all__ = [
     "airframes",
     "dense",
     "flatness",
+    "measures",
     "profile",
     "profile_spline",
     "rotations",

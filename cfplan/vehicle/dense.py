@@ -1,4 +1,4 @@
-"""What limits bind, at thousands of points: some 40 ns each; and full states, which take twice that.
+"""The measures that limits bind at thousands of points, some 40 ns each; and full states, which take twice that.
 
 Points are taken side by side, up to WIDTH at a time. A panel holds rows of one quantity each, WIDTH long, one behind
 the other in one array: so the compiler knows that they do not overlap, and works on several points with one
@@ -15,27 +15,15 @@ from cfplan.geometry.path import Path
 from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.flatness import ROUNDING, Body, Flat, compiled_body, flat_state
+from cfplan.vehicle.measures import MEASURES, measures
 from cfplan.vehicle.profile import SpeedProfile, h_within, yaw_within
 from cfplan.vehicle.rotations import hopf_quaternion
 from cfplan.vehicle.trigonometry import cosine, sine
 
-# What `dense_rows` gives, by row; all of it is smooth where path and profile are, as norms and angles near 0 are not.
-SPEED, ACCELERATION, BODY_RATE, ANGULAR_ACCELERATION = range(4)
-# squared: m²/s², m²/s⁴, rad²/s², rad²/s⁴
-AXIS_HEIGHT, HALF_TILT = 4, 5
-# cosine of the tilt, and the squared tangent of half of it
-SPECIFIC_THRUST = 6
-# m/s²
-MOTOR_THRUST = 7
-# N, and the three rows behind
-ROWS = 11
-
-# What `sample` gives besides:
-POSITION = 11
-# m, and the two rows behind
-PLACE = 14
-# s
-SAMPLED_ROWS = 15
+# Rows of what `sample` gives: the measures, and
+POSITION = MEASURES  # m, and the two rows behind
+PLACE = MEASURES + 3  # s
+SAMPLED_ROWS = MEASURES + 4
 
 # What `flat_states` gives, by row.
 STATES: dict[str, slice | int] = {
@@ -48,33 +36,29 @@ STATE_ROWS = 37
 
 WIDTH = 64
 LANES = 4  # points that the compiler may want to take at once: the places in use are a multiple
+# Rows of a panel: γ to γ'''', the place in the interval, the profile where that begins, and the results.
 _CURVE, _X, _NODE, _RESULT = 0, 15, 16, 23
-# rows of a panel: γ to γ'''', the place in the interval, the profile where that begins, and what comes of them
 _SIZE = (_RESULT + STATE_ROWS) * WIDTH
 _BLOCK = 8  # coefficients at a time
 _Derivatives = tuple[float, float, float, float, float]
+# h with three derivatives and yaw with two, where an interval begins.
 _Node = tuple[float, float, float, float, float, float, float]
-# h with three derivatives and yaw with two, where an interval begins
 
 
 class Stretches(NamedTuple):
     """Parts of a flight on which everything is smooth, (K,) each, and how many samples are taken of each."""
 
-    left: NDArray
-    right: NDArray
-    # s of the ends
-    interval: NDArray
-    # of the profile
-    piece: NDArray
-    # of the path
-    counts: NDArray
-    # samples, evenly spaced, both ends included; at least two
+    left: NDArray  # s
+    right: NDArray  # s
+    interval: NDArray  # of the profile
+    piece: NDArray  # of the path
+    counts: NDArray  # samples, evenly spaced, both ends included; at least two
 
 
 def dense_rows(
     airframe: Airframe, derivatives: NDArray, profile: SpeedProfile, places: NDArray, interval: NDArray
 ) -> NDArray:
-    """(ROWS, N) at N points of a path, whose `derivatives` γ' to γ'''', (4, 3, N), are known.
+    """Return the measures, (MEASURES, N), at N points of a path, whose `derivatives` γ' to γ'''', (4, 3, N), are known.
 
     `places`, (N,), is s less that of the grid point at which each point's `interval`, (N,), begins.
     """
@@ -82,14 +66,14 @@ def dense_rows(
     if count < LANES:  # the first point again and again
         more = np.r_[:count, np.zeros(LANES - count, dtype=int)]
         return dense_rows(airframe, derivatives[:, :, more], profile, places[more], interval[more])[:, :count]
-    out = np.empty((ROWS, count))
+    out = np.empty((MEASURES, count))
     curves = np.ascontiguousarray(derivatives, dtype=float).reshape(12, count)
     _at_points(out, compiled_body(airframe), curves, profile.table(), places, interval)
     return out
 
 
 def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray, interval: NDArray) -> NDArray:
-    """(STATE_ROWS, N): position, the full state, and the attitude at each s, (N,).
+    """Return (STATE_ROWS, N): position, the full state, and the attitude at each s, (N,).
 
     `interval` tells whose polynomials of the profile hold; a break of the path belongs to the piece on its right.
     """
@@ -104,7 +88,7 @@ def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArra
 
 
 def arrays_of(airframe: Airframe, path: Path, profile: SpeedProfile) -> tuple[Body, NDArray, NDArray, NDArray]:
-    """What sample() needs of a flight: its body, the path's coefficients and where they count from, the profile."""
+    """Return what sample() takes: the body, the path's coefficients and their origins, the profile's table."""
     coefficients = path.coefficients
     if missing := -coefficients.shape[1] % _BLOCK:
         coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
@@ -122,7 +106,7 @@ def _at_points(
         begin = min(start, len(places) - lanes)
         _place(panel, 3, derivatives, nodes, places, interval, begin, lanes)
         _flatten(panel, body, lanes)
-        for row in range(ROWS):
+        for row in range(MEASURES):
             for n in range(lanes):
                 out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
 
@@ -161,7 +145,7 @@ def sample(
             panel[_X * WIDTH + n] = s[n] - node[0]
         _flatten_stretch(panel, body, profile, lanes)
         count = min(WIDTH, last + 1 - done)
-        for row in range(ROWS):
+        for row in range(MEASURES):
             for n in range(count):
                 out[row, done + n] = panel[(_RESULT + row) * WIDTH + n]
         for row in range(3):
@@ -267,7 +251,7 @@ def _flatten(panel: NDArray, body: Body, lanes: int) -> None:
     lanes = min(lanes, WIDTH)
     for n in range(lanes):
         flat, _ = _flat_at(panel, body, _node_at(panel, n), n)
-        _write_rows(panel, n, flat)
+        _write_measures(panel, n, flat)
 
 
 @register_jitable(fastmath=ROUNDING)
@@ -276,24 +260,14 @@ def _flatten_stretch(panel: NDArray, body: Body, node: _Node, lanes: int) -> Non
     lanes = min(lanes, WIDTH)
     for n in range(lanes):
         flat, _ = _flat_at(panel, body, node, n)
-        _write_rows(panel, n, flat)
+        _write_measures(panel, n, flat)
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
-def _write_rows(panel: NDArray, n: int, flat: Flat) -> None:
-    x, y, z = flat.thrust_axis
-    panel[(_RESULT + SPEED) * WIDTH + n] = _squared(flat.velocity)
-    panel[(_RESULT + ACCELERATION) * WIDTH + n] = _squared(flat.acceleration)
-    panel[(_RESULT + BODY_RATE) * WIDTH + n] = _squared(flat.body_rate)
-    panel[(_RESULT + ANGULAR_ACCELERATION) * WIDTH + n] = _squared(flat.angular_acceleration)
-    panel[(_RESULT + AXIS_HEIGHT) * WIDTH + n] = z
-    lift = 1.0 / (1.0 + z)
-    panel[(_RESULT + HALF_TILT) * WIDTH + n] = (x * x + y * y) * lift * lift
-    panel[(_RESULT + SPECIFIC_THRUST) * WIDTH + n] = flat.specific_thrust
-    panel[(_RESULT + MOTOR_THRUST) * WIDTH + n] = flat.motor_thrust[0]
-    panel[(_RESULT + MOTOR_THRUST + 1) * WIDTH + n] = flat.motor_thrust[1]
-    panel[(_RESULT + MOTOR_THRUST + 2) * WIDTH + n] = flat.motor_thrust[2]
-    panel[(_RESULT + MOTOR_THRUST + 3) * WIDTH + n] = flat.motor_thrust[3]
+def _write_measures(panel: NDArray, n: int, flat: Flat) -> None:
+    values = measures(flat)
+    for row in range(MEASURES):
+        panel[(_RESULT + row) * WIDTH + n] = values[row]
 
 
 @register_jitable(fastmath=ROUNDING)
@@ -332,8 +306,3 @@ def _whole(count: int) -> int:
 @register_jitable(forceinline=True, fastmath=ROUNDING)
 def _vector(panel: NDArray, row: int, n: int) -> tuple[float, float, float]:
     return panel[row * WIDTH + n], panel[(row + 1) * WIDTH + n], panel[(row + 2) * WIDTH + n]
-
-
-@register_jitable(forceinline=True, fastmath=ROUNDING)
-def _squared(vector: tuple[float, float, float]) -> float:
-    return vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]

@@ -58,7 +58,7 @@ def test_flying_upside_down_is_slowed_too(make_profile):
     [
         ({"motor_thrust_max": 0.07}, "hovering takes"),
         ({"motor_thrust_min": 0.08}, "hovering takes"),
-        ({"specific_thrust_min": 9.9}, "hovering gives"),
+        ({"specific_thrust_min": 9.9}, "hovering takes"),
         ({"speed": 1e-9}, "speed exceeds its limit however slow"),
         ({"tilt": float("nan")}, "tilt exceeds its limit however slow"),
     ],

@@ -11,6 +11,7 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.flatness import flat_state
+from cfplan.vehicle.measures import MEASURES
 from cfplan.vehicle.trigonometry import cosine, sine
 
 WAYPOINTS = [[0, 0, 1], [1.5, 1, 1.4], [1, -1.5, 0.6], [-1, 0.5, 1.2]]
@@ -21,9 +22,10 @@ def plain_rows(airframe, derivatives, profile, s, interval):
     at = profile.at(s, interval)
     flat = flat_state(airframe, tuple(map(tuple, derivatives)), at[:4], at[4:], np.cos, np.sin)
     x, y, z = flat.thrust_axis
-    squares = [sum(c * c for c in v) for v in (flat.velocity, flat.acceleration, flat.body_rate)]
-    turning = sum(c * c for c in flat.angular_acceleration)
-    return np.stack([*squares, turning, z, (x * x + y * y) / (1 + z) ** 2, flat.specific_thrust, *flat.motor_thrust])
+    squares = [sum(c * c for c in v) for v in (flat.acceleration, flat.body_rate)]
+    turning, speed = (sum(c * c for c in v) for v in (flat.angular_acceleration, flat.velocity))
+    half_tilt = (x * x + y * y) / (1 + z) ** 2
+    return np.stack([*squares, half_tilt, flat.specific_thrust, turning, *flat.motor_thrust, speed])
 
 
 @pytest.mark.parametrize("airframe", AIRFRAMES.values(), ids=lambda airframe: airframe.name)
@@ -36,7 +38,7 @@ def test_dense_rows_are_those_of_the_flatness_map(make_profile, airframe, count)
     derivatives = np.stack([path(s, order).T for order in (1, 2, 3, 4)])
     rows = dense.dense_rows(airframe, derivatives, profile, s - profile.s[interval], interval)
     expected = plain_rows(airframe, derivatives, profile, s, interval)
-    assert rows.shape == (dense.ROWS, count)
+    assert rows.shape == (MEASURES, count)
     scale = 1.0 + np.abs(expected).max(axis=1, keepdims=True)
     np.testing.assert_allclose(rows / scale, expected / scale, rtol=0.0, atol=1e-14)
 

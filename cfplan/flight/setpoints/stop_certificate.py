@@ -1,8 +1,8 @@
-"""What proves the stops: their bytes, as the vehicle decodes them, held against the limits.
+"""The certificate of the stops: their bytes, as the vehicle decodes them, held against the limits.
 
 A stop may exceed the limits of the plan: where a turn is flown at its limit, braking adds to it. Longer stops gain
-little (5.7 m/s² instead of 5.8 for twice the way), so all are short, and must keep the limits of the flight, a tilt at
-which the controller is stable, and the thrust that the motors have.
+little (5.7 m/s² instead of 5.8 for twice the way), so all are short, and must keep what the table of quantities says
+that a stop may reach: the limits of the flight, a tilt at which the controller is stable, the thrust of the motors.
 """
 
 from dataclasses import dataclass
@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.packets import decode
 from cfplan.safety.limits import Limits
-from cfplan.vehicle.airframe import GRAVITY
+from cfplan.safety.quantities import AT_MOST, PACKET_ROUNDING, QUANTITIES
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.flatness import motor_thrusts
+from cfplan.vehicle.measures import measures_of
 
-LARGEST_TILT = np.radians(35.0)  # beyond some 40° the firmware's Mellinger controller was seen to fail
+BOUND = tuple(quantity for quantity in QUANTITIES if quantity.in_stop)
 _CHUNK = 1000  # stops at a time
-_ROUNDING = 1e-3  # of what fits a packet
+_SPAN = 2  # setpoints on each side, over which body rates are differentiated, as packets round them to a millirad/s
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,83 +28,70 @@ class StopCertificate:
     """Worst values over every moment of every stop."""
 
     count: int
-    as_planned: int
-    # stops that keep the limits of the plan too
-    speed: float
-    # m/s
-    acceleration: float
-    # m/s², without what makes up for drag
-    angular_velocity: float
-    # rad/s
-    tilt: float
-    # rad
-    specific_thrust: float
-    # m/s², least
-    motor_thrust: float
-    # N, most of one motor, torque counted
+    as_planned: int  # stops that keep the limits of the plan too
+    worst: dict[str, float]  # of each quantity that binds stops, by its name
 
     def require(self, limits: Limits) -> None:
-        """Raise NotCertifiedError where a stop breaks a limit of the flight."""
-        flight, airframe = limits.flight, limits.airframe
-        for name, value, most in (
-            ("speed", self.speed, flight.speed.brake),
-            ("acceleration", self.acceleration, flight.acceleration.brake),
-            ("angular velocity", self.angular_velocity, flight.angular_velocity.brake),
-            ("tilt", self.tilt, LARGEST_TILT),
-            ("specific thrust", -self.specific_thrust, -limits.plan.specific_thrust_min + _ROUNDING),
-            ("motor thrust", self.motor_thrust, airframe.motor_thrust_max),
-        ):
-            if not value <= most:
+        """Raise NotCertifiedError where a stop exceeds what stops may reach."""
+        for quantity in BOUND:
+            assert quantity.in_stop
+            value, limit = self.worst[quantity.name], quantity.in_stop(limits)
+            if not quantity.excess(value, limit) <= 0.0:
+                side = "at most" if quantity.side == AT_MOST else "at least"
                 raise NotCertifiedError(
-                    f"a stop's {name} comes to {abs(value):.3g}, which {abs(most):.3g} bounds",
+                    f"a stop reaches a {quantity.noun} of {value:.3g} {quantity.unit}; it may be {side} {limit:.3g}",
                     where="stops",
                     hint="plan with a lower speed or acceleration",
                 )
 
 
 def certify_stops(stops: NDArray, limits: Limits, rate: float) -> StopCertificate:
-    """Of stops (N, M, 29) uint8 at `rate`, Hz."""
-    parts = [_worst(stops[first : first + _CHUNK], limits, rate) for first in range(0, len(stops), _CHUNK)]
-    as_planned = sum(part[0] for part in parts)
-    most = np.max([part[1] for part in parts], axis=0)
-    speed, acceleration, turning, tilt, thrust, motor = most.tolist()
-    return StopCertificate(len(stops), as_planned, speed, acceleration, turning, tilt, -thrust, motor)
+    """Return the worst values of stops (N, M, 29) uint8 at `rate`, Hz."""
+    worst = np.concatenate(
+        [_worst(stops[first : first + _CHUNK], limits.airframe, rate) for first in range(0, len(stops), _CHUNK)], axis=1
+    )
+    allowed = np.array([quantity.allowed(limits.plan) for quantity in BOUND])
+    sides = np.array([quantity.side for quantity in BOUND])
+    excess = sides[:, None] * (worst - allowed[:, None])
+    as_planned = (excess <= PACKET_ROUNDING * (1.0 + allowed[:, None])).all(axis=0).sum()
+    worst_of_all = sides * (sides[:, None] * worst).max(axis=1)
+    names = [quantity.name for quantity in BOUND]
+    return StopCertificate(len(stops), int(as_planned), dict(zip(names, worst_of_all.tolist(), strict=True)))
 
 
-def _worst(stops: NDArray, limits: Limits, rate: float) -> tuple[int, NDArray]:
-    told = decode(stops)
+def _worst(stops: NDArray, airframe: Airframe, rate: float) -> NDArray:
+    """Return (len(BOUND), N): the worst value of each quantity in each of the stops, (N, M, 29)."""
+    decoded = decode(stops)
     shape = (*stops.shape[:2], 3)
-    velocity, acceleration = told.velocity.reshape(shape), told.acceleration.reshape(shape)
-    turning = told.body_rate.reshape(shape)
-    force = acceleration + np.array([0.0, 0.0, GRAVITY])
+    velocity, sent, body_rate = (
+        values.reshape(shape) for values in (decoded.velocity, decoded.acceleration, decoded.body_rate)
+    )
+    force = sent + np.array([0.0, 0.0, GRAVITY])
     thrust = np.linalg.norm(force, axis=2)
-    drag = limits.airframe.drag[0] / limits.airframe.mass
-    moved = np.linalg.norm(acceleration - drag * velocity, axis=2)
-    tilt = np.arccos(np.clip(force[..., 2] / thrust, -1.0, 1.0))
-    motor = _motors(limits, thrust, turning, rate)
-    speed, rates = np.linalg.norm(velocity, axis=2), np.linalg.norm(turning, axis=2)
-    plan = limits.plan
-    good = (
-        (speed <= plan.speed + _ROUNDING)
-        & (moved <= plan.acceleration * (1 + _ROUNDING) + _ROUNDING)
-        & (rates <= plan.angular_velocity + _ROUNDING)
-        & (tilt <= plan.tilt + _ROUNDING)
-        & (thrust >= plan.specific_thrust_min - _ROUNDING)
-        & (motor <= plan.motor_thrust_max + _ROUNDING)
+    turning = _differentiated(body_rate, rate)
+    measured = measures_of(
+        velocity=velocity,
+        acceleration=sent - airframe.drag[0] / airframe.mass * velocity,  # what is sent makes up for drag besides
+        body_rate=body_rate,
+        thrust_axis=force / thrust[..., None],
+        specific_thrust=thrust,
+        angular_acceleration=turning,
+        motor_thrust=_motors(airframe, thrust, body_rate, turning),
     )
-    return int(good.all(axis=1).sum()), np.array(
-        [values.max() for values in (speed, moved, rates, tilt, -thrust, motor)]
-    )
+    worst = [quantity.worst(measured) for quantity in BOUND]
+    return np.stack([q.side * (q.side * values).max(axis=1) for q, values in zip(BOUND, worst, strict=True)])
 
 
-def _motors(limits: Limits, specific_thrust: NDArray, turning: NDArray, rate: float) -> NDArray:
-    """(N, M) N, the largest of the four motors: thrust, and the torque of the change of the body rates."""
-    airframe = limits.airframe
+def _differentiated(body_rate: NDArray, rate: float) -> NDArray:
+    """Return (N, M, 3) rad/s²: the change of body rates from _SPAN setpoints before to as many after."""
+    place = np.arange(body_rate.shape[1])
+    ahead, behind = np.minimum(place + _SPAN, place[-1]), np.maximum(place - _SPAN, 0)
+    return (body_rate[:, ahead] - body_rate[:, behind]) * (rate / np.maximum(ahead - behind, 1))[:, None]
+
+
+def _motors(airframe: Airframe, specific_thrust: NDArray, body_rate: NDArray, turning: NDArray) -> NDArray:
+    """Return (N, M, 4) N: the thrust of each motor, torque counted."""
     inertia = np.array(airframe.inertia)
-    # Over 40 ms, as the bytes round rates to a millirad/s.
-    ahead, behind = np.minimum(np.arange(turning.shape[1]) + 2, turning.shape[1] - 1), np.arange(turning.shape[1]) - 2
-    behind = np.maximum(behind, 0)
-    change = (turning[:, ahead] - turning[:, behind]) * (rate / np.maximum(ahead - behind, 1))[:, None]
-    torque = inertia * change + np.cross(turning, inertia * turning)
-    wrench = np.concatenate([airframe.mass * specific_thrust[..., None], torque], axis=2)
-    return (wrench @ np.linalg.inv(airframe.mixing).T).max(axis=2)
+    torque = inertia * turning + np.cross(body_rate, inertia * body_rate)
+    parts = torque[..., 0], torque[..., 1], torque[..., 2]
+    return np.stack(motor_thrusts(airframe, airframe.mass * specific_thrust, parts), axis=-1)

@@ -7,11 +7,9 @@ import numpy as np
 from cfplan.errors import NotCertifiedError
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import Certificate, certify
+from cfplan.safety.quantities import BY_NAME
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
-
-PROPORTIONAL = frozenset({"speed", "angular velocity"})
-# to speed; every other share grows with its square
 
 
 def select_fastest(task: PlanningTask, profiles: Iterable[SpeedProfile]) -> SpeedProfile | None:
@@ -30,11 +28,7 @@ def select_fastest(task: PlanningTask, profiles: Iterable[SpeedProfile]) -> Spee
 
 def _speed_factor(certificate: Certificate) -> float:
     """Return the factor on speed at which every limit would hold if each share grew as a power of speed."""
-    shares = [
-        margin.share if margin.name in PROPORTIONAL else margin.share**0.5
-        for margin in certificate.margins
-        if not margin.passed
-    ]
+    shares = [margin.share ** (1 / BY_NAME[margin.name].power) for margin in certificate.margins if not margin.passed]
     if any(np.isnan(share) for share in shares):
         return 0.0
     return 1.0 / max(shares, default=1.0)

@@ -1,17 +1,17 @@
 """How far a profile exceeds its limits between the points where the optimiser holds them."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
-from cfplan.machine_code import njit
-from cfplan.planners.expert import point_constraints
+from cfplan.safety import quantities
 from cfplan.safety.limits import PlanLimits
+from cfplan.safety.quantities import scaled
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.measures import MEASURES
 from cfplan.vehicle.profile import SpeedProfile
 
 COUNT = 17
@@ -29,13 +29,10 @@ THRUST_ALLOWANCE = 4e-3
 FINE_ALLOWANCE = 5e-3
 # likewise in brisk intervals
 
-SPEED = point_constraints.ROWS
-# column of the squared speed, after the rows of the optimiser
-COLUMNS = point_constraints.ROWS + 1
-_ABOVE, _BELOW = np.append(point_constraints.UPPER, 1.0), np.append(point_constraints.LOWER, -np.inf)
+COLUMNS = MEASURES  # the rows of the optimiser, and the squared speed behind them
 # Chebyshev-Lobatto: both ends of an interval, and closer together near them
 _PLACES, _FINE = ((1.0 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2.0 for count in (COUNT, FINE_COUNT))
-CONTINUOUS = [c for c in range(COLUMNS) if c not in point_constraints.JUMPING]
+CONTINUOUS = np.flatnonzero(~quantities.JUMPS).tolist()
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +45,7 @@ class Excess:
     upper: NDArray
     # (N, COLUMNS) above 1
     lower: NDArray
-    # (N, COLUMNS) below point_constraints.LOWER
+    # (N, COLUMNS) below quantities.LOWER
 
     @property
     def worst(self) -> float:
@@ -65,7 +62,7 @@ class DensePath:
         brisk = turns(path, nodes) > SHARP
         brisk[:END_INTERVALS] = brisk[-END_INTERVALS:] = True
         self.allowance = np.full((nodes, COLUMNS), ALLOWANCE)
-        self.allowance[:, list(point_constraints.JUMPING)] = THRUST_ALLOWANCE
+        self.allowance[:, quantities.JUMPS] = THRUST_ALLOWANCE
         self.allowance[brisk] = FINE_ALLOWANCE
         self.groups = tuple(
             (which, places) for which, places in ((np.flatnonzero(~brisk), _PLACES), (np.flatnonzero(brisk), _FINE))
@@ -81,64 +78,33 @@ class DensePath:
     def excess(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Excess:
         """Of a profile with as many intervals; h must be positive."""
         highest, lowest = self._extremes(profile, airframe, limits)
-        upper, lower = highest.T - _ABOVE + self.allowance, _BELOW - lowest.T + self.allowance
+        upper, lower = highest.T - quantities.UPPER + self.allowance, quantities.LOWER - lowest.T + self.allowance
         return Excess(upper - self.held * np.maximum(upper, 0.0), lower - self.held * np.maximum(lower, 0.0))
 
     def _extremes(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> tuple[NDArray, NDArray]:
         """(COLUMNS, N) twice: the most and the least that each row comes to in each interval."""
         at = dense.dense_rows(airframe, self.derivatives, profile, self.places, self.interval)
-        highest, lowest = (np.empty((dense.ROWS, len(profile.dddh))) for _ in range(2))
+        highest, lowest = (np.empty((MEASURES, len(profile.dddh))) for _ in range(2))
         end = 0
         for which, places in self.groups:
             begin, end = end, end + len(which) * len(places)
-            rows = at[:, begin:end].reshape(dense.ROWS, len(places), len(which))
+            rows = at[:, begin:end].reshape(MEASURES, len(places), len(which))
             highest[:, which], lowest[:, which] = rows.max(axis=1), rows.min(axis=1)
-        # tilt is most where the thrust axis is lowest
-        least_height, most_height = lowest[dense.AXIS_HEIGHT].copy(), highest[dense.AXIS_HEIGHT].copy()
-        highest[dense.AXIS_HEIGHT], lowest[dense.AXIS_HEIGHT] = least_height, most_height
-        return _as_shares(highest, limits), _as_shares(lowest, limits)
+        return scaled(highest, limits), scaled(lowest, limits)
 
 
 def violates_at_nodes(path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> bool:
     """Whether a limit is exceeded at a node; where not, the certificate has the word."""
     first, nodes = profile.s[:-1], np.arange(len(profile.s) - 1)
     at = dense.dense_rows(airframe, path.derivatives(first)[1:], profile, np.zeros(len(first)), nodes)
-    rows = _as_shares(at, limits).T
-    return bool((rows > _ABOVE).any() or (rows < _BELOW).any())
+    rows = scaled(at, limits).T
+    return bool((rows > quantities.UPPER).any() or (rows < quantities.LOWER).any())
 
 
 def _by_place(path: Path, s: NDArray) -> NDArray:
     """(4, 3, P · K) γ' to the fourth derivative at s, (K, P) ascending along rows: of all first places, then on."""
     found = path.derivatives(s.ravel())[1:].reshape(4, 3, *s.shape)
     return found.transpose(0, 1, 3, 2).reshape(4, 3, -1)
-
-
-def _as_shares(at: NDArray, limits: PlanLimits) -> NDArray:
-    """(COLUMNS, N) the optimiser's rows, and the squared speed, of dense rows, (dense.ROWS, N)."""
-    middle = 0.5 * (limits.motor_thrust_max + limits.motor_thrust_min)
-    half = 0.5 * (limits.motor_thrust_max - limits.motor_thrust_min)
-    scales = np.array([  # column by column
-        limits.acceleration**2, limits.angular_velocity**2, 1.0 - math.cos(limits.tilt), limits.specific_thrust_min,
-        limits.angular_acceleration**2, half, half, half, half, limits.speed**2,
-    ])  # fmt: skip
-    return _scaled(at, middle, scales)
-
-
-@njit(error_model="numpy")
-def _scaled(at: NDArray, middle: float, scales: NDArray) -> NDArray:
-    rows = np.empty((COLUMNS, at.shape[1]))
-    for n in range(at.shape[1]):
-        rows[point_constraints.ACCELERATION, n] = at[dense.ACCELERATION, n]
-        rows[point_constraints.ANGULAR_VELOCITY, n] = at[dense.BODY_RATE, n]
-        rows[point_constraints.TILT, n] = 1.0 - at[dense.AXIS_HEIGHT, n]
-        rows[point_constraints.SPECIFIC_THRUST, n] = at[dense.SPECIFIC_THRUST, n]
-        rows[point_constraints.ANGULAR_ACCELERATION, n] = at[dense.ANGULAR_ACCELERATION, n]
-        for motor in range(4):
-            rows[point_constraints.THRUSTS.start + motor, n] = at[dense.MOTOR_THRUST + motor, n] - middle
-        rows[SPEED, n] = at[dense.SPEED, n]
-        for column in range(COLUMNS):
-            rows[column, n] /= scales[column]
-    return rows
 
 
 def turns(path: Path, nodes: int) -> NDArray:

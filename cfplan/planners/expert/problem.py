@@ -10,10 +10,11 @@ from cfplan.geometry.path import Path
 from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.initial_guess import guess_spline
-from cfplan.planners.expert.intersample import SPEED, Excess, spread
+from cfplan.planners.expert.intersample import Excess, spread
 from cfplan.planners.expert.program import Layout
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.measures import SPEED
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 from cfplan.vehicle.profile_spline import spline_profile
 from cfplan.vehicle.yaw_spline import YawSpline

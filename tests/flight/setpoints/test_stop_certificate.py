@@ -20,15 +20,17 @@ def test_the_worst_values_are_those_of_the_bytes(stops, limits):
     found = certify_stops(stops, limits, 100.0)
     told = decode(stops.reshape(-1, 29))
     assert found.count == len(stops)
-    assert found.speed == pytest.approx(np.linalg.norm(told.velocity, axis=1).max())
-    assert found.angular_velocity == pytest.approx(np.linalg.norm(told.body_rate, axis=1).max())
+    assert found.worst["speed"] == pytest.approx(np.linalg.norm(told.velocity, axis=1).max())
+    assert found.worst["angular velocity"] == pytest.approx(np.linalg.norm(told.body_rate, axis=1).max())
     force = told.acceleration + np.array([0.0, 0.0, 9.81])
-    assert np.tan(found.tilt) == pytest.approx((np.hypot(force[:, 0], force[:, 1]) / force[:, 2]).max())
+    assert np.tan(found.worst["tilt"]) == pytest.approx((np.hypot(force[:, 0], force[:, 1]) / force[:, 2]).max())
 
 
 def test_a_hover_needs_a_quarter_of_the_weight_from_each_motor(mission, limits):
     hover = encode_stops(mission.payloads[-1:].repeat(5, axis=0), 100.0)
-    assert certify_stops(hover, limits, 100.0).motor_thrust == pytest.approx(limits.airframe.hover_thrust, rel=1e-4)
+    assert certify_stops(hover, limits, 100.0).worst["motor thrust, most"] == pytest.approx(
+        limits.airframe.hover_thrust, rel=1e-4
+    )
 
 
 def test_stops_within_the_limits_of_the_flight_pass(stops, limits):

@@ -1,0 +1,181 @@
+"""The table of limited quantities: what each limit binds, in which unit, on which side, and how it is computed.
+
+Everything that holds motion to limits reads this table: the certificate, the expert's constraints and their check
+between nodes, the checks of bytes and of stops, the dry run, feasibility. A new limit is a row of QUANTITIES, a field
+of PlanLimits and its key in safety.yaml; it binds plans, certificates and bytes from then on.
+
+A quantity is computed from a full state by way of its measure (see vehicle/measures.py), which is smooth and rises
+with it. The optimiser bounds `row(measure)`, scaled so that each limit is 1, or -1 and 1 where there are two.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.safety.limits import Limits, PlanLimits
+from cfplan.vehicle import measures
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.rotations import Scalar
+
+AT_MOST, AT_LEAST = 1, -1  # sides of a limit
+STOP_TILT = np.radians(35.0)  # beyond some 40° the firmware's Mellinger controller was seen to fail
+PACKET_ROUNDING = 1e-3  # m/s² and less, by which packets may round what they hold
+
+
+def _itself(value: Any) -> Any:
+    return value
+
+
+def _nothing(_: Airframe) -> float:
+    return 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """One row of the table."""
+
+    name: str  # as certificates and messages have it
+    unit: str
+    limit: str  # field of PlanLimits
+    key: str  # of that limit in safety.yaml, section plan
+    side: int  # AT_MOST or AT_LEAST
+    measure: int  # the first of its measures
+    count: int = 1  # of measures, all of which keep the limit
+    value: Callable[[Any], Any] = _itself  # the quantity, of its measure
+    measured: Callable[[Any], Any] = _itself  # the measure, of its quantity
+    row: Callable[[Any], Any] = _itself  # what the optimiser bounds, of the measure
+    hover: Callable[[Airframe], float] = _nothing  # the quantity in hover
+    remedy: str = "loosen that limit"  # where hovering breaks it
+    jumps: bool = False
+    """Whether it jumps between intervals, as h''' and ψ'' do; a boundary state or a setpoint alone does not tell it."""
+    power: int = 2  # of speed, with which it grows when a flight is slowed as a whole
+    ladder: str = ""  # field of FlightLimits, where measured motion is bound too
+    in_stop: Callable[[Limits], float] | None = None
+    """What a stop may reach, as braking adds to a turn flown at its limit; None where stops are not bound."""
+
+    @property
+    def noun(self) -> str:
+        """The name without its side."""
+        return self.name.split(",")[0]
+
+    @property
+    def which(self) -> slice:
+        """Its measures."""
+        return slice(self.measure, self.measure + self.count)
+
+    def allowed(self, limits: PlanLimits) -> float:
+        """Return its limit for planned motion."""
+        return float(getattr(limits, self.limit))
+
+    def unused(self, airframe: Airframe) -> float:
+        """Return the value at which no share of the limit is used: nothing, or for a least value that of hover."""
+        return 0.0 if self.side == AT_MOST else self.hover(airframe)
+
+    def worst(self, measured: NDArray) -> NDArray:
+        """Return its worst value over its measures, of (MEASURES, ...) of full states."""
+        return np.asarray(self.value(self.side * np.max(self.side * measured[self.which], axis=0)))
+
+    def excess(self, value: Any, limit: float) -> Any:
+        """Return by how much a value lies beyond a limit; negative within it."""
+        return self.side * (value - limit)
+
+
+def _tilt(squared_tangent_of_half: Any) -> Any:
+    return 2.0 * np.arctan(np.sqrt(squared_tangent_of_half))
+
+
+def _squared_tangent_of_half(tilt: Any) -> Any:
+    return np.tan(tilt / 2.0) ** 2
+
+
+def _versine(squared_tangent_of_half: Any) -> Any:
+    """Return 1 - cos of the tilt: upside down the measure is infinite, which no search should meet."""
+    return 2.0 * squared_tangent_of_half / (1.0 + squared_tangent_of_half)
+
+
+QUANTITIES = (
+    Quantity(
+        "speed", "m/s", "speed", "speed", AT_MOST, measures.SPEED, value=np.sqrt, measured=np.square,
+        power=1, ladder="speed", in_stop=lambda limits: limits.flight.speed.brake,
+    ),
+    Quantity(
+        "acceleration", "m/s²", "acceleration", "acceleration", AT_MOST, measures.ACCELERATION, value=np.sqrt,
+        measured=np.square, ladder="acceleration", in_stop=lambda limits: limits.flight.acceleration.brake,
+    ),
+    Quantity(
+        "angular velocity", "rad/s", "angular_velocity", "angular_velocity", AT_MOST, measures.BODY_RATE,
+        value=np.sqrt, measured=np.square, power=1, ladder="angular_velocity",
+        in_stop=lambda limits: limits.flight.angular_velocity.brake,
+    ),
+    Quantity(
+        "angular acceleration", "rad/s²", "angular_acceleration", "angular_acceleration", AT_MOST,
+        measures.ANGULAR_ACCELERATION, value=np.sqrt, measured=np.square, jumps=True,
+    ),
+    Quantity(
+        "tilt", "rad", "tilt", "tilt_deg", AT_MOST, measures.TILT, value=_tilt,
+        measured=_squared_tangent_of_half, row=_versine, in_stop=lambda _: STOP_TILT,
+    ),
+    Quantity(
+        "motor thrust, most", "N", "motor_thrust_max", "motor_reserve", AT_MOST, measures.MOTOR_THRUST, 4, jumps=True,
+        remedy="choose a stronger vehicle or a smaller reserve",
+        hover=lambda airframe: airframe.hover_thrust, in_stop=lambda limits: limits.airframe.motor_thrust_max,
+    ),
+    Quantity(
+        "motor thrust, least", "N", "motor_thrust_min", "motor_reserve", AT_LEAST, measures.MOTOR_THRUST, 4, jumps=True,
+        remedy="choose a stronger vehicle or a smaller reserve",
+        hover=lambda airframe: airframe.hover_thrust,
+    ),
+    Quantity(
+        "specific thrust, least", "m/s²", "specific_thrust_min", "specific_thrust", AT_LEAST, measures.SPECIFIC_THRUST,
+        remedy="half of that keeps clear of the firmware's tumble rule",
+        hover=lambda _: GRAVITY, in_stop=lambda limits: limits.plan.specific_thrust_min - PACKET_ROUNDING,
+    ),
+)  # fmt: skip
+BY_NAME = {quantity.name: quantity for quantity in QUANTITIES}
+INSTANT = tuple(quantity for quantity in QUANTITIES if not quantity.jumps)  # what a boundary state or setpoint tells
+ON_LADDER = tuple(quantity for quantity in QUANTITIES if quantity.ladder)  # what the pilot watches
+
+# The optimiser's rows, one a measure: bounds of each in units of its scale, and which of them jump.
+LOWER, UPPER = np.full(measures.MEASURES, -np.inf), np.full(measures.MEASURES, np.inf)
+JUMPS = np.zeros(measures.MEASURES, dtype=bool)
+_ROWS: list[Callable[[Any], Any]] = [_itself] * measures.MEASURES
+for _quantity in QUANTITIES:
+    JUMPS[_quantity.which] = _quantity.jumps
+    _ROWS[_quantity.which] = [_quantity.row] * _quantity.count
+    (UPPER if _quantity.side == AT_MOST else LOWER)[_quantity.which] = 1.0
+LOWER[np.isfinite(LOWER) & np.isfinite(UPPER)] = -1.0  # scaled about the middle of both
+
+
+@lru_cache(maxsize=16)
+def scales(limits: PlanLimits) -> tuple[NDArray, NDArray]:
+    """Return offset and scale of each of the optimiser's rows, (MEASURES,) each; see rows_of."""
+    low, high = np.full(measures.MEASURES, np.nan), np.full(measures.MEASURES, np.nan)
+    for quantity in QUANTITIES:
+        of_side = high if quantity.side == AT_MOST else low
+        of_side[quantity.which] = quantity.row(quantity.measured(quantity.allowed(limits)))
+    both = np.isfinite(LOWER) & np.isfinite(UPPER)
+    offset = np.where(both, 0.5 * (high + low), 0.0)
+    scale = np.where(both, 0.5 * (high - low), np.where(np.isfinite(UPPER), high, low))
+    for array in (offset, scale):
+        array.setflags(write=False)
+    return offset, scale
+
+
+def rows_of(measured: Sequence[Scalar], offset: Sequence[Scalar], scale: Sequence[Scalar]) -> list[Scalar]:
+    """Return the optimiser's rows, which LOWER and UPPER bound, of the measures of a state, as CasADi symbols too."""
+    return [(row(m) - o) / s for row, m, o, s in zip(_ROWS, measured, offset, scale, strict=True)]
+
+
+def scaled(measured: NDArray, limits: PlanLimits) -> NDArray:
+    """Return the optimiser's rows, (MEASURES, N), of the measures of N states."""
+    offset, scale = scales(limits)
+    rows = measured - offset[:, None]
+    for quantity in QUANTITIES:
+        if quantity.row is not _itself:
+            rows[quantity.which] = quantity.row(measured[quantity.which]) - offset[quantity.which, None]
+    rows /= scale[:, None]
+    return rows

@@ -1,0 +1,82 @@
+"""Measures: the numbers of a full state that limits bind, by one function body for numpy, numba and CasADi alike.
+
+All of them are smooth where path and profile are, which norms and angles near zero are not: squares stand for norms,
+the squared tangent of half the tilt for the tilt. safety/quantities.py says what each is called, in which unit, and
+which limit binds it.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from cfplan.vehicle.flatness import ROUNDING, Flat
+from cfplan.vehicle.rotations import Scalar, Vector
+
+ACCELERATION, BODY_RATE = 0, 1  # squared: m²/s⁴, rad²/s²
+TILT = 2  # squared tangent of half the angle between thrust axis and vertical
+SPECIFIC_THRUST = 3  # m/s²
+ANGULAR_ACCELERATION = 4  # squared: rad²/s⁴
+MOTOR_THRUST = 5  # N, and the three behind
+SPEED = 9  # squared: m²/s²; the last, as planners bind it by h alone
+MEASURES = 10
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def measures(
+    flat: Flat,
+) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]:
+    """Return the measures of a full state, in the order of the names above."""
+    x, y, z = flat.thrust_axis
+    lift = 1.0 / (1.0 + z)
+    return (
+        _squared(flat.acceleration),
+        _squared(flat.body_rate),
+        (x * x + y * y) * lift * lift,
+        flat.specific_thrust,
+        _squared(flat.angular_acceleration),
+        flat.motor_thrust[0],
+        flat.motor_thrust[1],
+        flat.motor_thrust[2],
+        flat.motor_thrust[3],
+        _squared(flat.velocity),
+    )
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def _squared(vector: Vector) -> Scalar:
+    return vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]
+
+
+def measures_of(
+    velocity: NDArray,
+    acceleration: NDArray,
+    body_rate: NDArray,
+    thrust_axis: NDArray,
+    specific_thrust: NDArray,
+    angular_acceleration: NDArray | None = None,
+    motor_thrust: NDArray | None = None,
+) -> NDArray:
+    """Return (MEASURES, ...) of full states: vectors (..., 3), motor thrusts (..., 4); NaN where one is not known."""
+    unknown: Any = (np.full(np.shape(specific_thrust), np.nan),) * 4
+
+    def parts(vector: NDArray | None) -> Any:
+        return unknown if vector is None else tuple(np.moveaxis(np.asarray(vector), -1, 0))
+
+    return np.stack(
+        measures(
+            Flat(
+                velocity=parts(velocity),
+                acceleration=parts(acceleration),
+                jerk=unknown[:3],
+                snap=unknown[:3],
+                specific_thrust=specific_thrust,
+                thrust_axis=parts(thrust_axis),
+                body_rate=parts(body_rate),
+                angular_acceleration=parts(angular_acceleration)[:3],
+                torque=unknown[:3],
+                motor_thrust=parts(motor_thrust),
+            )
+        )
+    )

@@ -1,0 +1,126 @@
+"""The table of limited quantities: consistent in itself, and read by everything that holds motion to limits."""
+
+from dataclasses import fields, replace
+
+import casadi
+import numpy as np
+import pytest
+
+from cfplan.flight.setpoints import stop_certificate
+from cfplan.geometry.min_snap import min_snap
+from cfplan.planners.expert.intersample import DensePath, violates_at_nodes
+from cfplan.safety import quantities
+from cfplan.safety.certificate import certify, shares
+from cfplan.safety.feasibility import hover_violation, infeasible_limit, violated_limit
+from cfplan.safety.limit_sets import LIMIT_SETS
+from cfplan.safety.limits import FlightLimits, PlanLimits
+from cfplan.safety.quantities import AT_MOST, QUANTITIES
+from cfplan.vehicle import measures
+from cfplan.vehicle.trajectory import Trajectory
+
+CHOSEN = LIMIT_SETS["hardware"]
+AIRFRAME, LIMITS = CHOSEN.airframe, CHOSEN.limits
+each_quantity = pytest.mark.parametrize("quantity", QUANTITIES, ids=lambda quantity: quantity.name)
+
+
+@pytest.fixture(scope="module")
+def trajectory(make_profile):
+    path = min_snap([[0, 0, 1], [1, 1.5, 1.3], [-1, 2, 0.7]])
+    return Trajectory(path, make_profile(path.end, np.full(30, 1.0), 0.2 * np.arange(29)), AIRFRAME)
+
+
+def tightened(quantity, trajectory):
+    """Limits that the trajectory keeps but for this quantity, by a quarter of the way from what uses none of it."""
+    margins = {margin.name: margin for margin in certify(trajectory, LIMITS).margins}
+    unused = quantity.unused(AIRFRAME)
+    limit = unused + 0.75 * (margins[quantity.name].worst - unused)
+    wide = replace(
+        LIMITS, speed=100.0, acceleration=100.0, angular_velocity=100.0, angular_acceleration=1000.0, tilt=1.5,
+        motor_thrust_min=1e-3, motor_thrust_max=10.0, specific_thrust_min=1e-3,
+    )  # fmt: skip
+    return wide, replace(wide, **{quantity.limit: limit})
+
+
+def test_every_limit_of_a_plan_is_in_the_table_once():
+    assert sorted(quantity.limit for quantity in QUANTITIES) == sorted(field.name for field in fields(PlanLimits))
+    assert len(quantities.BY_NAME) == len(QUANTITIES)
+
+
+def test_every_measure_is_limited():
+    limited = np.concatenate([np.arange(measures.MEASURES)[quantity.which] for quantity in QUANTITIES])
+    assert set(limited.tolist()) == set(range(measures.MEASURES))
+
+
+@each_quantity
+def test_value_and_measure_are_inverse_and_rise_together(quantity):
+    values = np.linspace(0.05, 1.0, 9)
+    measured = quantity.measured(values)
+    np.testing.assert_allclose(quantity.value(measured), values, rtol=1e-12)
+    assert (np.diff(measured) > 0).all()
+    assert (np.diff(quantity.row(measured)) > 0).all()
+
+
+@each_quantity
+def test_the_optimisers_row_meets_its_bound_where_the_quantity_meets_its_limit(quantity):
+    measured = np.ones((measures.MEASURES, 1))
+    measured[quantity.which] = quantity.measured(quantity.allowed(LIMITS))
+    bound = (quantities.UPPER if quantity.side == AT_MOST else quantities.LOWER)[quantity.which]
+    np.testing.assert_allclose(quantities.scaled(measured, LIMITS)[quantity.which, 0], bound, rtol=1e-12)
+
+
+def test_rows_of_symbols_are_those_of_numbers():
+    offset, scale = quantities.scales(LIMITS)
+    measured = np.linspace(0.1, 1.0, measures.MEASURES)
+    symbols = casadi.SX.sym("m", measures.MEASURES)
+    rows = casadi.Function("rows", [symbols], quantities.rows_of(casadi.vertsplit(symbols), offset, scale))
+    found = [float(row) for row in rows(measured)]
+    np.testing.assert_allclose(found, quantities.scaled(measured[:, None], LIMITS)[:, 0], rtol=1e-12)
+
+
+@each_quantity
+def test_the_certificate_judges_it(quantity, trajectory):
+    wide, tight = tightened(quantity, trajectory)
+    assert certify(trajectory, wide).passed
+    failed = [margin.name for margin in certify(trajectory, tight).margins if not margin.passed]
+    assert failed == [quantity.name]
+    assert quantity.name in shares(trajectory, tight, np.array([0.5]))
+
+
+@each_quantity
+def test_the_expert_judges_it_between_nodes(quantity, trajectory):
+    nodes = len(trajectory.profile.s) - 1
+    dense = DensePath(trajectory.path, nodes, np.zeros(nodes))
+    wide, tight = tightened(quantity, trajectory)
+    assert dense.excess(trajectory.profile, AIRFRAME, wide).worst < 0.0
+    excess = dense.excess(trajectory.profile, AIRFRAME, tight)
+    side = excess.upper if quantity.side == AT_MOST else excess.lower
+    assert side[:, quantity.which].max() == excess.worst > 0.0
+    assert violates_at_nodes(trajectory.path, trajectory.profile, AIRFRAME, tight)
+
+
+@each_quantity
+def test_boundary_states_are_judged_by_what_an_instant_tells(quantity, trajectory):
+    wide, tight = tightened(quantity, trajectory)
+    states = [(trajectory.profile.boundary(node), trajectory.profile.s[node]) for node in range(30 - 3)]
+    assert not any(violated_limit(state, trajectory.path, s, AIRFRAME, wide) for state, s in states)
+    found = {violated_limit(state, trajectory.path, s, AIRFRAME, tight).split(" is ")[0] for state, s in states} - {""}
+    assert found == (set() if quantity.jumps else {quantity.noun})
+
+
+@each_quantity
+def test_a_limit_that_hovering_breaks_is_named(quantity):
+    broken = replace(LIMITS, **{quantity.limit: quantity.hover(AIRFRAME) + quantity.side * -1e-6})
+    assert hover_violation(AIRFRAME, LIMITS) is None
+    assert hover_violation(AIRFRAME, broken) is quantity
+    assert quantity.limit in infeasible_limit(AIRFRAME, broken)
+
+
+def test_what_stops_may_reach_is_said_of_all_but_two():
+    assert {q.name for q in QUANTITIES} - {q.name for q in stop_certificate.BOUND} == {
+        "angular acceleration", "motor thrust, least",
+    }  # fmt: skip
+
+
+def test_ladders_are_those_of_the_flight_limits():
+    ladders = {field.name for field in fields(FlightLimits)} - {"deviation", "fence", "patience"}
+    assert {quantity.ladder for quantity in quantities.ON_LADDER} == ladders
