@@ -1,8 +1,8 @@
-"""Tells good poses of a body from those that must not reach its filter, which would take them as the truth.
+"""Classification of a tracked body's poses: good, hidden, repeated, frozen, jumped, flipped or broken.
 
-A pose is held against where the last good ones led. What leaps away and stays away is not believed for a long while:
-tracking that took another body, or turned the marker pattern over, looks exactly like that, and a vehicle in the air
-is better off with no pose.
+A pose is compared with where the last good ones led. A pose that jumps away and stays away is not believed for a long
+while: tracking that took another body, or turned the marker pattern over, looks exactly like that, and a vehicle in the
+air is better off with no pose. `pose_faults` says why a second check follows in the pilot.
 """
 
 import math
@@ -10,21 +10,20 @@ from collections import Counter, deque
 from enum import StrEnum
 
 from cfplan.flight.mocap.frames import TrackedBody
+from cfplan.flight.mocap.pose_faults import MotionBounds, angle_between, is_finite, is_frozen, is_rotation
 from cfplan.flight.telemetry import Quaternion, Triple
 
-_ACCELERATION = 20.0  # m/s² by which the motion may have changed since; twice what a flight may do
-_TURN = 0.5  # rad that the attitude may turn from one pose to the next
-_TURN_RATE = 12.0  # rad/s by which it may have turned on since
-_MOST_TURN = 1.3  # rad, however long ago; a pattern seen the wrong way round turns by 90° or 180°
-_SEEN_LATELY = 0.2  # s; after longer the vehicle knows better how it turned than its last pose does
-_SPEED = 4.0  # m/s at which another track may go on
+# Of one track; a marker pattern that is seen the wrong way round turns by 90° or 180°.
+_BOUNDS = MotionBounds(speed=4.0, turn=0.5, turn_rate=12.0, largest_turn=1.3)
+_ACCELERATION = 20.0  # m/s² by which the motion may have changed since the last good pose; twice what a flight may do
+_ATTITUDE_LASTS = 0.2  # s; after a longer gap the vehicle's own attitude is better than that of its last pose
 _HISTORY = 0.1  # s of good poses from which the velocity is taken
 _EXTRAPOLATE = 0.3  # s for which that velocity is taken to last
-_BELIEVE_AFTER = 30.0  # s that another track must last; no landing takes so long
+_BELIEVE_AFTER = 30.0  # s that another track must last; no landing takes that long
 
 
 class Verdict(StrEnum):
-    """What a pose is."""
+    """What a pose is; only a good one may be used."""
 
     GOOD = "good"
     OCCLUDED = "occluded"
@@ -36,10 +35,12 @@ class Verdict(StrEnum):
 
 
 class PoseClassifier:
-    """Sorts the poses of one body, in the order of their time."""
+    """Classifies the poses of one body, in the order of their time.
+
+    `jump` in m, of a pose from where the last ones led.
+    """
 
     def __init__(self, jump: float):
-        # jump in m, of a pose from where the last ones led
         self._jump = jump
         self._good: deque[tuple[float, TrackedBody]] = deque()
         self._last: TrackedBody | None = None
@@ -48,12 +49,12 @@ class PoseClassifier:
         self._other_since = 0.0
         self._other_verdict = Verdict.JUMPED
         self.counts: Counter[Verdict] = Counter()
-        # as the vehicle itself believes it: its gyroscopes tell a vehicle that turned, while it was not seen, from a
-        # pattern that was turned over
         self.attitude: Quaternion | None = None
+        """The vehicle's own estimate: its gyroscopes tell a vehicle that turned while it was not seen from a marker
+        pattern that was turned over."""
 
     def classify(self, time: float, body: TrackedBody | None, number: int | None = None) -> Verdict:
-        """What this pose is. Only a good one may be used."""
+        """Return what this pose is; `body` is None where it was not seen, `number` the frame's where there is one."""
         verdict = self._verdict(time, body, number)
         self.counts[verdict] += 1
         if body is not None and verdict is not Verdict.BROKEN:
@@ -70,11 +71,9 @@ class PoseClassifier:
             return Verdict.REPEATED
         if body is None or not any(body.position):  # some systems send a hidden body as all zeros
             return Verdict.OCCLUDED
-        if not all(map(math.isfinite, (*body.position, *body.quaternion))):
+        if not (is_finite(body) and is_rotation(body.quaternion)):
             return Verdict.BROKEN
-        if abs(math.hypot(*body.quaternion) - 1.0) > 0.01:
-            return Verdict.BROKEN
-        if self._last is not None and _same(body, self._last):
+        if self._last is not None and is_frozen(body, self._last):
             return Verdict.FROZEN
         if not self._good:
             return Verdict.GOOD
@@ -86,11 +85,11 @@ class PoseClassifier:
         last_time, last = self._good[-1]
         elapsed = time - last_time
         off = math.dist(body.position, self._expected(time))
-        turned = _angle(body.quaternion, last.quaternion)
-        if self.attitude is not None and (turned > _TURN or elapsed > _SEEN_LATELY):
-            turned = _angle(body.quaternion, self.attitude)
-            turned = turned if turned > _TURN else 0.0
-        if off <= self._jump and turned <= _TURN:
+        turned = angle_between(body.quaternion, last.quaternion)
+        if self.attitude is not None and (turned > _BOUNDS.turn or elapsed > _ATTITUDE_LASTS):
+            turned = angle_between(body.quaternion, self.attitude)
+            turned = turned if turned > _BOUNDS.turn else 0.0
+        if off <= self._jump and turned <= _BOUNDS.turn:
             self._other = None
             return Verdict.GOOD
         if self._other is not None and self._goes_on(time, body):
@@ -101,7 +100,7 @@ class PoseClassifier:
             return Verdict.GOOD
         if off > self._jump + _ACCELERATION / 2 * elapsed**2:
             verdict = Verdict.JUMPED
-        elif turned > (_TURN if self.attitude is not None else min(_TURN + _TURN_RATE * elapsed, _MOST_TURN)):
+        elif turned > (_BOUNDS.turn if self.attitude is not None else _BOUNDS.turn_within(elapsed)):
             verdict = Verdict.FLIPPED
         else:
             self._other = None
@@ -110,7 +109,7 @@ class PoseClassifier:
         return verdict
 
     def _expected(self, time: float) -> Triple:
-        """Where the last good poses led."""
+        """Return where, m, the last good poses led."""
         (first_time, first), (last_time, last) = self._good[0], self._good[-1]
         span = last_time - first_time
         ahead = min(time - last_time, _EXTRAPOLATE)
@@ -119,23 +118,13 @@ class PoseClassifier:
         return x, y, z
 
     def _goes_on(self, time: float, body: TrackedBody) -> bool:
-        """Whether a pose belongs to the other track."""
+        """Return whether a pose continues the other track."""
         assert self._other is not None
         other_time, other = self._other
         elapsed = time - other_time
-        near = math.dist(body.position, other.position) <= self._jump + _SPEED * elapsed
-        return near and _angle(body.quaternion, other.quaternion) <= min(_TURN + _TURN_RATE * elapsed, _MOST_TURN)
+        near = math.dist(body.position, other.position) <= _BOUNDS.reach(self._jump, elapsed)
+        return near and angle_between(body.quaternion, other.quaternion) <= _BOUNDS.turn_within(elapsed)
 
     def _believe_other(self) -> None:
         self._other = None
         self._good.clear()
-
-
-def _same(a: TrackedBody, b: TrackedBody) -> bool:
-    return a.position == b.position and a.quaternion == b.quaternion
-
-
-def _angle(a: Quaternion, b: Quaternion) -> float:
-    """rad between two attitudes."""
-    aligned = abs(math.fsum(p * q for p, q in zip(a, b, strict=True)))
-    return 2.0 * math.acos(min(1.0, aligned))

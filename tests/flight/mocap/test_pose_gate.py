@@ -15,15 +15,15 @@ def pose(time, x=0.0, quaternion=LEVEL):
 
 
 @pytest.fixture
-def freshness():
+def gate():
     judge = PoseGate(jump=0.1)
     assert not judge.fault(pose(1.0))
     return judge
 
 
-def test_a_pose_that_moves_as_a_vehicle_does_is_good(freshness):
-    assert not freshness.fault(pose(1.01, 0.02))
-    assert not freshness.fault(pose(1.02, 0.04))
+def test_a_pose_that_moves_as_a_vehicle_does_is_good(gate):
+    assert not gate.fault(pose(1.01, 0.02))
+    assert not gate.fault(pose(1.02, 0.04))
 
 
 @pytest.mark.parametrize(
@@ -40,15 +40,15 @@ def test_a_pose_that_moves_as_a_vehicle_does_is_good(freshness):
         (pose(1.01, 0.01, (0.0, 0.0, 0.0, 0.0)), "no rotation"),
     ],
 )
-def test_a_bad_pose_is_named_and_forgotten(freshness, bad, why):
-    assert why in freshness.fault(bad)
-    assert freshness.last == pose(1.0)
-    assert not freshness.fault(pose(1.02, 0.02))
+def test_a_bad_pose_is_named_and_forgotten(gate, bad, why):
+    assert why in gate.fault(bad)
+    assert gate.last == pose(1.0)
+    assert not gate.fault(pose(1.02, 0.02))
 
 
-def test_the_sign_of_a_quaternion_means_nothing(freshness):
-    assert not freshness.fault(pose(1.01, 0.01, (0.0, 0.0, 0.0, -1.0)))
+def test_the_sign_of_a_quaternion_means_nothing(gate):
+    assert not gate.fault(pose(1.01, 0.01, (0.0, 0.0, 0.0, -1.0)))
 
 
-def test_after_a_dropout_a_vehicle_may_have_gone_far(freshness):
-    assert not freshness.fault(pose(1.5, 1.0))
+def test_after_a_dropout_a_vehicle_may_have_gone_far(gate):
+    assert not gate.fault(pose(1.5, 1.0))
