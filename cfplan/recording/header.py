@@ -1,4 +1,4 @@
-"""What a record says before its first message: which flight this is, on what vehicle, under what limits."""
+"""The header of a record: which flight it is, on what vehicle, under what limits; to JSON and back."""
 
 import json
 import math
@@ -19,7 +19,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class FlightBounds:
-    """Where a flight is judged and the plots draw their lines; NaN where there is no such limit."""
+    """Limits by which a flight is judged, drawn as lines in the plots; NaN where there is none."""
 
     speed: float = math.nan  # m/s
     acceleration: float = math.nan  # m/s², gravity not counted
@@ -65,7 +65,7 @@ def header_under(
     wall_time_at_zero: float = 0.0,
     provenance: Mapping[str, str] | None = None,
 ) -> RecordHeader:
-    """Of a flight under these limits, by this version."""
+    """Return the header of a flight under these limits, written by this version."""
     return RecordHeader(
         name=name,
         version=__version__,
@@ -84,14 +84,14 @@ def header_under(
 
 
 def header_to_json(header: RecordHeader) -> str:
-    """One line; numbers that are not finite become null."""
+    """Return the header as one line of JSON; numbers that are not finite become null."""
     return json.dumps(_plain({f.name: getattr(header, f.name) for f in fields(header)}), allow_nan=False)
 
 
 def header_from_json(text: str, *, where: str = "") -> RecordHeader:
-    """Raises InputError where a key is missing or of the wrong kind.
+    """Read a header. Raises InputError where a key is missing or of the wrong kind.
 
-    So that records outlive versions: keys of later ones are ignored, limits that earlier ones lacked are NaN.
+    Records outlive versions: keys of later ones are ignored, limits that earlier ones lacked are NaN.
     """
     try:
         values = json.loads(text)
@@ -133,7 +133,7 @@ def _airframe(values: Mapping[str, Any]) -> Airframe:
 
 
 def _limit(value: float | None, limit: Field) -> float:
-    """JSON has no word for a limit that is infinite: null is the default of a limit that has one, else not known."""
+    """Read a limit: null, as JSON has no infinity, is the default of a limit that has one, and NaN for the others."""
     return _number(value) if value is not None or limit.default is MISSING else limit.default
 
 

@@ -1,4 +1,4 @@
-"""Flights laid over one another, and over a plan: each a trial, time 0 where the path begins."""
+"""Lay flights over one another and over a plan: each is a trial, with time 0 where the path begins."""
 
 import math
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class Reference:
     position: NDArray  # (M, 3) m
 
     def at(self, time: NDArray) -> NDArray:
-        """(N, 3) m; NaN before its begin and after its end."""
+        """Return (N, 3) m; NaN before its begin and after its end."""
         axes = [np.interp(time, self.time, axis, left=np.nan, right=np.nan) for axis in self.position.T]
         return np.stack(axes, axis=-1)
 
@@ -48,14 +48,14 @@ class Trial:
 
     @property
     def deviation(self) -> NDArray:
-        """(N,) m from the reference at that time; NaN where there is none."""
+        """Return (N,) m from the reference at that time; NaN where there is none."""
         if self.reference is None:
             return np.full(len(self.time), np.nan)
         return np.linalg.norm(self.position - self.reference.at(self.time), axis=1)
 
     @property
     def speed(self) -> NDArray:
-        """(N,) m/s from SPEED_SPAN before to as much after, so that noise of a millimetre hardly shows; NaN at gaps."""
+        """Return (N,) m/s over SPEED_SPAN before and after, so that noise of a millimetre hardly shows; NaN at gaps."""
         speed = np.full(len(self.time), np.nan)
         if len(self.time) > 2:
             reach = max(1, round(SPEED_SPAN / float(np.median(np.diff(self.time)))))
@@ -86,13 +86,13 @@ class Alignment:
 
 
 def reference_of(trajectory: Trajectory, name: str) -> Reference:
-    """A plan, sampled."""
+    """Sample a plan."""
     time = np.append(np.arange(0.0, trajectory.duration, STEP), trajectory.duration)
     return Reference(name, time, trajectory.at(time).position)
 
 
 def trial_of_record(record: Record, name: str) -> Trial:
-    """A recorded flight with the setpoints that it followed as its reference; time 0 at the first of its path."""
+    """Return a recorded flight with its setpoints as reference; time 0 at the first of its path."""
     begin, end = reference_span(record)
     poses = record.poses
     if math.isnan(begin):
@@ -104,20 +104,20 @@ def trial_of_record(record: Record, name: str) -> Trial:
 
 
 def subject_of_record(record: Record, name: str) -> LoggedSubject:
-    """A recorded flight as motion capture saw it."""
+    """Return a recorded flight as motion capture saw it."""
     poses = record.poses
     return LoggedSubject(name, poses.time - record.start, poses.position, poses.quaternion)
 
 
 def trial_of_subject(subject: LoggedSubject, reference: Reference | None = None, offset: float = 0.0) -> Trial:
-    """A subject of a log; time 0 at `offset` of its clock."""
+    """Return a subject of a log as a trial; time 0 at `offset` of its clock."""
     return Trial(subject.name, subject.time - offset, subject.position, subject.quaternion, reference)
 
 
 def align(subject: LoggedSubject, reference: Reference) -> Alignment:
-    """Where in the log the plan was flown, by correlation.
+    """Find by correlation where in the log the plan was flown.
 
-    Looked for is the time at which the difference of log and plan varies least, so that neither a shift of the
+    It is the time at which the difference of log and plan varies least, so that neither a shift of the
     laboratory's origin nor what was flown before and after matters. A part of the plan that was not seen counts as if
     it had been missed by the plan's own spread. A vehicle that lags behind its setpoints by a constant time is moved
     by that too: no log by itself can tell the two apart.
@@ -126,7 +126,7 @@ def align(subject: LoggedSubject, reference: Reference) -> Alignment:
     """
     time, position = subject.time[subject.seen], subject.position[subject.seen]
     if len(time) < 2 or time[-1] - time[0] < 2 * STEP:
-        raise InputError("seen for too short a time to be laid over a plan", where=subject.name)
+        raise InputError("seen for too short a time to be aligned with a plan", where=subject.name)
     guess, left_over = _on_grid(time, position, reference)
     offset = _closely(guess, time, position, reference)
     difference = position - reference.at(time - offset)
@@ -146,7 +146,7 @@ def align(subject: LoggedSubject, reference: Reference) -> Alignment:
 
 
 def _on_grid(time: NDArray, position: NDArray, reference: Reference) -> tuple[float, float]:
-    """The best offset in steps of STEP, and what share of the plan's own variance is then left between log and plan."""
+    """Return the best offset in steps of STEP, and the share of the plan's variance left between log and plan."""
     centre = reference.position.mean(axis=0)
     plan_grid = np.arange(0.0, reference.time[-1] + STEP / 2, STEP)
     plan = np.stack([np.interp(plan_grid, reference.time, axis) for axis in (reference.position - centre).T], axis=1)
@@ -172,9 +172,9 @@ def _on_grid(time: NDArray, position: NDArray, reference: Reference) -> tuple[fl
 
 
 def _closely(guess: float, time: NDArray, position: NDArray, reference: Reference) -> float:
-    """The offset near a guess at which the difference of log and plan varies least.
+    """Return the offset near a guess at which the difference of log and plan varies least.
 
-    What part of the plan is seen changes with the offset and draws the guess by a few steps: here that part is kept.
+    The seen part of the plan changes with the offset, which draws the guess by a few steps: here that part is fixed.
     """
     moments = reference.time + guess
     fixed = _near(moments - NEARBY, time) & _near(moments + NEARBY, time)
@@ -191,21 +191,21 @@ def _closely(guess: float, time: NDArray, position: NDArray, reference: Referenc
 
 
 def _resampled(grid: NDArray, time: NDArray, position: NDArray) -> tuple[NDArray, NDArray]:
-    """Positions at the grid's times (N, 3), 0 in gaps, and weights (N,) that are 0 there."""
+    """Return positions at the grid's times (N, 3), 0 in gaps, and weights (N,) that are 0 there."""
     at = np.stack([np.interp(grid, time, axis) for axis in position.T], axis=1)
     weight = _near(grid, time).astype(float)
     return at * weight[:, None], weight
 
 
 def _near(moments: NDArray, time: NDArray) -> NDArray:
-    """(N,) whether the subject was seen shortly before and after each moment."""
+    """Return (N,) whether the subject was seen shortly before and after each moment."""
     after = np.clip(np.searchsorted(time, moments), 1, len(time) - 1)
     gap = max(_LONGEST_GAP, 3 * float(np.median(np.diff(time))))
     return (moments >= time[0]) & (moments <= time[-1]) & (time[after] - time[after - 1] <= gap)
 
 
 def extent(trials: Sequence[Trial]) -> tuple[NDArray, NDArray]:
-    """Lower and upper corner of all that is drawn, (3,) m each."""
+    """Return the lower and upper corner of all that is drawn, (3,) m each."""
     points = [trial.position[np.isfinite(trial.position).all(axis=1)] for trial in trials]
     points += [trial.reference.position for trial in trials if trial.reference is not None]
     everything = np.concatenate([*points, np.zeros((0, 3))])

@@ -1,4 +1,4 @@
-"""How far points lie from a path."""
+"""Measure how far points lie from a path."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ BLOCK = 32  # segments that are passed over at once where the box around them is
 
 
 def distance_to_path(points: NDArray, path: NDArray) -> NDArray:
-    """(N,) m from each of the points (N, 3) to the polyline through path (M, 3)."""
+    """Return (N,) m from each of the points (N, 3) to the polyline through path (M, 3)."""
     corners = np.ascontiguousarray(path, dtype=float)
     if len(corners) == 1:
         corners = np.repeat(corners, 2, axis=0)
@@ -21,7 +21,7 @@ def distance_to_path(points: NDArray, path: NDArray) -> NDArray:
 
 @njit
 def _squares(points: NDArray, path: NDArray, low: NDArray, high: NDArray) -> NDArray:
-    """Block by block, each point beginning with the block in which the point before it found its place."""
+    """Search block by block; each point begins with the block that was nearest to the point before it."""
     found = np.empty(len(points))
     nearest = 0
     for row in range(len(points)):
@@ -45,7 +45,7 @@ def _squares(points: NDArray, path: NDArray, low: NDArray, high: NDArray) -> NDA
 
 @njit
 def _to_segment(point: NDArray, begin: NDArray, end: NDArray) -> float:
-    """m², from a point to a straight line between two others."""
+    """Return m² from a point to a straight line between two others."""
     along = length = 0.0
     for axis in range(3):
         step = end[axis] - begin[axis]

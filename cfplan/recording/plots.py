@@ -1,4 +1,4 @@
-"""What the plots of a flight show: lines over time, and the limits that they are held against."""
+"""The plots of a flight: lines over time, and their limits."""
 
 import math
 from dataclasses import dataclass
@@ -50,12 +50,12 @@ class Plot:
 
     @property
     def title(self) -> str:
-        """What it shows, and its unit."""
+        """What it shows, with the unit."""
         return TITLES[self.name]
 
 
 def plots(record: Record) -> tuple[Plot, ...]:
-    """All plots of a flight, in the order of TITLES."""
+    """Return all plots of a flight, in the order of TITLES."""
     setpoints, estimates, status = record.setpoints, record.estimates, record.status
     bounds, planned, motors = record.header.bounds, record.header.plan_limits, motor_thrust(record)
     off = deviation(record)
@@ -117,17 +117,17 @@ def plots(record: Record) -> tuple[Plot, ...]:
 
 
 def motor_thrust(record: Record) -> NDArray:
-    """(N, 4) N, from the 16-bit commands of the status messages."""
+    """Return (N, 4) N, from the 16-bit commands of the status messages."""
     return record.status.motor / FULL_COMMAND * record.header.thrust_at_full_command
 
 
 def pose_age(record: Record) -> tuple[NDArray, NDArray]:
-    """When each pose but the first came (N-1,), and how old the one before it had become by then (N-1,), both s."""
+    """Return when each pose but the first came (N-1,), and how old the one before it was by then (N-1,), both s."""
     return record.poses.received[1:], record.poses.received[1:] - record.poses.time[:-1]
 
 
 def finite_limits(plot: Plot) -> tuple[float, ...]:
-    """Those that can be drawn."""
+    """Return the limits that can be drawn."""
     return tuple(limit for limit in plot.limits if math.isfinite(limit))
 
 

@@ -1,4 +1,4 @@
-"""Reads a record back, whole or as far as it goes."""
+"""Read a record back, whole or as far as it goes."""
 
 import io
 import json
@@ -43,10 +43,10 @@ _DAMAGE = (
 
 
 def read_record(place: Path) -> Record:
-    """The record in a folder, or in the MCAP file itself.
+    """Read the record in a folder, or in the MCAP file itself.
 
     What was cut off or damaged is left out, and `truncated` says so. Raises InputError where the place holds no record
-    of ours, or not even its header.
+    of cfplan, or not even its header.
     """
     file = _find(Path(place))
     data = _read(file)
@@ -78,7 +78,7 @@ def read_record(place: Path) -> Record:
 
 
 def is_record(place: Path) -> bool:
-    """Whether a folder or a file is a record of ours, damaged or not; other MCAP files and other logs are not."""
+    """Return whether a folder or a file is a record of cfplan, damaged or not; other MCAP files and logs are not."""
     if place.name == FLIGHT_FILE or (place / FLIGHT_FILE).exists():
         return True
     try:
@@ -93,12 +93,12 @@ def _find(place: Path) -> Path:
     if place.is_dir():
         file = place / FLIGHT_FILE
         if not file.is_file():
-            raise InputError(f"no {FLIGHT_FILE} in it", where=str(place), hint="name the folder of one flight")
+            raise InputError(
+                f"the folder holds no {FLIGHT_FILE}", where=str(place), hint="name the folder of one flight"
+            )
         return file
     if not place.exists():
-        raise InputError(
-            "no such record", where=str(place), hint="records lie where `cfplan fly` said, one folder each"
-        )
+        raise InputError("no such record", where=str(place), hint="`cfplan fly` prints the folder of each record")
     return place
 
 
@@ -139,9 +139,9 @@ def _header(values: Mapping[str, str], file: Path) -> RecordHeader:
 
 
 def _entries(data: bytes, place: int, payloads: dict[int, list[bytes]]) -> Iterator[McapRecord]:
-    """The MCAP records that matter from `place` on, those in chunks too, up to the first cut off or damaged.
+    """Yield the MCAP records that matter from `place` on, those in chunks too, up to the first cut off or damaged.
 
-    Messages are so many that they are no objects of their own: what they hold is put into `payloads` by their channel.
+    Messages are too many to be objects: their contents are put into `payloads` by their channel.
     """
     message, head, size = int(Opcode.MESSAGE), _RECORD.unpack_from, _RECORD.size
     try:

@@ -63,7 +63,7 @@ class StatusReports:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Phases:
-    """When the pilot went into which phase."""
+    """When the pilot entered which phase."""
 
     time: NDArray  # (N,) s
     phase: NDArray  # (N,) str, a value of telemetry.Phase
@@ -71,7 +71,7 @@ class Phases:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Events:
-    """What a reader should know."""
+    """Messages for people: warnings, aborts, results."""
 
     time: NDArray  # (N,) s
     level: NDArray  # (N,) str, a value of telemetry.Level
@@ -95,18 +95,18 @@ class Record:
 
     @property
     def start(self) -> float:
-        """s, the earliest time of any message; 0 in a record without messages."""
+        """Return s, the earliest time of any message; 0 in a record without messages."""
         firsts = [float(np.nanmin(times)) for times in self._times() if np.any(np.isfinite(times))]
         return min(firsts, default=0.0)
 
     @property
     def duration(self) -> float:
-        """s, from the first message to the last."""
+        """Return s from the first message to the last."""
         lasts = [float(np.nanmax(times)) for times in self._times() if np.any(np.isfinite(times))]
         return max(lasts, default=self.start) - self.start
 
     def phase_span(self, phase: str) -> tuple[float, float] | None:
-        """s, from the first entry into a phase until the next phase or the record's end; None where it never was."""
+        """Return s from the first entry into a phase until the next or the record's end; None where there was none."""
         entries = np.flatnonzero(self.phases.phase == phase)
         if len(entries) == 0:
             return None

@@ -1,6 +1,6 @@
-"""What a flight came to, in numbers, from its record.
+"""Summarise a record in numbers: travel time, deviation, peaks, lateness, dropouts, battery.
 
-The reference is what was sent: the position of each setpoint at its reference time, straight between them. A pose is
+The reference is the position of each setpoint at its reference time, straight between them. A pose is
 compared with the reference at the pose's own time (deviation in time) and with the nearest point of the path.
 """
 
@@ -24,7 +24,7 @@ DROPOUT = 3.0  # usual intervals between poses: a longer gap is a dropout
 
 @dataclass(frozen=True, slots=True)
 class FlightSummary:
-    """NaN where the record cannot tell."""
+    """The numbers of one flight; NaN where the record does not hold one."""
 
     travel_time_planned: float  # s
     travel_time_flown: float
@@ -48,13 +48,13 @@ class FlightSummary:
     truncated: bool
 
     def to_json(self) -> dict[str, float | int | bool | None]:
-        """For summary.json: what is not known is null."""
+        """Return it for summary.json: what is not known is null."""
         values = asdict(self)
         return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in values.items()}
 
 
 class PoseDeviations(NamedTuple):
-    """How far the vehicle was from where it should have been."""
+    """How far the vehicle was from where it should have been, at each pose."""
 
     time: NDArray  # (N,) s, of the poses
     in_time: NDArray  # (N,) m, from the reference at that time
@@ -62,7 +62,7 @@ class PoseDeviations(NamedTuple):
 
 
 def summarise(record: Record) -> FlightSummary:
-    """All numbers of one flight."""
+    """Return all numbers of one flight."""
     begin, end = reference_span(record)
     along = deviation(record, begin, end)
     settled = settling(record)
@@ -93,9 +93,9 @@ def summarise(record: Record) -> FlightSummary:
 
 
 def reference_span(record: Record) -> tuple[float, float]:
-    """s, from the first deadline of the phase `stream` over the planned time, at most until its last deadline.
+    """Return s from the first deadline of the phase `stream` over the planned time, at most until its last deadline.
 
-    What is streamed longer is the hover behind the end of the path. NaN where nothing was streamed.
+    What is streamed longer is the hover after the end of the path. NaN where nothing was streamed.
     """
     due = _streamed(record)
     if len(due) == 0:
@@ -105,7 +105,7 @@ def reference_span(record: Record) -> tuple[float, float]:
 
 
 def _streamed(record: Record) -> NDArray:
-    """The deadlines of the phase `stream`."""
+    """Return the deadlines of the phase `stream`."""
     span = record.phase_span(Phase.STREAM)
     if span is None:
         return np.empty(0)
@@ -113,7 +113,7 @@ def _streamed(record: Record) -> NDArray:
 
 
 def reference_times(setpoints: Setpoints) -> NDArray:
-    """(N,) s, when the vehicle should have been at each setpoint.
+    """Return (N,) s, when the vehicle should have been at each setpoint.
 
     That is its deadline, but for one sent so late that the pilot sent the state of a later deadline in its place.
     """
@@ -124,7 +124,7 @@ def reference_times(setpoints: Setpoints) -> NDArray:
 
 
 def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -> PoseDeviations:
-    """Of every pose between begin and end that falls in the time of the setpoints."""
+    """Return the deviation of every pose between begin and end that falls in the time of the setpoints."""
     wanted = reference_times(record.setpoints)
     if len(wanted) == 0:
         return PoseDeviations(np.empty(0), np.empty(0), np.empty(0))
@@ -138,9 +138,9 @@ def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -
 
 
 def settling(record: Record) -> float:
-    """s after the end of the reference until the vehicle, held at the path's end, stays within SETTLED of it.
+    """Return s after the end of the reference until the vehicle, held at the path's end, stays within SETTLED of it.
 
-    NaN where the path was not finished, where no pose tells, or where the vehicle was still outside at the last.
+    NaN where the path was not finished, where there is no pose, or where the vehicle was still outside at the last.
     """
     _, end = reference_span(record)
     held = record.phase_span(Phase.HOLD)
@@ -156,7 +156,7 @@ def settling(record: Record) -> float:
 
 
 def finished(record: Record) -> bool:
-    """Whether the whole plan was sent; a stop on the way is encoded apart, with indices of its own."""
+    """Return whether the whole plan was sent; a stop on the way is encoded apart and counts its own indices."""
     due = _streamed(record)
     if len(due) < 2:
         return False
@@ -167,12 +167,12 @@ def finished(record: Record) -> bool:
 
 
 def pose_gaps(times: NDArray) -> NDArray:
-    """s between poses, from their stamps."""
+    """Return s between poses, from their stamps."""
     return np.diff(_finite(times))
 
 
 def dropouts(gaps: NDArray) -> NDArray:
-    """Indices of the gaps that are longer than DROPOUT usual ones."""
+    """Return the indices of the gaps that are longer than DROPOUT usual ones."""
     return np.flatnonzero(gaps > DROPOUT * np.median(gaps)) if len(gaps) else np.empty(0, dtype=int)
 
 

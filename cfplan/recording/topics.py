@@ -1,4 +1,4 @@
-"""How each kind of message stands in a record's MCAP file: its topic, its JSON Schema, and its way to JSON and back."""
+"""The topics of a record's MCAP file: for each kind of message its JSON Schema, and the way to JSON and back."""
 
 import json
 import math
@@ -42,7 +42,7 @@ TOPICS = (
 
 
 def json_schema(message: type) -> dict[str, Any]:
-    """The JSON Schema of a message type, from its fields."""
+    """Return the JSON Schema of a message type, from its fields."""
     hints = get_type_hints(message)
     return {
         "title": message.__name__,
@@ -63,7 +63,7 @@ def _schema(kind: Any) -> dict[str, Any]:
 
 
 def message_to_json(message: telemetry.Telemetry) -> bytes:
-    """Exact: a float reads back as the same float."""
+    """Return the message as JSON. Exact: a float reads back as the same float."""
     values = {f.name: getattr(message, f.name) for f in fields(message)}
     try:
         return json.dumps(values, separators=(",", ":"), allow_nan=False, default=_from_numpy).encode()
@@ -88,7 +88,7 @@ def _finite(value: Any) -> Any:
 
 
 def columns_from_json(topic: Topic, payloads: list[bytes]) -> Any:
-    """The messages of one topic as arrays. Raises ValueError, KeyError or TypeError where they are not its messages."""
+    """Return the messages of one topic as arrays. Raises ValueError, KeyError or TypeError for other messages."""
     hints = get_type_hints(topic.message)
     names = [f.name for f in fields(topic.columns)]
     if not payloads:
@@ -117,7 +117,7 @@ def _arrow_type(kind: Any) -> pa.DataType:
 
 
 def _array(values: Any, kind: Any) -> NDArray:
-    """An Arrow column as NumPy has it: null becomes NaN, and is an error where that cannot be."""
+    """Return an Arrow column as an array: null becomes NaN, and is an error where that cannot be."""
     items = get_args(kind)
     if items:
         lengths = values.value_lengths()
@@ -132,7 +132,7 @@ def _array(values: Any, kind: Any) -> NDArray:
 
 
 def columns_of(topic: Topic, messages: Sequence[telemetry.Telemetry]) -> Any:
-    """Messages of one topic as arrays, as they would be read back from a record."""
+    """Return messages of one topic as arrays, as they would be read back from a record."""
     hints = get_type_hints(topic.message)
     return topic.columns(
         **{f.name: _column([getattr(m, f.name) for m in messages], hints[f.name]) for f in fields(topic.columns)}

@@ -1,7 +1,7 @@
 """Write a record's MCAP file while the flight goes on, without ever holding the flight up.
 
-`write` only puts a message into a queue. A thread of its own takes what has gathered, four times a second, and writes
-it as one chunk, so that a process killed at any moment leaves all but its last instant behind.
+`write` only puts a message into a queue. A thread takes the queued messages, four times a second, and writes them as
+one chunk, so that a process killed at any moment leaves all but its last instant behind.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ class RawFile(Protocol):
 
 
 def wall_time_at_zero() -> float:
-    """s since 1970 when time.monotonic() was zero, for the header."""
+    """Return s since 1970 when time.monotonic() was zero, for the header."""
     return time.time() - time.monotonic()
 
 
@@ -98,7 +98,9 @@ class RecordWriter:
             self._mcap = Writer(cast(IO[bytes], self._sink), chunk_size=1 << 24, compression=CompressionType.ZSTD)
             self._channels = _begin(self._mcap, header)
         except FileExistsError as error:
-            raise InputError("there is a record already", where=str(path), hint="name another folder") from error
+            raise InputError(
+                "the folder holds a record already", where=str(path), hint="name another folder"
+            ) from error
         except OSError as error:
             path.unlink(missing_ok=True)
             raise _cannot_write(path, error) from error
@@ -163,7 +165,7 @@ class RecordWriter:
             self._sink.flush()
 
     def _try(self, action: Callable[[], None], what: str) -> None:
-        """Do it; the first failure of all is told, the others are not: none may reach the flight."""
+        """Do it; warn of the first failure of all. None may reach the flight."""
         try:
             action()
         except Exception as error:
@@ -193,7 +195,7 @@ def _cannot_write(path: Path, error: OSError) -> InputError:
 
 
 class _Sink:
-    """Between the MCAP writer and the disk: a flush writes all or, on failure, leaves the file as it was before."""
+    """A file for the MCAP writer: a flush writes all or, on failure, leaves the file as it was before."""
 
     def __init__(self, file: RawFile):
         self.broken = False

@@ -262,7 +262,7 @@ def test_replay_of_one_record_is_its_own_view(tmp_path, flight):
 def test_replay_lists_the_subjects_where_one_is_not_there(tmp_path, vicon):
     result = run("replay", vicon, "--subject", "cf2", "--save", tmp_path / "a.rrd")
     assert isinstance(result.exception, InputError)
-    assert result.exception.hint == "there are: cf1"
+    assert result.exception.hint == "it has: cf1"
     assert not (tmp_path / "a.rrd").exists()
 
 

@@ -1,4 +1,4 @@
-"""crazyswarm2's CSV of states: one vehicle a file, `timestamp,x,y,z,qw,qx,qy,qz`, SI units, w first."""
+"""Read crazyswarm2's CSV of states: one vehicle a file, `timestamp,x,y,z,qw,qx,qy,qz`, SI units, w first."""
 
 import mmap
 from pathlib import Path
@@ -14,13 +14,13 @@ COLUMNS = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def recognises(file: Path, head: bytes) -> bool:
-    """By the names on its first line."""
+    """Return whether the first line names the columns."""
     names = _names(head)
     return "timestamp" in names and bool({"x", "qw"} & set(names))
 
 
 def read(file: Path) -> MocapLog:
-    """The one vehicle, named as the file is. Raises InputError where a column or a number is not what it should be."""
+    """Read the one vehicle, named as the file is. Raises InputError where a column is missing or a number is none."""
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         begin = data.find(b"\n") + 1 or len(data)
         names = _names(data[:begin])

@@ -1,4 +1,4 @@
-"""Lines of numbers in a mapped text file, read a block of lines at a time, so that its size hardly matters."""
+"""Read lines of numbers from a mapped text file, a block of lines at a time, so that its size hardly matters."""
 
 import mmap
 from collections.abc import Iterator, Sequence
@@ -20,7 +20,7 @@ _NO_NUMBER = ["", " ", "NaN", "nan", "-nan", "NA", "-nan(ind)"]  # what a cell w
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Where the numbers stand."""
+    """Which lines and cells of a file hold the numbers."""
 
     begin: int  # byte of the first line
     end: int  # byte behind the last line
@@ -31,7 +31,7 @@ class Lines:
 
 
 def numbers(data: mmap.mmap, lines: Lines, file: Path) -> tuple[NDArray, bool]:
-    """(rows, wanted), NaN for empty cells; and whether the file's last line was cut off, which is then left out.
+    """Return (rows, wanted), NaN for empty cells, and whether the last line was cut off, which is then left out.
 
     Raises InputError with the file's line where one has another number of cells, or a wanted one is no number.
     """
@@ -53,14 +53,14 @@ def numbers(data: mmap.mmap, lines: Lines, file: Path) -> tuple[NDArray, bool]:
 
 
 def place(data: mmap.mmap, offset: int, file: Path) -> str:
-    """`file:line` of a byte."""
+    """Return `file:line` of a byte."""
     starts = range(0, offset, BLOCK)
     before = sum(data[start : min(start + BLOCK, offset)].count(b"\n") for start in starts)
     return f"{file}:{before + 1}"
 
 
 def is_cut_off(data: mmap.mmap, begin: int, end: int) -> bool:
-    """Whether begin to end is the file's last line, and without its end."""
+    """Return whether begin to end is the file's last line, without its line end."""
     return begin < end == len(data) and data.find(b"\n", begin, end) < 0
 
 
@@ -73,7 +73,7 @@ def _blocks(data: mmap.mmap, lines: Lines) -> Iterator[tuple[int, int]]:
 
 
 def _block(text: bytes, lines: Lines) -> NDArray:
-    """(wanted, rows): a column of the file is a row here, side by side in memory as Arrow has it."""
+    """Return (wanted, rows): a column of the file is a row here, contiguous in memory as Arrow has it."""
     names = [str(index) for index in range(lines.width)]
     kept = [names[index] for index in lines.wanted]
     table = csv.read_csv(
@@ -91,7 +91,7 @@ def _block(text: bytes, lines: Lines) -> NDArray:
 
 
 def _mistake(data: mmap.mmap, begin: int, end: int, lines: Lines, file: Path) -> InputError | None:
-    """Which line, and which of its cells, is no row of numbers."""
+    """Find the first line, and the cell in it, that is not a row of numbers."""
     while begin < end:
         after = data.find(b"\n", begin, end) + 1 or end
         line = data[begin:after].decode("utf-8", errors="replace").strip("\r\n")
@@ -100,7 +100,7 @@ def _mistake(data: mmap.mmap, begin: int, end: int, lines: Lines, file: Path) ->
             return InputError(
                 f"{len(cells)} cells, {lines.width} in the lines before it",
                 where=place(data, begin, file),
-                hint="export it again, or take the line out",
+                hint="export it again, or remove the line",
             )
         for index in lines.wanted if line else ():
             text = cells[index].strip().strip('"')

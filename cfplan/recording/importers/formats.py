@@ -1,4 +1,4 @@
-"""The formats that can be read, told apart by what a file holds, whatever its name."""
+"""The log formats that can be read, recognised by a file's content, not by its name."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ IMPORTERS = (
 
 
 def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
-    """The log in a file or in a bag's folder; `rotations` says what a Vicon CSV's three angles are if it does not.
+    """Read the log in a file or in a bag's folder; `rotations`: of a Vicon CSV whose header does not say.
 
     Raises:
         InputError: not there, empty, of no known format, damaged, or without any pose.
@@ -40,19 +40,19 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
     importer = find_importer(file)
     if importer is None and _is_rerun(file):
         raise InputError(
-            "a recording of rerun's, drawn already",
+            "a rerun recording, not a log",
             where=str(file),
-            hint="open it with `rerun FILE`; `rerun rrd merge FILE -o NEW` mends one that is cut off",
+            hint="open it with `rerun FILE`; `rerun rrd merge FILE -o NEW` repairs one that is cut off",
         )
     if importer is None:
         known = ", ".join(importer.name for importer in IMPORTERS)
-        raise InputError("of no format that is known", where=str(file), hint=f"known are: a cfplan record, {known}")
+        raise InputError("unknown format", where=str(file), hint=f"known: a cfplan record, {known}")
     try:
         log = vicon_csv.read(file, rotations) if importer.read is vicon_csv.read else importer.read(file)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", where=str(file)) from error
     if not any(subject.seen.any() for subject in log.subjects):
-        raise InputError("there is no pose in it", where=str(file), hint="; ".join(log.notes))
+        raise InputError("the log holds no pose", where=str(file), hint="; ".join(log.notes))
     return log
 
 
@@ -64,7 +64,7 @@ def _is_rerun(file: Path) -> bool:
 
 
 def find_importer(file: Path) -> Importer | None:
-    """The importer that knows the file; None where none does. Raises InputError where it is absent or empty."""
+    """Return the importer that recognises the file, or None. Raises InputError where it is absent or empty."""
     head = b""
     if not file.is_dir():
         try:

@@ -1,4 +1,4 @@
-"""What every importer makes of a log: where each subject was, and when."""
+"""The poses of each subject in a log of motion capture or of a vehicle: what every importer returns."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ _LISTED = 12  # names that an error tells at most
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoggedSubject:
-    """One tracked object: poses on a clock of the log's own, NaN where it was not seen."""
+    """One tracked object: poses on the log's clock, NaN where it was not seen."""
 
     name: str
     time: NDArray  # (N,) s, ascending
@@ -22,12 +22,12 @@ class LoggedSubject:
 
     @property
     def seen(self) -> NDArray:
-        """(N,) whether there is a position."""
+        """Return (N,) whether there is a position."""
         return np.isfinite(self.position).all(axis=1)
 
     @property
     def duration(self) -> float:
-        """s, from the first row to the last."""
+        """Return s from the first row to the last."""
         return float(self.time[-1] - self.time[0]) if len(self.time) else 0.0
 
 
@@ -41,17 +41,17 @@ class MocapLog:
     truncated: bool  # the file ends before its time; the subjects hold all that can be read
 
     def select(self, names: Sequence[str], *, where: str = "") -> tuple[LoggedSubject, ...]:
-        """The subjects of these names, all where none is given. Raises InputError that lists what there is."""
+        """Return the subjects of these names, all where none is given. Raises InputError that lists the known names."""
         by_name = {subject.name: subject for subject in self.subjects}
         missing = [name for name in names if name not in by_name]
         if missing:
             listed = ", ".join(list(by_name)[:_LISTED]) + (", …" if len(by_name) > _LISTED else "")
-            raise InputError(f"no subject {missing[0]!r} in it", where=where, hint=f"there are: {listed}")
+            raise InputError(f"the log has no subject {missing[0]!r}", where=where, hint=f"it has: {listed}")
         return tuple(by_name[name] for name in names) if names else self.subjects
 
 
 def unit_quaternions(quaternion: NDArray, *, tolerance: float = 0.05) -> NDArray:
-    """(N, 4) of length 1; NaN where the length is 0 or not known, as logs have it where nothing was seen.
+    """Return them (N, 4) with length 1; NaN where the length is 0 or NaN, as in logs where nothing was seen.
 
     Raises ValueError naming the first row whose length is off by more than the tolerance: that is no quaternion.
     """
@@ -63,7 +63,7 @@ def unit_quaternions(quaternion: NDArray, *, tolerance: float = 0.05) -> NDArray
 
 
 def ascending(time: NDArray) -> NDArray:
-    """Which rows to keep so that time only grows: each that is later than all before it."""
+    """Return which rows to keep so that time only grows: each that is later than all before it."""
     if len(time) == 0:
         return np.zeros(0, dtype=bool)
     latest = np.maximum.accumulate(np.where(np.isfinite(time), time, -np.inf))

@@ -1,4 +1,4 @@
-"""ROS 2 bags (and ROS 1's) with poses, as crazyswarm2, motion_capture_tracking and vicon_bridge record them."""
+"""Read ROS 2 bags (and ROS 1's) with poses, as crazyswarm2, motion_capture_tracking and vicon_bridge record them."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,14 +24,14 @@ _Row = tuple[float, float, float, float, float, float, float, float]
 
 
 def recognises(file: Path, head: bytes) -> bool:
-    """A folder with a bag in it, or a bag's file. Records of cfplan, MCAP too, are told apart before."""
+    """Return whether this is a bag's folder or file. Records of cfplan, MCAP too, are recognised before."""
     if file.is_dir():
         return (file / "metadata.yaml").is_file()
     return head.startswith(tuple(_SUFFIXES))
 
 
 def read(file: Path) -> MocapLog:
-    """Every pose by its topic, or by its name where a message holds several; times are those of the messages' headers.
+    """Read every pose by its topic, or by its name where a message holds several; times are of the messages' headers.
 
     Raises InputError where the extra is not installed, the bag is damaged, or no message in it holds a pose.
     """
@@ -51,9 +51,9 @@ def read(file: Path) -> MocapLog:
             if not wanted:
                 topics = sorted({f"{c.topic} ({c.msgtype})" for c in reader.connections})
                 raise InputError(
-                    f"no topic with poses in it; there are {', '.join(topics[:8]) or 'none'}",
+                    f"no topic holds poses; the bag has {', '.join(topics[:8]) or 'none'}",
                     where=str(file),
-                    hint=f"known are {', '.join(name.rpartition('/')[2] for name in _TYPES)}",
+                    hint=f"known: {', '.join(name.rpartition('/')[2] for name in _TYPES)}",
                 )
             for connection, received, raw in reader.messages(connections=wanted):
                 message = reader.deserialize(raw, connection.msgtype)
@@ -79,7 +79,9 @@ def _check_suffix(file: Path) -> None:
         head = stream.read(len(_SQLITE))
     wanted = next(suffix for magic, suffix in _SUFFIXES.items() if head.startswith(magic))
     if file.suffix != wanted:
-        raise InputError("a bag under another name", where=str(file), hint=f"give it the suffix {wanted}")
+        raise InputError(
+            "the suffix is not that of the bag's format", where=str(file), hint=f"give it the suffix {wanted}"
+        )
 
 
 def _poses(topic: str, kind: str, message: Any, received: float) -> Iterator[tuple[str, _Row]]:
@@ -104,7 +106,7 @@ def _transform(message: Any, received: float) -> _Row:
 
 
 def _stamp(header: Any, received: float) -> float:
-    """s; when it was received, where the header says nothing."""
+    """Return s; the time of receipt where the header has no stamp."""
     stamp = header.stamp
     return stamp.sec + stamp.nanosec * 1e-9 if stamp.sec or stamp.nanosec else received
 

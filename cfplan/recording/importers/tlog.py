@@ -1,4 +1,4 @@
-"""MAVLink .tlog: packets as a ground station received them, each behind 8 bytes of time (big endian, µs since 1970).
+"""Read MAVLink .tlog: a ground station's packets, each after its time (8 bytes, big endian, µs since 1970).
 
 Positions in MAVLink are north, east, down and bodies forward, right, down; ours are z up and forward, left, up, with x
 east and y north (LOCAL_NED), or x forward (LOCAL_FRD).
@@ -34,12 +34,12 @@ _LONGEST_GAP = 0.5  # s between attitudes; over longer ones none is made up
 
 
 def recognises(file: Path, head: bytes) -> bool:
-    """By a plausible time before a packet's first byte."""
+    """Return whether a plausible time stands before a packet's first byte."""
     return len(head) > 8 and head[8] in (V1, V2) and _FIRST < int.from_bytes(head[:8], "big") < _LAST
 
 
 def read(file: Path) -> MocapLog:
-    """The positions that each vehicle reported and the setpoints it followed; what is no packet is passed over.
+    """Read the positions that each vehicle reported and the setpoints it followed; other bytes are skipped.
 
     Raises InputError where the extra is not installed.
     """
@@ -68,7 +68,7 @@ def read(file: Path) -> MocapLog:
                 frames[message.get_srcSystem(), kind] = frame
     notes = []
     if packets.skipped:
-        notes.append(f"{packets.skipped} bytes passed over that are no packet")
+        notes.append(f"{packets.skipped} bytes skipped that are no packet")
     if broken:
         notes.append(f"{broken} packets left out, as their checksums are wrong")
     if packets.cut:
@@ -80,7 +80,7 @@ def read(file: Path) -> MocapLog:
 
 
 class _Packets:
-    """(time in s, bytes) of each packet of a kind that is read; counts what it passes over."""
+    """Yields (time in s, bytes) of each packet of a kind that is read; counts the bytes that it skips."""
 
     def __init__(self, data: mmap.mmap):
         self.data = data
@@ -107,7 +107,7 @@ class _Packets:
             place = after
 
     def _packet(self, place: int) -> tuple[int, int]:
-        """Length and kind of the packet there; length 0 where there is none."""
+        """Return length and kind of the packet there; length 0 where there is none."""
         head = self.data[place : place + 10]
         stamp = int.from_bytes(self.data[place - _STAMP : place], "big")
         if not _FIRST < stamp < _LAST:
@@ -164,7 +164,7 @@ def _subject(name: str, world: Rotation, time: NDArray, position: NDArray, quate
 
 
 def _at(time: NDArray, attitude: NDArray) -> NDArray:
-    """(N, 4) the attitude at each time, NaN where none was reported nearby."""
+    """Return (N, 4) the attitude at each time, NaN where none was reported nearby."""
     turn = unit_quaternions(attitude[:, 1:], tolerance=np.inf)
     known = np.isfinite(turn).all(axis=1)
     stamps, turn = attitude[known, 0], turn[known]

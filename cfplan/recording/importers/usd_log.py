@@ -1,4 +1,4 @@
-"""The log that a Crazyflie writes to its microSD card, as the firmware's usddeck.c lays it out, little endian:
+"""Read the log that a Crazyflie writes to its microSD card, as the firmware's usddeck.c lays it out, little endian:
 
 u8 0xBC, u16 version, u16 event types
 each type: u16 number, name\\0, u16 variables, each `group.name(T)\\0` with T the struct code of its type
@@ -62,14 +62,14 @@ class _EventType:
 
 
 def recognises(file: Path, head: bytes) -> bool:
-    """By its first byte and a small version."""
+    """Return whether it has the log's first byte and a small version."""
     return len(head) >= 3 and head[0] == MAGIC and int.from_bytes(head[1:3], "little") < 16
 
 
 def read(file: Path) -> MocapLog:
-    """Every pose that was logged: that from motion capture, the estimate, the setpoint. Times from the first record.
+    """Read every pose that was logged: motion capture, estimate, setpoint. Times count from the first record.
 
-    Without checksum the log was cut off: what is there is read, and `truncated` says so.
+    Without its checksum the log was cut off: all whole records are read, and `truncated` says so.
     Raises InputError where the checksum is wrong, the head is damaged, or no variables of a pose were logged.
     """
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
@@ -94,7 +94,7 @@ def read(file: Path) -> MocapLog:
             hint="log stateEstimate.x, .y, .z and .qx, .qy, .qz, .qw, named in the card's config.txt",
         )
     if truncated:
-        notes.append("the log ends without its checksum, as when the vehicle loses power; what is there is shown")
+        notes.append("the log ends without its checksum, as when the vehicle loses power; all before that is shown")
     return MocapLog(FORMAT, tuple(subjects), tuple(notes), truncated)
 
 
@@ -136,7 +136,7 @@ def _text(data: mmap.mmap, offset: int) -> tuple[str, int]:
 
 
 def _places(data: mmap.mmap, types: dict[int, _EventType], begin: int) -> tuple[dict[int, list[int]], int]:
-    """Where the rows of each type begin, behind their number, and where the last whole record ends."""
+    """Return where the rows of each type begin, after their number, and where the last whole record ends."""
     sizes = {number: 2 + kind.row.itemsize for number, kind in types.items()}
     places: dict[int, list[int]] = {number: [] for number in types}
     last = len(data)
@@ -151,14 +151,14 @@ def _places(data: mmap.mmap, types: dict[int, _EventType], begin: int) -> tuple[
 
 
 def _check_end(data: mmap.mmap, types: dict[int, _EventType], end: int, file: Path) -> bool:
-    """Whether the log was cut off. Raises InputError where it is whole but not as it was written."""
+    """Return whether the log was cut off. Raises InputError where it is whole but damaged."""
     rest = len(data) - end
     if rest == 4 and _checksum(data, end) == int.from_bytes(data[end:], "little"):
         return False
     if rest < 2 or (data[end] | data[end + 1] << 8) in types:  # a record that was not written to its end
         return True
     what = "the checksum is wrong" if rest == 4 else f"damaged at byte {end}"
-    raise InputError(f"{what}: the log is not as it was written", where=str(file), hint="copy it from the card again")
+    raise InputError(f"{what}: the log is damaged", where=str(file), hint="copy it from the card again")
 
 
 def _checksum(data: mmap.mmap, end: int) -> int:
@@ -169,7 +169,7 @@ def _checksum(data: mmap.mmap, end: int) -> int:
 
 
 def _rows(data: mmap.mmap, row: np.dtype, offsets: NDArray) -> NDArray:
-    """(N,) of the row's type, gathered a block at a time."""
+    """Return (N,) of the row's type, gathered a block at a time."""
     whole = np.frombuffer(data, dtype=np.uint8)
     rows = np.empty(len(offsets), dtype=row)
     step = max(1, _BLOCK // row.itemsize)

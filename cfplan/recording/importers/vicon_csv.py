@@ -1,4 +1,4 @@
-"""Vicon Tracker's and Nexus's CSV: sections of frames at a fixed rate, a subject every few columns."""
+"""Read Vicon Tracker's and Nexus's CSV: sections of frames at a fixed rate, a subject every few columns."""
 
 import mmap
 import re
@@ -33,15 +33,15 @@ class _Rows:
 
 
 def recognises(file: Path, head: bytes) -> bool:
-    """By a section's name and rate on the first two lines, or by the columns Frame and Sub Frame."""
+    """Return whether two lines are a section's name and rate, or there are columns Frame and Sub Frame."""
     head = head.removeprefix(b"\xef\xbb\xbf")
     return bool(head) and (_BEGIN.match(head) is not None or _FRAME.search(head) is not None)
 
 
 def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
-    """Every subject of every section; markers too, as positions without orientation.
+    """Read every subject of every section; markers too, as positions without orientation.
 
-    `rotations` says what three angles are where the header does not; without it they are taken as helical.
+    `rotations` says what three angles are where the header does not; the default is helical.
 
     Raises InputError where a head, a unit or a number is wrong; a last line that is cut off only ends the log.
     """
@@ -59,7 +59,7 @@ class _Reading:
         self.truncated = False
 
     def sections(self) -> list[_Rows]:
-        """All of the file, in order."""
+        """Read all sections of the file, in order."""
         parts: list[_Rows] = []
         for begin, end in self._stretches():
             if parts and self.data[begin : begin + 1] in b'0123456789-"':  # a blank line between frames
@@ -72,7 +72,7 @@ class _Reading:
         return parts
 
     def _stretches(self) -> Iterator[tuple[int, int]]:
-        """What stands between blank lines."""
+        """Yield begin and end of each stretch between blank lines."""
         offset = 3 if self.data[:3] == b"\xef\xbb\xbf" else 0
         while (first := _CONTENT.search(self.data, offset)) is not None:
             begin = max(self.data.rfind(b"\n", offset, first.start()) + 1, offset)
@@ -82,7 +82,7 @@ class _Reading:
             offset = end
 
     def _lines(self, begin: int, end: int) -> tuple[list[str], int]:
-        """The lines of a head, and where its frames begin. A line of subjects may be blank but for one: not split."""
+        """Return the lines of a head and where its frames begin. Most of a line of subjects may be blank."""
         lines: list[str] = []
         while len(lines) < _HEAD_LINES and begin < end:
             after = self.data.find(b"\n", begin, end) + 1 or end
@@ -151,7 +151,7 @@ def _log(parts: list[_Rows], reading: _Reading, file: Path) -> MocapLog:
             column = after
     rates = dict.fromkeys(f"{part.section.rate:g}" for part in parts if part.section.groups)
     if len(rates) > 1:
-        notes.append(f"sections of {' and '.join(rates)} Hz, each with times of its own")
+        notes.append(f"sections of {' and '.join(rates)} Hz, each with its own times")
     assumed = [group.name for part in parts for group in part.section.groups if group.assumed]
     if assumed:
         notes.append(f"the header does not say what the angles of {', '.join(assumed)} are: taken as helical")
@@ -161,7 +161,7 @@ def _log(parts: list[_Rows], reading: _Reading, file: Path) -> MocapLog:
 
 
 def _subject(group: Group, time: NDArray, values: NDArray, file: Path) -> LoggedSubject:
-    """One subject's poses; a row of nothing but zeros is an occlusion, as some exports write it."""
+    """Return one subject's poses; a row of zeros alone is an occlusion, as some exports write it."""
     count = len(group.rotation_columns)
     unseen = np.isnan(values[:, count:]).any(axis=1) | (values == 0).all(axis=1)
     position = np.where(unseen[:, None], np.nan, values[:, count:] * group.position_scale)
@@ -184,7 +184,7 @@ def _subject(group: Group, time: NDArray, values: NDArray, file: Path) -> Logged
 
 
 def _quaternion(kind: Rotations, rotation: NDArray) -> NDArray:
-    """(N, 4) from what the columns hold, NaN where that is NaN."""
+    """Return (N, 4) from the columns' rotations, NaN where those are NaN."""
     if kind is Rotations.QUATERNION:
         return unit_quaternions(rotation)
     quaternion = np.full((len(rotation), 4), np.nan)

@@ -1,4 +1,4 @@
-"""The head of one section of a Vicon CSV: which columns hold which subject, in which unit.
+"""Read the head of one section of a Vicon CSV: which columns hold which subject, in which unit.
 
 Objects                                                          section
 100                                                              rate, Hz
@@ -17,7 +17,7 @@ from cfplan.errors import InputError
 
 
 class Rotations(StrEnum):
-    """What the columns of a subject say of its orientation."""
+    """How the columns of a subject state its orientation."""
 
     QUATERNION = "quaternion"  # x y z w
     HELICAL = "helical"  # rotation vector
@@ -63,7 +63,7 @@ class Section:
 
 
 def read_head(lines: list[str], *, where: str, rotations: Rotations | None) -> Section:
-    """From the five lines of a head. Raises InputError where a line is not what it should be."""
+    """Read the five lines of a head. Raises InputError where a line is malformed."""
     name = _first_cell(lines[0])
     rate = _rate(lines[1] if len(lines) > 1 else "", name, where)
     if len(lines) < 4:
@@ -119,7 +119,7 @@ def _rate(line: str, section: str, where: str) -> float:
 def _group(
     title: str, headings: list[str], units: list[str], columns: range, where: str, rotations: Rotations | None
 ) -> Group | None:
-    """The subject under a title; None where its columns are no pose. Raises InputError where some are missing."""
+    """Return the subject under a title; None where it is no pose. Raises InputError where columns are missing."""
     at = {headings[index]: index for index in reversed(columns) if headings[index]}
     match = _NAME.match(title)
     word = (match["word"] or "").lower() if match else ""
@@ -141,20 +141,20 @@ def _group(
     length = _unit(units, place, LENGTHS, name, where)
     if wanted is _QUATERNION:
         return Group(name, Rotations.QUATERNION, turn, 1.0, place, length, False)
-    said = Rotations.EULER if "euler" in word else Rotations.HELICAL if "helical" in word else None
-    kind = said or rotations or Rotations.HELICAL
+    stated = Rotations.EULER if "euler" in word else Rotations.HELICAL if "helical" in word else None
+    kind = stated or rotations or Rotations.HELICAL
     angle = _unit(units, turn, ANGLES, name, where)
-    return Group(name, kind, turn, angle, place, length, assumed=said is None and rotations is None)
+    return Group(name, kind, turn, angle, place, length, assumed=stated is None and rotations is None)
 
 
 def _subject(name: str) -> str:
-    """`cf1` for `cf1:cf1`, an object and its only segment; other names as they are."""
+    """Return `cf1` for `cf1:cf1`, an object and its only segment; other names as they are."""
     subject, _, segment = name.strip().partition(":")
     return subject if subject == segment else name.strip()
 
 
 def _unit(units: list[str], columns: tuple[int, ...], known: dict[str, float], name: str, where: str) -> float:
-    """The factor to SI, where all the columns have one unit that is known."""
+    """Return the factor to SI. Raises InputError unless all the columns have one known unit."""
     found = sorted({units[column].lower().strip("()[] ") if column < len(units) else "" for column in columns})
     if len(found) == 1 and found[0] in known:
         return known[found[0]]

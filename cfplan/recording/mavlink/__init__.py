@@ -1,3 +1,3 @@
-"""A flight told to MAVLink ground stations, and their commands."""
+"""MAVLink telemetry to ground stations during a flight, and their commands."""
 
 __all__ = ["bridge"]

@@ -1,6 +1,6 @@
 """The MAVLink bridge: to and from ground stations during a flight, without ever holding the flight up.
 
-A thread of the main process, never of the pilot's, sends what the main process was told of the flight and listens for
+A thread of the main process, never of the pilot's, sends the pilot's telemetry and listens for
 commands to stop. Those come out of `orders`, on the same way into the pilot as the keys. All packets of both
 directions are kept in a .tlog: each behind its time, µs since 1970, 8 bytes big endian.
 """
@@ -53,30 +53,30 @@ class Place:
 
 
 def parse_place(text: str) -> Place:
-    """From udp:HOST:PORT. Raises InputError."""
+    """Read udp:HOST:PORT. Raises InputError."""
     kind, _, rest = text.partition(":")
     host, _, port = rest.rpartition(":")
     if kind != "udp" or not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise InputError("not a place for MAVLink", where=text, hint=_FORM)
+        raise InputError("not a MAVLink address", where=text, hint=_FORM)
     return Place(host.strip("[]"), int(port))
 
 
 def check_place(text: str) -> None:
-    """Raises InputError where this is no place for MAVLink, where it cannot be reached, or the extra is missing."""
+    """Check that MAVLink can be sent there. Raises InputError; also where the extra is not installed."""
     _dialect()
     link, _ = _open(parse_place(text))
     link.close()
 
 
 class GroundStation:
-    """The link to one ground station; in the air while it is entered.
+    """The link to one ground station; sends and receives while it is entered.
 
-    `show` takes what the pilot reports and returns at once; `orders` gives what was commanded since the last call.
+    `show` takes a message of the pilot's and returns at once; `orders` returns the commands since the last call.
     Only a ground station on this machine is heard where the place is one on this machine.
     """
 
     def __init__(self, place: Place, log: Path | None = None, *, boot: float | None = None):
-        """Raises InputError where the extra is not installed, the place is none, or the log cannot be written."""
+        """Raises InputError where the extra is missing, the place cannot be reached or the log cannot be written."""
         self._mav = _dialect().MAVLink(self, srcSystem=SYSTEM, srcComponent=COMPONENT)
         self._latest = messages.Latest(time.monotonic() if boot is None else boot)
         self._texts: deque[tuple[int, str]] = deque(maxlen=200)
@@ -130,14 +130,14 @@ class GroundStation:
                 self._texts.append((_SEVERITY[level], text))
 
     def orders(self) -> list[Order]:
-        """What was commanded since the last call; never waits."""
+        """Return the commands since the last call; never waits."""
         given = []
         while self._orders:
             given.append(self._orders.popleft())
         return given
 
     def write(self, packet: bytes) -> None:
-        """Send a packet; what the dialect's encoder calls."""
+        """Send a packet; the dialect's encoder calls this."""
         self._keep(packet)
         with contextlib.suppress(OSError):  # nobody listens there now
             self._socket.sendto(packet, self._to)
@@ -217,7 +217,7 @@ class GroundStation:
         return message.target_system in (BROADCAST, SYSTEM) and message.target_component in (BROADCAST, COMPONENT)
 
     def _reply(self, message: Any, sender: Any) -> None:
-        """To whoever asked, wherever the telemetry goes."""
+        """Send a reply to the sender of the request, not to where the telemetry goes."""
         self._to = sender
         try:
             self._mav.send(message)
@@ -238,9 +238,9 @@ class GroundStation:
 
 
 def messages_in(data: bytes) -> Iterator[tuple[bytes, Any]]:
-    """The packets of a datagram that are whole and known, in order, each with what it says.
+    """Yield the packets of a datagram that are whole and known, in order, each with its message.
 
-    Each datagram is looked at by itself, so that garbage in one can never swallow a command in the next.
+    Each datagram is decoded alone, so that garbage in one can never swallow a command in the next.
     """
     dialect = _dialect()
     place = 0
@@ -259,7 +259,7 @@ def messages_in(data: bytes) -> Iterator[tuple[bytes, Any]]:
 
 
 def _size(data: bytes, place: int) -> int:
-    """Length of the packet that begins there; 0 where none does."""
+    """Return the length of the packet that begins there; 0 where none does."""
     if data[place] == _V2 and place + 2 < len(data):
         return 12 + data[place + 1] + (13 if data[place + 2] & _SIGNED else 0)
     if data[place] == _V1 and place + 1 < len(data):
@@ -278,7 +278,7 @@ def _dialect() -> Any:
 
 
 def _open(place: Place) -> tuple[socket.socket, Any]:
-    """A socket that only this machine reaches where the place is on this machine; and the place's address."""
+    """Open a socket, which only this machine reaches where the place is on it; return it and the place's address."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(place.host, place.port, type=socket.SOCK_DGRAM)[0]
         link = socket.socket(family, kind)

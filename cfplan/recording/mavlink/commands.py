@@ -1,4 +1,4 @@
-"""What a ground station may command: to stop. Everything else is refused, and every command is answered.
+"""Answer a ground station's commands: it may stop a flight; everything else is refused.
 
 MAVLink is not authenticated, so nothing is obeyed that arms or moves the vehicle; a stop only makes things safer,
 whoever sends it.
@@ -30,7 +30,7 @@ class Result(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """To one command."""
+    """The answer to one command."""
 
     result: Result
     order: Order | None = None  # for the pilot
@@ -39,7 +39,7 @@ class Answer:
 
 
 def answer(command: int, parameters: tuple[float, ...]) -> Answer:
-    """To MAV_CMD `command` with its first two parameters, which may be anything, NaN too."""
+    """Answer MAV_CMD `command` with its first two parameters, which may be any number or NaN."""
     first, second = parameters[:2]
     if command == _LAND:
         return Answer(Result.ACCEPTED, Order.LAND, "landing, as the ground station commands")
@@ -55,7 +55,7 @@ def answer(command: int, parameters: tuple[float, ...]) -> Answer:
 
 
 def command_of(message: Any) -> tuple[int, tuple[float, float]] | None:
-    """The command in a COMMAND_LONG or COMMAND_INT; None for other messages."""
+    """Return the command in a COMMAND_LONG or COMMAND_INT; None for other messages."""
     if message.get_type() not in ("COMMAND_LONG", "COMMAND_INT"):
         return None
     return int(message.command), (float(message.param1), float(message.param2))

@@ -1,4 +1,4 @@
-"""Between our axes (world z up, body forward, left, up) and MAVLink's (north, east, down; body forward, right, down).
+"""Convert from our axes (world z up, body forward, left, up) to MAVLink's (north, east, down; forward, right, down).
 
 A laboratory has no north: its y axis is sent as north and its x axis as east, so that yaw turns the right way and a
 log that is read back lies as the flight did. Quaternions are x y z w here and w x y z there.
@@ -13,25 +13,25 @@ _HALF = math.sqrt(0.5)
 
 
 def ned(vector: Triple) -> Triple:
-    """A vector in world axes."""
+    """Convert a vector in world axes."""
     x, y, z = vector
     return y, x, -z
 
 
 def frd(vector: Triple) -> Triple:
-    """A vector in body axes."""
+    """Convert a vector in body axes."""
     x, y, z = vector
     return x, -y, -z
 
 
 def attitude(quaternion: Quaternion) -> Quaternion:
-    """body→world, x y z w, as (w, x, y, z) from forward, right, down to north, east, down."""
+    """Convert body→world, x y z w, to (w, x, y, z) from forward, right, down to north, east, down."""
     x, y, z, w = quaternion
     return _HALF * (w + z), _HALF * (x + y), _HALF * (x - y), _HALF * (w - z)
 
 
 def in_body(vector: Triple, quaternion: Quaternion) -> Triple:
-    """A vector in world axes, turned into the axes of the body that has this attitude."""
+    """Turn a vector in world axes into the axes of the body that has this attitude."""
     x, y, z, w = quaternion
     vx, vy, vz = vector
     # v + 2 u × (u × v + w v) with the conjugate, u = (-x, -y, -z)
@@ -40,7 +40,7 @@ def in_body(vector: Triple, quaternion: Quaternion) -> Triple:
 
 
 def euler(wxyz: Quaternion) -> Triple:
-    """rad: roll, pitch, yaw of an attitude as MAVLink has it; yaw is clockwise from north."""
+    """Return roll, pitch, yaw, rad, of an attitude as MAVLink has it; yaw is clockwise from north."""
     w, x, y, z = wxyz
     roll, pitch = roll_pitch_of((x, y, z, w))
     return float(roll), float(pitch), float(yaw_of((x, y, z, w)))

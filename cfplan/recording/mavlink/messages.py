@@ -1,4 +1,4 @@
-"""What is sent to ground stations: the newest of what the pilot reports, each message at its own rate."""
+"""Make the messages for ground stations of the pilot's newest telemetry, each at its own rate."""
 
 import math
 from collections.abc import Callable
@@ -24,7 +24,7 @@ _LANDED_STATES = {Phase.TAKE_OFF: _TAKING_OFF, Phase.LAND: _LANDING}
 
 @dataclass(slots=True)
 class Latest:
-    """The newest of each kind; None where there was none yet."""
+    """The newest message of each kind; None where there was none yet."""
 
     start: float  # s on the pilot's clock, counted as the vehicle's boot
     estimate: Estimate | None = None
@@ -131,7 +131,7 @@ def autopilot_version(mav: Any, latest: Latest) -> Any:
 
 
 def status_texts(mav: Any, severity: int, text: str, number: int) -> list[Any]:
-    """One message, or several that belong together where the text is long."""
+    """Return one message, or several that belong together where the text is long."""
     data = text.encode()
     pieces = [data[i : i + TEXT_LENGTH] for i in range(0, len(data), TEXT_LENGTH)] or [b""]
     if len(pieces) == 1:

@@ -1,3 +1,3 @@
-"""A page with a flight's figures and charts."""
+"""The report: a page with a flight's figures and charts."""
 
 __all__ = ["page", "report"]

@@ -1,6 +1,6 @@
-"""Charts as SVG text: lines over time with their limits, and places seen from above or from a side.
+"""Draw charts as SVG text: lines over time with their limits, and places seen from above or from a side.
 
-Nothing is needed to see them but a browser. Where there are more points than pixels, the least and the largest of each
+A browser alone shows them. Where there are more points than pixels, the least and the largest of each
 pixel's width are drawn, so that no spike is lost.
 """
 
@@ -37,9 +37,9 @@ class Curve:
 def time_chart(
     title: str, curves: Sequence[Curve], *, limits: Sequence[float] = (), band: tuple[float, float] | None = None
 ) -> str:
-    """Curves over time in s, the limits as level lines, the band (the time along the path) shaded.
+    """Draw curves over time in s, the limits as level lines, the band (the time along the path) shaded.
 
-    A limit far above all that was measured is named rather than drawn, or nothing else could be seen.
+    A limit far above all measured values is named, not drawn, or nothing else could be seen.
     """
     x = _span([curve.x for curve in curves])
     y = _span([curve.y for curve in curves])
@@ -68,7 +68,7 @@ def time_chart(
 
 
 def place_chart(title: str, curves: Sequence[Curve], axes: tuple[str, str]) -> str:
-    """Curves in m over m, both axes to the same scale."""
+    """Draw curves in m over m, both axes to the same scale."""
     x, y = _span([curve.x for curve in curves]), _span([curve.y for curve in curves])
     (left, right), (low, high) = _padded(*x), _padded(*y)
     narrow = max(NARROWEST - (right - left), 0.0) / 2
@@ -87,7 +87,7 @@ def place_chart(title: str, curves: Sequence[Curve], axes: tuple[str, str]) -> s
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """From values to places in the chart."""
+    """The mapping from values to places in the chart."""
 
     left: float
     right: float
@@ -112,13 +112,13 @@ def _span(arrays: Sequence[NDArray]) -> tuple[float, float]:
 
 
 def _padded(low: float, high: float) -> tuple[float, float]:
-    """With some room around; what begins at zero stays there."""
+    """Return the range with some room around it; a range that begins at zero still does."""
     room = 0.05 * (high - low)
     return (0.0 if low == 0 else low - room), high + room
 
 
 def ticks(low: float, high: float, count: int = 6) -> list[float]:
-    """Round numbers between low and high, about `count` of them."""
+    """Return round numbers between low and high, about `count` of them."""
     raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw * (1 - 1e-9))
@@ -148,7 +148,7 @@ def _label(value: float) -> str:
 
 
 def _line(frame: _Frame, curve: Curve) -> str:
-    """A path with a new begin behind every gap."""
+    """Draw a curve that begins anew after every gap."""
     rows = thinned(curve.x, curve.y, COLUMNS) if _rising(curve.x) else np.arange(len(curve.x))
     x, y = frame.x(curve.x[rows]), frame.y(curve.y[rows])
     known = np.isfinite(x) & np.isfinite(y)
@@ -165,7 +165,7 @@ def _rising(x: NDArray) -> bool:
 
 
 def thinned(x: NDArray, y: NDArray, columns: int) -> NDArray:
-    """Rows enough to draw y over rising x: of each column the first, the last, the least, the largest, and a gap."""
+    """Return rows enough to draw y over rising x: of each column the first, last, least, largest, and a gap."""
     if len(x) <= 4 * columns:
         return np.arange(len(x))
     width = (x[-1] - x[0]) / columns
@@ -200,7 +200,7 @@ def _svg(
 
 
 def _css(colour: Colour) -> str:
-    """For white paper: as it is, or darkened."""
+    """Return the colour for white paper, darkened where it is too light."""
     red, green, blue = colour
     luminance = (0.2126 * red + 0.7152 * green + 0.0722 * blue) / 255
     factor = min(1.0, LIGHTEST / luminance) if luminance > 0 else 1.0

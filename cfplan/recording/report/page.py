@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing else: tables, charts, events, certificate, provenance."""
+"""Write the report as one self-contained HTML page: tables, charts, events, certificate, provenance."""
 
 import html
 import os
@@ -32,7 +32,7 @@ td.n, th.n { text-align: right; } .note { background: #fff6e0; padding: .4em .8e
 
 
 def page(flights: Sequence[ReportedFlight]) -> str:
-    """The whole page; of several flights a comparison first."""
+    """Return the whole page; several flights are compared first."""
     title = flights[0].record.header.name if len(flights) == 1 else f"{len(flights)} flights"
     parts = [f"<h1>{html.escape(title)}</h1>", _summary(flights)]
     if len(flights) > 1:
@@ -51,7 +51,7 @@ def page(flights: Sequence[ReportedFlight]) -> str:
 def write_page(flights: Sequence[ReportedFlight], file: Path, *, overwrite: bool = False) -> None:
     """Write the page; whole or not at all. Raises InputError where the file cannot be."""
     if file.exists() and not overwrite:
-        raise InputError("there is a file already", where=str(file), hint="name another with -o, or add --force")
+        raise InputError("the file exists already", where=str(file), hint="name another with -o, or add --force")
     content = page(flights)
     unfinished = ""
     try:
@@ -69,7 +69,7 @@ def write_page(flights: Sequence[ReportedFlight], file: Path, *, overwrite: bool
 
 
 def _summary(flights: Sequence[ReportedFlight]) -> str:
-    """One row a number, one column a flight."""
+    """Return a table with a row for each number and a column for each flight."""
     columns = [rows(flight) for flight in flights]
     head = "" if len(flights) == 1 else "".join(f'<th class="n">{html.escape(f.name)}</th>' for f in flights)
     body = [
@@ -91,22 +91,22 @@ def _comparison(flights: Sequence[ReportedFlight]) -> str:
         ("Speed, m/s", [trial.speed for trial in trials]),
     ):
         curves = [
-            Curve(trial.name, trial.time[rows_], value[rows_], COLOURS[index % len(COLOURS)])
-            for index, (trial, value, rows_) in enumerate(zip(trials, values, over, strict=True))
+            Curve(trial.name, trial.time[along_rows], value[along_rows], COLOURS[index % len(COLOURS)])
+            for index, (trial, value, along_rows) in enumerate(zip(trials, values, over, strict=True))
         ]
         charts.append(time_chart(f"{title}, from the begin of the path", curves))
     return f'<h2>Side by side</h2><div class="charts">{"".join(charts)}</div>'
 
 
 def _along(trial: Trial) -> np.ndarray:
-    """The rows while the path was flown; all where there was none."""
+    """Return the rows while the path was flown; all where there was none."""
     if trial.reference is None or len(trial.reference.time) == 0:
         return np.arange(len(trial.time))
     return np.flatnonzero((trial.time >= 0) & (trial.time <= trial.reference.time[-1]))
 
 
 def _views(trials: Sequence[Trial]) -> list[str]:
-    """From above, and beside it from two sides."""
+    """Draw the room from above, and beside it from two sides."""
     sides = "".join(_places(trials, name, across, up) for name, across, up in _SIDES)
     return [_places(trials, "From above", 0, 1), f"<div>{sides}</div>"]
 
@@ -118,9 +118,9 @@ def _places(trials: Sequence[Trial], title: str, across: int, up: int) -> str:
     ]
     for index, trial in enumerate(trials):
         colour = COLOURS[index % len(COLOURS)] if len(trials) > 1 else FLOWN
-        rows_ = _along(trial)
+        along_rows = _along(trial)
         label = trial.name if len(trials) > 1 else "flown"
-        curves.append(Curve(label, trial.position[rows_, across], trial.position[rows_, up], colour))
+        curves.append(Curve(label, trial.position[along_rows, across], trial.position[along_rows, up], colour))
     return place_chart(title, curves, ("xyz"[across], "xyz"[up]))
 
 
@@ -152,17 +152,19 @@ def _flight(flight: ReportedFlight) -> str:
 
 def _events(flight: ReportedFlight) -> str:
     record = flight.record
-    said = [
+    entries = [
         (time, str(level), str(text))
         for time, level, text in zip(record.events.time, record.events.level, record.events.text, strict=True)
     ]
-    said += [(time, "phase", str(phase)) for time, phase in zip(record.phases.time, record.phases.phase, strict=True)]
-    if not said:
+    entries += [
+        (time, "phase", str(phase)) for time, phase in zip(record.phases.time, record.phases.phase, strict=True)
+    ]
+    if not entries:
         return "<h3>Events</h3><p>None were recorded.</p>"
     lines = [
         f'<tr class="{html.escape(level)}"><td class="n">{time - record.start:.2f} s</td><td>{html.escape(level)}</td>'
         f"<td>{html.escape(text)}</td></tr>"
-        for time, level, text in sorted(said, key=lambda entry: entry[0])
+        for time, level, text in sorted(entries, key=lambda entry: entry[0])
     ]
     return f"<h3>Events</h3><table>{''.join(lines)}</table>"
 

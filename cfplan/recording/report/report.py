@@ -1,4 +1,4 @@
-"""What is reported of a flight: its numbers, its certificate, its events, and where it all came from."""
+"""Gather what is reported of a flight: its numbers, its certificate, its events, its provenance."""
 
 import math
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from cfplan.safety.certificate import Certificate
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportedFlight:
-    """One record with all that is derived from it."""
+    """One record with everything derived from it."""
 
     name: str  # of its folder
     record: Record
@@ -29,7 +29,7 @@ class ReportedFlight:
 
 
 def read_flight(place: Path) -> ReportedFlight:
-    """A record, with the plan that lies beside it. Raises InputError where it is no record."""
+    """Read a record, with the plan that lies beside it. Raises InputError where it is no record."""
     record = read_record(place)
     summary, header = summarise(record), record.header
     notes = ["The record ends early: what follows its last whole chunk is lost."] if record.truncated else []
@@ -50,7 +50,7 @@ def read_flight(place: Path) -> ReportedFlight:
         except CfplanError as error:
             notes.append(f"Its plan cannot be read: {error.what}.")
     else:
-        notes.append("There is no plan beside it, so no certificate either.")
+        notes.append("No plan lies beside it, so there is no certificate.")
     return ReportedFlight(
         name=record.folder.resolve().name,
         record=record,
@@ -81,9 +81,9 @@ def _provenance(record: Record) -> list[tuple[str, str]]:
 
 
 def outcome(flight: ReportedFlight) -> str:
-    """How it ended, as the pilot said."""
-    said = flight.record.summary.get("outcome")
-    return str(said.get("reason") or UNKNOWN) if isinstance(said, Mapping) else UNKNOWN
+    """Return how it ended, in the pilot's words."""
+    ended = flight.record.summary.get("outcome")
+    return str(ended.get("reason") or UNKNOWN) if isinstance(ended, Mapping) else UNKNOWN
 
 
 def rows(flight: ReportedFlight) -> list[tuple[str, str]]:
@@ -103,7 +103,7 @@ def _verdict(certificate: Certificate | None) -> str:
 
 
 def flight_to_dict(flight: ReportedFlight) -> dict[str, Any]:
-    """For JSON: all numbers in SI."""
+    """Return the report for JSON: all numbers in SI."""
     record = flight.record
     events = zip(record.events.time - record.start, record.events.level, record.events.text, strict=True)
     return {

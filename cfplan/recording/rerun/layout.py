@@ -1,4 +1,4 @@
-"""Where each part of the rerun view stands."""
+"""The layout of the rerun view: the name of each entity, and the blueprint."""
 
 from typing import Literal
 
@@ -36,7 +36,7 @@ _STATES = "Phases, limit that holds the plan back, supervisor"
 
 
 def blueprint(header: RecordHeader, *, play_state: PlayState = "paused") -> rrb.Blueprint:
-    """3-D at the left, the plots beside it in two columns, phases, events and the summary below."""
+    """Return the layout: 3-D at the left, the plots beside it in two columns, phases, events and the summary below."""
     grid = rrb.Grid(*(_plot(name, title) for name, title in TITLES.items()), grid_columns=2)
     below = rrb.Horizontal(
         rrb.StateTimelineView(contents=[PHASES, ACTIVE_LIMIT, SUPERVISOR], name=_STATES),
@@ -67,16 +67,11 @@ def _plot(name: str, title: str) -> rrb.TimeSeriesView:
 
 
 def _room(header: RecordHeader) -> rrb.Spatial3DView:
-    """The room from above one of its long sides, such that the whole fence is in sight."""
+    """Return the 3-D view from above one of the room's long sides, with the whole fence in sight."""
     low, high = np.array(header.fence)
     centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
     target = (*centre[:2], low[2] + 0.1 * (high - low)[2])
     aside = (0.66, -0.17, 0.45) if high[1] - low[1] > high[0] - low[0] else (-0.17, -0.66, 0.45)
-    tail = rrb.VisibleTimeRange(
-        TIMELINE,
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TAIL_SECONDS),
-        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0),
-    )
     ever = rrb.VisibleTimeRange(
         TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0)
     )
@@ -84,8 +79,8 @@ def _room(header: RecordHeader) -> rrb.Spatial3DView:
         origin=WORLD,
         name=header.name,
         overrides={
-            TAIL: [rrb.VisibleTimeRanges([tail])],
-            WANTED_TAIL: [rrb.VisibleTimeRanges([tail])],
+            TAIL: [tail_range()],
+            WANTED_TAIL: [tail_range()],
             FLOWN: [rrb.VisibleTimeRanges([ever])],
         },
         line_grid=False,
@@ -93,3 +88,13 @@ def _room(header: RecordHeader) -> rrb.Spatial3DView:
             position=centre + size * np.array(aside), look_target=target, eye_up=(0.0, 0.0, 1.0)
         ),
     )
+
+
+def tail_range() -> rrb.VisibleTimeRanges:
+    """Return the range in which a tail is shown: the last TAIL_SECONDS."""
+    tail = rrb.VisibleTimeRange(
+        TIMELINE,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TAIL_SECONDS),
+        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0),
+    )
+    return rrb.VisibleTimeRanges([tail])

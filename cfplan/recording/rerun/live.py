@@ -1,7 +1,7 @@
-"""The flight in rerun while it goes on, from what the main process is told of it; the pilot's process never sees this.
+"""Show a flight in rerun as it happens, from the main process's telemetry; the pilot's process takes no part.
 
-Messages are only put into a queue; a thread sends what has gathered as columns, ten times a second. The viewer is a
-process of its own at a low priority: the setpoints come first.
+Messages are only put into a queue; a thread sends the queued ones as columns, ten times a second. The viewer is a
+separate process at a low priority: the setpoints come first.
 """
 
 import contextlib
@@ -41,7 +41,7 @@ _GOODBYE = 3.0  # s
 
 
 def open_live(header: RecordHeader, folder: Path) -> "LiveView":
-    """A live view in a viewer's window, of a flight whose plan lies in the record's folder.
+    """Open a viewer's window on a flight whose plan lies in the record's folder.
 
     Raises InputError where there is no screen.
     """
@@ -61,7 +61,7 @@ def open_live(header: RecordHeader, folder: Path) -> "LiveView":
 
 
 def live_blueprint(header: RecordHeader) -> rrb.Blueprint:
-    """The same as of a replay, but the time follows."""
+    """Return a replay's layout, with the time following."""
     return layout.blueprint(header, play_state="following")
 
 
@@ -132,7 +132,7 @@ class LiveView:
 
 
 def _part(header: RecordHeader, messages: list[Telemetry]) -> Record:
-    """Some messages of a flight, as if they were all of it."""
+    """Return some messages of a flight as a record."""
     streams = {
         topic.stream: columns_of(topic, [message for message in messages if type(message) is topic.message])
         for topic in TOPICS

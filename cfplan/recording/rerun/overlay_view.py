@@ -1,4 +1,4 @@
-"""Several flights in one rerun recording: each trial its colour, the references dashed."""
+"""Draw several flights in one rerun recording: each trial in its colour, the references dashed."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cfplan.recording.overlay import Reference, Trial, extent
 from cfplan.recording.plots import FOUR, WANTED, Colour
-from cfplan.recording.rerun.layout import PLOTS, TAIL_SECONDS, TIMELINE, WORLD
+from cfplan.recording.rerun.layout import PLOTS, TIMELINE, WORLD, tail_range
 from cfplan.recording.rerun.picture import write_png
 from cfplan.recording.rerun.record_view import (
     FLOOR_COLOUR,
@@ -44,7 +44,7 @@ def show_overlay(trials: Sequence[Trial]) -> None:
 def picture_overlay(
     trials: Sequence[Trial], file: Path, *, moment: float | None = None, overwrite: bool = False
 ) -> tuple[str, ...]:
-    """Write a PNG of the view at a moment, s from the begin of the path; else half-way. What the viewer complains of.
+    """Write a PNG of the view at a moment, s from the begin of the path; else half-way. Return the viewer's complaints.
 
     Raises InputError as write_png does.
     """
@@ -55,7 +55,7 @@ def picture_overlay(
 
 
 def blueprint(trials: Sequence[Trial]) -> rrb.Blueprint:
-    """3-D at the left; deviation where there are references, speed and the coordinates at the right."""
+    """Return the layout: 3-D at the left; deviation where there are references, speed and coordinates at the right."""
     names = {"speed": "Speed, m/s", **{axis: f"{axis}, m" for axis in _AXES}}
     if references(trials):
         names = {"deviation": "Deviation, m", **names}
@@ -76,15 +76,10 @@ def _room(trials: Sequence[Trial]) -> rrb.Spatial3DView:
     low, high = extent(trials)
     centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 1.0)
     aside = (0.9, -0.35, 0.6) if high[1] - low[1] > high[0] - low[0] else (-0.35, -0.9, 0.6)
-    tail = rrb.VisibleTimeRange(
-        TIMELINE,
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TAIL_SECONDS),
-        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0),
-    )
     return rrb.Spatial3DView(
         origin=WORLD,
         name="Trials",
-        overrides={f"{_TRIAL}/{i}/tail": [rrb.VisibleTimeRanges([tail])] for i in range(len(trials))},
+        overrides={f"{_TRIAL}/{i}/tail": [tail_range()] for i in range(len(trials))},
         line_grid=False,
         eye_controls=rrb.EyeControls3D(
             position=centre + size * np.array(aside), look_target=centre, eye_up=(0.0, 0.0, 1.0)
@@ -93,7 +88,7 @@ def _room(trials: Sequence[Trial]) -> rrb.Spatial3DView:
 
 
 def references(trials: Sequence[Trial]) -> tuple[Reference, ...]:
-    """Each that any trial follows, once: trials of one plan share theirs."""
+    """Return each reference that any trial follows, once: trials of one plan share theirs."""
     found: list[Reference] = []
     for reference in (trial.reference for trial in trials):
         if reference is not None and not any(_same(reference, other) for other in found):
@@ -102,7 +97,7 @@ def references(trials: Sequence[Trial]) -> tuple[Reference, ...]:
 
 
 def _same(one: Reference, other: Reference) -> bool:
-    """Whether both lead along the same places at the same times, as far as anyone could see."""
+    """Return whether both lead along the same places at the same times, within what can be seen."""
     if one is other:
         return True
     if abs(one.time[-1] - other.time[-1]) > 0.05:
@@ -134,7 +129,7 @@ def log_trials(stream: rr.RecordingStream, trials: Sequence[Trial]) -> None:
 
 
 def dashes(points: NDArray) -> list[NDArray]:
-    """(M, 3) as pieces DASH long with gaps of the same length between them."""
+    """Return (M, 3) as pieces DASH long with gaps of the same length between them."""
     if len(points) < 2:
         return []
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
@@ -145,7 +140,7 @@ def dashes(points: NDArray) -> list[NDArray]:
 
 
 def stretches(trial: Trial) -> list[NDArray]:
-    """The rows between the gaps in which it was not seen."""
+    """Return the rows of each stretch in which it was seen."""
     seen = np.isfinite(trial.position).all(axis=1)
     edges = np.flatnonzero(np.diff(seen.astype(int))) + 1
     pieces = np.split(np.arange(len(seen)), edges)
@@ -173,7 +168,7 @@ def _log_track(stream: rr.RecordingStream, entity: str, trial: Trial, colour: Co
 
 
 def _drawn(trial: Trial) -> NDArray:
-    """The rows to draw in 3-D: those in which it was seen, not more of them than can be told apart."""
+    """Return the rows to draw in 3-D: those in which it was seen, no more of them than can be distinguished."""
     seen = np.flatnonzero(np.isfinite(trial.position).all(axis=1))
     if len(seen) < 2:
         return seen

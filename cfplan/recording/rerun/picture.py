@@ -1,4 +1,4 @@
-"""Pictures of the rerun view, made without a screen: rerun's own viewer on whatever Vulkan driver there is."""
+"""Make pictures of the rerun view without a screen, by rerun's viewer on any Vulkan driver."""
 
 import contextlib
 import os
@@ -35,7 +35,7 @@ class View:
 def write_png(
     file: Path, blueprint: rrb.Blueprint, draw: Draw, moment: float, *, overwrite: bool = False
 ) -> tuple[str, ...]:
-    """Write the whole view as it stands at a moment, s on the timeline, and tell what the viewer complains of.
+    """Write the whole view at a moment, s on the timeline, and return the viewer's complaints.
 
     Raises InputError where the file cannot be written or where there is nothing to draw with.
     """
@@ -61,23 +61,23 @@ class HeadlessViewer:
     @classmethod
     @contextlib.contextmanager
     def opened(cls, recording: Path, size: tuple[int, int] = SIZE) -> "Iterator[HeadlessViewer]":
-        """With a recording loaded. Raises InputError where there is no driver, or where it does not load."""
+        """Open a viewer with a recording loaded. Raises InputError where there is no driver, or loading fails."""
         port = free_port()
-        with tempfile.TemporaryDirectory(prefix="cfplan-") as folder, (Path(folder) / "said").open("wb+") as said:
+        with tempfile.TemporaryDirectory(prefix="cfplan-") as folder, (Path(folder) / "output").open("wb+") as output:
             process = subprocess.Popen(
                 [
                     viewer_program(), "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1", "--port", str(port),
                     "--window-size", f"{size[0]}x{size[1]}",
                 ],
                 env={"XDG_RUNTIME_DIR": folder, **os.environ, "RERUN_ANALYTICS": "false"},
-                stdin=subprocess.DEVNULL, stdout=said, stderr=said,
+                stdin=subprocess.DEVNULL, stdout=output, stderr=output,
             )  # fmt: skip
             try:
                 viewer = cls(_client(port, process))
                 viewer._open(recording)
                 yield viewer
             except ConnectionError:
-                raise _explained(process, Path(said.name)) from None
+                raise _explained(process, Path(output.name)) from None
             finally:
                 process.kill()
                 process.wait()
@@ -87,7 +87,7 @@ class HeadlessViewer:
         end = time.monotonic() + _LOADS_WITHIN
         while self._client.get_state().loading:
             if time.monotonic() > end:
-                raise InputError("the viewer does not come to an end of loading it", where=str(recording))
+                raise InputError("the viewer does not finish loading it", where=str(recording))
             time.sleep(0.1)
 
     def go_to(self, moment: float) -> None:
@@ -96,25 +96,25 @@ class HeadlessViewer:
         time.sleep(_SETTLES)
 
     def views(self) -> tuple[View, ...]:
-        """All that the window holds, those behind others in tabs too."""
+        """Return all views of the window, those behind others in tabs too."""
         return tuple(
             View(view.name or "", tuple(str(report) for report in view.reports), str(view.view_id))
             for view in self._client.get_state().views
         )
 
     def picture(self, view: View | None = None) -> bytes:
-        """A PNG of one view, or of the whole window."""
+        """Return a PNG of one view, or of the whole window."""
         return self._client.take_screenshot(view.identity if view is not None else None)
 
     def complaints(self) -> tuple[str, ...]:
-        """What could not be drawn, and what went wrong at all."""
-        told = [f"{view.name}: {report}" for view in self.views() for report in view.reports]
-        told += [entry.message for entry in self._client.get_logs() if entry.level.upper() == "ERROR"]
-        return tuple(told)
+        """Return what could not be drawn, and every other error."""
+        complaints = [f"{view.name}: {report}" for view in self.views() for report in view.reports]
+        complaints += [entry.message for entry in self._client.get_logs() if entry.level.upper() == "ERROR"]
+        return tuple(complaints)
 
 
 def _client(port: int, process: subprocess.Popen) -> Any:
-    """Once the viewer listens. Raises ConnectionError where it does not, or ends instead."""
+    """Connect once the viewer listens. Raises ConnectionError where it does not, or ends instead."""
     from rerun.experimental import ViewerClient
 
     end = time.monotonic() + _STARTS_WITHIN
@@ -129,15 +129,15 @@ def _client(port: int, process: subprocess.Popen) -> Any:
             time.sleep(0.1)
 
 
-def _explained(process: subprocess.Popen, said: Path) -> InputError:
-    """Why the viewer left: it listens before it knows whether it can draw."""
+def _explained(process: subprocess.Popen, output: Path) -> InputError:
+    """Explain why the viewer ended: it listens before it knows whether it can draw."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(5.0)
-    text = said.read_text(errors="replace")
+    text = output.read_text(errors="replace")
     if any(words in text for words in _NO_DRIVER_WORDS):
         return InputError(
             "there is no Vulkan driver to draw with",
             hint="install a software one (Debian: apt install mesa-vulkan-drivers), or --save and look at it elsewhere",
         )
-    lines = [line.strip() for line in text.splitlines() if line.strip()] or ["it said nothing"]
+    lines = [line.strip() for line in text.splitlines() if line.strip()] or ["it printed nothing"]
     return InputError(f"the viewer ended: {lines[-1][:200]}", hint="--save writes what it should have shown")

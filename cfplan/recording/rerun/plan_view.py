@@ -1,4 +1,4 @@
-"""What is known of the plan, in the rerun view: where it was put together, and where which limit holds it back."""
+"""Draw the plan in the rerun view: where its pieces join, and where which limit holds it back."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -43,7 +43,7 @@ class ActiveLimits:
     name: NDArray  # (N,) str: the limit that is used most, where that is at least ACTIVE of it, else FREE
 
     def stretches(self) -> list[tuple[str, slice]]:
-        """Each run of samples with one name, in order; neighbours share a sample, so that lines meet."""
+        """Return each run of samples with one name, in order; neighbours share a sample, so that lines meet."""
         edges = [0, *(np.flatnonzero(self.name[1:] != self.name[:-1]) + 1), len(self.name)]
         return [
             (str(self.name[begin]), slice(int(begin), min(int(end) + 1, len(self.name))))
@@ -52,7 +52,7 @@ class ActiveLimits:
 
 
 def active_limits(plan: Plan) -> ActiveLimits:
-    """Sampled every STEP."""
+    """Sample the active limit every STEP."""
     trajectory = plan.trajectory
     time = np.append(np.arange(0.0, trajectory.duration, STEP), trajectory.duration)
     used = shares(trajectory, plan.limits.plan, time)
@@ -62,7 +62,7 @@ def active_limits(plan: Plan) -> ActiveLimits:
 
 
 def log_plan(stream: rr.RecordingStream, record: Record) -> None:
-    """Send what the plan beside a record tells; nothing where there is none that can be read."""
+    """Send the plan beside a record; nothing where there is none that can be read."""
     try:
         plan = load_plan(record.folder / PLAN_FILE)
     except CfplanError:

@@ -1,4 +1,4 @@
-"""A flight as a rerun recording: room, path and vehicle in 3-D, plots with their limits, phases and events.
+"""Draw a flight as a rerun recording: room, path and vehicle in 3-D, plots with their limits, phases and events.
 
 Everything is sent as whole columns after the flight; the stream's process never sees any of this. All times are seconds
 since the record's first message, on the one timeline `flight`.
@@ -46,14 +46,14 @@ def write_rrd(record: Record, file: Path, *, overwrite: bool = False) -> None:
 
 
 def show(record: Record) -> None:
-    """Open the viewer on the recording; it stays open by itself. Raises InputError where there is no screen."""
+    """Open the viewer on the recording; it outlives this command. Raises InputError where there is no screen."""
     open_viewer(layout.blueprint(record.header), partial(log_record, record=record))
 
 
 def picture(record: Record, file: Path, *, moment: float | None = None, overwrite: bool = False) -> tuple[str, ...]:
-    """Write a PNG of the view at a moment, s since the record's start; else amid the path.
+    """Write a PNG of the view at a moment, s since the record's start; else in the middle of the path.
 
-    What the viewer complains of. Raises InputError as write_png does.
+    Return the viewer's complaints. Raises InputError as write_png does.
     """
     begin, end = reference_span(record)
     middle = (begin + end) / 2 - record.start if np.isfinite(begin) else record.duration / 2
@@ -96,7 +96,7 @@ def log_room(stream: rr.RecordingStream, header: RecordHeader) -> None:
 
 
 def floor_lines(low: NDArray, high: NDArray) -> list[NDArray]:
-    """Lines on the floor, 1 m apart, beneath the box from low to high, both (3,) m."""
+    """Return lines on the floor, 1 m apart, beneath the box from low to high, both (3,) m."""
     low, high = np.floor(low), np.ceil(high)
     xs, ys = np.arange(low[0], high[0] + 0.5), np.arange(low[1], high[1] + 0.5)
     across = [np.array([[x, low[1], 0.0], [x, high[1], 0.0]]) for x in xs]
@@ -104,7 +104,7 @@ def floor_lines(low: NDArray, high: NDArray) -> list[NDArray]:
 
 
 def log_styles(stream: rr.RecordingStream, shown: Sequence[Plot]) -> None:
-    """Send how everything is drawn that has a time."""
+    """Send the styles of everything that has a time."""
     stream.log(layout.BODY, rr.TransformAxes3D(AXIS_LENGTH), static=True)
     stream.log(layout.THRUST, rr.Arrows3D.from_fields(colors=[THRUST_COLOUR], radii=[0.008]), static=True)
     for plot in shown:
@@ -122,7 +122,7 @@ def log_styles(stream: rr.RecordingStream, shown: Sequence[Plot]) -> None:
 
 
 def log_columns(stream: rr.RecordingStream, record: Record, shown: Sequence[Plot], start: float) -> None:
-    """Send all rows of a record, or of a part of one, and of its plots; the timeline calls `start` 0, s."""
+    """Send all rows of a record, or of a part of one, and of its plots; `start`, s, is 0 on the timeline."""
     poses, setpoints = record.poses, record.setpoints
     for entity, tail, times, moving, colour, radius in (
         (layout.BODY, layout.TAIL, poses.time, poses, FLOWN_COLOUR, TAIL_RADIUS),
@@ -153,7 +153,7 @@ def _log_whole_track(stream: rr.RecordingStream, record: Record) -> None:
 
 
 def _log_thrust(stream: rr.RecordingStream, record: Record, start: float) -> None:
-    """An arrow along the body's z axis, by what the four motors are told: in hover as long as HOVER_ARROW."""
+    """Send an arrow along the body's z axis, by the commands to the four motors; HOVER_ARROW long in hover."""
     status, poses = record.status, record.poses
     if len(status.time) == 0 or len(poses.time) == 0:
         return
@@ -164,7 +164,7 @@ def _log_thrust(stream: rr.RecordingStream, record: Record, start: float) -> Non
 
 
 def log_outline(stream: rr.RecordingStream, entity: str, arm: float, times: NDArray, colour: Colour) -> None:
-    """The outline of the vehicle from the first of the times to the last, so that it never stands at the origin.
+    """Send the outline of the vehicle from the first of the times to the last, so that it never stands at the origin.
 
     With one time alone it stands from then on.
     """
@@ -177,7 +177,7 @@ def log_outline(stream: rr.RecordingStream, entity: str, arm: float, times: NDAr
 
 
 def vehicle_outline(arm: float) -> list[NDArray]:
-    """Two crossed arms and four rotors in body axes, m; a motor stands at ±arm in x and in y."""
+    """Return two crossed arms and four rotors in body axes, m; a motor stands at ±arm in x and in y."""
     angle = np.linspace(0, 2 * np.pi, 25)
     circle = 0.6 * arm * np.stack([np.cos(angle), np.sin(angle), np.zeros(25)], axis=1)
     corners = arm * np.array([[1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]], dtype=float)
@@ -192,7 +192,7 @@ def log_tail(
     colour: Colour,
     radius: float = TAIL_RADIUS,
 ) -> None:
-    """Each step as a short line at its own time; the layout shows those of the last seconds."""
+    """Send each step as a short line at its own time; the layout shows those of the last seconds."""
     stream.log(entity, rr.LineStrips3D.from_fields(colors=[colour], radii=[radius]), static=True)
     for begin in range(0, len(times) - 1, STRIPS_AT_ONCE):
         some = slice(begin, begin + STRIPS_AT_ONCE + 1)
@@ -201,14 +201,14 @@ def log_tail(
 
 
 def _steps(positions: NDArray) -> pa.ListArray:
-    """From each position to the next, as Arrow has strips; rerun's own conversion takes 30 µs a strip."""
+    """Return a strip from each position to the next, as Arrow has strips; rerun's conversion takes 30 µs a strip."""
     ends = np.stack([positions[:-1], positions[1:]], axis=1).astype(np.float32)
     points = pa.FixedSizeListArray.from_arrays(pa.array(ends.reshape(-1)), type=_STRIP.value_type)
     return pa.ListArray.from_arrays(pa.array(np.arange(0, 2 * len(ends) + 1, 2, dtype=np.int32)), points, type=_STRIP)
 
 
 def log_limits(stream: rr.RecordingStream, shown: Sequence[Plot], times: Sequence[float]) -> None:
-    """The level lines of every plot, at some times, s on the timeline."""
+    """Send the level lines of every plot, at some times, s on the timeline."""
     for plot in shown:
         levels = finite_limits(plot)
         if levels:

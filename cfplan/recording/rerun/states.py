@@ -39,6 +39,6 @@ SUPERVISOR_COLOURS = {
 
 
 def supervisor_states(bits: NDArray) -> NDArray:
-    """(N,) supervisor.info to (N,) str: the gravest of its bits that is set."""
+    """Return (N,) str for (N,) supervisor.info: the gravest of its bits that is set."""
     flags = [(bits >> place) & 1 == 1 for _, place in _SUPERVISOR_BITS]
     return np.select(flags, [name for name, _ in _SUPERVISOR_BITS], default="not ready")

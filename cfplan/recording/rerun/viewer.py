@@ -1,4 +1,4 @@
-"""How anything drawn in rerun reaches people: as a file, or in the viewer's window."""
+"""Save a rerun recording to a file, or open it in the viewer's window."""
 
 import contextlib
 import os
@@ -31,7 +31,7 @@ def save(file: Path, blueprint: rrb.Blueprint, draw: Draw, *, overwrite: bool = 
 
 
 def open_viewer(blueprint: rrb.Blueprint, draw: Draw) -> None:
-    """Open the viewer on what `draw` sends; it stays open by itself. Raises InputError where there is no screen."""
+    """Open the viewer on what `draw` sends; it outlives this command. Raises InputError where there is no screen."""
     require_screen("save the recording: --save flight.rrd, or draw it: --png flight.png")
     with rr.RecordingStream(APPLICATION) as stream:
         rr.spawn(
@@ -45,32 +45,32 @@ def open_viewer(blueprint: rrb.Blueprint, draw: Draw) -> None:
 
 
 def lay_out(stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
-    """Have the viewer take this blueprint; else it takes the one in which its window was left the last time."""
+    """Send this blueprint; else the viewer takes the one that its window had last."""
     stream.send_blueprint(blueprint, make_active=True, make_default=True)
 
 
 def require_screen(hint: str) -> None:
-    """Raises InputError with this hint where no window can be opened."""
+    """Check that a window can be opened. Raises InputError with this hint where it cannot."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError("there is no screen to open the viewer on", hint=hint)
 
 
 def free_port() -> int:
-    """A port on this machine that nobody listens on now."""
+    """Return a free port on this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def refuse_existing(file: Path, *, overwrite: bool) -> None:
-    """Raises InputError where the file is there already and is not to be overwritten."""
+    """Check that the file may be written. Raises InputError where it exists and is not to be overwritten."""
     if file.exists() and not overwrite:
-        raise InputError("there is a file already", where=str(file), hint="name another file, or add --force")
+        raise InputError("the file exists already", where=str(file), hint="name another file, or add --force")
 
 
 @contextlib.contextmanager
 def whole_file(file: Path) -> Iterator[Path]:
-    """A name to write under, which becomes the file's own when the block ends well. Raises InputError for OSError."""
+    """Yield a temporary name; rename it to the file's when the block ends well. Raises InputError for OSError."""
     unfinished = file.with_name(file.name + ".part")
     try:
         yield unfinished
@@ -87,5 +87,5 @@ def whole_file(file: Path) -> Iterator[Path]:
 
 
 def viewer_program() -> Path:
-    """rerun's own; not the `rerun` found by name, which is absent where the environment is not activated."""
+    """Return rerun's viewer; not the `rerun` found by name, which is absent where the environment is not activated."""
     return Path(rerun_cli.__file__).with_name("rerun.exe" if sys.platform == "win32" else "rerun")

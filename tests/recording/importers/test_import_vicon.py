@@ -150,7 +150,7 @@ def test_sections_of_other_rates_have_times_of_their_own_and_forces_are_left_out
     np.testing.assert_allclose(log.subjects[0].time, np.arange(40) / RATE)
     np.testing.assert_allclose(log.subjects[1].time, np.arange(40) / (RATE / 2))
     assert "Devices" in log.notes[0]
-    assert log.notes[1] == f"sections of {RATE:g} and {RATE / 2:g} Hz, each with times of its own"
+    assert log.notes[1] == f"sections of {RATE:g} and {RATE / 2:g} Hz, each with its own times"
 
 
 def test_a_gap_in_the_frame_numbers_is_a_gap_in_time(tmp_path):
@@ -183,7 +183,7 @@ def test_a_subject_that_is_not_there_is_answered_with_those_that_are(tmp_path):
     assert [s.name for s in log.select(["gate"])] == ["gate"]
     with pytest.raises(InputError, match="no subject 'cf2'") as caught:
         log.select(["cf2"])
-    assert caught.value.hint == "there are: cf1, gate"
+    assert caught.value.hint == "it has: cf1, gate"
 
 
 HEAD = "Objects\n100\n,,cf1:cf1,,,,,\nFrame,Sub Frame,RX,RY,RZ,TX,TY,TZ\n,,deg,deg,deg,mm,mm,mm\n"
@@ -260,7 +260,7 @@ def test_a_last_line_that_is_cut_off_ends_the_log_and_is_said(tmp_path):
 def test_what_is_no_log_is_told_so(tmp_path, content):
     file = tmp_path / "log.csv"
     file.write_bytes(content)
-    with pytest.raises(InputError, match=r"empty|no format"):
+    with pytest.raises(InputError, match=r"empty|unknown format"):
         read_log(file)
 
 

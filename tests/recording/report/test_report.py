@@ -139,7 +139,7 @@ def test_texts_are_shown_as_they_are_never_run(folder, text):
 def test_a_record_without_a_plan_says_so(folder):
     flight = read_flight(folder)
     assert flight.certificate is None
-    assert "no plan beside it" in page([flight])
+    assert "No plan lies beside it" in page([flight])
 
 
 def test_the_certificate_is_that_of_the_plan_beside_the_record(flight, tmp_path, made_plan):
