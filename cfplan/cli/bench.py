@@ -12,6 +12,7 @@ from cfplan.cli.output import print_json, print_table
 from cfplan.errors import InputError
 
 if TYPE_CHECKING:
+    from cfplan.flight.pilot.mission import Mission
     from cfplan.studies.result import StudyResult
 
 _output = click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the result here, as JSON.")
@@ -175,11 +176,10 @@ def faults(path_file: Path, only: tuple[str, ...], **given: Any) -> None:
     """Fly along PATH with one fault a flight, at full speed, and judge what the pilot does about it."""
     from cfplan.studies.fault_scenarios import SCENARIOS
     from cfplan.studies.faults import fault_table
-    from cfplan.studies.missions import plan_mission
 
     def run(**rest: Any) -> "StudyResult":
         wanted = [row for row in SCENARIOS if not only or any(text in row.name for text in only)]
-        mission = plan_mission(path_file, _safety_file(path_file))
+        mission = _prepared_mission(path_file)
         return fault_table(mission, path_file.stem, scenarios=wanted, **rest)
 
     _measure(run, "flying", given)
@@ -194,11 +194,10 @@ def faults(path_file: Path, only: tuple[str, ...], **given: Any) -> None:
 @options.as_json
 def random_faults(path_files: tuple[Path, ...], count: int, first_seed: int, **given: Any) -> None:
     """Fly along each PATH in turn with random faults: kind, moment, length and size are drawn by seeds."""
-    from cfplan.studies.missions import plan_mission
     from cfplan.studies.random_faults import random_flights
 
     def run(**rest: Any) -> "StudyResult":
-        missions = {file.stem: plan_mission(file, _safety_file(file)) for file in path_files}
+        missions = {file.stem: _prepared_mission(file) for file in path_files}
         return random_flights(missions, seeds=range(first_seed, first_seed + count), **rest)
 
     _measure(run, "flying", given)
@@ -216,6 +215,13 @@ def docs(folder: Path) -> None:
 
 def _safety_file(path_file: Path) -> Path:
     return options.find_safety_file(None, path_file)
+
+
+def _prepared_mission(path_file: Path) -> "Mission":
+    from cfplan.preparation.prepare_flight import prepare_flight
+    from cfplan.safety.limits_file import load_limits
+
+    return prepare_flight(path_file, load_limits(_safety_file(path_file))).mission
 
 
 def _use_one_thread() -> None:

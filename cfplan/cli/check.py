@@ -1,12 +1,12 @@
 """`cfplan check`: the certificate of a plan or of a path."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json
-from cfplan.cli.rehearsal import PlanOptions, certify_bytes, obtain_plan
 from cfplan.errors import ExitCode
 
 
@@ -14,27 +14,26 @@ from cfplan.errors import ExitCode
 @options.path_or_plan
 @options.planning
 @options.as_json
-def check(
-    path_or_plan: Path,
-    safety_file: Path | None,
-    planner: str,
-    nodes: int | None,
-    speed_factor: float | None,
-    as_json: bool,
-) -> int:
+def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> int:
     """Check every limit along a path's plan, or along a plan file's, and the bytes that would fly it.
 
     Exit code 4 where a limit is exceeded.
     """
-    from cfplan.cli.certificate_table import print_certificate
-
     steps = Steps(as_json=as_json)
-    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_factor), steps)
+    limits = options.read_limits(safety_file, path_or_plan, steps)
+
+    from cfplan.cli.certificate_table import print_certificate
+    from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+
+    planned = plan_flight(path_or_plan, limits, FlightOptions(**planning), steps)
     if as_json:
-        print_json(flight.to_dict())
+        print_json(planned.to_dict())
     else:
-        print_certificate(flight.plan.certificate)
-    if not flight.plan.certificate.passed:
+        print_certificate(planned.plan.certificate)
+    if not planned.plan.certificate.passed:
         return int(ExitCode.NOT_CERTIFIED)
-    certify_bytes(flight, steps)
+
+    from cfplan.preparation.prepare_flight import encode_flight
+
+    encode_flight(planned, steps)
     return 0

@@ -12,53 +12,53 @@ from cfplan.cli.vehicle import SIMULATED
 from cfplan.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
-    from cfplan.flight.pilot.mission import Mission
+    from cfplan.preparation.prepare_flight import PreparedFlight
 
-FIRST_SPEED = 0.3  # share at which a path should be flown first
+FIRST_SPEED = 0.3  # factor on the speed at which a path should be flown first
 
 
-def confirmed(name: str, mission: "Mission", uri: str, records: Path, *, yes: bool, speed_factor: float | None) -> bool:
-    """Whether to fly: always with a virtual vehicle or --yes, else what a person answers.
+def confirmed(prepared: "PreparedFlight", uri: str, records: Path, *, yes: bool, speed_factor: float | None) -> bool:
+    """Return whether to fly: always with a virtual vehicle or --yes, otherwise what the person answers.
 
-    Raises InputError where there is nobody to ask.
+    Raises InputError where standard input is not a terminal.
     """
     if yes or uri.startswith(SIMULATED):
         return True
-    click.echo(what_it_does(name, mission, uri), err=True)
+    name = prepared.planned.name
+    click.echo(describe(prepared, uri), err=True)
     if not flown_before(name, records) and (speed_factor is None or speed_factor > FIRST_SPEED):
         click.echo(
             f"No flight of {name!r} on hardware is in {records}: fly it with --speed {FIRST_SPEED} first.", err=True
         )
     if not sys.stdin.isatty():
-        raise InputError("nobody is there to say yes", where=uri, hint="fly from a terminal, or give --yes")
+        raise InputError("not a terminal: cannot ask for confirmation", where=uri, hint="--yes")
     return click.confirm("Fly?", err=True)
 
 
-def what_it_does(name: str, mission: "Mission", uri: str) -> str:
-    """Time, speed, fence, how to end it, and where it ends if nobody can."""
+def describe(prepared: "PreparedFlight", uri: str) -> str:
+    """Say how long, how fast and where it will fly, how to end it, and where link loss would end it."""
     import numpy as np
 
     from cfplan.flight.setpoints.packets import decode
-    from cfplan.simulation.link_loss import orphaned
 
+    mission, lost = prepared.mission, prepared.link_loss
     speed = float(np.linalg.norm(decode(mission.payloads).velocity, axis=1).max())
     space = mission.limits.space
     walls = ", ".join(
         f"{axis} {low:.2f} to {high:.2f} m" for axis, low, high in zip("xyz", space.low, space.high, strict=True)
     )
-    lost = orphaned(mission.payloads, mission.limits, mission.rate)
-    calmer = "a lower --speed" if mission.limits.firmware.watchdog else "a lower --speed, or firmware.watchdog,"
-    nearer = f" With {calmer} it would not come so far." if lost.beyond > 0 else ""
+    remedy = "a lower --speed" if mission.limits.firmware.watchdog else "a lower --speed, or firmware.watchdog,"
+    advice = f" With {remedy} it would not come so far." if lost.beyond > 0 else ""
     return (
-        f"{uri} will take off to {mission.take_off_height:g} m, go to the start of {name!r}, fly it in "
-        f"{mission.motion_ends:.1f} s at up to {speed:.1f} m/s, and land where it ends.\n"
-        f"Nobody may be inside {walls}. Space lands it, Esc cuts the motors.\n"
-        f"If the pilot's process or the radio dies, it stops its motors by itself: {lost}.{nearer}"
+        f"{uri} will take off to {mission.take_off_height:g} m, go to the start of {prepared.planned.name!r}, fly it "
+        f"in {mission.motion_ends:.1f} s at up to {speed:.1f} m/s, and land where it ends.\n"
+        f"Keep everybody out of {walls}. Space lands it, Esc cuts the motors.\n"
+        f"If the pilot's process or the radio dies, it stops its motors by itself: {lost}.{advice}"
     )
 
 
 def flown_before(name: str, records: Path) -> bool:
-    """Whether a record says that a path of this name was flown to its end on hardware."""
+    """Return whether a record says that a path of this name was flown to its end on hardware."""
     from cfplan.recording.record import SUMMARY_FILE
 
     for file in records.glob(f"*/{SUMMARY_FILE}"):

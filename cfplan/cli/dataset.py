@@ -1,13 +1,16 @@
 """`cfplan dataset`: labelled paths for training."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from cfplan.cli import options
 from cfplan.cli.output import print_json, print_table
 from cfplan.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
 @click.group(short_help="Labelled paths for training.")
@@ -73,17 +76,6 @@ def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **wha
 
     The same options give the same rows, whatever the number of workers; solves that fail are rows with a reason.
     """
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
     from cfplan.geometry.yaw import YawMode
     from cfplan.learning.dataset import make_dataset
     from cfplan.learning.dataset_spec import DatasetSpec, Relabel
@@ -93,18 +85,7 @@ def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **wha
         raise InputError(f"no limit set {what['limits']!r}", where="--limits", hint=f"one of {', '.join(LIMIT_SETS)}")
     spec = DatasetSpec(**what | {"yaw": YawMode(what["yaw"]), "relabel": Relabel(what["relabel"])})
 
-    class _Rate(ProgressColumn):
-        def render(self, task: Task) -> str:
-            return f"{task.speed:.0f} rows/s" if task.speed else "– rows/s"
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        _Rate(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True, quiet=as_json)) as progress:
+    with _progress(as_json) as progress:
         task = progress.add_task("labelling", total=spec.rows)
         make_dataset(
             folder,
@@ -117,6 +98,27 @@ def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **wha
         print_json({"folder": str(folder), "rows": spec.rows})
     else:
         click.echo(f"{spec.rows} rows in {folder}; look at them with: cfplan dataset info {folder}")
+
+
+def _progress(as_json: bool) -> "Progress":
+    """Return a bar with rows a second and the time left."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    class Rate(ProgressColumn):
+        def render(self, task: Task) -> str:
+            return f"{task.speed:.0f} rows/s" if task.speed else "– rows/s"
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Rate(), TimeRemainingColumn())
+    return Progress(*columns, console=Console(stderr=True, quiet=as_json))
 
 
 @dataset.command(epilog="Example: cfplan dataset info datasets/hardware")

@@ -2,10 +2,15 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from cfplan.errors import InputError
+
+if TYPE_CHECKING:
+    from cfplan.cli.output import Steps
+    from cfplan.safety.limits import Limits
 
 SAFETY_FILE = "safety.yaml"
 
@@ -15,14 +20,14 @@ path_or_plan = click.argument("path_or_plan", metavar="PATH_OR_PLAN", type=click
 
 
 def planning(command: Callable) -> Callable:
-    """What every command that plans takes."""
+    """Add the options of every command that plans."""
     for option in reversed(
         (
             click.option(
                 "--safety",
                 "safety_file",
                 type=click.Path(path_type=Path),
-                help=f"Limits to keep; else the nearest {SAFETY_FILE}, from here or from the path file upwards.",
+                help=f"Limits to keep; else the nearest {SAFETY_FILE} in or above this folder, or above the path file.",
             ),
             click.option(
                 "--planner",
@@ -35,7 +40,7 @@ def planning(command: Callable) -> Callable:
                 "--speed",
                 "speed_factor",
                 type=click.FloatRange(0, 1, min_open=True),
-                help="Share of the allowed speed to fly at; else the path file's, else 1.",
+                help="Factor on the allowed speed; else the path file's, else 1.",
             ),
         )
     ):
@@ -44,7 +49,10 @@ def planning(command: Callable) -> Callable:
 
 
 def find_safety_file(given: Path | None, path_file: Path) -> Path:
-    """The safety.yaml to use: the one given, or the nearest above the working folder or above the path file."""
+    """Return the safety.yaml to use: the one given, or the nearest above the working folder or above the path file.
+
+    Raises InputError where there is none.
+    """
     if given is not None:
         return given
     for start in (Path.cwd(), path_file.resolve().parent):
@@ -52,7 +60,19 @@ def find_safety_file(given: Path | None, path_file: Path) -> Path:
             if (folder / SAFETY_FILE).is_file():
                 return folder / SAFETY_FILE
     raise InputError(
-        f"no {SAFETY_FILE} here, above, or above the path file",
+        f"no {SAFETY_FILE} in or above this folder, or above the path file",
         where=str(path_file),
         hint="name one with --safety; cfplan's own repository has one to start from",
     )
+
+
+def read_limits(given: Path | None, path_file: Path, steps: "Steps") -> "Limits":
+    """Find and read safety.yaml, once a command, as its first step."""
+    with steps.step("limits") as results:
+        from cfplan.safety.limits_file import load_limits
+
+        safety_file = find_safety_file(given, path_file)
+        limits = load_limits(safety_file)
+        plan = limits.plan
+        results.append(f"{limits.vehicle}, {plan.speed:g} m/s, {plan.acceleration:g} m/s² ({safety_file})")
+    return limits

@@ -3,51 +3,47 @@
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import click
 
-from cfplan.errors import CfplanError, ExitCode
+from cfplan.errors import CfplanError
+from cfplan.preparation.steps import StepState, step
 
 _FILE_WIDTH = 170  # characters, of tables that go to a file or a pipe
 
 
 class Steps:
-    """Prints one line a step, with its number, as each one ends; silent where JSON is asked for."""
+    """Prints one line a step as it ends, with the time that it took; silent where JSON is asked for."""
 
     def __init__(self, *, as_json: bool):
         self.as_json = as_json
+        self._begun = 0.0
 
-    @contextmanager
-    def step(self, name: str) -> Iterator[list[str]]:
-        """Time a step. What the block appends to the list is printed behind the step's name."""
-        started = time.perf_counter()
-        said: list[str] = []
-        try:
-            yield said
-        except CfplanError:
-            self._line("✗", name, "", started)
-            raise
-        self._line("✓", name, ", ".join(said), started)
+    def __call__(self, name: str, state: StepState, result: str) -> None:
+        """Show how far a step is; an OnStep."""
+        if state is StepState.BEGUN:
+            self._begun = time.perf_counter()
+        elif not self.as_json:
+            mark = click.style("✓", fg="green") if state is StepState.FINISHED else click.style("✗", fg="red")
+            took = f"{(time.perf_counter() - self._begun) * 1e3:.0f} ms"
+            click.echo(f"{mark} {name:<12} {took:>8}  {result}".rstrip())
+
+    def step(self, name: str) -> AbstractContextManager[list[str]]:
+        """Time a step of a command. What the block appends to the list is printed behind the step's name."""
+        return step(self, name)
 
     def failed(self, name: str, text: str) -> None:
-        """A step that ran to its end and whose verdict is no."""
+        """Show a step that ran to its end with the verdict no."""
         if not self.as_json:
             click.echo(f"{click.style('✗', fg='red')} {name:<12} {text}")
 
     def say(self, text: str = "") -> None:
-        """A line that is no step."""
+        """Print a line that is no step."""
         if not self.as_json:
             click.echo(text)
-
-    def _line(self, mark: str, name: str, text: str, started: float) -> None:
-        if self.as_json:
-            return
-        took = f"{(time.perf_counter() - started) * 1e3:.0f} ms"
-        color = "green" if mark == "✓" else "red"
-        click.echo(f"{click.style(mark, fg=color)} {name:<12} {took:>8}  {text}".rstrip())
 
 
 def print_json(document: Any) -> None:
@@ -91,8 +87,3 @@ def finite(value: Any) -> Any:
         return value
     number = float(value)
     return number if math.isfinite(number) else None
-
-
-def exit_with(code: ExitCode) -> None:
-    """End the command with this code."""
-    raise click.exceptions.Exit(int(code))

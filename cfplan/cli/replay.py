@@ -11,7 +11,6 @@ import click
 
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json
-from cfplan.cli.rehearsal import PLAN_SUFFIX, PlanOptions, obtain_plan
 from cfplan.errors import InputError
 
 if TYPE_CHECKING:
@@ -138,16 +137,18 @@ def _replay_trials(
 
 
 def _reference(plan_file: Path, steps: Steps) -> "Reference":
+    from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, plan_flight
     from cfplan.recording.overlay import reference_of
 
     if plan_file.suffix == PLAN_SUFFIX:  # as it was planned, whatever today's limits say
         from cfplan.planning.plan_file import load_plan
 
-        with steps.step("plan") as said:
+        with steps.step("plan") as results:
             trajectory = load_plan(plan_file).trajectory
-            said.append(f"{trajectory.duration:.2f} s, read from {plan_file}")
+            results.append(f"{trajectory.duration:.2f} s, read from {plan_file}")
         return reference_of(trajectory, plan_file.stem)
-    planned = obtain_plan(plan_file, PlanOptions(None, "expert", None, None), steps)
+    limits = options.read_limits(None, plan_file, steps)
+    planned = plan_flight(plan_file, limits, FlightOptions("expert"), steps)
     return reference_of(planned.plan.trajectory, planned.name)
 
 

@@ -1,32 +1,33 @@
 """`cfplan sim`: the dry run alone."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table
-from cfplan.cli.rehearsal import PlanOptions, certify_bytes, obtain_plan, rehearse
 
 
 @click.command(short_help="The dry run alone.", epilog="Example: cfplan sim flights/slalom.yaml")
 @options.path_or_plan
 @options.planning
 @options.as_json
-def sim(
-    path_or_plan: Path,
-    safety_file: Path | None,
-    planner: str,
-    nodes: int | None,
-    speed_factor: float | None,
-    as_json: bool,
-) -> None:
+def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> None:
     """Rehearse a path or a plan file: its very setpoints, the firmware's controller, a body with drag and motor lag."""
     steps = Steps(as_json=as_json)
-    flight = obtain_plan(path_or_plan, PlanOptions(safety_file, planner, nodes, speed_factor), steps)
-    encoded = certify_bytes(flight, steps)
-    result = rehearse(flight, encoded, steps)
+    limits = options.read_limits(safety_file, path_or_plan, steps)
+
+    from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+
+    planned = plan_flight(path_or_plan, limits, FlightOptions(**planning), steps)
+
+    from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, rehearse
+
+    encoded = encode_flight(planned, steps)
+    rehearsed = rehearse(planned, encoded, steps)
+    find_link_loss(encoded, limits, steps)
     if as_json:
-        print_json(flight.to_dict() | {"dry_run": result.summary()})
+        print_json(planned.to_dict() | {"dry_run": rehearsed.summary()})
     else:
-        print_table("Dry run", ["", "value"], result.rows())
+        print_table("Dry run", ["", "value"], rehearsed.rows())

@@ -3,13 +3,16 @@
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from cfplan.cli import options
 from cfplan.cli.output import print_json
 from cfplan.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
 @click.command(
@@ -48,29 +51,14 @@ def train(dataset: Path, folder: Path, device: str, as_json: bool, **what: Any) 
         raise InputError(
             f"training needs {error.name}", where="cfplan train", hint='pip install "cfplan[learn]"'
         ) from None
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
     chosen = Options(**what | {"architecture": Architecture(what["architecture"])})
-    columns = (
-        TextColumn("epochs"), BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(elapsed_when_finished=False),
-    )  # fmt: skip
-    console = Console(stderr=True, quiet=as_json)
-    with Progress(*columns, console=console, speed_estimate_period=600) as progress:
+    with _progress(as_json) as progress:
         task = progress.add_task("", total=chosen.epochs)
 
         def show(epoch: Epoch) -> None:
             progress.update(task, completed=epoch.epoch, description=_line(epoch))
-            if not console.is_terminal:
-                console.print(f"epoch {epoch.epoch} of {chosen.epochs}: {_line(epoch)}, {epoch.seconds:.1f} s")
+            if not progress.console.is_terminal:
+                progress.console.print(f"epoch {epoch.epoch} of {chosen.epochs}: {_line(epoch)}, {epoch.seconds:.1f} s")
 
         card = train(dataset, folder, chosen, device=device, command=_command(), on_epoch=show)
     if card is None:
@@ -83,6 +71,25 @@ def train(dataset: Path, folder: Path, device: str, as_json: bool, **what: Any) 
             f"{folder}: travel time of unseen paths off by {scores['time_error_mean']:.2%} in the mean, "
             f"{scores['time_error_p95']:.2%} at the 95th percentile"
         )
+
+
+def _progress(as_json: bool) -> "Progress":
+    """Return a bar with the epochs, the time passed and the time left."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("epochs"), BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}"),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(elapsed_when_finished=False),
+    )  # fmt: skip
+    return Progress(*columns, console=Console(stderr=True, quiet=as_json), speed_estimate_period=600)
 
 
 def _line(epoch: Any) -> str:

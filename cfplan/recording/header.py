@@ -4,7 +4,8 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
-from typing import Any
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,13 @@ from cfplan.errors import InputError
 from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.vehicle.airframe import Airframe
 
+if TYPE_CHECKING:
+    from cfplan.planning.plan_result import Plan
+
 Triple = tuple[float, float, float]
+
+PROMISED_LATENESS = 2e-3  # s, of all setpoints but one in a hundred
+_PATH_SAMPLES = 500  # of the drawn path
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +87,30 @@ def header_under(
         fence=(limits.space.low, limits.space.high),
         wall_time_at_zero=wall_time_at_zero,
         provenance=provenance or {},
+    )
+
+
+def header_of_plan(plan: "Plan", *, name: str, uri: str, source: FilePath, wall_time_at_zero: float) -> RecordHeader:
+    """Return the header of the flight of a plan that was made from, or read from, `source`."""
+    limits = plan.limits
+    return header_under(
+        limits,
+        name=name,
+        uri=uri,
+        planner=plan.planner,
+        bounds=FlightBounds(
+            speed=limits.flight.speed.brake,
+            acceleration=limits.flight.acceleration.brake,
+            body_rate=limits.flight.angular_velocity.brake,
+            deviation=limits.flight.deviation.brake,
+            lateness=PROMISED_LATENESS,
+            pose_age=limits.pose.age_warning,
+            battery_voltage=limits.battery.under_load,
+        ),
+        travel_time=plan.trajectory.duration,
+        path=plan.path(np.linspace(0.0, plan.path.end, _PATH_SAMPLES)),
+        wall_time_at_zero=wall_time_at_zero,
+        provenance={"path file": str(source), "planner": plan.planner},
     )
 
 

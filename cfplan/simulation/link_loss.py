@@ -1,8 +1,8 @@
-"""Where the vehicle goes when its pilot dies, by the firmware's own time-outs.
+"""Link loss: where the vehicle goes by itself when its pilot or its radio dies, by the firmware's own time-outs.
 
 It holds the last setpoint, then its supervisor levels it out at that height, then it stops the motors. While it levels
-out, the controller goes on with the body rates of that last setpoint, so a vehicle that was about to turn never gets
-quite level and may speed up; where it comes down depends on the moment, and is found by flying it.
+out, the controller keeps the body rates of that last setpoint, so a vehicle that was about to turn never gets quite
+level and may speed up. Where it comes down depends on the moment, and is found by simulating it.
 """
 
 from dataclasses import dataclass
@@ -28,47 +28,44 @@ from cfplan.simulation.dynamics.mellinger import (
 )
 from cfplan.vehicle.rotations import yaw_of
 
-LEVEL_AFTER, OFF_AFTER = 0.54, 2.04  # s after the last setpoint; the supervisor looks every 40 ms
-OFF_BY_WATCHDOG = 1.0  # s, where the emergency-stop watchdog is awake
-_LONGEST = 4.0  # s until it lies on the floor
-_MOMENTS = 48  # at which the pilot is let die
+LEVEL_AFTER, OFF_AFTER = 0.54, 2.04  # s after the last setpoint; the supervisor checks every 40 ms
+OFF_BY_WATCHDOG = 1.0  # s after the last setpoint, if the emergency-stop watchdog is enabled
+_LONGEST = 4.0  # s that are simulated after the last setpoint, unless the vehicle lies on the floor before
+_MOMENTS = 48  # at which the link is lost
 _STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)
 
 
 @dataclass(frozen=True, slots=True)
-class Orphaned:
-    """The worst moment for a pilot to die."""
+class LinkLoss:
+    """The worst moment to lose the link, and where the vehicle goes from there."""
 
-    moment: float
-    # s from the first setpoint
-    distance: float
-    # m, horizontally from the last setpoint to the far corner of what it sweeps
-    beyond: float
-    # m beyond the walls or the ceiling; negative inside
+    moment: float  # s from the first setpoint
+    distance: float  # m, horizontally from the last setpoint to the far corner of the box that the vehicle sweeps
+    beyond: float  # m beyond the walls or the ceiling; negative inside
 
     def __str__(self) -> str:
         walls = f"{self.beyond:.1f} m beyond the walls" if self.beyond > 0 else "inside the walls"
         return f"at the worst moment, {self.moment:.1f} s, it comes down {self.distance:.1f} m on, {walls}"
 
 
-def orphaned(payloads: NDArray, limits: Limits, rate: float = RATE) -> Orphaned:
-    """Let the pilot die at moments all along a flight, (N, 29) uint8; that from which it ends farthest out."""
+def simulate_link_loss(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLoss:
+    """Lose the link at moments all along a flight, (N, 29) uint8 at `rate`, Hz; return what ends farthest out."""
     moments = np.linspace(0.0, (len(payloads) - 1) / rate, _MOMENTS)
-    places, swept = swept_when_orphaned(payloads, limits, moments, rate)
+    places, swept = swept_after_link_loss(payloads, limits, moments, rate)
     low, high = np.array(limits.space.low), np.array(limits.space.high)
     low[2] = -np.inf  # it ends on the floor
     beyond = np.maximum(low - swept[:, 0], swept[:, 1] - high).max(axis=1)
     away = np.abs(swept[:, :, :2] - places[:, None, :2]).max(axis=1)
     worst = int(np.argmax(beyond))
-    return Orphaned(float(moments[worst]), float(np.hypot(*away[worst])), float(beyond[worst]))
+    return LinkLoss(float(moments[worst]), float(np.hypot(*away[worst])), float(beyond[worst]))
 
 
-def swept_when_orphaned(
+def swept_after_link_loss(
     payloads: NDArray, limits: Limits, moments: NDArray, rate: float = RATE
 ) -> tuple[NDArray, NDArray]:
-    """For each moment, (K,) s and rising: the last setpoint's place, (K, 3), and the box that is swept, (K, 2, 3).
+    """Return the last setpoint's place, (K, 3) m, and the box swept after it, (K, 2, 3) m, for each moment, (K,) s.
 
-    The vehicle's estimate is taken for perfect, although no pose comes either.
+    Moments must rise. The vehicle's estimate is taken to be perfect, although no pose comes either.
     """
     state, airframe = decode(payloads), limits.airframe
     rows = np.zeros((len(payloads), SETPOINT_SIZE))

@@ -11,7 +11,6 @@ __all__ = [
     "learned",
     "long_paths",
     "machine",
-    "missions",
     "provenance",
     "random_faults",
     "real_time",

@@ -12,10 +12,9 @@ from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import encode
 from cfplan.geometry.path_file import load_path_file
-from cfplan.planners.baselines.convex import lower_bound
-from cfplan.planners.task import PlanningTask
+from cfplan.preparation.prepare_flight import PreparedFlight, prepare_flight
+from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dry_run import dry_run
-from cfplan.studies.missions import PlannedMission, planned_mission
 from cfplan.studies.real_time import Conditions, RealTimeFlight, fly_in_real_time
 from cfplan.studies.result import Column, StudyResult, Table, detail_table
 
@@ -121,7 +120,7 @@ def fly_each(
         for index, file in enumerate(path_files):
             progress(index * repeats, total)
             try:
-                made = planned_mission(file, find_safety_file(file))
+                made = prepare_flight(file, load_limits(find_safety_file(file)))
                 plans.append(_rehearsed(file.stem, made))
             except CfplanError as error:
                 flights.append(JudgedFlight(file.stem, conditions.seed, landed=False, reason=str(error)))
@@ -160,31 +159,31 @@ def flight_tables(
     )
 
 
-def _rehearsed(name: str, made: PlannedMission) -> RehearsedPlan:
-    plan, encoded = made.plan, made.encoded
-    rehearsal = dry_run(encoded, plan.trajectory, plan.airframe, plan.limits.flight)
-    rehearsal.require_passed()
+def _rehearsed(name: str, made: PreparedFlight) -> RehearsedPlan:
+    plan = made.plan
+    bound = made.planned.lower_bound
+    assert bound is not None  # a path file has one
     return RehearsedPlan(
         path=name,
         length=plan.path.length,
         planner=plan.planner,
         planned=plan.trajectory.duration,
-        lower_bound=plan.lower_bound or lower_bound(PlanningTask(plan.path, plan.airframe, plan.limits.plan)),
+        lower_bound=bound,
         speed_factor=plan.repair_speed_factor,
         worst_share=plan.certificate.worst.share,
-        dry_run=rehearsal.deviation,
+        dry_run=made.dry_run.deviation,
         dry_run_without_drag=dry_run(_without_drag(made), plan.trajectory, plan.airframe, plan.limits.flight).deviation,
     )
 
 
-def _without_drag(made: PlannedMission) -> EncodedFlight:
+def _without_drag(made: PreparedFlight) -> EncodedFlight:
     """Return the same flight with the acceleration of the motion alone."""
     states = made.plan.trajectory.at(made.encoded.times + made.encoded.lead)
     setpoints = replace(made.encoded.decoded, acceleration=states.acceleration)
     return replace(made.encoded, payloads=encode(setpoints), decoded=setpoints)
 
 
-def _judged(name: str, seed: int, made: PlannedMission, flight: RealTimeFlight) -> JudgedFlight:
+def _judged(name: str, seed: int, made: PreparedFlight, flight: RealTimeFlight) -> JudgedFlight:
     outcome, truth, trajectory = flight.outcome, flight.truth, made.plan.trajectory
     if not flight.landed or outcome is None or truth is None:
         return JudgedFlight(name, seed, landed=False, reason=flight.reason, refusals=flight.refusals)

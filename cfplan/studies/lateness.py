@@ -22,10 +22,12 @@ from cfplan.errors import ExitCode, InputError
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.real_time import may_use_fifo_scheduling
 from cfplan.flight.setpoints.encoding import RATE
+from cfplan.preparation.plan_flight import FlightOptions
+from cfplan.preparation.prepare_flight import prepare_flight
 from cfplan.recording.header import RecordHeader
 from cfplan.recording.rerun.live import LiveView, live_blueprint
 from cfplan.recording.rerun.viewer import APPLICATION, free_port, lay_out, viewer_program
-from cfplan.studies.missions import planned_mission
+from cfplan.safety.limits_file import load_limits
 from cfplan.studies.real_time import Conditions, fly_in_real_time
 from cfplan.studies.result import Column, StudyResult, Table
 from cfplan.studies.sleeper import Sleeper
@@ -99,7 +101,8 @@ def lateness_study(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StudyResult:
     """Measure with and without SCHED_FIFO. Afterwards this process and its children may not use it any more."""
-    mission = _patient(planned_mission(path_file, safety_file, stream_for=seconds).mission)
+    options = FlightOptions(stream_for=seconds)
+    mission = _patient(prepare_flight(path_file, load_limits(safety_file), options).mission)
     rows: list[WakeUps] = []
     with contextlib.suppress(KeyboardInterrupt):
         for step, priority in enumerate((FIRST, ORDINARY)):

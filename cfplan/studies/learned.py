@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import CfplanError, InputError, NotCertifiedError
-from cfplan.flight.setpoints.encoding import encode_checked
+from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.baselines.convex import plan_convex
@@ -236,7 +236,8 @@ def _fly(path: Path, box: str, seed: int, chosen: LimitSet) -> UnseenFlight:
             values |= _convex(task)
 
         encoding = time.perf_counter()
-        encoded = encode_checked(found.trajectory, limits)
+        encoded = encode_trajectory(found.trajectory)
+        check_bytes(encoded, found.trajectory, limits)
         values["seconds"] = planned - begun, repaired - planned, time.perf_counter() - encoding
         run = dry_run(encoded, found.trajectory, airframe, _lost_alone())
         values |= {"deviation": run.deviation, "dry_run": run.reason}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.flight.setpoints.encoding import encode_checked
+from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.expert.expert import plan_expert
@@ -172,7 +172,7 @@ def _planned(path: Path, chosen: LimitSet) -> tuple[Repaired, tuple[float, float
         raise CfplanError(solution.reason or str(solution.status))
     found = repair(task, solution.profile)
     repaired = time.process_time()
-    encode_checked(found.trajectory, chosen.limits)
+    check_bytes(encode_trajectory(found.trajectory), found.trajectory, chosen.limits)
     return found, (planned - begun, repaired - planned, time.process_time() - repaired)
 
 

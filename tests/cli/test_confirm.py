@@ -13,6 +13,7 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.link_loss import simulate_link_loss
 
 RADIO = "radio://0/80/2M"
 REPOSITORY = Path(__file__).parents[2]
@@ -50,7 +51,9 @@ def terminal(monkeypatch):
 
 
 def ask(mission, records, uri=RADIO, yes=False, speed_factor=None):
-    return confirm.confirmed("eight", mission, uri, records, yes=yes, speed_factor=speed_factor)
+    lost = simulate_link_loss(mission.payloads, mission.limits)
+    prepared = SimpleNamespace(planned=SimpleNamespace(name="eight"), mission=mission, link_loss=lost)
+    return confirm.confirmed(prepared, uri, records, yes=yes, speed_factor=speed_factor)
 
 
 def record(records, folder, exit_code=0, uri=RADIO):
@@ -68,7 +71,7 @@ def test_yes_answers_beforehand(mission, tmp_path):
 
 def test_without_a_terminal_nothing_is_flown(mission, tmp_path, monkeypatch):
     monkeypatch.setattr(confirm.sys, "stdin", SimpleNamespace(isatty=lambda: False))
-    with pytest.raises(InputError, match="nobody") as caught:
+    with pytest.raises(InputError, match="not a terminal") as caught:
         ask(mission, tmp_path)
     assert "--yes" in caught.value.hint
 

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from cfplan.preparation.prepare_flight import prepare_flight
+from cfplan.safety.limits_file import load_limits
 from cfplan.studies.fault_scenarios import SCENARIOS
 from cfplan.studies.faults import fly_scenario, fly_stepped
-from cfplan.studies.missions import plan_mission
 from cfplan.studies.random_faults import fly_random
 
 REPOSITORY = Path(__file__).parents[2]
@@ -28,7 +29,7 @@ SEEDS, PATHS = range(200), ("helix", "line", "loop3d", "random", "slalom")
 
 @pytest.fixture(scope="module")
 def line():
-    return plan_mission(REPOSITORY / "flights" / "line.yaml", REPOSITORY / "safety.yaml")
+    return prepare_flight(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml")).mission
 
 
 @pytest.mark.parametrize(
@@ -80,8 +81,7 @@ def test_a_random_fault_stays_inside_the_walls(seed, line):
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_no_random_fault_of_two_hundred_leaves_the_walls():
-    missions = {
-        name: plan_mission(REPOSITORY / "flights" / f"{name}.yaml", REPOSITORY / "safety.yaml") for name in PATHS
-    }
+    limits = load_limits(REPOSITORY / "safety.yaml")
+    missions = {name: prepare_flight(REPOSITORY / "flights" / f"{name}.yaml", limits).mission for name in PATHS}
     outside = [flown.name for _, flown in (fly_random(seed, missions) for seed in SEEDS) if flown.to_wall <= 0.0]
     assert not outside

@@ -16,13 +16,14 @@ from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import Event, SetpointSent
+from cfplan.preparation.prepare_flight import prepare_flight
+from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.lab import Lab, start_lab
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.room import RoomSettings
 from cfplan.simulation.lab.sim_driver import SimDriver
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
-from cfplan.studies.missions import plan_mission
 
 REPOSITORY = Path(__file__).parents[2]
 AT = 150  # setpoints into the stream
@@ -79,7 +80,7 @@ ROWS = {
 
 @pytest.fixture(scope="module")
 def line():
-    mission = plan_mission(REPOSITORY / "flights" / "line.yaml", REPOSITORY / "safety.yaml")
+    mission = prepare_flight(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml")).mission
     return replace(mission, limits=replace(mission.limits, lateness=0.1))  # other tests may run beside this
 
 

@@ -1,4 +1,4 @@
-"""Where a vehicle without a pilot goes: the quick loop against the whole virtual Crazyflie, and limit cases."""
+"""Where a vehicle goes after link loss: the quick loop against the whole virtual Crazyflie, and limit cases."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,11 +8,11 @@ import pytest
 
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
+from cfplan.preparation.prepare_flight import prepare_flight
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.link_loss import orphaned, swept_when_orphaned
+from cfplan.simulation.link_loss import simulate_link_loss, swept_after_link_loss
 from cfplan.studies.fault_scenarios import SCENARIOS
 from cfplan.studies.faults import fly_stepped
-from cfplan.studies.missions import plan_mission
 
 REPOSITORY = Path(__file__).parents[2]
 KILLED = next(row for row in SCENARIOS if row.name == "pilot killed")
@@ -25,7 +25,7 @@ def limits():
 
 @pytest.fixture(scope="module")
 def line() -> Mission:
-    return plan_mission(REPOSITORY / "flights" / "line.yaml", REPOSITORY / "safety.yaml")
+    return prepare_flight(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml")).mission
 
 
 def straight(speed: float, seconds: float = 1.0) -> np.ndarray:
@@ -44,21 +44,21 @@ def straight(speed: float, seconds: float = 1.0) -> np.ndarray:
 
 
 def test_a_vehicle_that_hovers_comes_down_below_where_it_was(limits):
-    lost = orphaned(straight(0.0), limits)
+    lost = simulate_link_loss(straight(0.0), limits)
     assert lost.distance < 0.05
     assert lost.beyond < -0.9
     assert "inside the walls" in str(lost)
 
 
 def test_the_faster_it_flies_the_farther_it_goes(limits):
-    distances = [orphaned(straight(speed), limits).distance for speed in (0.5, 1.0, 1.5)]
+    distances = [simulate_link_loss(straight(speed), limits).distance for speed in (0.5, 1.0, 1.5)]
     assert distances == sorted(distances)
     assert distances[0] > 0.05
 
 
 def test_body_rates_that_are_held_carry_it_away_and_the_watchdog_ends_that_sooner(line, limits):
-    lost = orphaned(line.payloads, limits)
-    watched = orphaned(line.payloads, replace(limits, firmware=replace(limits.firmware, watchdog=True)))
+    lost = simulate_link_loss(line.payloads, limits)
+    watched = simulate_link_loss(line.payloads, replace(limits, firmware=replace(limits.firmware, watchdog=True)))
     assert lost.beyond > 0
     assert "beyond the walls" in str(lost)
     assert watched.distance < lost.distance / 2
@@ -66,7 +66,7 @@ def test_body_rates_that_are_held_carry_it_away_and_the_watchdog_ends_that_soone
 
 def test_the_virtual_crazyflie_goes_there_too(line, limits):
     moments = np.round(np.array([0.3, 0.5, 0.7]) * line.motion_ends, 2)
-    places, swept = swept_when_orphaned(line.payloads, limits, moments)
+    places, swept = swept_after_link_loss(line.payloads, limits, moments)
     for moment, place, box in zip(moments, places, swept, strict=True):
         flown = fly_stepped(replace(KILLED, moment=float(moment)), line)
         alone = flown.truth.position[flown.truth.time >= flown.struck]

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 from cfplan.errors import ExitCode
 from cfplan.flight.pilot.deadlines import Lateness
@@ -74,3 +75,32 @@ class FlightOutcome:
     settled_after: float  # s after the last moving setpoint; inf where it did not settle, or was not asked to
     end_position: Triple  # m, where it was last seen
     telemetry_dropped: int = 0  # messages that found the main process too slow
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the outcome for JSON, as it stands in a record's summary."""
+        return {
+            "exit_code": int(self.exit_code),
+            "reason": self.reason,
+            "rung": self.rung.name.lower(),
+            "flown": self.flown,
+            "settled_after": self.settled_after if math.isfinite(self.settled_after) else None,
+            "lateness_p99": self.lateness.p99,
+            "lateness_max": self.lateness.max,
+            "deviation_max": self.deviation.max,
+            "deviation_rms": self.deviation.rms,
+            "setpoints_skipped": self.lateness.skipped,
+            "telemetry_dropped": self.telemetry_dropped,
+            "preflight": [
+                {"name": check.name, "value": check.value, "threshold": check.threshold, "passed": check.passed}
+                for check in self.checks
+            ],
+        }
+
+    def check_rows(self) -> list[list[str]]:
+        """Return the preflight table: check, value, threshold, verdict, and a hint where it failed."""
+        return [
+            [check.name, check.value, check.threshold, "ok", ""]
+            if check.passed
+            else [check.name, check.value, check.threshold, "FAILED", check.hint]
+            for check in self.checks
+        ]

@@ -6,8 +6,7 @@ cflib's own call truncates towards zero; here values are rounded, which halves t
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from cfplan.machine_code import njit
 
 CRTP_PORT = 7
 FULL_STATE_TYPE = 6
-LARGEST = 32.767  # the most that 16 bits hold of m, m/s, m/s², rad/s
+LARGEST = 32.767  # the largest value that 16 bits hold, in m, m/s, m/s² or rad/s
 
 _WIRE = np.dtype(
     [
@@ -37,28 +36,17 @@ _MAGNITUDES = 511  # nine bits for a component in [0, 1/√2]
 class FullStateSetpoints:
     """What the controller is asked to do, one row a setpoint."""
 
-    position: NDArray
-    # (N, 3) m
-    velocity: NDArray
-    # (N, 3) m/s
-    acceleration: NDArray
-    # (N, 3) m/s², without gravity
-    quaternion: NDArray
-    # (N, 4) body→world, x y z w
-    body_rate: NDArray
-    # (N, 3) rad/s, body axes
-
-
-def joined(parts: Sequence[FullStateSetpoints]) -> FullStateSetpoints:
-    """All their rows, in order."""
-    names = (field.name for field in fields(FullStateSetpoints))
-    return FullStateSetpoints(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+    position: NDArray  # (N, 3) m
+    velocity: NDArray  # (N, 3) m/s
+    acceleration: NDArray  # (N, 3) m/s², without gravity
+    quaternion: NDArray  # (N, 4) body→world, x y z w
+    body_rate: NDArray  # (N, 3) rad/s, body axes
 
 
 def encode(setpoints: FullStateSetpoints, first: int = 0) -> NDArray:
-    """The payloads, (N, 29) uint8. Raises NotCertifiedError where a value is not finite or does not fit.
+    """Return the payloads, (N, 29) uint8. Raises NotCertifiedError where a value is not finite or does not fit.
 
-    `first` is the number of the first setpoint, for those who read of one that does not.
+    `first` is the number of the first setpoint, for the error's text.
     """
     rows = np.zeros(len(setpoints.position), dtype=_WIRE)
     rows["type"] = FULL_STATE_TYPE
@@ -69,7 +57,7 @@ def encode(setpoints: FullStateSetpoints, first: int = 0) -> NDArray:
 
 
 def decode(payloads: NDArray) -> FullStateSetpoints:
-    """What the vehicle will read from the payloads, (N, 29) uint8.
+    """Return what the vehicle reads from the payloads, (N, 29) uint8.
 
     Encoding that again may give other bytes that read alike: a zero in the quaternion has two signs, and of two
     components that tie for the largest either may be left out.
@@ -96,7 +84,10 @@ def _milli(name: str, values: NDArray, first: int) -> NDArray:
 
 
 def compress_quaternion(quaternion: NDArray, first: int = 0) -> NDArray:
-    """(N, 4) x y z w, not zero, to (N,) u32: 2 bits name the largest component, 3 × (sign, 9 bits) give the others."""
+    """Compress (N, 4) x y z w, not zero, to (N,) u32.
+
+    2 bits name the largest component, 3 × (sign, 9 bits) give the others.
+    """
     compressed, bad = _compressed(np.array(quaternion, dtype=float))
     if bad >= 0:
         raise NotCertifiedError("the quaternion is zero or not finite", where=f"setpoint {first + bad}")
@@ -104,13 +95,13 @@ def compress_quaternion(quaternion: NDArray, first: int = 0) -> NDArray:
 
 
 def decompress_quaternion(compressed: NDArray) -> NDArray:
-    """(N,) u32 to (N, 4) unit quaternions x y z w, the largest component positive."""
+    """Decompress (N,) u32 to (N, 4) unit quaternions x y z w, the largest component positive."""
     return _decompressed(np.array(compressed, dtype=np.int64))
 
 
 @njit(error_model="numpy")
 def _compressed(quaternions: NDArray) -> tuple[NDArray, int]:
-    """And the first row that is zero or not finite, else -1."""
+    """Return the compressed quaternions, and the first row that is zero or not finite, else -1."""
     out = np.empty(len(quaternions), dtype=np.uint32)
     for n in range(len(quaternions)):
         q = quaternions[n]

@@ -1,0 +1,97 @@
+"""A prepared flight flown and recorded, while a terminal, a live view and a ground station watch."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cfplan.cli.flight_progress import FlightProgress
+from cfplan.cli.output import Steps
+from cfplan.cli.vehicle import vehicle
+from cfplan.cli.watchers import watchers
+from cfplan.errors import CfplanError
+from cfplan.flight.mocap.poses import PoseSource
+from cfplan.flight.pilot.outcome import FlightOutcome
+from cfplan.flight.pilot.process import fly
+from cfplan.flight.telemetry import Telemetry
+from cfplan.planning.plan_file import save_plan
+from cfplan.preparation.prepare_flight import PreparedFlight
+from cfplan.recording.header import header_of_plan
+from cfplan.recording.reader import read_record
+from cfplan.recording.summary import summarise
+from cfplan.recording.writer import RecordWriter, new_record_folder, wall_time_at_zero, write_summary
+
+
+@dataclass(frozen=True, slots=True)
+class FlownAs:
+    """Which vehicle flies, where its poses come from, and who watches."""
+
+    uri: str
+    mocap_uri: str | None
+    live: bool
+    mavlink: str | None
+
+
+def fly_and_record(
+    prepared: PreparedFlight, source: Path, records: Path, flown_as: FlownAs, steps: Steps
+) -> tuple[Path, FlightOutcome, dict[str, Any]]:
+    """Fly, and return the record's folder, the outcome and the summary. Without a flight no folder is left.
+
+    Raises a CfplanError where the vehicle or its poses cannot be had.
+    """
+    with vehicle(flown_as.uri, flown_as.mocap_uri, prepared.mission.limits) as reached:
+        folder = new_record_folder(records, prepared.planned.name)
+        progress = FlightProgress(duration=prepared.mission.duration, steps=steps)
+        try:
+            outcome, failures = _fly_into(folder, prepared, source, flown_as, reached, progress)
+        except CfplanError:
+            if progress.heard_vehicle:
+                steps.say(f"what was recorded: {folder}")
+            else:
+                shutil.rmtree(folder)  # there was no flight
+            raise
+    for what, failure in failures:
+        steps.failed(what, failure)
+    summary = {"uri": flown_as.uri, "outcome": outcome.to_dict(), **summarise(read_record(folder)).to_json()}
+    write_summary(folder, summary)
+    return folder, outcome, summary
+
+
+def _fly_into(
+    folder: Path,
+    prepared: PreparedFlight,
+    source: Path,
+    flown_as: FlownAs,
+    reached: tuple[list[type], PoseSource],
+    progress: FlightProgress,
+) -> tuple[FlightOutcome, list[tuple[str, str]]]:
+    """Fly, and return the outcome and what failed beside the flight: (record or watching, why)."""
+    name, uri, (drivers, pose_source) = prepared.planned.name, flown_as.uri, reached
+    save_plan(prepared.plan, folder / "plan.parquet", {"name": name, "path file": str(source)})
+    header = header_of_plan(prepared.plan, name=name, uri=uri, source=source, wall_time_at_zero=wall_time_at_zero())
+    with (
+        RecordWriter(folder, header) as writer,
+        watchers(header, folder, live=flown_as.live, mavlink=flown_as.mavlink) as watching,
+        progress,
+    ):
+        outcome = fly(
+            prepared.mission,
+            uri=uri,
+            drivers=drivers,
+            pose_source=pose_source,
+            on_telemetry=_for_all(writer.write, progress.show, *watching.listeners),
+            more_orders=watching.orders,
+        )
+    failures = [("record", writer.failure)] if writer.failure else []
+    return outcome, failures + [("watching", failure) for failure in watching.failures()]
+
+
+def _for_all(*listeners: Callable[[Telemetry], None]) -> Callable[[Telemetry], None]:
+    """Return a listener that passes each message to all of these."""
+
+    def tell(message: Telemetry) -> None:
+        for listener in listeners:
+            listener(message)
+
+    return tell

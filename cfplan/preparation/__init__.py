@@ -1,0 +1,3 @@
+"""From a path file to a mission: planned, certified, encoded, rehearsed, with a way to stop from every setpoint."""
+
+__all__ = ["plan_flight", "prepare_flight", "steps"]

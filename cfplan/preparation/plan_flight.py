@@ -1,0 +1,109 @@
+"""From a path file or a plan file to a plan that is certified under today's limits."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cfplan.errors import InputError
+from cfplan.geometry.path_file import load_path_file
+from cfplan.planners.baselines.convex import lower_bound
+from cfplan.planners.task import PlanningTask
+from cfplan.planning.plan import plan
+from cfplan.planning.plan_file import load_plan
+from cfplan.planning.plan_result import Plan
+from cfplan.planning.planners import AUTO
+from cfplan.preparation.steps import OnStep, ignore_steps, step
+from cfplan.safety.certificate import certify
+from cfplan.safety.limits import Limits
+from cfplan.safety.space import check_space
+
+PLAN_SUFFIX = ".parquet"
+
+
+@dataclass(frozen=True, slots=True)
+class FlightOptions:
+    """How to plan and encode a flight."""
+
+    planner: str = AUTO
+    nodes: int | None = None  # grid intervals; None chooses them by the path's length
+    speed_factor: float | None = None  # of the speed that the limits allow; None takes the path file's
+    stream_for: float = 0.0  # s of setpoints at least; behind the end of the path they hover
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedFlight:
+    """A plan, its name, and the limits under which it was certified."""
+
+    name: str
+    plan: Plan
+    limits: Limits
+    lower_bound: float | None = None  # s, which no flight along the path can beat; None for a plan that was read
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures of the plan and its certificate, for JSON."""
+        plan = self.plan
+        return {
+            "name": self.name,
+            "vehicle": plan.airframe.name,
+            "planner": plan.planner,
+            "length": plan.path.length,
+            "duration": plan.trajectory.duration,
+            "lower_bound": self.lower_bound,
+            "nodes": plan.nodes,
+            "planning_seconds": plan.seconds,
+            "slowed": plan.repair_speed_factor,
+            "speed_share": plan.speed_factor,
+            "notes": list(plan.notes),
+            "certificate": plan.certificate.to_dict(),
+        }
+
+
+def plan_flight(
+    source: Path, limits: Limits, options: FlightOptions | None = None, on_step: OnStep = ignore_steps
+) -> PlannedFlight:
+    """Plan a path file, or read a plan file and certify it anew. The certificate may fail: look at it.
+
+    Raises:
+        InputError: a file or an option is wrong.
+        InfeasibleError: the path leaves the space, or no profile keeps the limits.
+    """
+    if source.suffix == PLAN_SUFFIX:
+        return _read_plan(source, limits, on_step)
+    options = options or FlightOptions()
+    with step(on_step, "path") as results:
+        path_file = load_path_file(source)
+        check_space(path_file.path, limits.space, waypoints=path_file.waypoints, where=str(source))
+        results.append(f"{path_file.name}, {path_file.path.length:.1f} m, {len(path_file.waypoints)} waypoints")
+    with step(on_step, "plan") as results:
+        planned = plan(
+            path_file.path,
+            limits.airframe,
+            limits,
+            planner=options.planner,
+            nodes=options.nodes,
+            yaw=path_file.yaw,
+            yaw_angle=path_file.yaw_angle,
+            speed_factor=path_file.speed if options.speed_factor is None else options.speed_factor,
+        )
+        results.append(f"{planned.trajectory.duration:.2f} s of flight by {planned.planner}")
+        results.extend(planned.notes)
+    with step(on_step, "bound") as results:
+        bound = planned.lower_bound or lower_bound(PlanningTask(planned.path, planned.airframe, limits.plan))
+        more = planned.trajectory.duration / bound - 1
+        results.append(f"no flight takes less than {bound:.2f} s; this one takes {more:.1%} more")
+    return PlannedFlight(path_file.name, planned, limits, bound)
+
+
+def _read_plan(file: Path, limits: Limits, on_step: OnStep) -> PlannedFlight:
+    """Read a plan made under any limits, and certify it under these. Raises InputError if its vehicle is another."""
+    with step(on_step, "plan") as results:
+        plan = load_plan(file)
+        if plan.airframe != limits.airframe:
+            raise InputError(
+                f"planned for {plan.airframe.name}, but safety.yaml has {limits.vehicle}",
+                where=str(file),
+                hint="plan the path again for this vehicle",
+            )
+        certificate = certify(plan.trajectory, limits.plan, limits.space)
+        results.append(f"{plan.trajectory.duration:.2f} s, {plan.planner}, read from {file}")
+    return PlannedFlight(file.stem, replace(plan, limits=limits, certificate=certificate), limits)

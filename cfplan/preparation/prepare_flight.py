@@ -1,0 +1,109 @@
+"""The way of the data from a path file to a mission, on one screen.
+
+    path file → path → plan → certificate → bytes → dry run, link loss → stops → mission
+
+Each arrow is one function with frozen dataclasses in and out. `prepare_flight` is all of them in order; commands that
+need a part of the way call the parts.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from cfplan.errors import NotCertifiedError
+from cfplan.flight.pilot.mission import Mission, mission_of
+from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.stop_certificate import StopCertificate, certify_stops
+from cfplan.planning.plan_result import Plan
+from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
+from cfplan.preparation.steps import OnStep, ignore_steps, step
+from cfplan.safety.limits import Limits
+from cfplan.simulation.dry_run import DryRun, dry_run
+from cfplan.simulation.link_loss import LinkLoss, simulate_link_loss
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedFlight:
+    """A mission that may fly, and everything that it was made from and checked by."""
+
+    planned: PlannedFlight
+    encoded: EncodedFlight
+    dry_run: DryRun
+    link_loss: LinkLoss
+    stops: StopCertificate
+    mission: Mission
+
+    @property
+    def plan(self) -> Plan:
+        """The plan, with its certificate."""
+        return self.planned.plan
+
+
+def prepare_flight(
+    source: Path, limits: Limits, options: FlightOptions | None = None, on_step: OnStep = ignore_steps
+) -> PreparedFlight:
+    """Plan, certify, encode and rehearse the flight along a path file or of a plan file.
+
+    Raises:
+        InputError: a file or an option is wrong.
+        InfeasibleError: the path leaves the space, or no profile keeps the limits.
+        NotCertifiedError: the certificate, the bytes, the dry run or a stop does not pass.
+    """
+    options = options or FlightOptions()
+    planned = plan_flight(source, limits, options, on_step)
+    encoded = encode_flight(planned, on_step, stream_for=options.stream_for)
+    rehearsed = rehearse(planned, encoded, on_step)
+    lost = find_link_loss(encoded, limits, on_step)
+    mission, stops = make_mission(encoded, limits, on_step)
+    return PreparedFlight(planned, encoded, rehearsed, lost, stops, mission)
+
+
+def encode_flight(planned: PlannedFlight, on_step: OnStep = ignore_steps, *, stream_for: float = 0.0) -> EncodedFlight:
+    """Encode a certified plan, and check the bytes against the trajectory. Raises NotCertifiedError."""
+    plan = planned.plan
+    with step(on_step, "certificate") as results:
+        worst = plan.certificate.worst
+        results.append(f"worst {100 * worst.share:.1f} % of the limit on {worst.name} at {worst.time:.2f} s")
+        if not plan.certificate.passed:
+            raise NotCertifiedError(
+                f"{worst.name} reaches {100 * worst.share:.1f} % of its limit at {worst.time:.2f} s",
+                where=planned.name,
+                hint="plan the path again under this safety.yaml",
+            )
+    with step(on_step, "bytes") as results:
+        encoded = encode_trajectory(plan.trajectory, hold=max(HOLD, stream_for - plan.trajectory.duration))
+        check_bytes(encoded, plan.trajectory, planned.limits.plan)
+        results.append(f"{len(encoded.payloads)} setpoints")
+    return encoded
+
+
+def rehearse(planned: PlannedFlight, encoded: EncodedFlight, on_step: OnStep = ignore_steps) -> DryRun:
+    """Fly exactly these bytes in the simulator. Raises NotCertifiedError if the dry run fails."""
+    limits = planned.limits
+    with step(on_step, "dry run") as results:
+        rehearsed = dry_run(encoded, planned.plan.trajectory, limits.airframe, limits.flight)
+        results.append(
+            f"deviation {100 * rehearsed.deviation:.1f} cm at most, {100 * rehearsed.deviation_rms:.1f} cm rms"
+        )
+        results.append(f"{rehearsed.real_time_factor:.0f} times real time")
+        rehearsed.require_passed()
+    return rehearsed
+
+
+def find_link_loss(encoded: EncodedFlight, limits: Limits, on_step: OnStep = ignore_steps) -> LinkLoss:
+    """Simulate that the pilot or the radio dies at moments all along the flight, and return the worst."""
+    with step(on_step, "link loss") as results:
+        lost = simulate_link_loss(encoded.payloads, limits)
+        results.append(str(lost))
+    return lost
+
+
+def make_mission(
+    encoded: EncodedFlight, limits: Limits, on_step: OnStep = ignore_steps
+) -> tuple[Mission, StopCertificate]:
+    """Encode a stop from every setpoint and certify them all. Raises NotCertifiedError."""
+    with step(on_step, "stops") as results:
+        mission = mission_of(encoded, limits)
+        stops = certify_stops(mission.stops, limits, mission.rate)
+        stops.require(limits)
+        results.append(f"certified from each of {stops.count} setpoints, {stops.as_planned} within the plan's limits")
+    return mission, stops

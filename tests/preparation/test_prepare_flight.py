@@ -1,0 +1,108 @@
+"""From a path file to a mission: each step once, in order, and what does not pass goes no further."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
+from cfplan.flight.setpoints.packets import decode
+from cfplan.planning.plan_file import save_plan
+from cfplan.preparation import plan_flight as planning
+from cfplan.preparation import prepare_flight as preparation
+from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+from cfplan.preparation.prepare_flight import encode_flight, prepare_flight
+from cfplan.preparation.steps import StepState
+from cfplan.safety.limits_file import load_limits
+
+REPOSITORY = Path(__file__).parents[2]
+LINE = REPOSITORY / "flights" / "line.yaml"
+AFTER_PLANNING = ["certificate", "bytes", "dry run", "link loss", "stops"]
+
+
+@pytest.fixture(scope="module")
+def limits():
+    return load_limits(REPOSITORY / "safety.yaml")
+
+
+@pytest.fixture
+def steps():
+    """Notes each report; an OnStep."""
+    noted = []
+
+    def note(name, state, result):
+        noted.append((name, state, result))
+
+    note.noted = noted
+    note.names = lambda wanted: [name for name, state, _ in noted if state is wanted]
+    return note
+
+
+def test_every_step_is_reported_once_in_the_order_of_the_data(limits, steps):
+    prepared = prepare_flight(LINE, limits, on_step=steps)
+    order = ["path", "plan", "bound", *AFTER_PLANNING]
+    assert steps.names(StepState.BEGUN) == steps.names(StepState.FINISHED) == order
+    assert all(result for _, state, result in steps.noted if state is StepState.FINISHED)
+    assert prepared.plan.certificate.passed
+    assert prepared.dry_run.passed
+    assert prepared.mission.payloads is prepared.encoded.payloads
+    assert prepared.stops.count == len(prepared.mission.stops) == len(prepared.mission.payloads)
+    assert prepared.planned.lower_bound <= prepared.plan.trajectory.duration
+
+
+def test_nothing_is_simulated_twice(limits, monkeypatch):
+    called = []
+    for name in ("dry_run", "simulate_link_loss", "certify_stops", "check_bytes"):
+        function = getattr(preparation, name)
+        monkeypatch.setattr(preparation, name, lambda *a, _f=function, _n=name, **k: called.append(_n) or _f(*a, **k))
+    prepare_flight(LINE, limits)
+    assert called == ["check_bytes", "dry_run", "simulate_link_loss", "certify_stops"]
+
+
+def test_a_plan_file_gives_the_same_bytes_as_its_path_file(limits, tmp_path, steps):
+    prepared = prepare_flight(LINE, limits)
+    save_plan(prepared.plan, tmp_path / "plan.parquet")
+    again = prepare_flight(tmp_path / "plan.parquet", limits, on_step=steps)
+    assert steps.names(StepState.FINISHED) == ["plan", *AFTER_PLANNING]
+    np.testing.assert_array_equal(again.mission.payloads, prepared.mission.payloads)
+    np.testing.assert_array_equal(again.mission.stops, prepared.mission.stops)
+    assert again.planned.lower_bound is None
+
+
+def test_a_plan_of_another_vehicle_is_refused(limits, tmp_path):
+    save_plan(plan_flight(LINE, limits).plan, tmp_path / "plan.parquet")
+    heavier = replace(limits, airframe=replace(limits.airframe, mass=1.1 * limits.airframe.mass))
+    with pytest.raises(InputError, match="planned for"):
+        prepare_flight(tmp_path / "plan.parquet", heavier)
+
+
+def test_a_plan_that_breaks_todays_limits_is_certified_anew_and_not_encoded(limits, tmp_path, steps):
+    save_plan(plan_flight(LINE, limits).plan, tmp_path / "plan.parquet")
+    stricter = replace(limits, plan=replace(limits.plan, speed=0.8 * limits.plan.speed))
+    planned = plan_flight(tmp_path / "plan.parquet", stricter)
+    assert not planned.plan.certificate.passed
+    with pytest.raises(NotCertifiedError, match="speed"):
+        encode_flight(planned, steps)
+    assert steps.names(StepState.FAILED) == ["certificate"]
+
+
+def test_the_path_files_speed_holds_unless_another_is_given(limits, monkeypatch):
+    real = planning.load_path_file
+    monkeypatch.setattr(planning, "load_path_file", lambda file: replace(real(file), speed=0.7))
+    flown = [plan_flight(LINE, limits, FlightOptions(speed_factor=given)).plan.speed_factor for given in (None, 0.5)]
+    assert flown == [0.7, 0.5]
+
+
+def test_a_stream_as_long_as_asked_for_ends_in_a_hover(limits):
+    prepared = prepare_flight(LINE, limits, FlightOptions(stream_for=6.0))
+    assert 6.0 <= prepared.encoded.duration < 6.03
+    after = prepared.encoded.times > prepared.plan.trajectory.duration
+    assert not np.any(decode(prepared.encoded.payloads[after]).velocity)
+
+
+def test_a_path_outside_the_space_fails_at_the_path_with_its_waypoint(limits, tmp_path, steps):
+    (tmp_path / "path.yaml").write_text("waypoints: [[0, 0, 1], [3, 0, 1]]\n")
+    with pytest.raises(InfeasibleError, match="waypoint 2"):
+        prepare_flight(tmp_path / "path.yaml", limits, on_step=steps)
+    assert steps.names(StepState.FAILED) == ["path"]
