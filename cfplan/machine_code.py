@@ -35,6 +35,7 @@ from numba.core.serialize import dumps
 PACKAGE = Path(__file__).parent
 _IMPORT = re.compile(r"^\s*from (cfplan[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 _KEPT_DAYS = 60.0  # after which files that no process has read are deleted
+_DIGEST = 32  # bytes of the checksum before a file's content
 _PLACES = 2**30  # bytes of the lock file, of which each function locks one
 
 
@@ -72,10 +73,10 @@ def _machine() -> bytes:
 @lru_cache(maxsize=512)
 def _source(module: str) -> tuple[str, tuple[str, ...]]:
     """Return a module's hash, and the cfplan modules that it imports; none where the name is no module."""
-    parts = module.split(".")[1:]
-    file = PACKAGE.joinpath(*parts[:-1], f"{parts[-1]}.py") if parts else PACKAGE / "__init__.py"
+    *folders, last = module.split(".")[1:] or ["__init__"]
+    file = getattr(sys.modules.get(module), "__file__", None) or PACKAGE.joinpath(*folders, f"{last}.py")
     try:
-        text = file.read_bytes()
+        text = Path(file).read_bytes()
     except OSError:
         return "", ()
     imported: list[str] = []
@@ -102,15 +103,16 @@ def _name(title: str, *parts: str) -> str:
 
 
 def _read(name: str) -> bytes | None:
-    """Return a file of the cache folder, if it is there."""
+    """Return what a file of the cache folder holds, if it is there and whole."""
     file = cache_folder() / name
     try:
         data = file.read_bytes()
         if time.time() - file.stat().st_mtime > 86400:
             os.utime(file)  # not to be deleted: it is in use
-        return data
     except OSError:
         return None
+    digest, content = data[:_DIGEST], data[_DIGEST:]
+    return content if hashlib.sha256(content).digest() == digest else None
 
 
 def _write(name: str, data: bytes) -> None:
@@ -120,7 +122,7 @@ def _write(name: str, data: bytes) -> None:
         handle, made = tempfile.mkstemp(dir=folder, prefix="making-")
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(data)
+                file.write(hashlib.sha256(data).digest() + data)
             os.replace(made, folder / name)
         except BaseException:
             os.unlink(made)

@@ -20,15 +20,15 @@ OPTIONAL = {
 }
 
 
-@click.command(short_help="Versions, packages, compiler, radio.", epilog="Example: cfplan doctor --json")
+@click.command(short_help="Versions, packages, machine code, radio.", epilog="Example: cfplan doctor --json")
 @options.as_json
 def doctor(as_json: bool) -> int:
-    """Show versions, packages, the compiler and the radio, and what is missing."""
+    """Show versions, packages, compiled functions and the radio, and what is missing."""
     checks = [
         _python(),
         *map(_package, NEEDED),
         *(_optional(name) for name in OPTIONAL),
-        _expert(),
+        _machine_code(),
         _priority(),
         _radio(),
     ]
@@ -68,16 +68,15 @@ def _optional(name: str) -> dict[str, str]:
     return _check(name, version or "-", "ok" if version else "optional", "" if version else OPTIONAL[name])
 
 
-def _expert() -> dict[str, str]:
-    """How the expert's functions are evaluated here; compiles them if that was never done."""
-    from cfplan.planners.expert.compiled import Backend, compiler
-    from cfplan.planners.expert.kernel import backend
+def _machine_code() -> dict[str, str]:
+    """Whether compiled functions are kept for the next start."""
+    from cfplan.machine_code import cache_folder, kept
 
-    used = backend()
-    if used is Backend.COMPILED:
-        return _check("expert", f"compiled ({compiler()})")
-    hint = "its cache folder cannot be written" if compiler() else "install a C compiler to plan several times faster"
-    return _check("expert", str(used), "optional", hint)
+    if not kept():
+        hint = f"{cache_folder()} cannot be written: each command compiles anew; CFPLAN_CACHE names another folder"
+        return _check("machine code", "-", "optional", hint)
+    functions = len(list(cache_folder().glob("*-*")))
+    return _check("machine code", f"{functions} functions in {cache_folder()}")
 
 
 def _priority() -> dict[str, str]:

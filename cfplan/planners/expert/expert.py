@@ -19,8 +19,7 @@ import time
 from numpy.typing import NDArray
 
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.expert.compiled import Backend
-from cfplan.planners.expert.kernel import backend as backend_in_use
+from cfplan.planners.expert.kernel import Backend
 from cfplan.planners.expert.point_constraints import Penalties
 from cfplan.planners.expert.problem import Ends, pose, profile_of
 from cfplan.planners.expert.program import Shape, layout_of
@@ -48,7 +47,7 @@ def plan_expert(
     both are laid out before the speed (see yaw_track), which then respects what turning takes. FREE leaves yaw to the
     optimiser, from a first yaw between that angle and a quarter turn more, as the paper has it. A start or end state
     brings its own yaw in every mode. Long paths are taken window by window, unless `windows` is False. `backend` is for
-    tests: left out, compiled code where there is a compiler.
+    tests: left out, compiled code.
 
     Raises:
         InputError: fewer nodes than the path needs.
@@ -89,7 +88,7 @@ def plan_expert(
         "rounds": joined.rounds,
         "windows": 1 + len(joined.joints),
         "solver": " and ".join(sorted(solvers)),
-        "backend": str(backend or backend_in_use()),
+        "backend": str(backend or Backend.COMPILED),
     }
     profile = profile_of(joined.table, limits.speed**2, track, path.end)
     return Solution(Status.SOLVED, profile, "; ".join(failures), stats, joined.joints)

@@ -8,7 +8,7 @@ import casadi
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.planners.expert.compiled import Backend
+from cfplan.planners.expert.kernel import Backend
 from cfplan.planners.expert.problem import Problem, table_of, variables_of
 from cfplan.planners.expert.program import Shape, program
 from cfplan.planners.expert.transcription import SplineProblem

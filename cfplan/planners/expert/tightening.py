@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
-from cfplan.planners.expert.compiled import Backend
 from cfplan.planners.expert.intersample import ALLOWANCE, DensePath
+from cfplan.planners.expert.kernel import Backend
 from cfplan.planners.expert.problem import Ends, Problem, held_by, profile_of, tightened
 from cfplan.planners.expert.program import Layout
 from cfplan.planners.expert.solvers import AGAIN, Attempt, again

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
-from cfplan.planners.expert.compiled import Backend
-from cfplan.planners.expert.kernel import H_SPLINE, LANES, YAW_SPLINE, Points, coefficients
+from cfplan.planners.expert.kernel import H_SPLINE, YAW_SPLINE, Backend, Points, coefficients
+from cfplan.planners.expert.llvm_emitter import LANES
 from cfplan.planners.expert.problem import FLOOR, Problem
 from cfplan.planners.expert.program import OBJECTIVE_SCALE, Layout
 from cfplan.planners.solver.barrier import PULLS, bounds_of

@@ -1,17 +1,15 @@
 """The problems behind the expert: derivatives, backends, solvers, and what lies between the points."""
 
-import shutil
-
 import casadi
 import numpy as np
 import pytest
 
 from cfplan.geometry.min_snap import min_snap
-from cfplan.planners.expert import compiled, kernel, point_constraints
 from cfplan.planners.expert import expert as reduced
-from cfplan.planners.expert.compiled import Backend
+from cfplan.planners.expert import kernel, point_constraints
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.expert.intersample import Excess
+from cfplan.planners.expert.kernel import Backend
 from cfplan.planners.expert.point_constraints import Penalties
 from cfplan.planners.expert.problem import Ends, pose, profile_of, table_of, tightened, variables_of
 from cfplan.planners.expert.program import Program, Shape, layout_of, program
@@ -145,9 +143,7 @@ def test_rows_of_the_program_are_what_the_flatness_map_gives():
         np.testing.assert_allclose(values[row == which], expected[row == which], atol=1e-6)
 
 
-@pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler")
 def test_compiled_code_and_virtual_machine_agree():
-    assert kernel.backend() is Backend.COMPILED
     profiles = [
         plan_expert(PlanningTask(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=30), backend=backend).profile
         for backend in Backend
@@ -155,7 +151,6 @@ def test_compiled_code_and_virtual_machine_agree():
     np.testing.assert_allclose(profiles[0].h, profiles[1].h, rtol=1e-5)
 
 
-@pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("turned", [-40.0, -3.2, 0.0, 0.8, 1.6, 3.1, 4.7, 900.0])
 @pytest.mark.parametrize("free_yaw", [False, True])
 def test_compiled_code_and_virtual_machine_agree_at_each_point_whichever_way_it_looks(free_yaw, turned):
@@ -175,57 +170,45 @@ def test_compiled_code_and_virtual_machine_agree_at_each_point_whichever_way_it_
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * abs(other).max())
 
 
-def test_without_a_compiler_the_virtual_machine_plans(monkeypatch, tmp_path):
-    monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "empty"))
-    monkeypatch.setattr(shutil, "which", lambda *_: None)
-    kernel.machine_code.cache_clear()
-    try:
-        assert kernel.backend() is Backend.VIRTUAL_MACHINE
-        solution = plan_expert(PlanningTask(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=31))
-        assert solution.status is Status.SOLVED
-        assert solution.stats["backend"] == "virtual machine"
-    finally:
-        kernel.machine_code.cache_clear()
+def test_the_virtual_machine_plans_the_same_flight():
+    task = PlanningTask(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=31)
+    compiled, interpreted = (plan_expert(task, backend=each) for each in Backend)
+    assert compiled.status is interpreted.status is Status.SOLVED
+    assert (compiled.stats["backend"], interpreted.stats["backend"]) == ("compiled", "virtual machine")
+    np.testing.assert_allclose(compiled.profile.h, interpreted.profile.h, rtol=1e-6)
 
 
-def test_a_cache_folder_that_cannot_be_written_falls_back(monkeypatch, tmp_path):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "file" / "below"))
-    kernel.machine_code.cache_clear()
-    try:
-        assert kernel.machine_code() is None
-    finally:
-        kernel.machine_code.cache_clear()
-
-
-@pytest.mark.skipif(compiled.compiler() is None, reason="no C compiler")
-def test_the_library_is_made_once_and_left_alone(monkeypatch, tmp_path):
+@pytest.fixture
+def other_cache(monkeypatch, tmp_path):
+    """Compiles kernels anew, for a cache folder of the test's choice."""
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path))
     kernel.machine_code.cache_clear()
-    try:
-        made = kernel.machine_code()
-        assert made is not None
-        before = made.stat().st_mtime_ns
-        kernel.machine_code.cache_clear()
-        assert kernel.machine_code() == made
-        assert made.stat().st_mtime_ns == before
-        assert [entry.name for entry in tmp_path.iterdir()] == [made.name]  # nothing half-made beside it
-    finally:
-        kernel.machine_code.cache_clear()
+    yield tmp_path
+    kernel.machine_code.cache_clear()
 
 
-def test_an_instruction_that_cannot_be_written_out_leaves_the_virtual_machine(monkeypatch, tmp_path):
+def test_kernels_compile_where_the_cache_folder_cannot_be_written(monkeypatch, other_cache):
+    (other_cache / "file").write_text("")
+    monkeypatch.setenv("CFPLAN_CACHE", str(other_cache / "file" / "below"))
+    assert set(kernel.machine_code()) == {"given_values", "given_derivatives", "free_values", "free_derivatives"}
+
+
+def test_kernels_are_compiled_once_and_left_alone(other_cache):
+    kernel.machine_code()
+    (made,) = other_cache.glob("kernels-*")
+    before = made.stat().st_mtime_ns
+    kernel.machine_code.cache_clear()
+    kernel.machine_code()
+    assert made.stat().st_mtime_ns == before
+    assert {entry.name for entry in other_cache.iterdir()} == {made.name, "locks"}  # nothing half-made beside it
+
+
+def test_an_instruction_that_cannot_be_written_out_is_named(monkeypatch):
     x = casadi.SX.sym("x")
     unknown = casadi.Function("unknown", [x], [casadi.atan(x)])
     monkeypatch.setattr(kernel, "point_kernels", lambda free_yaw: (unknown, unknown))
-    monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path))
     with pytest.raises(NotImplementedError, match="unknown: instruction"):
         kernel.source()
-    kernel.machine_code.cache_clear()
-    try:
-        assert kernel.backend() is Backend.VIRTUAL_MACHINE
-    finally:
-        kernel.machine_code.cache_clear()
 
 
 def test_ipopt_is_told_the_whole_gradient_and_finds_the_same_flight_each_time():

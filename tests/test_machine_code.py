@@ -1,0 +1,130 @@
+"""Compiled functions are kept where no stale code can come from, and by two processes at once."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan import machine_code
+from cfplan.machine_code import njit
+
+PACKAGE = Path(machine_code.__file__).parent
+
+
+@pytest.fixture
+def cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def doubling():
+    @njit
+    def doubled(x):
+        return 2 * x
+
+    return doubled
+
+
+def files(cache):
+    return sorted(file.name for file in cache.iterdir() if file.suffix == ".numba")
+
+
+def test_a_function_is_compiled_once_for_each_kind_of_argument(cache):
+    function = doubling()
+    assert function(2) == 4
+    assert function(2.0) == 4.0
+    assert len(files(cache)) == 2
+    again = doubling()
+    assert again(3) == 6
+    assert sum(again.stats.cache_hits.values()) == 1
+    assert len(files(cache)) == 2
+
+
+def test_where_nothing_can_be_written_functions_are_compiled_all_the_same(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "file" / "below"))
+    assert not machine_code.kept()
+    assert doubling()(2) == 4
+
+
+def test_a_damaged_file_is_compiled_anew(cache):
+    doubling()(2)
+    (name,) = files(cache)
+    (cache / name).write_bytes(b"half a file")
+    assert doubling()(2) == 4
+    assert doubling()(3) == 6
+    assert files(cache) == [name]
+
+
+def test_a_change_in_an_imported_module_changes_the_key(monkeypatch, tmp_path):
+    for name, text in {
+        "upper": "from cfplan.lower import (\n    G,\n    H,\n)\n",
+        "lower": "from cfplan.lowest import G\n",
+        "lowest": "G = 9.81\n",
+        "other": "G = 9.81\n",
+    }.items():
+        (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.setattr(machine_code, "PACKAGE", tmp_path)
+
+    def keys():
+        machine_code.key.cache_clear()
+        machine_code._source.cache_clear()
+        return [machine_code.key(f"cfplan.{name}") for name in ("upper", "lower", "lowest", "other")]
+
+    try:
+        before = keys()
+        assert keys() == before
+        (tmp_path / "lowest.py").write_text("G = 9.80665\n")
+        changed = [old != new for old, new in zip(before, keys(), strict=True)]
+        assert changed == [True, True, True, False]
+    finally:
+        machine_code.key.cache_clear()
+        machine_code._source.cache_clear()
+
+
+SLOWLY = """
+import sys, time
+from cfplan import machine_code
+from numba.core import event
+
+class Slowly(event.Listener):
+    def on_start(self, event):
+        print("compiling", event.data["dispatcher"].__name__, flush=True)
+        time.sleep(1.0)
+    def on_end(self, event): ...
+
+event.register("numba:compile", Slowly())
+from cfplan.vehicle.rotations import matrix_of
+import numpy as np
+print("ready", flush=True)
+sys.stdin.readline()
+print(matrix_of(np.array([0.0, 0.0, 0.0, 1.0])).tolist(), flush=True)
+"""
+
+
+def test_of_two_processes_one_compiles_and_the_other_waits(cache):
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", SLOWLY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ
+        )
+        for _ in range(3)
+    ]
+    for process in processes:
+        assert process.stdout.readline() == "ready\n"
+    for process in processes:
+        process.stdin.write("\n")
+        process.stdin.flush()
+    outputs = [process.communicate(timeout=120)[0].splitlines() for process in processes]
+    assert all(process.returncode == 0 for process in processes)
+    assert {lines[-1] for lines in outputs} == {str(np.eye(3).tolist())}
+    assert sum("compiling matrix_of" in lines for lines in outputs) == 1
+
+
+def test_no_module_takes_njit_past_the_cache():
+    for file in PACKAGE.rglob("*.py"):
+        if file.name != "machine_code.py":
+            assert not re.search(r"from numba import .*\bnjit\b|numba\.njit", file.read_text()), file
