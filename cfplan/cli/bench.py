@@ -218,10 +218,10 @@ def _safety_file(path_file: Path) -> Path:
 
 
 def _prepared_mission(path_file: Path) -> "Mission":
-    from cfplan.preparation.prepare_flight import prepare_flight
+    from cfplan.preparation.prepare_flight import prepare_mission
     from cfplan.safety.limits_file import load_limits
 
-    return prepare_flight(path_file, load_limits(_safety_file(path_file))).mission
+    return prepare_mission(path_file, load_limits(_safety_file(path_file)))
 
 
 def _use_one_thread() -> None:

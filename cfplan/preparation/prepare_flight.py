@@ -57,6 +57,15 @@ def prepare_flight(
     return PreparedFlight(planned, encoded, rehearsed, lost, stops, mission)
 
 
+def prepare_mission(source: Path, limits: Limits, options: FlightOptions | None = None) -> Mission:
+    """Plan, certify and encode a mission without rehearsing it or certifying its stops: for the virtual vehicle alone.
+
+    Studies of faults fly such missions. Raises what planning and encoding raise.
+    """
+    options = options or FlightOptions()
+    return mission_of(encode_flight(plan_flight(source, limits, options), stream_for=options.stream_for), limits)
+
+
 def encode_flight(planned: PlannedFlight, on_step: OnStep = ignore_steps, *, stream_for: float = 0.0) -> EncodedFlight:
     """Encode a certified plan, and check the bytes against the trajectory. Raises NotCertifiedError."""
     plan = planned.plan

@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import CfplanError, ExitCode
+from cfplan.flight.pilot.mission import mission_of
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import encode
 from cfplan.geometry.path_file import load_path_file
-from cfplan.preparation.prepare_flight import PreparedFlight, prepare_flight
+from cfplan.preparation.plan_flight import PlannedFlight, plan_flight
+from cfplan.preparation.prepare_flight import encode_flight, rehearse
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dry_run import dry_run
 from cfplan.studies.real_time import Conditions, RealTimeFlight, fly_in_real_time
 from cfplan.studies.result import Column, StudyResult, Table, detail_table
+from cfplan.vehicle.trajectory import Trajectory
 
 PLAN_COLUMNS = (
     Column("path", "path"),
@@ -120,17 +123,18 @@ def fly_each(
         for index, file in enumerate(path_files):
             progress(index * repeats, total)
             try:
-                made = prepare_flight(file, load_limits(find_safety_file(file)))
-                plans.append(_rehearsed(file.stem, made))
+                planned = plan_flight(file, load_limits(find_safety_file(file)))
+                encoded = encode_flight(planned)
+                plans.append(_rehearsed(file.stem, planned, encoded))
             except CfplanError as error:
                 flights.append(JudgedFlight(file.stem, conditions.seed, landed=False, reason=str(error)))
                 continue
-            lag = made.plan.airframe.motor_time_constant
+            mission, lag = mission_of(encoded, planned.limits), planned.plan.airframe.motor_time_constant
             for number in range(repeats):
                 progress(index * repeats + number, total)
                 lab = replace(conditions, seed=conditions.seed + number)
-                flight = fly_in_real_time(made.mission, lab, name=file.stem)
-                flights.append(_judged(file.stem, lab.seed, made, flight))
+                flight = fly_in_real_time(mission, lab, name=file.stem)
+                flights.append(_judged(file.stem, lab.seed, planned.plan.trajectory, flight))
                 if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT:
                     raise KeyboardInterrupt
         progress(total, total)
@@ -159,10 +163,10 @@ def flight_tables(
     )
 
 
-def _rehearsed(name: str, made: PreparedFlight) -> RehearsedPlan:
-    plan = made.plan
-    bound = made.planned.lower_bound
+def _rehearsed(name: str, planned: PlannedFlight, encoded: EncodedFlight) -> RehearsedPlan:
+    plan, bound = planned.plan, planned.lower_bound
     assert bound is not None  # a path file has one
+    without_drag = dry_run(_without_drag(encoded, plan.trajectory), plan.trajectory, plan.airframe, plan.limits.flight)
     return RehearsedPlan(
         path=name,
         length=plan.path.length,
@@ -171,20 +175,20 @@ def _rehearsed(name: str, made: PreparedFlight) -> RehearsedPlan:
         lower_bound=bound,
         speed_factor=plan.repair_speed_factor,
         worst_share=plan.certificate.worst.share,
-        dry_run=made.dry_run.deviation,
-        dry_run_without_drag=dry_run(_without_drag(made), plan.trajectory, plan.airframe, plan.limits.flight).deviation,
+        dry_run=rehearse(planned, encoded).deviation,
+        dry_run_without_drag=without_drag.deviation,
     )
 
 
-def _without_drag(made: PreparedFlight) -> EncodedFlight:
+def _without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFlight:
     """Return the same flight with the acceleration of the motion alone."""
-    states = made.plan.trajectory.at(made.encoded.times + made.encoded.lead)
-    setpoints = replace(made.encoded.decoded, acceleration=states.acceleration)
-    return replace(made.encoded, payloads=encode(setpoints), decoded=setpoints)
+    states = trajectory.at(encoded.times + encoded.lead)
+    setpoints = replace(encoded.decoded, acceleration=states.acceleration)
+    return replace(encoded, payloads=encode(setpoints), decoded=setpoints)
 
 
-def _judged(name: str, seed: int, made: PreparedFlight, flight: RealTimeFlight) -> JudgedFlight:
-    outcome, truth, trajectory = flight.outcome, flight.truth, made.plan.trajectory
+def _judged(name: str, seed: int, trajectory: Trajectory, flight: RealTimeFlight) -> JudgedFlight:
+    outcome, truth = flight.outcome, flight.truth
     if not flight.landed or outcome is None or truth is None:
         return JudgedFlight(name, seed, landed=False, reason=flight.reason, refusals=flight.refusals)
     elapsed = truth.time - outcome.first_setpoint

@@ -23,7 +23,7 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.real_time import may_use_fifo_scheduling
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.preparation.plan_flight import FlightOptions
-from cfplan.preparation.prepare_flight import prepare_flight
+from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.recording.header import RecordHeader
 from cfplan.recording.rerun.live import LiveView, live_blueprint
 from cfplan.recording.rerun.viewer import APPLICATION, free_port, lay_out, viewer_program
@@ -102,7 +102,7 @@ def lateness_study(
 ) -> StudyResult:
     """Measure with and without SCHED_FIFO. Afterwards this process and its children may not use it any more."""
     options = FlightOptions(stream_for=seconds)
-    mission = _patient(prepare_flight(path_file, load_limits(safety_file), options).mission)
+    mission = _patient(prepare_mission(path_file, load_limits(safety_file), options))
     rows: list[WakeUps] = []
     with contextlib.suppress(KeyboardInterrupt):
         for step, priority in enumerate((FIRST, ORDINARY)):

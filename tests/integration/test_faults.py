@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from cfplan.preparation.prepare_flight import prepare_flight
+from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
 from cfplan.studies.fault_scenarios import SCENARIOS
 from cfplan.studies.faults import fly_scenario, fly_stepped
@@ -29,7 +29,7 @@ SEEDS, PATHS = range(200), ("helix", "line", "loop3d", "random", "slalom")
 
 @pytest.fixture(scope="module")
 def line():
-    return prepare_flight(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml")).mission
+    return prepare_mission(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml"))
 
 
 @pytest.mark.parametrize(
@@ -82,6 +82,6 @@ def test_a_random_fault_stays_inside_the_walls(seed, line):
 @pytest.mark.timeout(1800)
 def test_no_random_fault_of_two_hundred_leaves_the_walls():
     limits = load_limits(REPOSITORY / "safety.yaml")
-    missions = {name: prepare_flight(REPOSITORY / "flights" / f"{name}.yaml", limits).mission for name in PATHS}
+    missions = {name: prepare_mission(REPOSITORY / "flights" / f"{name}.yaml", limits) for name in PATHS}
     outside = [flown.name for _, flown in (fly_random(seed, missions) for seed in SEEDS) if flown.to_wall <= 0.0]
     assert not outside

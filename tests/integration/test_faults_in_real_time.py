@@ -16,7 +16,7 @@ from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import Event, SetpointSent
-from cfplan.preparation.prepare_flight import prepare_flight
+from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.lab import Lab, start_lab
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
@@ -80,7 +80,7 @@ ROWS = {
 
 @pytest.fixture(scope="module")
 def line():
-    mission = prepare_flight(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml")).mission
+    mission = prepare_mission(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml"))
     return replace(mission, limits=replace(mission.limits, lateness=0.1))  # other tests may run beside this
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
-from cfplan.preparation.prepare_flight import prepare_flight
+from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.link_loss import simulate_link_loss, swept_after_link_loss
 from cfplan.studies.fault_scenarios import SCENARIOS
@@ -25,7 +25,7 @@ def limits():
 
 @pytest.fixture(scope="module")
 def line() -> Mission:
-    return prepare_flight(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml")).mission
+    return prepare_mission(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml"))
 
 
 def straight(speed: float, seconds: float = 1.0) -> np.ndarray:

@@ -176,7 +176,7 @@ def test_no_flight_at_all_is_a_table_too(flown):
 
 @pytest.mark.parametrize("wrong", [["--loss", "1"], ["--pose-noise", "-1"], ["--repeats", "0"]])
 def test_conditions_that_cannot_be_are_refused_before_anything_is_planned(wrong, monkeypatch, capsys):
-    monkeypatch.setattr(flights, "prepare_flight", None)
+    monkeypatch.setattr(flights, "plan_flight", None)
     monkeypatch.setattr("sys.argv", ["cfplan", "study", "flights", str(LINE), *wrong])
     with pytest.raises(SystemExit) as ended:
         main()
