@@ -1,7 +1,6 @@
 """How the commands speak: a line a step for people, one JSON document for scripts."""
 
 import json
-import math
 import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -10,6 +9,7 @@ from typing import Any
 import click
 
 from cfplan.errors import CfplanError
+from cfplan.files.json_values import json_value
 from cfplan.preparation.steps import StepState, step
 
 _FILE_WIDTH = 170  # characters, of tables that go to a file or a pipe
@@ -48,7 +48,7 @@ class Steps:
 
 def print_json(document: Any) -> None:
     """One document on standard output; what is not finite becomes null, as JSON has no word for it."""
-    click.echo(json.dumps(finite(document), indent=2, ensure_ascii=False))
+    click.echo(json.dumps(json_value(document), indent=2, ensure_ascii=False))
 
 
 def print_error(error: CfplanError, *, as_json: bool) -> None:
@@ -75,15 +75,3 @@ def print_table(title: str, columns: list[str], rows: Sequence[Sequence[str]]) -
     if not console.is_terminal:
         console.width = _FILE_WIDTH
     console.print(table)
-
-
-def finite(value: Any) -> Any:
-    """The same as JSON knows it: what is not finite becomes None."""
-    if isinstance(value, dict):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    if isinstance(value, bool | str | int) or value is None:
-        return value
-    number = float(value)
-    return number if math.isfinite(number) else None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cfplan import __version__
 from cfplan.errors import InputError
+from cfplan.files.json_values import json_value
 from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.vehicle.airframe import Airframe
 
@@ -116,7 +117,7 @@ def header_of_plan(plan: "Plan", *, name: str, uri: str, source: FilePath, wall_
 
 def header_to_json(header: RecordHeader) -> str:
     """Return the header as one line of JSON; numbers that are not finite become null."""
-    return json.dumps(_plain({f.name: getattr(header, f.name) for f in fields(header)}), allow_nan=False)
+    return json.dumps(json_value(header), allow_nan=False)
 
 
 def header_from_json(text: str, *, where: str = "") -> RecordHeader:
@@ -175,18 +176,3 @@ def _triple(values: list[float | None]) -> Triple:
 
 def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
-
-
-def _plain(value: Any) -> Any:
-    """The same as JSON knows it."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "__dataclass_fields__"):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value

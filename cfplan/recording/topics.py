@@ -1,7 +1,6 @@
 """The topics of a record's MCAP file: for each kind of message its JSON Schema, and the way to JSON and back."""
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
@@ -12,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import json as pa_json
 
+from cfplan.files.json_values import json_value
 from cfplan.flight import telemetry
 from cfplan.recording import record
 
@@ -68,23 +68,13 @@ def message_to_json(message: telemetry.Telemetry) -> bytes:
     try:
         return json.dumps(values, separators=(",", ":"), allow_nan=False, default=_from_numpy).encode()
     except ValueError:
-        return json.dumps(_finite(values), separators=(",", ":"), allow_nan=False).encode()
+        return json.dumps(json_value(values), separators=(",", ":"), allow_nan=False).encode()
 
 
 def _from_numpy(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"a {type(value).__name__} does not belong into a message")
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return _finite(value.tolist())
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def columns_from_json(topic: Topic, payloads: list[bytes]) -> Any:

@@ -1,4 +1,4 @@
-"""What goes wrong, when, and which rung of the abort ladder it must come to: the rows of the fault table."""
+"""The faults of the fault table: what goes wrong, when, and which rung of the abort ladder it must lead to."""
 
 from dataclasses import dataclass, field
 from math import pi
@@ -19,12 +19,12 @@ FULL_SPEED = 1.5  # s after the stream began: the path's cruise
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One row."""
+    """One flight of the fault table."""
 
     name: str
-    rung: Rung  # that it must come to, and no graver one
+    rung: Rung  # that it must lead to, and none below
     faults: tuple[Fault, ...] = ()  # their starts count from the moment
-    phase: Phase = Phase.STREAM
+    phase: Phase = Phase.STREAM  # in which it begins
     moment: float = FULL_SPEED  # s after the phase began
     stall: float = 0.0  # s for which the pilot's computer stands still
     order: Order | None = None  # of the operator
@@ -53,7 +53,7 @@ def _vehicle(name: str, kind: VehicleFaultKind, rung: Rung, duration: float, **c
 
 
 def _odd(name: str, *, grounded: bool = False, **settings: Any) -> Scenario:
-    """A vehicle that is not as it should be."""
+    """Return the scenario of a vehicle that is not as it should be."""
     return Scenario(name, Rung.NONE, vehicle=VehicleSettings(auto_arming=False, **settings), grounded=grounded)
 
 

@@ -150,7 +150,7 @@ def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0) -> FaultFl
 def fly_stepped(
     scenario: Scenario, mission: Mission, *, listen: Callable[[Telemetry], None] = lambda _: None, seed: int = 0
 ) -> SteppedFlight:
-    """Fly one in the stepped lab, and let what is left behind come to rest."""
+    """Fly one in the stepped lab until everything has come to rest."""
     lab = SteppedLab(mission.limits.airframe, vehicle=scenario.vehicle, cameras=scenario.cameras, seed=seed)
     orders, flown = StudyOrders(), SteppedFlight(None, "", lab.truth(), math.nan)
 
@@ -203,7 +203,7 @@ def fly_stepped(
 
 
 def judge(scenario: Scenario, flown: SteppedFlight, mission: Mission, readable: bool) -> FaultFlight:
-    """Hold what really happened against what must."""
+    """Judge a flight by the truth."""
     truth, outcome = flown.truth, flown.outcome
     rung = outcome.rung if outcome is not None else Rung.NONE
     reaction = next(
@@ -247,7 +247,7 @@ def _off_plan(flown: SteppedFlight, mission: Mission) -> float:
 
 
 def _off_setpoint(flown: SteppedFlight, mission: Mission) -> float:
-    """In time: a vehicle that is late on its path is off its setpoint."""
+    """Return the largest distance in time: a vehicle that is late on its path is off its setpoint."""
     if not flown.sent:
         return 0.0
     sent, truth = np.array([time for time, _ in flown.sent]), flown.truth

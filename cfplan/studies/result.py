@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cfplan.errors import InputError
+from cfplan.files.json_values import json_value
 from cfplan.studies.provenance import Provenance, provenance
 
 NOTHING = "–"  # stands where there was nothing to measure
@@ -68,7 +69,7 @@ class Table:
             "title": self.title,
             **({"across": True} if self.across else {}),
             "columns": [{key: value for key, value in asdict(column).items() if value} for column in self.columns],
-            "rows": [[row[column.key] for column in self.columns] for row in self.rows],
+            "rows": [[json_value(row[column.key]) for column in self.columns] for row in self.rows],
         }
 
     @staticmethod
@@ -101,15 +102,14 @@ class StudyResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as JSON has it; what is not finite is null."""
-        document = {
+        return {
             "study": self.study,
-            "provenance": asdict(self.provenance),
-            "settings": dict(self.settings),
+            "provenance": json_value(self.provenance),
+            "settings": json_value(self.settings),
             "interrupted": self.interrupted,
             "tables": [table.to_json() for table in self.tables],
             "details": [table.to_json() for table in self.details],
         }
-        return {key: _finite(value) for key, value in document.items()}
 
     def write(self, file: Path) -> None:
         """Write the JSON, each row on one line."""
@@ -163,17 +163,6 @@ def collect(items: Iterator[Item]) -> tuple[list[Item], bool]:
     except KeyboardInterrupt:
         return collected, True
     return collected, False
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, bool | str | int) or value is None:
-        return value
-    number = float(value)
-    return number if math.isfinite(number) else None
 
 
 def _text(value: Any, indent: str = "") -> str:

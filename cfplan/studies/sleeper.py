@@ -1,4 +1,4 @@
-"""A process that only sleeps until deadlines: how late it wakes is what the computer itself adds to any other."""
+"""Measure wake-up latency by a process that only sleeps until deadlines: the computer makes every program as late."""
 
 import contextlib
 import gc
@@ -17,10 +17,10 @@ _WATCH, _LATE, _QUEUED, _END = "watch", "late", "queued", None
 
 
 class Sleeper:
-    """A process that sleeps until deadlines, with what the stream's thread is given, while the block lasts."""
+    """A process that sleeps until deadlines while the block lasts, with the priority of the stream's thread."""
 
     def __init__(self, rate: float, *, first: bool):
-        # rate in Hz; first by SCHED_FIFO
+        """Start it. `rate` is in Hz; `first`: by SCHED_FIFO."""
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_sleep, args=(theirs, rate, first), name="sleeper", daemon=True)
@@ -37,15 +37,15 @@ class Sleeper:
         self._connection.close()
 
     def watch(self, process: int) -> None:
-        """From now on note at each waking how long that process's first thread waited for a processor."""
+        """Begin to note at each waking how long that process's first thread waited for a processor."""
         self._connection.send((_WATCH, process))
 
     def late(self, begin: float = -math.inf, end: float = math.inf) -> list[float]:
-        """s by which each waking so far was late whose deadline lies between, by time.monotonic()."""
+        """Return the wake-up latency, s, of every deadline in [begin, end], by time.monotonic()."""
         return [late for _, late in self._ask(_LATE, begin, end)]
 
     def queued(self, begin: float, end: float) -> list[float]:
-        """s that what is watched waited, in each period between; empty where the system does not tell."""
+        """Return s that the watched thread waited in each period of [begin, end]; empty where that is not known."""
         totals = [total for _, total in self._ask(_QUEUED, begin, end)]
         return [later - earlier for earlier, later in pairwise(totals)]
 
@@ -56,7 +56,7 @@ class Sleeper:
 
 
 def _sleep(connection: Connection, rate: float, first: bool) -> None:
-    """The sleeper's process."""
+    """Run the sleeper's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever started this
     if not (first and use_fifo_scheduling()):
         shorten_time_slice()
@@ -75,8 +75,8 @@ def _sleep(connection: Connection, rate: float, first: bool) -> None:
             continue
         match connection.recv():
             case (_, process):
-                told = Path(f"/proc/{process}/task/{process}/schedstat")
-                watched = told if told.is_file() else None
+                schedstat = Path(f"/proc/{process}/task/{process}/schedstat")
+                watched = schedstat if schedstat.is_file() else None
             case (what, begin, end):
                 connection.send([note for note in noted[what] if begin <= note[0] <= end])
             case _:

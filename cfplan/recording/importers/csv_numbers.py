@@ -30,13 +30,13 @@ class Lines:
     point: str = "."  # of the decimals
 
 
-def numbers(data: mmap.mmap, lines: Lines, file: Path) -> tuple[NDArray, bool]:
+def numbers(data: mmap.mmap, lines: Lines, file: Path, *, block: int = BLOCK) -> tuple[NDArray, bool]:
     """Return (rows, wanted), NaN for empty cells, and whether the last line was cut off, which is then left out.
 
     Raises InputError with the file's line where one has another number of cells, or a wanted one is no number.
     """
     blocks, cut = [], False
-    for begin, end in _blocks(data, lines):
+    for begin, end in _blocks(data, lines, block):
         try:
             blocks.append(_block(data[begin:end], lines))
         except pa.ArrowInvalid as error:
@@ -64,10 +64,10 @@ def is_cut_off(data: mmap.mmap, begin: int, end: int) -> bool:
     return begin < end == len(data) and data.find(b"\n", begin, end) < 0
 
 
-def _blocks(data: mmap.mmap, lines: Lines) -> Iterator[tuple[int, int]]:
+def _blocks(data: mmap.mmap, lines: Lines, size: int) -> Iterator[tuple[int, int]]:
     begin = lines.begin
     while begin < lines.end:
-        end = lines.end if lines.end - begin <= BLOCK else data.rfind(b"\n", begin, begin + BLOCK) + 1 or lines.end
+        end = lines.end if lines.end - begin <= size else data.rfind(b"\n", begin, begin + size) + 1 or lines.end
         yield begin, end
         begin = end
 

@@ -22,7 +22,7 @@ from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, ascend
 FORMAT = "Crazyflie microSD log"
 MAGIC = 0xBC
 _MOST = 64  # event types, and variables of one; the firmware allows 20
-_BLOCK = 1 << 24
+BLOCK = 1 << 24  # bytes checked or gathered at a time
 _TIMES = {1: (np.dtype("<u4"), 1e-3), 2: (np.dtype("<u8"), 1e-6)}  # of a record, and its unit in s
 _CODES = {"B": "u1", "b": "i1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4", "e": "<f2"}
 
@@ -66,7 +66,7 @@ def recognises(file: Path, head: bytes) -> bool:
     return len(head) >= 3 and head[0] == MAGIC and int.from_bytes(head[1:3], "little") < 16
 
 
-def read(file: Path) -> MocapLog:
+def read(file: Path, *, block: int = BLOCK) -> MocapLog:
     """Read every pose that was logged: motion capture, estimate, setpoint. Times count from the first record.
 
     Without its checksum the log was cut off: all whole records are read, and `truncated` says so.
@@ -75,9 +75,9 @@ def read(file: Path) -> MocapLog:
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         version, types, begin = _head(data, file)
         places, end = _places(data, types, begin)
-        truncated = _check_end(data, types, end, file)
+        truncated = _check_end(data, types, end, file, block)
         tables = {
-            types[number].name: _rows(data, types[number].row, np.array(offsets, dtype=np.int64))
+            types[number].name: _rows(data, types[number].row, np.array(offsets, dtype=np.int64), block)
             for number, offsets in places.items()
         }
     starts = [float(rows["time"][0]) for rows in tables.values() if len(rows)]
@@ -150,10 +150,10 @@ def _places(data: mmap.mmap, types: dict[int, _EventType], begin: int) -> tuple[
     return places, begin
 
 
-def _check_end(data: mmap.mmap, types: dict[int, _EventType], end: int, file: Path) -> bool:
+def _check_end(data: mmap.mmap, types: dict[int, _EventType], end: int, file: Path, block: int) -> bool:
     """Return whether the log was cut off. Raises InputError where it is whole but damaged."""
     rest = len(data) - end
-    if rest == 4 and _checksum(data, end) == int.from_bytes(data[end:], "little"):
+    if rest == 4 and _checksum(data, end, block) == int.from_bytes(data[end:], "little"):
         return False
     if rest < 2 or (data[end] | data[end + 1] << 8) in types:  # a record that was not written to its end
         return True
@@ -161,18 +161,18 @@ def _check_end(data: mmap.mmap, types: dict[int, _EventType], end: int, file: Pa
     raise InputError(f"{what}: the log is damaged", where=str(file), hint="copy it from the card again")
 
 
-def _checksum(data: mmap.mmap, end: int) -> int:
+def _checksum(data: mmap.mmap, end: int, block: int) -> int:
     value = 0
-    for start in range(0, end, _BLOCK):
-        value = zlib.crc32(data[start : min(start + _BLOCK, end)], value)
+    for start in range(0, end, block):
+        value = zlib.crc32(data[start : min(start + block, end)], value)
     return value
 
 
-def _rows(data: mmap.mmap, row: np.dtype, offsets: NDArray) -> NDArray:
+def _rows(data: mmap.mmap, row: np.dtype, offsets: NDArray, block: int) -> NDArray:
     """Return (N,) of the row's type, gathered a block at a time."""
     whole = np.frombuffer(data, dtype=np.uint8)
     rows = np.empty(len(offsets), dtype=row)
-    step = max(1, _BLOCK // row.itemsize)
+    step = max(1, block // row.itemsize)
     for start in range(0, len(offsets), step):
         picked = whole[offsets[start : start + step, None] + np.arange(row.itemsize)]
         rows[start : start + step] = picked.view(row)[:, 0]

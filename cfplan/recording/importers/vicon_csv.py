@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
-from cfplan.recording.importers.csv_numbers import Lines, is_cut_off, numbers, place
+from cfplan.recording.importers.csv_numbers import BLOCK, Lines, is_cut_off, numbers, place
 from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, ascending, unit_quaternions
 from cfplan.recording.importers.vicon_header import Group, Rotations, Section, read_head
 
@@ -38,7 +38,7 @@ def recognises(file: Path, head: bytes) -> bool:
     return bool(head) and (_BEGIN.match(head) is not None or _FRAME.search(head) is not None)
 
 
-def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
+def read(file: Path, rotations: Rotations | None = None, *, block: int = BLOCK) -> MocapLog:
     """Read every subject of every section; markers too, as positions without orientation.
 
     `rotations` says what three angles are where the header does not; the default is helical.
@@ -46,7 +46,7 @@ def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
     Raises InputError where a head, a unit or a number is wrong; a last line that is cut off only ends the log.
     """
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        reading = _Reading(data, file, rotations)
+        reading = _Reading(data, file, rotations, block)
         parts = reading.sections()
         return _log(parts, reading, file)
 
@@ -54,8 +54,8 @@ def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
 class _Reading:
     """One pass through a mapped file."""
 
-    def __init__(self, data: mmap.mmap, file: Path, rotations: Rotations | None):
-        self.data, self.file, self.rotations = data, file, rotations
+    def __init__(self, data: mmap.mmap, file: Path, rotations: Rotations | None, block: int):
+        self.data, self.file, self.rotations, self.block = data, file, rotations, block
         self.truncated = False
 
     def sections(self) -> list[_Rows]:
@@ -107,7 +107,9 @@ class _Reading:
                 f"{width} cells where the columns are {rows.section.headings}",
                 where=place(self.data, begin, self.file),
             )
-        values, cut = numbers(self.data, Lines(begin, end, delimiter, width, wanted, point), self.file)
+        values, cut = numbers(
+            self.data, Lines(begin, end, delimiter, width, wanted, point), self.file, block=self.block
+        )
         self.truncated = self.truncated or cut
         if len(values):
             rows.blocks.append(values)

@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
+from cfplan.recording.importers import usd_log
 from cfplan.recording.importers.formats import find_importer, read_log
 
 COUNT = 30
@@ -131,12 +132,11 @@ def test_a_microsd_log_that_lost_power_is_read_as_far_as_it_goes(tmp_path, lost)
 
 
 @pytest.mark.parametrize("block", [7, 100])
-def test_a_microsd_log_of_many_blocks_is_read_like_one_of_few(tmp_path, monkeypatch, block):
-    monkeypatch.setattr("cfplan.recording.importers.usd_log._BLOCK", block)
+def test_a_microsd_log_of_many_blocks_is_read_like_one_of_few(tmp_path, block):
     rows, position, rotations = estimate_rows()
     file = tmp_path / "log00"
     file.write_bytes(usd(ESTIMATE, rows))
-    log = read_log(file)
+    log = usd_log.read(file, block=block)
     assert not log.truncated
     assert_same(log.subjects[0], position, rotations)
 

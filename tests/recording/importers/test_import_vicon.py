@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
+from cfplan.recording.importers import vicon_csv
 from cfplan.recording.importers.formats import read_log
 from cfplan.recording.importers.vicon_header import Rotations
 
@@ -223,19 +224,18 @@ def test_what_is_wrong_is_named_with_its_place(tmp_path, text, message, line):
 
 
 @pytest.mark.parametrize("block", [150, 1000, 4000])
-def test_a_file_of_many_blocks_is_read_like_one_of_few(tmp_path, monkeypatch, block):
-    monkeypatch.setattr("cfplan.recording.importers.csv_numbers.BLOCK", block)
+def test_a_file_of_many_blocks_is_read_like_one_of_few(tmp_path, block):
     wanted = {"cf1": ("quaternion", poses()), "gate": ("euler", poses(seed=1))}
     file = write(tmp_path / "log", wanted)
-    for subject in read_log(file).subjects:
+    for subject in vicon_csv.read(file, block=block).subjects:
         assert_same(subject, wanted[subject.name][1])
     file.write_text(file.read_text()[:-60])
-    assert read_log(file).truncated
+    assert vicon_csv.read(file, block=block).truncated
     lines = file.read_text().splitlines(keepends=True)
     lines[30] = lines[30].replace(",0,", ",zero,", 1).replace(".", "!", 1)
     file.write_text("".join(lines))
     with pytest.raises(InputError, match="not a number") as caught:
-        read_log(file)
+        vicon_csv.read(file, block=block)
     assert caught.value.where == f"{file}:31"
 
 

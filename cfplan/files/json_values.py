@@ -1,0 +1,21 @@
+"""Values as JSON knows them: what is not finite is null, as JSON has no word for it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+
+def json_value(value: Any) -> Any:
+    """Return the value as dictionaries, lists, text, numbers and None, from dataclasses and arrays too."""
+    if isinstance(value, Mapping):
+        return {str(key): json_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_value(item) for item in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if is_dataclass(value):
+        return {field.name: json_value(getattr(value, field.name)) for field in fields(value)}
+    if hasattr(value, "tolist"):  # of NumPy, which need not be loaded for this
+        return json_value(value.tolist())
+    return value
