@@ -1,4 +1,4 @@
-"""What tests of several packages need, and what becomes of real time on a computer that stands still.
+"""What tests of several packages share: profiles, limits, and repeats of tests in real time that this computer spoiled.
 
 A virtual machine whose host is busy stands still for tenths of seconds, and a flight in real time then ends as it
 should: the vehicle brakes, or preflight refuses. Such a test is repeated, if possible in a calmer moment, but only
@@ -9,23 +9,23 @@ repeated.
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
+from cfplan.safety.limits import Limits
+from cfplan.safety.limits_file import load_limits
 from cfplan.studies.sleeper import Sleeper
 from cfplan.vehicle.profile import SpeedProfile
 
+REPOSITORY = Path(__file__).parents[1]
 MOST_REPEATS = 3
-RATE = 200.0
-# Hz, of the sleeper's wakings
-STANDSTILL = 0.02
-# s late
-CALM, PATIENCE = 2.0, 30.0
-# s without one, before a test is repeated; and how long that is waited for
-
+RATE = 200.0  # Hz, at which the sleeper wakes
+STANDSTILL = 0.02  # s late
+CALM, PATIENCE = 2.0, 30.0  # s without one before a test is repeated, and the longest wait for that
 
 Result = TypeVar("Result")
 
@@ -35,8 +35,7 @@ class Standstills:
 
     def __init__(self) -> None:
         self._sleeper = Sleeper(RATE, first=True).__enter__()
-        self.since = 0.0
-        # when that began which the present attempt at a test looks at, by time.monotonic()
+        self.since = 0.0  # by time.monotonic(), when the act began that the present attempt at a test looks at
 
     def seen(self) -> bool:
         """Whether there was one in what the present attempt looks at."""
@@ -87,7 +86,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="module")
 def kept() -> dict[str, tuple[float, object]]:
-    """When each act began, by its name, and what it came to."""
+    """When each act began, by its name, and its result."""
     return {}
 
 
@@ -130,3 +129,9 @@ def spline_profile(end, h_coefficients, yaw_coefficients=None) -> SpeedProfile:
 @pytest.fixture(scope="session")
 def make_profile():
     return spline_profile
+
+
+@pytest.fixture(scope="session")
+def limits() -> Limits:
+    """The limits of the project's own safety.yaml."""
+    return load_limits(REPOSITORY / "safety.yaml")

@@ -1,16 +1,8 @@
-"""The limits of the project's own safety.yaml, and a short path."""
-
-from pathlib import Path
+"""A short path."""
 
 import pytest
 
 from cfplan.geometry.min_snap import min_snap
-from cfplan.safety.limits_file import load_limits
-
-
-@pytest.fixture(scope="session")
-def limits():
-    return load_limits(Path(__file__).parents[2] / "safety.yaml")
 
 
 @pytest.fixture(scope="session")

@@ -14,16 +14,10 @@ from cfplan.preparation import prepare_flight as preparation
 from cfplan.preparation.plan_flight import FlightOptions, plan_flight
 from cfplan.preparation.prepare_flight import encode_flight, prepare_flight
 from cfplan.preparation.steps import StepState
-from cfplan.safety.limits_file import load_limits
 
 REPOSITORY = Path(__file__).parents[2]
 LINE = REPOSITORY / "flights" / "line.yaml"
 AFTER_PLANNING = ["certificate", "bytes", "dry run", "link loss", "stops"]
-
-
-@pytest.fixture(scope="module")
-def limits():
-    return load_limits(REPOSITORY / "safety.yaml")
 
 
 @pytest.fixture
