@@ -11,7 +11,7 @@ import threading
 STREAM_PRIORITY = 20  # of SCHED_FIFO, for the thread that sends setpoints
 # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of mlockall(2): every page, now and later, once it is used
 _LOCK_ALL_IN_USE = 1 | 2 | 4
-_SHORT_SLICE = 100_000  # ns, the shortest that Linux grants
+_SHORTEST_SLICE = 100_000  # ns, the shortest that Linux grants
 # numbers of the system call, which has no name in older C libraries
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
 # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
@@ -19,12 +19,12 @@ _SCHED_ATTR = struct.Struct("=IIQiIQQQ")
 
 
 def uses_fifo_scheduling() -> bool:
-    """Whether the calling thread is scheduled ahead of ordinary ones."""
+    """Return whether the calling thread is scheduled ahead of ordinary ones."""
     return hasattr(os, "SCHED_FIFO") and os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
 
 
 def use_fifo_scheduling(priority: int = STREAM_PRIORITY, thread: int = 0) -> bool:
-    """Have a thread of this process, the calling one, scheduled ahead of ordinary ones; whether that is permitted."""
+    """Schedule a thread of this process, by default the calling one, ahead of ordinary ones; return if permitted."""
     try:
         os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError):  # not permitted; not on this system
@@ -33,27 +33,27 @@ def use_fifo_scheduling(priority: int = STREAM_PRIORITY, thread: int = 0) -> boo
 
 
 def shorten_time_slice(thread: int = 0) -> bool:
-    """Have a thread of this process wait less for the processor, for shorter turns on it; whether that was granted.
+    """Let a thread of this process wait less for the processor, for shorter turns on it; return if granted.
 
-    Needs no permission, unlike `use_fifo_scheduling`. Linux from 6.12 on knows turns of one's own; an older one
+    Needs no permission, unlike `use_fifo_scheduling`. Linux has per-thread time slices from 6.12 on; an older one
     grants this and does nothing.
     """
     number = _SCHED_SETATTR.get(platform.machine()) if sys.platform.startswith("linux") else None
     if number is None:
         return False
     nice = os.getpriority(os.PRIO_PROCESS, thread)
-    wanted = _SCHED_ATTR.pack(_SCHED_ATTR.size, os.SCHED_OTHER, 0, nice, 0, _SHORT_SLICE, 0, 0)
+    wanted = _SCHED_ATTR.pack(_SCHED_ATTR.size, os.SCHED_OTHER, 0, nice, 0, _SHORTEST_SLICE, 0, 0)
     return int(ctypes.CDLL(None).syscall(number, thread, wanted, 0)) == 0
 
 
 def use_ordinary_scheduling(process: int) -> None:
-    """Have a process scheduled as ordinary ones are, whatever it inherited."""
+    """Schedule a process as an ordinary one, whatever it inherited."""
     with contextlib.suppress(OSError, AttributeError):  # it has ended; not on this system
         os.sched_setscheduler(process, os.SCHED_OTHER, os.sched_param(0))
 
 
 def may_use_fifo_scheduling() -> bool:
-    """Whether that would be permitted; tried in a thread that ends at once."""
+    """Return whether `use_fifo_scheduling` is permitted; tried in a thread that ends at once."""
     permitted: list[bool] = []
     thread = threading.Thread(target=lambda: permitted.append(use_fifo_scheduling()))
     thread.start()
@@ -62,9 +62,9 @@ def may_use_fifo_scheduling() -> bool:
 
 
 def lock_memory() -> bool:
-    """Keep the pages that this process uses from being taken away and read again; whether that is permitted.
+    """Keep the pages that this process uses in memory; return if permitted.
 
-    Of code that runs once a second they are taken where a system trims its caches, and reading them back takes
+    A system that trims its caches takes the pages of code that runs once a second, and reading them back takes
     milliseconds.
     """
     if not sys.platform.startswith("linux"):

@@ -1,4 +1,4 @@
-"""What the pilot reports while it flies: small frozen messages on the clock of time.monotonic()."""
+"""Telemetry of the pilot: small frozen messages on the clock of time.monotonic()."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -75,14 +75,14 @@ class VehicleStatus:
 
 @dataclass(frozen=True, slots=True)
 class PhaseEntered:
-    """The pilot went into a phase."""
+    """The pilot entered a phase."""
 
     time: float
     phase: Phase
 
 
 class Level(StrEnum):
-    """How grave an event is."""
+    """Severity of an event."""
 
     INFO = "info"
     WARNING = "warning"

@@ -1,4 +1,4 @@
-"""The process in which a driver runs; what it says goes through a pipe.
+"""The process in which a motion capture driver runs; its messages go through a pipe.
 
 A driver may hang without ever giving the interpreter back, so no thread and no signal handler of Python's can end it:
 the kernel's own alarm does, which is set anew before every step.
@@ -20,8 +20,8 @@ from cfplan.flight.mocap.sdk import SdkDriver
 from cfplan.flight.mocap.uri import MocapUri, parse_uri
 from cfplan.flight.real_time import lock_memory
 
-HEAD = struct.Struct("<I?")  # bytes of the message behind it, and whether it is a frame
-CONNECT_ALARM = 2.5  # s to resolve the name, connect, and get the first frame's promise
+HEAD = struct.Struct("<I?")  # bytes of the message that follows, and whether it is a frame
+CONNECT_ALARM = 2.5  # s to resolve the name, connect, and ask for frames
 FRAME_ALARM = 1.5  # s between frames
 _TRY_AGAIN = 0.1  # s
 _PRIORITY = 10  # of SCHED_FIFO; the setpoint stream's is higher
@@ -30,7 +30,7 @@ Message = Frame | Scene | Stage | CfplanError
 
 
 def encoded(message: Message) -> bytes:
-    """A message as it goes through the pipe. Frames are many, and read where time is short: they go as plain tuples."""
+    """Return a message as bytes. Frames are many, and are read where time is short: they go as plain tuples."""
     if isinstance(message, Frame):
         bodies = tuple((body.name, body.position, body.quaternion, body.quality) for body in message.bodies)
         plain = (message.received, bodies, message.hidden, message.number, message.rate, message.latency)
@@ -41,7 +41,7 @@ def encoded(message: Message) -> bytes:
 
 
 def decoded(buffer: bytearray) -> list[Message]:
-    """The whole messages at the buffer's begin, which are taken from it."""
+    """Take the complete messages from the start of a buffer and return them."""
     found: list[Message] = []
     while len(buffer) >= HEAD.size:
         size, is_frame = HEAD.unpack_from(buffer)
@@ -59,37 +59,37 @@ def decoded(buffer: bytearray) -> list[Message]:
 
 
 def driver_of(uri: MocapUri) -> Driver:
-    """The driver of a system."""
+    """Return the driver of a system."""
     if uri.system == "vicon":
         return DataStreamClient(uri.host, uri.port, str(uri))
     return SdkDriver(uri)
 
 
 class Outlet:
-    """The writing end."""
+    """The writing end of the pipe; with a `subject`, only that body's poses are sent."""
 
     def __init__(self, descriptor: int, subject: str):
         self._descriptor, self._subject = descriptor, subject
 
-    def say(self, message: Message) -> None:
-        """Send a message. Raises BrokenPipeError where nobody listens any more."""
+    def send(self, message: Message) -> None:
+        """Send a message. Raises BrokenPipeError if the pipe has no reader any more."""
         data = encoded(message)
         while data:
             data = data[os.write(self._descriptor, data) :]
 
-    def frame(self, frame: Frame) -> None:
-        """Send a frame, or of it only the body that is asked for."""
+    def send_frame(self, frame: Frame) -> None:
+        """Send a frame, with only the body that was asked for."""
         if self._subject:
             bodies = tuple(body for body in frame.bodies if body.name == self._subject)
             hidden = () if bodies else (self._subject,)
             frame = Frame(frame.received, bodies, hidden, frame.number, frame.rate, frame.latency)
-        self.say(frame)
+        self.send(frame)
 
 
 def run(uri: MocapUri, outlet: Outlet, *, again: bool) -> None:
-    """Connect and pass frames on; where a stream is lost that once was there, connect again, for ever.
+    """Connect and send frames, for ever; connect again if a stream is lost.
 
-    `again` says that it was there already, for an earlier process.
+    `again` says that an earlier process has had a stream. Without one, a failure to connect ends the run.
     """
     while True:
         driver = driver_of(uri)
@@ -97,11 +97,11 @@ def run(uri: MocapUri, outlet: Outlet, *, again: bool) -> None:
             again = _stream(driver, uri, outlet) or again
         except LinkError as lost:
             if not again:
-                outlet.say(lost)
+                outlet.send(lost)
                 return
-            outlet.say(Stage(f"trying again: {lost.what}"))
+            outlet.send(Stage(f"trying again: {lost.what}"))
         except CfplanError as error:
-            outlet.say(error)
+            outlet.send(error)
             return
         finally:
             driver.close()
@@ -109,13 +109,13 @@ def run(uri: MocapUri, outlet: Outlet, *, again: bool) -> None:
 
 
 def _stream(driver: Driver, uri: MocapUri, outlet: Outlet) -> bool:
-    """Until the stream is lost; whether there was one. Raises LinkError where there was none."""
+    """Send frames until the stream is lost; return whether there was one. Raises LinkError if there was none."""
     _alarm(CONNECT_ALARM)
-    outlet.say(Stage(f"connecting to {uri.address}"))
+    outlet.send(Stage(f"connecting to {uri.address}"))
     driver.connect()
     _alarm(FRAME_ALARM)
-    outlet.say(Stage("connected, waiting for a frame"))
-    told: Scene | None = None
+    outlet.send(Stage("connected, waiting for a frame"))
+    sent: Scene | None = None
     frames = 0
     while True:
         try:
@@ -123,44 +123,44 @@ def _stream(driver: Driver, uri: MocapUri, outlet: Outlet) -> bool:
         except LinkError as lost:
             if not frames:
                 raise
-            outlet.say(Stage(lost.what))
+            outlet.send(Stage(lost.what))
             return True
         _alarm(FRAME_ALARM)
         frames += 1
         scene = driver.scene()
-        if scene is not None and scene is not told:
-            told = scene
-            outlet.say(scene)
-        outlet.frame(frame)
+        if scene is not None and scene is not sent:
+            sent = scene
+            outlet.send(scene)
+        outlet.send_frame(frame)
 
 
 def _alarm(seconds: float) -> None:
-    """From now on the kernel ends this process after so long."""
+    """Have the kernel end this process after `seconds`, unless called again."""
     signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
-def _come_first() -> None:
-    """Ahead of other processes where the system permits it; not for the vendors' clients, which may spin for ever."""
+def _take_priority() -> None:
+    """Run ahead of other processes if permitted; not for the vendors' clients, which may spin for ever."""
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
 
 
 def main() -> None:
-    """`python -m cfplan.flight.mocap.child FD URI SUBJECT AGAIN`: frames go to FD; SUBJECT "" means every body."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever started this
+    """Run `python -m cfplan.flight.mocap.child FD URI SUBJECT AGAIN`: frames go to FD; SUBJECT "" means every body."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     descriptor, text, subject, again = sys.argv[1:]
     outlet = Outlet(int(descriptor), subject)
     try:
         uri = parse_uri(text, subject_needed=False)
         if uri.system == "vicon":
-            _come_first()
+            _take_priority()
         lock_memory()
         run(uri, outlet, again=again == "again")
     except BrokenPipeError:
         return
-    except Exception as error:  # whatever a driver raises must be read by somebody
-        outlet.say(InputError(f"fault in the driver: {error!r}", where=text))
+    except Exception as error:  # the parent must learn of anything that a driver raises
+        outlet.send(InputError(f"fault in the driver: {error!r}", where=text))
 
 
 if __name__ == "__main__":

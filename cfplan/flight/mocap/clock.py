@@ -1,4 +1,4 @@
-"""When a frame was taken, from when it came.
+"""Date frames back: when a frame was taken, from when it arrived.
 
 A frame comes late by what the network and the computers add at that moment. Frame numbers count at the cameras' steady
 rate, so the earliest arrival tells when each number should have come, and what is later than that was delayed on its
@@ -8,32 +8,34 @@ its numbers were seen to count at it.
 
 import math
 
-_PROOF = 1.0  # s; over two of these the numbers must count at the announced rate
-_DRIFT = 5e-4  # by which the two clocks may differ: so fast is what was earliest forgotten
-_TOLERANCE = _DRIFT  # of that rate, as the earliest arrivals of both tell
+_PROOF = 1.0  # s; over two of these the frame numbers must count at the announced rate
+_DRIFT = 5e-4  # relative difference of the two clocks; the earliest arrival is forgotten at this rate
+_TOLERANCE = _DRIFT  # relative error of that rate, from the earliest arrivals of both proofs
 
 
 class FrameClock:
-    """Dates frames back. Without frame numbers or a rate that holds, a frame counts as just taken."""
+    """Dates frames back. Without frame numbers or a rate that holds, a frame counts as just taken.
+
+    `latency`, s, is the time from the exposure to this computer when nothing delays a frame.
+    """
 
     def __init__(self, latency: float):
-        # latency in s from the exposure to this computer where nothing delays it
         self._latency = latency
         self._number: int | None = None
         self._rate = math.nan
-        # s, the earliest of the first and of the second time of proof; None once the rate is proven
+        # s, the earliest arrival in the first and in the second time of proof; None once the rate is proven
         self._proof: list[float] | None = None
         self._proof_begin = math.nan
-        # s, when number 0 came, as the earliest arrivals have it; the last arrival
+        # s, when number 0 came, according to the earliest arrivals; the last arrival
         self._earliest = self._heard = math.inf
 
     @property
     def sure(self) -> bool:
-        """Whether delays are seen."""
+        """Whether delays are recognised."""
         return self._number is not None and self._proof is None
 
     def taken(self, received: float, number: int | None, rate: float, latency: float = math.nan) -> float:
-        """When the frame was taken, s. `latency` is the system's own figure and counts where it is the larger one."""
+        """Return when the frame was taken, s. `latency`, s, is the system's own figure; the larger one counts."""
         behind = max(self._latency, latency) if math.isfinite(latency) else self._latency
         if number is None or not (math.isfinite(rate) and rate > 0):
             return received - behind

@@ -1,4 +1,4 @@
-"""Vicon's DataStream on the wire, as read from the SDK's public source: little endian, packed.
+"""Vicon's DataStream protocol, read from the SDK's public source: little endian, packed.
 
     packet = u32 OBJECTS, u32 length, block*        block = u32 type, u32 length, payload
     string = u32 n, bytes        vector, set, map = u32 n, items
@@ -18,13 +18,13 @@ from cfplan.flight.telemetry import Quaternion
 
 OBJECTS = 0x1A2B0001
 PACKET_HEAD = struct.Struct("<II")
-LARGEST_PACKET = 16 << 20  # bytes; what claims to be larger is no packet
+LARGEST_PACKET = 16 << 20  # bytes; a larger size means that this is not a packet
 _SEGMENT = struct.Struct("<I12d")
-_ROTATION_ERROR = 1e-3  # of a matrix's product with its transpose from the unit matrix
+_ROTATION_ERROR = 1e-3  # by which a matrix's product with its transpose may differ from the unit matrix
 
 
 class Block(IntEnum):
-    """Types of blocks that are used here."""
+    """Types of the blocks that cfplan uses."""
 
     STREAM_INFO = 1
     SUBJECT_INFO = 2
@@ -47,7 +47,7 @@ WANTED = (
 
 
 class MalformedError(ValueError):
-    """Bytes that are not DataStream."""
+    """These bytes are not a DataStream."""
 
 
 class Fields:
@@ -57,7 +57,7 @@ class Fields:
         self._data, self._at = data, 0
 
     def take(self, layout: struct.Struct) -> tuple:
-        """The fields of this layout."""
+        """Read the fields of this layout."""
         try:
             values = layout.unpack_from(self._data, self._at)
         except struct.error as why:
@@ -66,14 +66,14 @@ class Fields:
         return values
 
     def count(self, smallest: int) -> int:
-        """How many items follow, each of at least so many bytes."""
+        """Read how many items follow, each of at least `smallest` bytes."""
         (count,) = self.take(_U32)
         if count * smallest > len(self._data) - self._at:
             raise MalformedError(f"{count} items in {len(self._data) - self._at} bytes")
         return count
 
     def string(self) -> str:
-        """A text."""
+        """Read a text."""
         size = self.count(1)
         self._at += size
         return bytes(self._data[self._at - size : self._at]).decode("utf-8", "replace")
@@ -85,24 +85,24 @@ _QUALITY = struct.Struct("<Id")
 
 
 def packet(*blocks: tuple[int, bytes]) -> bytes:
-    """A packet of these blocks: type and payload."""
+    """Return a packet of these blocks: type and payload."""
     body = b"".join(PACKET_HEAD.pack(kind, len(payload)) + payload for kind, payload in blocks)
     return PACKET_HEAD.pack(OBJECTS, len(body)) + body
 
 
 def kinds(values: Collection[int]) -> bytes:
-    """A set of types."""
+    """Return a set of types as bytes."""
     return struct.pack(f"<I{len(values)}I", len(values), *sorted(values))
 
 
 def read_kinds(payload: memoryview) -> tuple[int, ...]:
-    """A set of types."""
+    """Return a set of types from bytes."""
     fields = Fields(payload)
     return tuple(fields.take(_U32)[0] for _ in range(fields.count(4)))
 
 
 def read_blocks(body: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """The blocks of a packet's body: type and payload."""
+    """Yield the blocks of a packet's body: type and payload."""
     at = 0
     while at < len(body):
         if len(body) - at < PACKET_HEAD.size:
@@ -117,7 +117,7 @@ def read_blocks(body: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 @dataclass(slots=True)
 class _Known:
-    """A subject as its info block tells it."""
+    """A subject as its info block describes it."""
 
     name: str
     segments: dict[int, str]
@@ -126,7 +126,7 @@ class _Known:
 
 @dataclass(slots=True)
 class Decoder:
-    """Makes frames of packets; keeps what a server does not repeat."""
+    """Decodes frames; keeps what a server does not repeat."""
 
     _subjects: dict[int, _Known] = field(default_factory=dict)
     _seen: dict[int, dict[int, tuple[float, ...]]] = field(default_factory=dict)
@@ -138,7 +138,7 @@ class Decoder:
     scene: Scene | None = None
 
     def frame(self, body: memoryview, received: float) -> Frame | None:
-        """The frame in a packet's body, None where it has none. Raises MalformedError."""
+        """Return the frame in a packet's body, None if it has none. Raises MalformedError."""
         subjects: dict[int, _Known] = {}
         seen: dict[int, dict[int, tuple[float, ...]]] = {}
         unchanged: tuple[int, ...] = ()
@@ -217,7 +217,7 @@ def _as_subject(known: _Known) -> Subject:
 
 
 def _body(name: str, pose: tuple[float, ...], y_up: bool, quality: float) -> TrackedBody:
-    """Millimetres to metres, a matrix to a quaternion, and z up."""
+    """Return a body in metres, with a quaternion from the matrix, and z up."""
     x, y, z = (value / 1000 for value in pose[:3])
     qx, qy, qz, qw = _quaternion(pose[3:])
     if y_up:  # x stays, y up becomes z up: a turn by 90° about x, of the world and of the body's own axes
@@ -226,7 +226,7 @@ def _body(name: str, pose: tuple[float, ...], y_up: bool, quality: float) -> Tra
 
 
 def _quaternion(matrix: tuple[float, ...]) -> Quaternion:
-    """x y z w of a row-major rotation matrix; not a number where it is none."""
+    """Return x y z w of a row-major rotation matrix; not a number if it is not a rotation."""
     nowhere = (math.nan, math.nan, math.nan, math.nan)
     a, b, c, d, e, f, g, h, i = matrix
     error = max(

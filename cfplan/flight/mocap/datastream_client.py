@@ -30,7 +30,7 @@ _NO_VICON = "is Vicon Tracker running there, and is this computer in its network
 
 
 class DataStreamClient:
-    """A Driver."""
+    """A `Driver` for Vicon's DataStream; `where` names it in errors."""
 
     def __init__(self, host: str, port: int, where: str):
         self._host, self._port, self._where = host, port, where
@@ -39,7 +39,7 @@ class DataStreamClient:
         self._decoder = Decoder()
 
     def connect(self) -> None:
-        """Raises InputError where the name or the server is wrong, LinkError where nobody answers."""
+        """Connect and ask for frames. Raises InputError if name or server is wrong, LinkError if nothing answers."""
         self._socket = open_connection(self._host, self._port, self._where, _NO_VICON)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.settimeout(FRAME_TIMEOUT)
@@ -55,7 +55,7 @@ class DataStreamClient:
         self._socket.sendall(packet((Block.OBJECT_ENUMS, kinds(wanted)), (Block.REQUEST_FRAME, push)))
 
     def wait(self) -> Frame:
-        """The next frame."""
+        """Wait for the next frame and return it."""
         while True:
             body = self._packet()
             received = time.monotonic()
@@ -67,17 +67,17 @@ class DataStreamClient:
                 return frame
 
     def scene(self) -> Scene | None:
-        """The subjects and their segments."""
+        """Return the subjects and their segments."""
         return self._decoder.scene
 
     def close(self) -> None:
-        """End the connection."""
+        """Close the connection."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def _packet(self) -> memoryview:
-        """The body of the next packet."""
+        """Return the body of the next packet."""
         head = self._read(PACKET_HEAD.size)
         tag, size = PACKET_HEAD.unpack(head)
         if tag != OBJECTS or size > LARGEST_PACKET:
@@ -107,14 +107,14 @@ class DataStreamClient:
 
     def _no_server(self) -> InputError:
         return InputError(
-            "what listens there is no Vicon DataStream server",
+            "the server there is not a Vicon DataStream server",
             where=self._where,
             hint="the DataStream's port is 801 unless Tracker says otherwise",
         )
 
 
 def open_connection(host: str, port: int, where: str, hint: str) -> socket.socket:
-    """A TCP connection within CONNECT_TIMEOUT. Raises InputError on an unknown name, LinkError where nobody answers."""
+    """Return a TCP connection. Raises InputError on an unknown name, LinkError if nothing answers in time."""
     try:
         return socket.create_connection((host, port), CONNECT_TIMEOUT)
     except (socket.gaierror, UnicodeError) as why:
@@ -126,7 +126,7 @@ def open_connection(host: str, port: int, where: str, hint: str) -> socket.socke
 
 
 def unknown_name(host: str, where: str) -> InputError:
-    """The error of a name that nobody knows."""
+    """Return the error of an unknown computer."""
     return InputError(
         f"there is no computer named {host!r}", where=where, hint="give its address in numbers, as 192.168.1.2"
     )

@@ -1,4 +1,4 @@
-"""A motion capture system's frames, read from a child process without ever waiting for it."""
+"""Frames of a motion capture system, read from a child process without ever waiting for it."""
 
 import os
 import select
@@ -16,13 +16,13 @@ from cfplan.flight.mocap.uri import MocapUri
 from cfplan.flight.real_time import use_ordinary_scheduling
 
 _CHUNK = 1 << 16  # bytes
-_LOOK = 0.05  # s between looks at the child
-_SILENT = CONNECT_ALARM + 1.0  # s without a word, after which a child is killed that even the kernel's alarm spared
+_CHECK_PERIOD = 0.05  # s between checks of the child
+_LONGEST_SILENCE = CONNECT_ALARM + 1.0  # s, after which a child is killed that the kernel's alarm did not end
 _BACKOFF = 0.2  # s before a new child
 
 
 class Feed:
-    """Frames of one system, of the body that the URI names or of all. A context manager."""
+    """Frames of one system, with the body that the URI names or with all. A context manager."""
 
     def __init__(self, uri: MocapUri):
         self._uri = uri
@@ -33,20 +33,20 @@ class Feed:
         self._closed = threading.Event()
         self._keeper: threading.Thread | None = None
         self._heard = 0.0
-        self.stage = "starting"  # the last that was heard of where the driver is
+        self.stage = "starting"  # what the driver last said it was doing
         self.restarts = 0
 
     def start(self) -> None:
-        """Start the child. Its first failure is found by `failure`."""
+        """Start the child; `failure` tells if it fails."""
         self._spawn("first")
 
     def keep(self) -> None:
-        """From now on, in the background: a child that dies or hangs is replaced, for as long as the feed is open."""
+        """Replace a child that dies or hangs, in the background, while the feed is open."""
         self._keeper = threading.Thread(target=self._keep, name="mocap keeper", daemon=True)
         self._keeper.start()
 
     def messages(self) -> list[Message]:
-        """All that came since the last call; never waits."""
+        """Return the messages since the last call; never waits."""
         with self._lock:
             if self._descriptor < 0:
                 return []
@@ -65,7 +65,7 @@ class Feed:
         return found
 
     def failure(self) -> CfplanError | None:
-        """Why the child died, where it did without a word."""
+        """Return why the child died without a message; None while it lives."""
         code = self._process.poll() if self._process is not None else 0
         if code is None:
             return None
@@ -81,7 +81,7 @@ class Feed:
         return LinkError(f"the driver's process died (exit code {code}, {self.stage})", where=str(self._uri))
 
     def close(self) -> None:
-        """End; may be called twice."""
+        """End the child; may be called twice."""
         self._closed.set()
         if self._keeper is not None:
             self._keeper.join()
@@ -109,9 +109,9 @@ class Feed:
                 pass_fds=(writing,),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,  # the vendors' libraries chat
+                stderr=subprocess.DEVNULL,  # the vendors' libraries print
             )
-            use_ordinary_scheduling(process.pid)  # it is not the stream; what may go first asks for it itself
+            use_ordinary_scheduling(process.pid)  # a driver that needs priority asks for it itself
         except BaseException:
             os.close(reading)
             raise
@@ -132,7 +132,7 @@ class Feed:
             self._process = None
 
     def _keep(self) -> None:
-        while not self._closed.wait(_LOOK):
+        while not self._closed.wait(_CHECK_PERIOD):
             if self._process is not None and self._process.poll() is None and not self._is_silent():
                 continue
             self._end_child()
@@ -145,8 +145,8 @@ class Feed:
                 continue
 
     def _is_silent(self) -> bool:
-        """Whether the child says nothing; what it said and nobody has read yet counts."""
-        if time.monotonic() - self._heard < _SILENT:
+        """Return whether the child has sent nothing for long; what has not been read yet counts as sent."""
+        if time.monotonic() - self._heard < _LONGEST_SILENCE:
             return False
         return not select.select([self._descriptor], [], [], 0)[0]
 

@@ -1,4 +1,4 @@
-"""What comes from a motion capture system, whichever it is: plain data that goes through a pipe."""
+"""Frames, bodies and scenes as every motion capture driver delivers them: plain data that goes through a pipe."""
 
 import math
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ class TrackedBody:
 
     name: str
     position: Triple  # m
-    quaternion: Quaternion  # body→world, x y z w; not a number where the system sent no rotation
-    quality: float = math.nan  # 0 to 1, where the system tells
+    quaternion: Quaternion  # body→world, x y z w; not a number if the system sent no rotation
+    quality: float = math.nan  # 0 to 1, if the system tells
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,11 +22,11 @@ class Frame:
     """One frame of the cameras."""
 
     received: float  # s on the clock of time.monotonic(), when it reached this computer
-    bodies: tuple[TrackedBody, ...]  # those that were seen
-    hidden: tuple[str, ...] = ()  # those that the system knows and did not see
-    number: int | None = None  # of the system's own count, where it tells
-    rate: float = math.nan  # Hz, where the system tells
-    latency: float = math.nan  # s from the exposure to the system's sending, where it tells
+    bodies: tuple[TrackedBody, ...]  # bodies that were seen
+    hidden: tuple[str, ...] = ()  # bodies that the system knows and did not see
+    number: int | None = None  # in the system's own count, if it has one
+    rate: float = math.nan  # Hz, if the system tells
+    latency: float = math.nan  # s from the exposure to the system's sending, if it tells
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,29 +39,29 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """All that the system knows."""
+    """All bodies that the system knows."""
 
     subjects: tuple[Subject, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """What the driver is about to do; where it hangs, this is the last that is heard of it."""
+    """What the driver is about to do; if it hangs, this is its last message."""
 
     text: str
 
 
 class Driver(Protocol):
-    """A client of one kind of system. May hang or die: it runs in a process of its own."""
+    """A client of one kind of system. It may hang or die, so it runs in its own process."""
 
     def connect(self) -> None:
-        """Find the system. Raises a CfplanError where it is not there."""
+        """Find the system. Raises a CfplanError if it does not answer."""
 
     def wait(self) -> Frame:
-        """The next frame, as soon as it is there. Raises LinkError where the stream has ended."""
+        """Wait for the next frame and return it. Raises LinkError if the stream has ended."""
 
     def scene(self) -> Scene | None:
-        """What the system knows, as of the last frame; None where it does not tell."""
+        """Return the bodies that the system knows, as of the last frame; None if it does not tell."""
 
     def close(self) -> None:
-        """End; may be called twice, and before connecting."""
+        """Disconnect; may be called twice, and before connecting."""

@@ -16,7 +16,7 @@ _FEWEST = 4
 
 
 class PosePredictor:
-    """Position a little later than the last pose."""
+    """Predicts the position shortly after the last pose."""
 
     def __init__(self) -> None:
         self._poses: deque[Pose] = deque()
@@ -28,7 +28,7 @@ class PosePredictor:
             self._poses.popleft()
 
     def velocity(self) -> Triple:
-        """m/s, the slope of the line; zero while there are too few poses."""
+        """Return the slope of the line, m/s; zero while there are too few poses."""
         count = len(self._poses)
         if count < _FEWEST:
             return 0.0, 0.0, 0.0
@@ -40,7 +40,7 @@ class PosePredictor:
         return x, y, z
 
     def position(self, time: float) -> Triple:
-        """m, at a time, s, not long after the last pose. Needs one pose."""
+        """Return the position, m, at a time, s, shortly after the last pose. Needs one pose."""
         last = self._poses[-1]
         elapsed = min(max(time - last.time, 0.0), FARTHEST)
         (x, y, z), (vx, vy, vz) = last.position, self.velocity()

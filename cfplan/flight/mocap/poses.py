@@ -1,4 +1,4 @@
-"""One face for every source of poses."""
+"""Poses of the vehicle, and the interface that every source of poses has."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -6,7 +6,7 @@ from typing import Protocol
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where the vehicle was."""
+    """Where the vehicle was at one moment."""
 
     time: float  # s on the clock of time.monotonic(), when it was there (already less the source's latency)
     received: float  # s, when it reached this process
@@ -15,18 +15,18 @@ class Pose:
 
 
 class PoseSource(Protocol):
-    """Gives poses as they come; never the same one twice. Opened in the process that uses it."""
+    """Delivers poses as they come, each once. Opened in the process that uses it."""
 
-    fault: str  # why none comes; "" while good ones do, or where it cannot tell
+    fault: str  # why no pose comes; "" while good ones come, or if the source does not know
 
     def open(self) -> None:
-        """Begin. Raises a CfplanError within 5 s where nothing can come."""
+        """Start. Raises a CfplanError within 5 s if no pose can come."""
 
     def poses(self) -> list[Pose]:
-        """All that came since the last call, oldest first; empty when there is none. Never blocks."""
+        """Return the poses since the last call, oldest first; never waits."""
 
     def tell_attitude(self, attitude: tuple[float, float, float, float]) -> None:
-        """What the vehicle believes its attitude to be, now; helps to judge the next pose."""
+        """Take the vehicle's own estimate of its attitude, now; it helps to judge the next pose."""
 
     def close(self) -> None:
-        """End; may be called twice."""
+        """Stop; may be called twice."""

@@ -1,8 +1,8 @@
-"""The vendors' own clients, through the `motioncapture` package.
+"""A driver that uses the vendors' own clients, by the `motioncapture` package.
 
 They tell neither frame number nor latency, and they hang: Vicon's holds the interpreter while it looks for a server,
-spins when the server goes away, and is silent about a subject whose segment bears another name. So this runs only in
-a process that can be killed, and what can be looked at beforehand is.
+spins when the server goes away, and is silent about a subject whose segment has another name. So this runs only in a
+process that can be killed, and checks beforehand what it can.
 """
 
 import math
@@ -23,7 +23,7 @@ _SCENE_TIMEOUT = 0.5  # s to hear of the subjects
 
 
 class SdkDriver:
-    """A Driver."""
+    """A `Driver` around a vendor's client."""
 
     def __init__(self, uri: MocapUri):
         self._uri = uri
@@ -32,7 +32,7 @@ class SdkDriver:
         self._names: set[str] = set()
 
     def connect(self) -> None:
-        """Raises InputError where the package is missing, LinkError where nobody answers. May hang."""
+        """Connect. Raises InputError if the package is missing, LinkError if nothing answers. May hang."""
         try:
             import motioncapture
 
@@ -41,10 +41,10 @@ class SdkDriver:
             raise InputError(
                 "the package motioncapture is not installed",
                 where=str(self._uri),
-                hint="pip install 'cfplan[mocap]'" + ("; or use vicon://, which does without" * self._is_vicon),
+                hint="pip install 'cfplan[mocap]'" + ("; or use vicon://, which does not need it" * self._is_vicon),
             ) from why
         if self._is_vicon:
-            self._scene = self._look_at_scene()
+            self._scene = self._read_scene()
         elif self._uri.system == "qualisys":
             open_connection(
                 self._uri.host, self._uri.port, str(self._uri), "is Qualisys Track Manager running there, in real time?"
@@ -55,7 +55,7 @@ class SdkDriver:
             raise LinkError(str(why), where=str(self._uri), hint="is the system running there?") from why
 
     def wait(self) -> Frame:
-        """The next frame. May hang."""
+        """Wait for the next frame and return it. May hang."""
         if self._client is None:
             raise LinkError("the stream is closed", where=str(self._uri))
         try:
@@ -70,11 +70,11 @@ class SdkDriver:
         return Frame(received, bodies, tuple(sorted(known - seen.keys())))
 
     def scene(self) -> Scene | None:
-        """What Vicon knows; of the others only what was seen so far, which says nothing of what was not."""
+        """Return Vicon's subjects; None for the other systems, which tell only what they have seen so far."""
         return self._scene
 
     def close(self) -> None:
-        """Nothing: the package cannot disconnect, the end of the process does."""
+        """Drop the client: the package cannot disconnect, only the end of the process does."""
         self._client = None
 
     @property
@@ -91,8 +91,8 @@ class SdkDriver:
             "vrpn": {"hostname": f"{host}:{port}"},
         }[self._uri.system]
 
-    def _look_at_scene(self) -> Scene | None:
-        """The subjects and their segments, which Vicon's own client does not tell."""
+    def _read_scene(self) -> Scene | None:
+        """Return the subjects and their segments, which Vicon's own client does not tell."""
         client = DataStreamClient(self._uri.host, self._uri.port, str(self._uri))
         try:
             client.connect()

@@ -1,4 +1,4 @@
-"""The pilot's poses from a motion capture system."""
+"""Poses for the pilot from a motion capture system."""
 
 import math
 import time
@@ -15,14 +15,14 @@ from cfplan.flight.telemetry import Quaternion
 from cfplan.safety.limits import PoseLimits
 
 OPEN_WITHIN = 3.5  # s
-_RATE_SLACK = 1.2  # over the expected rate may so much be forwarded; more only burdens the radio
-_FARTHEST = 30.0  # m; no lab is larger, and a lab in millimetres is
-_MOST_TILT = math.radians(45)  # of a vehicle that stands on the floor
-_ENOUGH = 5  # good poses to believe in a body
+_RATE_SLACK = 1.2  # times the expected rate may be forwarded; more only burdens the radio
+_FARTHEST = 30.0  # m from the origin; no lab is larger, but a lab in millimetres is
+_LARGEST_TILT = math.radians(45)  # of a vehicle that stands on the floor
+_ENOUGH = 5  # good poses that prove a body
 
 
 def pose_source(uri: str, limits: PoseLimits) -> "MocapSource":
-    """The poses of the body that a URI names. Raises InputError on a URI that is none."""
+    """Return a source of the poses of the body that a URI names. Raises InputError if the URI is wrong."""
     return MocapSource(parse_uri(uri, subject_needed=True), limits)
 
 
@@ -44,20 +44,20 @@ class MocapSource:
         self._clock = FrameClock(self._limits.latency)
         self._scene: Scene | None = None
         self._next = -math.inf
-        self.fault = ""  # why there is silence; "" while good poses come
+        self.fault = ""  # why no pose comes; "" while good poses come
 
     def tell_attitude(self, attitude: Quaternion) -> None:
-        """What the vehicle believes."""
+        """Take the vehicle's own estimate of its attitude."""
         self._classifier.attitude = attitude
 
     @property
     def counts(self) -> "Counter[Verdict]":
-        """How many poses were what."""
+        """How many poses had which verdict."""
         return self._classifier.counts
 
     @property
     def sees_delays(self) -> bool:
-        """Whether frames that come late are known to be old; some seconds after opening, where frames bear numbers."""
+        """Whether delayed frames are recognised: some seconds after opening, if frames have numbers."""
         return self._clock.sure
 
     @property
@@ -66,7 +66,7 @@ class MocapSource:
         return self._feed.child_id if self._feed is not None else None
 
     def open(self) -> None:
-        """Connect, and see the body upright and in metres. Raises a CfplanError within 5 s where that cannot be."""
+        """Connect, and check that the body is seen upright and in metres. Raises a CfplanError within 5 s otherwise."""
         self._begin()
         deadline = time.monotonic() + OPEN_WITHIN
         self._feed = Feed(self._uri)
@@ -90,7 +90,7 @@ class MocapSource:
         self._feed.keep()
 
     def poses(self) -> list[Pose]:
-        """The good ones that came since the last call."""
+        """Return the good poses since the last call."""
         if self._feed is None:
             return []
         found, self._first = self._first, []
@@ -137,10 +137,10 @@ class MocapSource:
         self._next = max(self._next, taken - period) + period
         return Pose(taken, frame.received, body.position, body.quaternion)
 
-    # What is wrong, in words.
+    # Messages about what is wrong.
 
     def _check_subject(self) -> None:
-        """Raises InputError as soon as it is clear that this body will never be seen."""
+        """Raise InputError as soon as it is clear that this body will never be seen."""
         if self._scene is None:
             return
         subjects = {subject.name: subject for subject in self._scene.subjects}
@@ -170,7 +170,7 @@ class MocapSource:
         if self._uri.system == "vrpn" and worst is Verdict.OCCLUDED and count == total:
             return nothing_by_vrpn(self._uri, OPEN_WITHIN)
         hints = {
-            Verdict.OCCLUDED: "are its markers in view, and is its name right? `cfplan mocap` lists what is there",
+            Verdict.OCCLUDED: "are its markers in view, and is its name right? `cfplan mocap` lists the bodies",
             Verdict.FROZEN: "is the system paused, or playing nothing?",
             Verdict.REPEATED: "is the system paused?",
             Verdict.BROKEN: "calibrate the body anew",
@@ -185,7 +185,7 @@ class MocapSource:
 
 
 def _check_looks(pose: Pose, where: str) -> None:
-    """Raises InputError where poses are in millimetres or another axis is up."""
+    """Raise InputError if poses are in millimetres or another axis is up."""
     farthest = max(map(abs, pose.position))
     if farthest > _FARTHEST:
         raise InputError(
@@ -195,7 +195,7 @@ def _check_looks(pose: Pose, where: str) -> None:
         )
     x, y = pose.quaternion[:2]
     upright = 1.0 - 2.0 * (x * x + y * y)  # of the body's z axis, its z
-    if upright < math.cos(_MOST_TILT):
+    if upright < math.cos(_LARGEST_TILT):
         tilt = math.degrees(math.acos(max(-1.0, upright)))
         raise InputError(
             f"the body is tilted by {tilt:.0f}° before take-off: is y up instead of z?",

@@ -1,4 +1,4 @@
-"""What a motion capture system sends, looked at for a while: is it good enough to fly by?"""
+"""A survey of a motion capture system: what it sends, and whether that is good enough to fly by."""
 
 import math
 import statistics
@@ -19,13 +19,13 @@ from cfplan.vehicle.rotations import tilt_of, yaw_of
 FIRST_FRAME_WITHIN = 3.5  # s
 _JUMP = 0.15  # m
 _DROPOUT = 1.5  # periods between frames; one is missing where it takes longer
-_LOOK = 0.005  # s
-_SHOW = 0.25  # s
+_READ_PERIOD = 0.005  # s
+_SHOW_PERIOD = 0.25  # s
 
 
 @dataclass(frozen=True, slots=True)
 class BodyReport:
-    """One body over the time that was looked at."""
+    """One body over the time of the survey."""
 
     name: str
     segments: tuple[str, ...]  # the root first; empty where the system does not tell
@@ -37,13 +37,13 @@ class BodyReport:
 
     @property
     def seen(self) -> float:
-        """Share of the frames in which it was seen."""
+        """Share of the frames in which the body was seen."""
         total = sum(self.counts.values())
         return 1.0 - self.counts.get(Verdict.OCCLUDED, 0) / total if total else 0.0
 
     @property
     def remark(self) -> str:
-        """What a person should know about it."""
+        """A warning about the body; "" if there is none."""
         if self.segments and self.name not in self.segments:
             return f"its segment is named {self.segments[0]!r}: Vicon's own client (vicon-sdk://) will not see it"
         if self.counts.get(Verdict.GOOD, 0) == 0:
@@ -73,7 +73,7 @@ class Survey:
 
 
 class Surveyor:
-    """Gathers frames."""
+    """Gathers frames for a survey."""
 
     def __init__(self) -> None:
         self._received: list[float] = []
@@ -87,7 +87,7 @@ class Surveyor:
 
     @property
     def frames(self) -> int:
-        """How many came."""
+        """How many frames came."""
         return len(self._received)
 
     def add(self, frame: Frame) -> None:
@@ -105,7 +105,7 @@ class Surveyor:
             self._classifiers.setdefault(name, PoseClassifier(_JUMP)).classify(taken, seen.get(name), frame.number)
 
     def report(self) -> Survey:
-        """What was seen so far."""
+        """Return the survey so far."""
         gaps = [b - a for a, b in zip(self._received, self._received[1:], strict=False)]
         span = self._received[-1] - self._received[0] if gaps else 0.0
         last = self._last
@@ -149,9 +149,9 @@ class Surveyor:
 
 
 def survey(uri: MocapUri, seconds: float, show: Callable[[Survey], None] = lambda _: None) -> Survey:
-    """Look at everything that a system sends for so long; `show` gets what is known a few times a second.
+    """Return a survey of all that a system sends in `seconds`; `show` gets the survey so far a few times a second.
 
-    Raises a CfplanError where no frame comes, or where the URI names a body that is not there.
+    Raises a CfplanError if no frame comes, or if the URI names an unknown body.
     """
     surveyor, shown = Surveyor(), 0.0
     with Feed(replace(uri, subject="")) as feed:
@@ -170,10 +170,10 @@ def survey(uri: MocapUri, seconds: float, show: Callable[[Survey], None] = lambd
                     surveyor.add(message)
             if failure := feed.failure():
                 raise failure
-            if surveyor.frames and time.monotonic() - shown > _SHOW:
+            if surveyor.frames and time.monotonic() - shown > _SHOW_PERIOD:
                 shown = time.monotonic()
                 show(surveyor.report())
-            time.sleep(_LOOK)
+            time.sleep(_READ_PERIOD)
         if not surveyor.frames:
             hint = "is the system live and streaming?"
             raise LinkError(f"no frame within {FIRST_FRAME_WITHIN:g} s ({feed.stage})", where=str(uri), hint=hint)

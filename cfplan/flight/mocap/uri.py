@@ -1,4 +1,4 @@
-"""Where motion capture is found, and which body in it is the vehicle: `vicon://192.168.1.2/cf1`."""
+"""A motion capture URI: the system, its address, and which body is the vehicle (`vicon://192.168.1.2/cf1`)."""
 
 import difflib
 from collections.abc import Collection
@@ -8,7 +8,7 @@ from urllib.parse import unquote, urlsplit
 from cfplan.errors import InputError, LinkError
 
 VICON_PORT = 801
-# What stands before :// and the default port, None where the port cannot be chosen.
+# Scheme and default port.
 SYSTEMS: dict[str, int | None] = {
     "vicon": VICON_PORT,  # cfplan's own client of Vicon's DataStream
     "vicon-sdk": VICON_PORT,  # the same server through Vicon's own client
@@ -33,55 +33,61 @@ class MocapUri:
 
     @property
     def address(self) -> str:
-        """The host, with its port where that is not the usual one."""
+        """The host, with its port if that is not the usual one."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return host if self.port == SYSTEMS[self.system] else f"{host}:{self.port}"
 
 
 def parse_uri(text: str, *, subject_needed: bool) -> MocapUri:
-    """Read a URI. Raises InputError, with what is wrong about it."""
+    """Return the parts of a URI. Raises InputError, saying what is wrong."""
     try:
         parts = urlsplit(text)
         host, port = parts.hostname, parts.port
     except ValueError as why:
-        raise InputError(f"no URI of motion capture: {why}", where=text, hint=f"write it as {EXAMPLE}") from why
+        raise InputError(
+            f"not the URI of a motion capture system: {why}", where=text, hint=f"write it as {EXAMPLE}"
+        ) from why
     usual = SYSTEMS.get(parts.scheme)
     if usual is None:
         raise InputError(
-            f"there is no motion capture of kind {parts.scheme!r}" if parts.scheme else "no URI of motion capture",
+            f"unknown motion capture system {parts.scheme!r}"
+            if parts.scheme
+            else "not the URI of a motion capture system",
             where=text,
-            hint=f"write it as {EXAMPLE}; known are {', '.join(SYSTEMS)}",
+            hint=f"write it as {EXAMPLE}; systems: {', '.join(SYSTEMS)}",
         )
     if not host or parts.query or parts.fragment or parts.username is not None:
         raise InputError(
-            "no URI of motion capture" if host else "the computer is not named",
+            "not the URI of a motion capture system" if host else "the computer is not named",
             where=text,
             hint=f"write it as {EXAMPLE}",
         )
     subject = unquote(parts.path).strip("/")
     if "/" in subject or not subject.isprintable() or not host.isprintable() or any(c.isspace() for c in host):
-        raise InputError("one body behind the computer's name, and no more", where=text, hint=f"write it as {EXAMPLE}")
+        raise InputError(
+            "one body must follow the computer's name, and nothing else", where=text, hint=f"write it as {EXAMPLE}"
+        )
     if subject_needed and not subject:
         raise InputError(
             "which body is the vehicle?", where=text, hint=f"write it as {EXAMPLE}; `cfplan mocap {text}` lists them"
         )
     if port == 0:
-        raise InputError("port 0 is none", where=text, hint=f"leave it out for {usual}")
+        raise InputError("there is no port 0", where=text, hint=f"leave it out for {usual}")
     return MocapUri(parts.scheme, host, port or usual, subject)
 
 
 def nothing_by_vrpn(uri: MocapUri, seconds: float) -> LinkError:
-    """The error where VRPN is silent: its client does not tell a server that is not there from one without trackers."""
+    """Return the error of a silent VRPN: its client cannot tell a missing server from one without trackers."""
     whose = f" of {uri.subject!r}" if uri.subject else ""
     return LinkError(
-        f"nothing{whose} comes within {seconds:.1f} s",
+        f"nothing{whose} came within {seconds:.1f} s",
         where=str(uri),
-        hint="is the VRPN server running there, has it a tracker of that name, and is that in view?",
+        hint="is the VRPN server running there, does it have a tracker of that name, and is the tracker in view?",
     )
 
 
 def no_such_body(uri: MocapUri, there: Collection[str]) -> InputError:
-    """The error of a body that is not there, with what is."""
+    """Return the error of an unknown body, listing the known ones."""
     close = difflib.get_close_matches(uri.subject, there, 1)
     meant = f"did you mean {close[0]!r}? " if close else ""
     return InputError(

@@ -1,4 +1,4 @@
-"""Deadlines at a fixed rate that do not drift, and how well they were met."""
+"""Absolute deadlines at a fixed rate, and how late they were met."""
 
 import math
 import time
@@ -16,7 +16,7 @@ class Lateness:
     p99: float  # s
     max: float  # s
     count: int
-    skipped: int  # deadlines that passed altogether; the clock chose a later setpoint instead
+    skipped: int  # deadlines that passed without a setpoint; the clock chose a later one
 
     @classmethod
     def of(cls, late: Sequence[float], skipped: int) -> "Lateness":
@@ -26,7 +26,7 @@ class Lateness:
 
 
 class Deadlines:
-    """Absolute deadlines: the next one is where it was always going to be, however late this one was."""
+    """Deadlines that do not drift: one that is met late does not move the next."""
 
     def __init__(
         self,
@@ -40,12 +40,12 @@ class Deadlines:
 
     @property
     def upcoming(self) -> float:
-        """s, the next deadline that is still to come."""
+        """The next deadline that is still to come, s."""
         passed = math.floor((self._clock() - self._first) / self._period)
         return self._first + (max(self._count, passed) + 1) * self._period
 
     def wait(self) -> float:
-        """Sleep until the next deadline that is still to come; its time."""
+        """Sleep until the next deadline that is still to come; return its time, s."""
         self._count += 1
         due = self._first + self._count * self._period
         now = self._clock()

@@ -1,4 +1,4 @@
-"""What the operator orders: keys of the terminal and signals."""
+"""The operator's orders, by keys of the terminal and by signals."""
 
 import contextlib
 import os
@@ -18,14 +18,14 @@ _SEQUENCES = re.compile(rb"\x1b[\[O][0-9;]*[A-Za-z~]")
 
 
 class Order(IntEnum):
-    """What the pilot can be told in the air."""
+    """Orders that the pilot obeys in the air."""
 
     LAND = 1
     CUT = 2
 
 
 def orders_of(keys: bytes) -> list[Order]:
-    """Space is land and Esc is cut; arrow keys and the like begin with Esc but are not Esc."""
+    """Return the orders of typed keys: space lands, Esc cuts; arrow keys and the like begin with Esc but do not cut."""
     found = {ord(" "): Order.LAND, 0x1B: Order.CUT}
     return [found[key] for key in _SEQUENCES.sub(b"", keys) if key in found]
 
@@ -52,11 +52,11 @@ class Keyboard:
             descriptor = sys.stdin.fileno()
             if os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp():
                 self._terminal = descriptor, termios.tcgetattr(descriptor)
-                self._enter_real_time(descriptor)
+                self._read_keys_at_once(descriptor)
         return self
 
     @staticmethod
-    def _enter_real_time(descriptor: int) -> None:
+    def _read_keys_at_once(descriptor: int) -> None:
         mode = termios.tcgetattr(descriptor)
         mode[3] &= ~(termios.ICANON | termios.ECHO)
         mode[6][termios.VMIN], mode[6][termios.VTIME] = 0, 0
@@ -80,11 +80,11 @@ class Keyboard:
 
     @property
     def descriptor(self) -> int | None:
-        """To wait on for keys; None without a terminal."""
+        """A file descriptor to wait on for keys; None without a terminal."""
         return self._terminal[0] if self._terminal is not None else None
 
     def orders(self) -> list[Order]:
-        """What was ordered since the last call. Takes 30 ms after an Esc, else does not wait."""
+        """Return the orders since the last call. Takes 30 ms after an Esc, else does not wait."""
         if self._terminal is not None:
             keys = os.read(self._terminal[0], 64)
             if keys.endswith(b"\x1b"):

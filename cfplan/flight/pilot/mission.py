@@ -1,4 +1,4 @@
-"""Everything that the pilot needs to know, fixed before the vehicle is armed."""
+"""The mission: everything that the pilot needs to know, fixed before the vehicle is armed."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,10 @@ from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.rotations import yaw_of
 
-# How far the vehicle's filter trusts poses: what Crazyswarm2 flies with. The large one cures yaw trouble.
+# Standard deviations that the vehicle's filter gives poses, as Crazyswarm2 sets them. The large one avoids yaw trouble.
 EXTERNAL_POSITION_STD = 1e-3  # m
 EXTERNAL_ATTITUDE_STD = 5e-2  # rad
-_SHORTEST = 1.5  # s, of any manoeuvre of the on-board commander
+_SHORTEST_MANOEUVRE = 1.5  # s
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,10 +23,10 @@ class Mission:
     """One certified flight, encoded."""
 
     payloads: NDArray  # (N, 29) uint8, the setpoints from rest to rest
-    stops: NDArray  # (N, M, 29) uint8, a way to stop from each setpoint, as brake.encode_stops gives it
+    stops: NDArray  # (N, M, 29) uint8, a way to stop from each setpoint, as stops.encode_stops makes them
     limits: Limits
     lead: float = 0.0  # s by which each setpoint is ahead of the trajectory at its time
-    hold_time: float = 1.0  # s that the vehicle hovers behind the last setpoint before it is handed back
+    hold_time: float = 1.0  # s that the vehicle hovers after the last setpoint before it is handed back
     rate: float = RATE  # Hz
 
     @property
@@ -41,23 +41,23 @@ class Mission:
 
     @property
     def motion_ends(self) -> float:
-        """s from the first setpoint to the first of those that only hover at the end."""
+        """Time, s, from the first setpoint to the first of those that only hover at the end."""
         moving = np.flatnonzero(np.any(decode(self.payloads).velocity != 0.0, axis=1))
         return float(moving[-1] + 1) / self.rate if len(moving) else 0.0
 
     @property
     def duration(self) -> float:
-        """s from the first setpoint to the last."""
+        """Time, s, from the first setpoint to the last."""
         return (len(self.payloads) - 1) / self.rate
 
     @property
     def take_off_height(self) -> float:
-        """m above the origin"""
+        """Height of the hover after take-off, m above the origin."""
         return self.limits.ground.take_off_height
 
     @property
     def parameters(self) -> dict[str, float]:
-        """What is set on the vehicle and read back before the feed of poses begins."""
+        """Parameters that are set on the vehicle and read back before the feed of poses begins."""
         return {
             "stabilizer.estimator": self.limits.firmware.estimator,
             "stabilizer.controller": self.limits.firmware.controller,
@@ -69,7 +69,7 @@ class Mission:
 
     @property
     def parameters_if_known(self) -> dict[str, float]:
-        """What is set where the vehicle has it, which is from firmware 2026.04 on: rotor drag over mass, 1/s.
+        """Parameters that are set if the vehicle has them, from firmware 2026.04 on: rotor drag over mass, 1/s.
 
         A filter that does not know of drag takes the tilt that holds against it for acceleration: at 2 m/s its
         attitude is 4° off. Along the thrust axis it measures what drag does.
@@ -79,13 +79,13 @@ class Mission:
 
 
 def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0) -> Mission:
-    """The mission that flies these setpoints; stops are made for each of them."""
+    """Return the mission that flies these setpoints, with a stop from each of them."""
     return Mission(encoded.payloads, encode_stops(encoded.payloads, RATE), limits, encoded.lead, hold_time)
 
 
 def manoeuvre_time(distance: float, mean_speed: float) -> float:
-    """s that the on-board commander is given for a distance, m."""
-    return max(_SHORTEST, distance / mean_speed)
+    """Return the time, s, for a distance, m, from hover to hover."""
+    return max(_SHORTEST_MANOEUVRE, distance / mean_speed)
 
 
 def _place(payload: NDArray) -> tuple[Triple, float]:

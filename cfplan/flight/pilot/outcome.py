@@ -1,4 +1,4 @@
-"""How a flight went."""
+"""The outcome of a flight: exit code, preflight table, phases, lateness and deviation."""
 
 import math
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class Deviation:
 
     @classmethod
     def of(cls, samples: Sequence[tuple[float, float]]) -> "Deviation":
-        """From (s from the first setpoint, m), in any order."""
+        """Return the largest and the mean of samples (s from the first setpoint, m), in any order."""
         if not samples:
             return cls(0.0, 0.0, 0.0, 0)
         time, worst = max(samples, key=lambda sample: sample[1])
@@ -51,9 +51,9 @@ class Deviation:
 
 
 def settle_time(samples: Sequence[tuple[float, float]], within: float) -> float:
-    """s after the end of the motion from which the vehicle stays `within` m; `samples` are (s after it, m), ascending.
+    """Return when, s after the end of the motion, the vehicle has come to stay `within` m; inf if it has not.
 
-    inf where it does not.
+    `samples` are (s after the end of the motion, m), ascending.
     """
     last_outside = max((index for index, (_, distance) in enumerate(samples) if distance > within), default=-1)
     return samples[last_outside + 1][0] if last_outside + 1 < len(samples) else math.inf

@@ -20,9 +20,11 @@ CONVERGED_FOR = 1.0  # s
 def prepare(
     loop: FlightLoop, connect: Callable[[Callable[[], None]], Link], enter_real_time: Callable[[], None] = lambda: None
 ) -> float:
-    """Go through all phases on the ground, to an armed vehicle. `enter_real_time` is called before measurements begin.
+    """Go through all phases on the ground, to an armed vehicle; return the height, m, of its pose on the floor.
 
-    Raises a CfplanError where the vehicle or its poses cannot be had, or a check fails, and what a tick raises.
+    `enter_real_time` is called before anything is measured.
+
+    Raises a CfplanError if the vehicle or its poses are not available, or a check fails, and what a tick raises.
     """
     mission = loop.mission
     loop.history.enter(Phase.CONNECT)
@@ -68,7 +70,7 @@ def _feed(loop: FlightLoop) -> None:
 
 
 def _converge(loop: FlightLoop) -> None:
-    """Set the vehicle's filter to where motion capture sees it, and wait until both agree."""
+    """Set the vehicle's filter to the pose of motion capture, and wait until both agree."""
     loop.history.enter(Phase.CONVERGE)
     pose = loop.pose()
     for name, value in zip(("X", "Y", "Z"), pose.position, strict=True):
@@ -98,10 +100,10 @@ def _converge(loop: FlightLoop) -> None:
 
 
 def _preflight(loop: FlightLoop, wanted: dict[str, float], read_back: dict[str, float]) -> None:
-    """The table. An auto-arming vehicle is not ready for moments, so a table that fails gets two more tries."""
+    """Run the preflight checks, up to three times: an auto-arming vehicle is briefly not ready."""
     loop.history.enter(Phase.PREFLIGHT)
     for _ in range(TRIES):
-        loop.history.checks = run_checks(_look_around(loop, wanted, read_back))
+        loop.history.checks = run_checks(_observe(loop, wanted, read_back))
         if all(check.passed for check in loop.history.checks):
             break
     for check in loop.history.checks:
@@ -117,8 +119,8 @@ def _preflight(loop: FlightLoop, wanted: dict[str, float], read_back: dict[str, 
     loop.link.stop_variance_log()
 
 
-def _look_around(loop: FlightLoop, wanted: dict[str, float], read_back: dict[str, float]) -> PreflightSnapshot:
-    """What a second of looking shows."""
+def _observe(loop: FlightLoop, wanted: dict[str, float], read_back: dict[str, float]) -> PreflightSnapshot:
+    """Observe for a second and return what is known of the vehicle."""
     could_fly = False
 
     def look() -> bool:

@@ -1,4 +1,4 @@
-"""The pilot in a process of its own, and the main process's side of it."""
+"""The pilot's process, and the main process's side of it."""
 
 import contextlib
 import gc
@@ -26,8 +26,8 @@ from cfplan.flight.telemetry import Telemetry
 
 _SWITCH_INTERVAL = 0.0001  # s; the stream gets the interpreter back after at most this
 _THREAD_PRIORITY = STREAM_PRIORITY // 2
-_POLL = 0.05  # s
-_LANDING = 60.0  # s that a pilot without a main process has to come down
+_POLL_PERIOD = 0.05  # s
+_LANDING_TIME = 60.0  # s that a pilot without a main process has to land
 
 
 def fly(
@@ -39,12 +39,12 @@ def fly(
     on_telemetry: Callable[[Telemetry], None] = lambda _: None,
     more_orders: Callable[[], Sequence[Order]] = tuple,
 ) -> FlightOutcome:
-    """Fly a mission and come back when the vehicle is down. Call from the main thread, so that Ctrl-C lands.
+    """Fly a mission and return when the vehicle is down. Call from the main thread, so that Ctrl-C lands.
 
     `pose_source` and `drivers` (cflib link drivers tried before cflib's own) go to the pilot's process by pickle.
     `on_telemetry` gets every message, in order; what it raises is raised here after the vehicle has landed.
-    `more_orders` tells what was ordered otherwise than by key or signal since it was last asked; it must not wait.
-    Raises LinkError where the vehicle cannot be reached or the pilot's process dies, and what the pose source raises.
+    `more_orders` returns the orders since its last call that came neither by key nor by signal; it must not wait.
+    Raises LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose source raises.
     """
     context = multiprocessing.get_context("spawn")
     telemetry, telemetry_end = context.Pipe(duplex=False)
@@ -60,9 +60,9 @@ def fly(
         try:
             return _attend(process, telemetry, orders, keyboard, on_telemetry, more_orders)
         finally:
-            orders.close()  # where this end fails, the pilot notices and lands
+            orders.close()  # if this end fails, the pilot notices and lands
             telemetry.close()
-            process.join(_LANDING)
+            process.join(_LANDING_TIME)
             if process.is_alive():
                 process.kill()
 
@@ -75,13 +75,13 @@ def _attend(
     on_telemetry: Callable[[Telemetry], None],
     more_orders: Callable[[], Sequence[Order]],
 ) -> FlightOutcome:
-    """Pass telemetry one way and orders the other until the pilot's last message."""
+    """Pass telemetry one way and orders the other; return the pilot's last message."""
     failure: BaseException | None = None
     watched: list[Connection | int] = [telemetry]
     if keyboard.descriptor is not None:
         watched.append(keyboard.descriptor)
     while True:
-        ready = wait(watched, _POLL)
+        ready = wait(watched, _POLL_PERIOD)
         for order in (*keyboard.orders(), *more_orders()):
             _send(orders, order)
         if telemetry not in ready:
@@ -99,7 +99,7 @@ def _attend(
                 try:
                     for each in message:
                         on_telemetry(each)
-                except BaseException as error:  # whatever breaks here must not break the flight
+                except BaseException as error:  # a fault here must not break the flight
                     failure = error
                     _send(orders, Order.LAND)
             continue
@@ -117,7 +117,7 @@ def _send(orders: Connection, order: Order) -> None:
 
 @contextlib.contextmanager
 def _signals_ignored():
-    """A process started meanwhile never sees a Ctrl-C, not even before it runs its first line."""
+    """Block the terminal's signals: a process started meanwhile never sees a Ctrl-C, not even before its first line."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -129,7 +129,7 @@ def _signals_ignored():
 
 
 class OrderReceiver:
-    """What the main process tells the pilot, read by a thread; `gone` when there is no main process any more."""
+    """Orders of the main process to the pilot, read by a thread; `gone` when the main process has ended."""
 
     def __init__(self, connection: Connection):
         self._connection = connection
@@ -156,14 +156,14 @@ def _run(
     telemetry: Connection,
     orders_connection: Connection,
 ) -> None:
-    """The pilot's process, from its first line to its last."""
+    """Run the pilot's process, from its first line to its last."""
     with contextlib.suppress(OSError):
-        os.setsid()  # the terminal's signals are the main process's affair
+        os.setsid()  # the terminal's signals are for the main process
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
         signal.signal(number, signal.SIG_IGN)
     orders, report = OrderReceiver(orders_connection), Reporter(telemetry)
     signal.signal(signal.SIGTERM, lambda *_: orders.give(Order.LAND))
-    logging.getLogger("cflib").setLevel(logging.CRITICAL)  # what matters is reported as telemetry
+    logging.getLogger("cflib").setLevel(logging.CRITICAL)  # its warnings are reported as telemetry
     warnings.filterwarnings("ignore", module="cflib")
     sys.setswitchinterval(_SWITCH_INTERVAL)
     last: FlightOutcome | CfplanError
@@ -186,13 +186,12 @@ def _run(
 
 
 def _enter_real_time() -> None:
-    """Nothing but the flight from here on: no collection of garbage, and first in the queue for the processor."""
+    """Leave the processor to the flight: no garbage collection, and scheduled before ordinary programs."""
     gc.collect()
     gc.freeze()
     gc.disable()
     with contextlib.suppress(OSError):
-        # The other threads too: one that is kept from the processor while it holds the interpreter keeps the stream
-        # waiting as well.
+        # The other threads too: one that waits for the processor while it holds the interpreter delays the stream.
         for thread in map(int, os.listdir("/proc/self/task")):
             if not use_fifo_scheduling(_THREAD_PRIORITY, thread):
                 shorten_time_slice(thread)

@@ -1,4 +1,4 @@
-"""Telemetry on its way out of the pilot's process, never in the stream's way."""
+"""The reporter sends telemetry out of the pilot's process without ever delaying the stream."""
 
 import threading
 import time
@@ -9,13 +9,13 @@ from cfplan.flight.telemetry import Telemetry
 
 CAPACITY = 20_000  # messages: half a minute of a flight
 _PERIOD = 0.02  # s between batches
-_LAST_WORDS = 2.0  # s that the end of a flight waits for a slow reader
+_CLOSING_TIME = 2.0  # s that the end of a flight waits for a slow reader
 
 
 class Reporter:
-    """Takes messages at once and sends them in batches from a thread of its own.
+    """Takes messages at once and sends them in batches from its own thread.
 
-    A reader that is slow or stuck costs the oldest messages, which are counted, and never time.
+    If the reader is slow or stuck, the oldest messages are dropped, and counted.
     """
 
     def __init__(self, connection: Connection, capacity: int = CAPACITY):
@@ -44,10 +44,10 @@ class Reporter:
             return  # no reader any more; the pilot learns that from its orders
 
     def close(self, last: object) -> None:
-        """Send what waits, then `last`, as far as the reader takes it within 2 s."""
-        end = time.monotonic() + _LAST_WORDS
+        """Send the waiting messages, then `last`, as far as the reader takes them within 2 s."""
+        end = time.monotonic() + _CLOSING_TIME
         self._closing.set()
-        self._thread.join(_LAST_WORDS)
+        self._thread.join(_CLOSING_TIME)
         if self._thread.is_alive():
             return
         sending = threading.Thread(target=self._send_last, args=(last,), daemon=True)

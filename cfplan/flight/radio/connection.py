@@ -1,4 +1,4 @@
-"""Connecting to a Crazyflie, within bounds of time, and refusing with a hint what cannot be reached."""
+"""Connect to a Crazyflie within bounded time, or fail with a hint."""
 
 import contextlib
 import os
@@ -18,8 +18,8 @@ from cfplan.flight.telemetry import Telemetry
 
 FIRST_ANSWER = 4.0  # s, from opening the link to the first packet
 WHOLE_CONNECTION = 30.0  # s, to the last parameter, over a lossy radio without a cache
-PATIENCE = 0.005  # s that a packet in flight waits for a radio that is busy; then the next, fresher one counts
-_RETRIES = 5000  # transmissions that may fail in a row, some 10 s: a vehicle that hovers alone is worth waiting for
+PATIENCE = 0.005  # s that a packet waits in flight for a busy radio; then it is dropped, as the next one is fresher
+_RETRIES = 5000  # transmissions that may fail in a row, about 10 s: a vehicle that hovers alone is worth waiting for
 
 
 def connect(
@@ -29,10 +29,10 @@ def connect(
     *,
     waiting: Callable[[], None] = lambda: None,
 ) -> Link:
-    """Connect, and take the vehicle out of whatever an earlier connection left it in.
+    """Connect, and end the state in which an earlier connection left the vehicle.
 
     `drivers` are cflib link drivers tried before cflib's own. `waiting` is called while nothing happens, and may raise.
-    Raises LinkError, within 5 s where nothing answers.
+    Raises LinkError, within 5 s if nothing answers.
     """
     from cflib import crtp
     from cflib.crazyflie import Crazyflie
@@ -112,7 +112,7 @@ def _hint(uri: str, reason: str) -> str:
 
 
 def _table_cache() -> str | None:
-    """Where cflib keeps the vehicle's tables between connections; None where nothing can be written."""
+    """Return the folder where cflib keeps the vehicle's tables between connections; None where it cannot write."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "cfplan" / "tables"
     try:
@@ -123,10 +123,10 @@ def _table_cache() -> str | None:
 
 
 class _Serialized:
-    """A link driver that sends for one thread at a time, and in flight gives a packet up rather than wait for long.
+    """A link driver that sends for one thread at a time, and in flight drops a packet rather than wait for long.
 
-    cflib's radio driver has a queue of one and waits for 2 s where the radio is dead. A setpoint or a pose that waited
-    so long would be taken for a fresh one.
+    cflib's radio driver has a queue of one and waits for 2 s if the radio is dead. A setpoint or a pose that waited
+    that long would be taken for a fresh one.
     """
 
     def __init__(self, driver: Any):
@@ -134,7 +134,7 @@ class _Serialized:
         self.needs_resending = driver.needs_resending
 
     def send_packet(self, packet: Any) -> None:
-        """For cflib itself."""
+        """Send a packet for cflib itself."""
         if self._lock.acquire(timeout=0.1):
             try:
                 self._driver.send_packet(packet)
@@ -142,7 +142,7 @@ class _Serialized:
                 self._lock.release()
 
     def send_soon(self, packet: Any) -> None:
-        """For what is out of date in a moment."""
+        """Send a packet that is soon out of date; drop it if the radio is busy."""
         waiting = getattr(self._driver, "out_queue", None)
         if isinstance(waiting, queue.Queue):
             with contextlib.suppress(queue.Full):

@@ -1,10 +1,10 @@
-"""A look at the Crazyradio on USB before anything else is done: is it there, may it be used, is it free?"""
+"""Check of the Crazyradio on USB: is it plugged in, permitted and free?"""
 
 from typing import Any
 
 from cfplan.errors import LinkError
 
-CRAZYRADIO = (0x1915, 0x7777)  # vendor and product; Crazyradio 2.0 too, with the firmware that cflib speaks to
+CRAZYRADIO = (0x1915, 0x7777)  # vendor and product; also of a Crazyradio 2.0 that emulates a Crazyradio PA
 OTHER_FIRMWARE = (0x35F0, 0xBAD2)  # Crazyradio 2.0 with its own
 _DENIED, _BUSY = 13, 16
 
@@ -16,7 +16,7 @@ UDEV_RULES = (
 
 
 def find_radios(kind: tuple[int, int] = CRAZYRADIO) -> list[Any]:
-    """The radios plugged in, through the library that cflib uses. Raises LinkError where USB cannot be read."""
+    """Return the radios that are plugged in, by the library that cflib uses. Raises LinkError if USB cannot be read."""
     import libusb_package
     import usb.core
 
@@ -30,9 +30,9 @@ def find_radios(kind: tuple[int, int] = CRAZYRADIO) -> list[Any]:
 
 
 def check_radio(uri: str) -> None:
-    """Raises LinkError with a hint where the radio of a URI is absent, forbidden or another program's.
+    """Raise LinkError with a hint if the radio of a URI is absent, not permitted or used by another program.
 
-    Takes the radio for a moment, as cflib will; a URI that names it otherwise than by number is left to cflib.
+    Claims the radio for a moment, as cflib will. A URI that does not name the radio by its number is left to cflib.
     """
     number = uri.removeprefix("radio://").partition("/")[0]
     if not uri.startswith("radio://") or not number.isdecimal() or len(number) >= 10:
@@ -70,7 +70,7 @@ def _take(radio: Any, uri: str) -> None:
 
 
 def usb_hint(number: int | None, text: str) -> str:
-    """What to do about an error of USB; "" where that is not known."""
+    """Return what to do about a USB error; "" where that is not known."""
     text = text.lower()
     if number == _DENIED or "denied" in text or "permission" in text:
         return f"allow it once: {UDEV_RULES}; then unplug and plug in"

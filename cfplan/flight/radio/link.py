@@ -1,4 +1,4 @@
-"""The connection to one Crazyflie: cflib for what it does well, and bounded waits where it would wait for ever.
+"""The connection to one Crazyflie: cflib does the work, with bounded waits where cflib would wait for ever.
 
 cflib connects, fetches the tables and carries parameters and logs. What is sent in flight goes straight to the link
 driver: cflib's own sending holds a lock while a dying link joins the thread that waits for it.
@@ -37,7 +37,7 @@ VARIANCE_LOG = ([(f"kalman.var{axis}", "float") for axis in "XYZ"], 10)
 
 
 class Link:
-    """A connected Crazyflie. Made by `connection.connect`."""
+    """A connected Crazyflie, made by `connection.connect`."""
 
     def __init__(
         self,
@@ -56,7 +56,7 @@ class Link:
         self.replies: dict[int, int] = {}  # command of the on-board commander: the code that it answered, 0 for done
         self.firmware = ""
         self._variance_block: Any = None
-        # s, when the vehicle's clock of ms was zero, as the quickest messages have it; the last message
+        # s, when the vehicle's clock of ms was zero, according to the quickest messages; when the last message came
         self._log_zero, self._log_heard = math.inf, 0.0
         crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
         crazyflie.add_port_callback(PLATFORM_PORT, self._on_platform)
@@ -67,10 +67,10 @@ class Link:
 
     @property
     def round_trip(self) -> float:
-        """s, 95th percentile of the last echoes; 0 before the first."""
+        """Round trip, s: 95th percentile of the last echoes; 0 before the first."""
         return float(self._crazyflie.link_statistics.latency.latency) * _MILLI
 
-    # What is sent in flight: never waits.
+    # Sent in flight: these never wait.
 
     def _send(self, port: int, channel: int, data: bytes) -> None:
         self.send(packet(port, channel, data))
@@ -89,22 +89,22 @@ class Link:
         self._send(GENERIC_PORT, 1, struct.pack("<BI", 0, 0))
 
     def take_off(self, height: float, duration: float) -> None:
-        """Straight up to `height`, m above the origin, keeping yaw."""
+        """Take off straight up to `height`, m above the origin, in `duration`, s, keeping yaw."""
         self._command(TAKE_OFF, struct.pack("<Bff?f", 0, height, 0.0, True, duration))
 
     def land(self, height: float, duration: float) -> None:
-        """Straight down to `height`, keeping yaw; motors off at the end."""
+        """Land straight down to `height`, m above the origin, in `duration`, s, keeping yaw; motors off at the end."""
         self._command(LAND, struct.pack("<Bff?f", 0, height, 0.0, True, duration))
 
     def go_to(self, position: Sequence[float], yaw: float, duration: float) -> None:
         self._command(GO_TO, struct.pack("<BBB5f", 0, False, False, *position, yaw, duration))
 
     def stop_motors(self) -> None:
-        """End what the on-board commander does; motors off."""
+        """End whatever the on-board commander does; motors off."""
         self._command(STOP, b"\0")
 
     def stop_setpoint(self) -> None:
-        """Motors off until another setpoint comes."""
+        """Switch the motors off until another setpoint comes."""
         self._send(GENERIC_PORT, 0, b"\0")
 
     def _command(self, command: int, arguments: bytes) -> None:
@@ -118,26 +118,26 @@ class Link:
             self._send(PLATFORM_PORT, 0, bytes([1, do_arm]))
 
     def emergency_stop(self) -> None:
-        """Motors off at once, wherever it is; the vehicle must be restarted after it."""
+        """Cut the motors at once, also in the air; the vehicle must be restarted afterwards."""
         if self.protocol >= 12:
             self._send(SUPERVISOR_PORT, 1, b"\x03")
         else:
             self._send(LOCALIZATION_PORT, 1, b"\x03")
 
     def keep_alive(self) -> None:
-        """A sign of life for the vehicle's emergency-stop watchdog, which the first one starts for good."""
+        """Feed the vehicle's emergency-stop watchdog, which the first call starts for good."""
         if self.protocol >= 12:
             self._send(SUPERVISOR_PORT, 1, b"\x04")
         else:
             self._send(LOCALIZATION_PORT, 1, b"\x04")
 
-    # What waits for an answer: for the ground only.
+    # For the ground only: these wait for an answer.
 
     def has_parameter(self, name: str) -> bool:
         return self._crazyflie.param.toc.get_element_by_complete_name(name) is not None
 
     def set_parameter(self, name: str, value: float, patience: float = 2.0) -> float:
-        """Write, then read what the vehicle has. Raises LinkError where it has no such parameter or does not answer."""
+        """Write a parameter and return it as read back. Raises LinkError if the vehicle lacks it or does not answer."""
         group, _, short = name.partition(".")
         values: list[float] = []
         answered = threading.Event()
@@ -162,7 +162,7 @@ class Link:
         return values[-1]
 
     def start_logs(self) -> None:
-        """From here on `estimate`, `status` and `position_variance` are kept, and the first two reported."""
+        """Start the logs that keep `estimate`, `status` and `position_variance`; report the first two."""
         self._log("estimate", ESTIMATE_LOG, self._on_estimate)
         self._log("status", STATUS_LOG, self._on_status)
         self._variance_block = self._log("variance", VARIANCE_LOG, self._on_variance)
@@ -187,7 +187,7 @@ class Link:
         return block
 
     def ask_firmware(self) -> None:
-        """`firmware` is set when the answer comes, where the vehicle gives one."""
+        """Ask for the firmware's version; `firmware` is set when the answer comes."""
         self._send(PLATFORM_PORT, 1, b"\x01")
 
     def close(self) -> None:
@@ -202,10 +202,10 @@ class Link:
         """Remember why the link is gone; a callback of cflib."""
         self.lost = self.lost or reason
 
-    # What comes in: these run in cflib's thread and must be quick.
+    # Callbacks: these run in cflib's thread and must be quick.
 
     def _when(self, stamp_ms: int) -> float:
-        """When the vehicle wrote a message, as the quickest ones tell; a radio that was dead delivers old ones."""
+        """Return when, s, the vehicle wrote a message: after a pause of the radio, old ones arrive."""
         now = self._clock()
         zero = now - stamp_ms * _MILLI
         if abs(zero - self._log_zero) > _STAMPS_WRAP / 2:  # the first, or the vehicle's 24 bits began anew
@@ -250,7 +250,7 @@ class Link:
 
 
 def packet(port: int, channel: int, data: bytes) -> Any:
-    """A CRTP packet that `Link.send` takes."""
+    """Return a CRTP packet for `Link.send`."""
     from cflib.crtp.crtpstack import CRTPPacket
 
     made = CRTPPacket()

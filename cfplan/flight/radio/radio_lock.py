@@ -1,4 +1,4 @@
-"""One radio, one pilot: a second that opened it would take the first one's packets."""
+"""A lock on the radio: one radio serves one pilot, as a second would take the first one's packets."""
 
 import fcntl
 import re
@@ -12,16 +12,17 @@ _EXCLUSIVE = ("radio://", "usb://", "udp://")
 
 
 def lock_radio(uri: str) -> IO[str] | None:
-    """Keep others away until it is closed or this process ends. Raises LinkError where another is there already.
+    """Lock the radio of a URI until the returned file is closed or this process ends.
 
-    None for a vehicle that nothing else can reach, or where no lock can be written.
+    Returns None for a vehicle that no other process can reach, or where no lock can be written. Raises LinkError if
+    another pilot holds the lock.
     """
     if not uri.startswith(_EXCLUSIVE):
         return None
-    path = Path(tempfile.gettempdir()) / f"cfplan-{_what(uri)}.lock"
+    path = Path(tempfile.gettempdir()) / f"cfplan-{_locked_name(uri)}.lock"
     try:
         file = path.open("a")
-    except OSError:  # another user's, or no place: the driver will say what is the matter
+    except OSError:  # another user's lock, or the disk is full: the driver will say what is wrong
         return None
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -33,7 +34,7 @@ def lock_radio(uri: str) -> IO[str] | None:
     return file
 
 
-def _what(uri: str) -> str:
-    """A radio serves one link, whatever channel and address; elsewhere the whole URI counts."""
+def _locked_name(uri: str) -> str:
+    """Return the lock's name: a radio serves one link, on any channel and address; elsewhere the whole URI counts."""
     radio = re.match(r"radio://([^/?]*)", uri)
     return f"radio-{radio[1]}" if radio else re.sub(r"[^A-Za-z0-9.]+", "-", uri)

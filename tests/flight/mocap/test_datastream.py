@@ -170,7 +170,7 @@ ENUMS = packet((Block.OBJECT_ENUMS, kinds([2, 5, 9])))
 
 
 def test_another_server_is_told_from_vicon(talker):
-    with pytest.raises(InputError, match="no Vicon") as caught:
+    with pytest.raises(InputError, match="not a Vicon") as caught:
         talker(b"SSH-2.0-OpenSSH_9.2\r\n", close=False).connect()
     assert caught.value.hint
 

@@ -34,13 +34,13 @@ def test_a_uri_survives_being_written_and_read():
     [
         ("vicon://192.168.1.2", "which body"),
         ("vicon:///cf1", "not named"),
-        ("192.168.1.2/cf1", "no URI"),
+        ("192.168.1.2/cf1", "not the URI"),
         ("vikon://a/cf1", "vikon"),
-        ("vicon://a:99999/cf1", "no URI"),
+        ("vicon://a:99999/cf1", "not the URI"),
         ("vicon://a:0/cf1", "port 0"),
         ("vicon://a/b/c", "one body"),
-        ("vicon://a/cf1?rate=5", "no URI"),
-        ("vicon://me@a/cf1", "no URI"),
+        ("vicon://a/cf1?rate=5", "not the URI"),
+        ("vicon://me@a/cf1", "not the URI"),
     ],
 )
 def test_a_wrong_uri_is_an_error_with_a_hint(text, words):
