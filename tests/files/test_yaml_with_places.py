@@ -1,4 +1,4 @@
-"""The strict YAML reader: what it takes, and what it says of what it does not take."""
+"""The strict YAML reader: what it reads, and how it reports what it refuses."""
 
 import pathlib
 

@@ -1,4 +1,4 @@
-"""Hard paths that are no paths are refused by name."""
+"""Hard paths that cannot be flown through are refused with the reason."""
 
 import pytest
 from hard_paths import hard_paths
