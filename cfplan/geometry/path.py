@@ -142,6 +142,15 @@ class Path:
         )
 
 
+Derivatives = tuple[float, float, float, float, float]  # γ to γ'''' of one axis, over the factorials of their orders
+
+
+@register_jitable(forceinline=True, fastmath={"contract"})
+def horner_step(x: float, coefficient: float, p: Derivatives) -> Derivatives:
+    """Take one step of Horner's scheme, for a polynomial and its first four derivatives over their factorials."""
+    return x * p[0] + coefficient, x * p[1] + p[0], x * p[2] + p[1], x * p[3] + p[2], x * p[4] + p[3]
+
+
 @njit(fastmath={"contract"})
 def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray, out: NDArray) -> None:
     """Write γ and four derivatives at s into `out`, consecutive points of one piece together, up to _BATCH of them."""
@@ -164,14 +173,10 @@ def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray,
             d3, d4 = out[3, axis, begin:end], out[4, axis, begin:end]
             for n in range(end - begin):
                 p[n], d1[n], d2[n], d3[n], d4[n] = 0.0, 0.0, 0.0, 0.0, 0.0
-            for power in range(coefficients.shape[1] - 1, -1, -1):  # Horner, for derivatives over factorials
+            for power in range(coefficients.shape[1] - 1, -1, -1):
                 term = coefficients[piece, power, axis]
                 for n in range(end - begin):
-                    d4[n] = d4[n] * x[n] + d3[n]
-                    d3[n] = d3[n] * x[n] + d2[n]
-                    d2[n] = d2[n] * x[n] + d1[n]
-                    d1[n] = d1[n] * x[n] + p[n]
-                    p[n] = p[n] * x[n] + term
+                    p[n], d1[n], d2[n], d3[n], d4[n] = horner_step(x[n], term, (p[n], d1[n], d2[n], d3[n], d4[n]))
             for n in range(end - begin):
                 d2[n], d3[n], d4[n] = 2.0 * d2[n], 6.0 * d3[n], 24.0 * d4[n]
         begin = end

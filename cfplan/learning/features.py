@@ -13,11 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.geometry.path import Path
+from cfplan.geometry.path import Path, horner_step
 from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.profile_spline import node_coefficients
 
 VERSION = 1
 # of everything in this file: a model only understands the features that it was trained on
@@ -67,8 +68,7 @@ def bounds(airframe: Airframe, limits: PlanLimits) -> Bounds:
 
 def start_coefficients(state: BoundaryState, step: float) -> tuple[float, float, float]:
     """u₋₁, u₀, u₁ of the spline with this state at its first node."""
-    slope, bend = state.dh * step, state.ddh * step * step
-    return state.h - slope + bend / 3, state.h - bend / 6, state.h + slope + bend / 3
+    return node_coefficients(state.h, state.dh * step, state.ddh * step * step)
 
 
 def start_logs(state: BoundaryState, step: float) -> tuple[float, float, float]:
@@ -80,10 +80,11 @@ def start_logs(state: BoundaryState, step: float) -> tuple[float, float, float]:
 def coefficient_logs(h: float, slope: float, bend: float, step: float) -> tuple[float, float, float]:
     """log √u/Δs of u₋₁, u₀, u₁ from h, h'Δs, h''Δs²; what would be hardly positive is raised."""
     least, unit = LEAST_SHARE * h, math.log(step)
+    before, here, after = node_coefficients(h, slope, bend)
     return (
-        0.5 * math.log(max(h - slope + bend / 3, least)) - unit,
-        0.5 * math.log(max(h - bend / 6, least)) - unit,
-        0.5 * math.log(max(h + slope + bend / 3, least)) - unit,
+        0.5 * math.log(max(before, least)) - unit,
+        0.5 * math.log(max(here, least)) - unit,
+        0.5 * math.log(max(after, least)) - unit,
     )
 
 
@@ -135,15 +136,11 @@ def fill_nodes(out: NDArray, breaks: NDArray, coefficients: NDArray, first: floa
             piece += 1
         x = s - (breaks[pieces] if piece == pieces - 1 else breaks[piece])
         for axis in range(3):
-            p0 = p1 = p2 = p3 = p4 = 0.0  # Horner's scheme for the derivatives over their factorials
+            p = (0.0, 0.0, 0.0, 0.0, 0.0)
             for k in range(powers - 1, -1, -1):
-                p4 = x * p4 + p3
-                p3 = x * p3 + p2
-                p2 = x * p2 + p1
-                p1 = x * p1 + p0
-                p0 = x * p0 + coefficients[piece, k, axis]
-            g[0, axis], g[1, axis], g[2, axis] = p0, p1 * step, 2.0 * p2 * step**2
-            g[3, axis], g[4, axis] = 6.0 * p3 * step**3, 24.0 * p4 * step**4
+                p = horner_step(x, coefficients[piece, k, axis], p)
+            g[0, axis], g[1, axis], g[2, axis] = p[0], p[1] * step, 2.0 * p[2] * step**2
+            g[3, axis], g[4, axis] = 6.0 * p[3] * step**3, 24.0 * p[4] * step**4
         row = out[n]
         for order in range(4):
             for axis in range(3):

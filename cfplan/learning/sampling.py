@@ -32,6 +32,7 @@ from cfplan.learning.features import (
 from cfplan.machine_code import njit
 from cfplan.planners.solution import Status
 from cfplan.safety.limit_sets import LIMIT_SETS
+from cfplan.vehicle.profile import h_within, yaw_within
 
 LEAST_CERTIFIED = 0.97
 # share of its speed at which a label must be certified to be learned from
@@ -217,16 +218,16 @@ def _fill(
             i = min(int(place), grid - 1)
             x = (place - i) * end / grid
             h0, h1, h2, h3 = labels.h[row, 0, i], labels.h[row, 1, i], labels.h[row, 2, i], labels.h[row, 3, i]
-            h = h0 + x * (h1 + x * (h2 / 2 + x * h3 / 6))
-            slope, bend = (h1 + x * (h2 + x * h3 / 2)) * step, (h2 + x * h3) * step * step
+            h, dh, ddh, _ = h_within(x, h0, h1, h2, h3)
+            slope, bend = dh * step, ddh * step * step
             if n == 0:
                 start = told(*coefficient_logs(h, slope, bend, step))
                 start = (start[0] + noise[b, 0], start[1] + noise[b, 1], start[2] + noise[b, 2])
             rate = coefficient_logs(h, slope, bend, step)[1]
-            psi = labels.yaw[row, 0, i] + x * (labels.yaw[row, 1, i] + x * labels.yaw[row, 2, i] / 2)
+            psi, dpsi, _ = yaw_within(x, labels.yaw[row, 0, i], labels.yaw[row, 1, i], labels.yaw[row, 2, i])
             targets[b, n, 0] = rate - table[n, REFERENCE]
             if n == 0:
-                yaw, turning = psi, (labels.yaw[row, 1, i] + x * labels.yaw[row, 2, i]) * step
+                yaw, turning = psi, dpsi * step
             targets[b, n, 1] = np.cos(psi - yaw)
             targets[b, n, 2] = np.sin(psi - yaw)
             duration = np.exp(-rate) * (0.5 if n in (0, count - 1) else 1.0)

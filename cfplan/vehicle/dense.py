@@ -11,7 +11,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from cfplan.geometry.path import Path
+from cfplan.geometry.path import Derivatives, Path, horner_step
 from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.flatness import ROUNDING, Body, Flat, compiled_body, flat_state
@@ -40,7 +40,6 @@ LANES = 4  # points that the compiler may want to take at once: the places in us
 _CURVE, _X, _NODE, _RESULT = 0, 15, 16, 23
 _SIZE = (_RESULT + STATE_ROWS) * WIDTH
 _BLOCK = 8  # coefficients at a time
-_Derivatives = tuple[float, float, float, float, float]
 # h with three derivatives and yaw with two, where an interval begins.
 _Node = tuple[float, float, float, float, float, float, float]
 
@@ -172,7 +171,7 @@ def _place(
 
 @register_jitable(fastmath=ROUNDING)
 def _trace(panel: NDArray, table: NDArray, lanes: int) -> None:
-    """γ to γ'''' from the coefficients, (D, 3), at x from where they count: Horner's scheme, for factorial shares."""
+    """Trace γ to γ'''' from a piece's coefficients, (D, 3), at x from its origin; D is a multiple of _BLOCK."""
     lanes = min(lanes, WIDTH)  # the compiler must see that no index overflows
     for axis in range(3):
         for k in range(len(table) - _BLOCK, -1, -_BLOCK):
@@ -181,7 +180,7 @@ def _trace(panel: NDArray, table: NDArray, lanes: int) -> None:
             if k == len(table) - _BLOCK:
                 for n in range(lanes):
                     x = panel[_X * WIDTH + n]
-                    p = _step(x, c0, _step(x, c1, _step(x, c2, _begun(x, c3, c4, c5, c6, c7))))
+                    p = horner_step(x, c0, horner_step(x, c1, horner_step(x, c2, _begun(x, c3, c4, c5, c6, c7))))
                     _write_curve(panel, axis, n, p)
             else:
                 for n in range(lanes):
@@ -190,8 +189,8 @@ def _trace(panel: NDArray, table: NDArray, lanes: int) -> None:
                         panel[at], panel[3 * WIDTH + at], panel[6 * WIDTH + at], panel[9 * WIDTH + at],
                         panel[12 * WIDTH + at],
                     )  # fmt: skip
-                    p = _step(x, c4, _step(x, c5, _step(x, c6, _step(x, c7, p))))
-                    p = _step(x, c0, _step(x, c1, _step(x, c2, _step(x, c3, p))))
+                    p = horner_step(x, c4, horner_step(x, c5, horner_step(x, c6, horner_step(x, c7, p))))
+                    p = horner_step(x, c0, horner_step(x, c1, horner_step(x, c2, horner_step(x, c3, p))))
                     _write_curve(panel, axis, n, p)
     for row in range(6, 9):
         for n in range(lanes):
@@ -201,7 +200,7 @@ def _trace(panel: NDArray, table: NDArray, lanes: int) -> None:
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
-def _write_curve(panel: NDArray, axis: int, n: int, p: _Derivatives) -> None:
+def _write_curve(panel: NDArray, axis: int, n: int, p: Derivatives) -> None:
     panel[(_CURVE + axis) * WIDTH + n] = p[0]
     panel[(_CURVE + 3 + axis) * WIDTH + n] = p[1]
     panel[(_CURVE + 6 + axis) * WIDTH + n] = p[2]
@@ -210,17 +209,12 @@ def _write_curve(panel: NDArray, axis: int, n: int, p: _Derivatives) -> None:
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
-def _begun(x: float, c3: float, c4: float, c5: float, c6: float, c7: float) -> _Derivatives:
+def _begun(x: float, c3: float, c4: float, c5: float, c6: float, c7: float) -> Derivatives:
     """Five steps from nothing, less what would multiply zeros."""
     p1, p0 = c7, x * c7 + c6
     p2, p1, p0 = p1, x * p1 + p0, x * p0 + c5
     p3, p2, p1, p0 = p2, x * p2 + p1, x * p1 + p0, x * p0 + c4
     return x * p0 + c3, x * p1 + p0, x * p2 + p1, x * p3 + p2, p3
-
-
-@register_jitable(forceinline=True, fastmath=ROUNDING)
-def _step(x: float, c: float, p: _Derivatives) -> _Derivatives:
-    return x * p[0] + c, x * p[1] + p[0], x * p[2] + p[1], x * p[3] + p[2], x * p[4] + p[3]
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)

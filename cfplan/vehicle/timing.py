@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.machine_code import njit
-from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.profile import SpeedProfile, h_within, yaw_within
 
 TOLERANCE = 1e-12  # s, of each piece
 LONGEST = 3600.0  # s, beyond which a profile is a mistake
@@ -135,11 +135,10 @@ def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
         for root in (far / jerk, 2.0 * slope / far):
             if np.isfinite(root):
                 least[k] = min(least[k], _h(node, node[0] + min(max(root, 0.0), x)))
-        jumps[k, 0] = abs(_h(node, after[0]) - after[1])
-        jumps[k, 1] = abs(slope + x * (bend + x * jerk / 2) - after[2])
-        jumps[k, 2] = abs(bend + x * jerk - after[3])
-        jumps[k, 3] = abs(node[5] + x * (node[6] + x * node[7] / 2) - after[5])
-        jumps[k, 4] = abs(node[6] + x * node[7] - after[6])
+        h, dh, ddh, _ = h_within(x, node[1], slope, bend, jerk)
+        yaw, dyaw, _ = yaw_within(x, node[5], node[6], node[7])
+        jumps[k, 0], jumps[k, 1], jumps[k, 2] = abs(h - after[1]), abs(dh - after[2]), abs(ddh - after[3])
+        jumps[k, 3], jumps[k, 4] = abs(yaw - after[5]), abs(dyaw - after[6])
     sound = True
     for k in range(count):
         sound = sound and nodes[k + 1, 0] > nodes[k, 0] and least[k] > 0.0
@@ -252,7 +251,7 @@ def _piece(edges: NDArray, value: float, guess: int) -> int:
 def _h(node: NDArray, s: float) -> float:
     """h at s in the interval that begins with this row of a profile's table."""
     x = s - node[0]
-    return node[1] + x * (node[2] + x * (node[3] / 2 + x * node[4] / 6))
+    return h_within(x, node[1], node[2], node[3], node[4])[0]
 
 
 @njit(error_model="numpy")
@@ -286,9 +285,8 @@ def _invert(polynomial: NDArray, node: NDArray, left: float, right: float, durat
 @njit(error_model="numpy")
 def _time_derivatives(node: NDArray, s: float, unit: float) -> tuple[float, float, float]:
     """The first three time derivatives of s, with time in units of `unit`."""
-    x = s - node[0]
-    speed = np.sqrt(_h(node, s))
-    dh, ddh = node[2] + x * (node[3] + x * node[4] / 2), node[3] + x * node[4]
+    h, dh, ddh, _ = h_within(s - node[0], node[1], node[2], node[3], node[4])
+    speed = np.sqrt(h)
     return speed * unit, dh / 2.0 * unit**2, speed * ddh / 2.0 * unit**3
 
 

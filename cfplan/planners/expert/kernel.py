@@ -20,12 +20,10 @@ from numpy.typing import NDArray
 from cfplan.machine_code import llvm_functions
 from cfplan.planners.expert import llvm_emitter, point_constraints
 from cfplan.planners.solver import barrier
+from cfplan.vehicle.profile_spline import AT_NODE as H_SPLINE
+from cfplan.vehicle.yaw_spline import AT_NODE as YAW_SPLINE
 
 _KERNELS = ("values", "derivatives")
-H_SPLINE = np.array([[1 / 6, 4 / 6, 1 / 6, 0], [-1 / 2, 0, 1 / 2, 0], [1, -2, 1, 0], [-1, 3, -3, 1]])
-# x, x', x'', x''' at an interval's left end, from the four coefficients that matter there, in node units
-YAW_SPLINE = np.array([[1 / 2, 1 / 2, 0], [-1, 1, 0], [1, -2, 1]])
-# ψ, ψ', ψ'' likewise
 
 
 def coefficients(free_yaw: bool) -> int:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.flatness import Flat, Vector, flat_state
+from cfplan.vehicle.profile import h_within, yaw_within
 
 # Rows of the constraint vector; each is scaled so that the limit is 1 (thrusts: -1 to 1).
 ACCELERATION, ANGULAR_VELOCITY, TILT, SPECIFIC_THRUST, ANGULAR_ACCELERATION = range(5)
@@ -86,16 +87,8 @@ def _squared(vector: Vector) -> Any:
 
 def local_variables(z: casadi.SX, free_yaw: bool, place: casadi.SX) -> tuple[list[casadi.SX], list[casadi.SX]]:
     """(x, x', x'', x''') and, where yaw is free, (ψ, ψ', ψ''), at a place within the interval."""
-    jerk = z[5] if free_yaw else z[3]
-    x = [
-        z[0] + place * (z[1] + place * (z[2] / 2 + place * jerk / 6)),
-        z[1] + place * (z[2] + place * jerk / 2),
-        z[2] + place * jerk,
-        jerk,
-    ]
-    if not free_yaw:
-        return x, []
-    return x, [z[3] + place * (z[4] + place * z[6] / 2), z[4] + place * z[6], z[6]]
+    x = list(h_within(place, z[0], z[1], z[2], z[5] if free_yaw else z[3]))
+    return x, list(yaw_within(place, z[3], z[4], z[6])) if free_yaw else []
 
 
 def point_expressions(free_yaw: bool) -> tuple[list[casadi.SX], casadi.SX, casadi.SX]:

@@ -16,6 +16,7 @@ from cfplan.planners.expert.program import Shape, layout_of
 from cfplan.planners.expert.tightening import Kept, Task
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.profile_spline import node_values
 from cfplan.vehicle.yaw_spline import YawSpline
 
 NEAR = 0.5
@@ -87,7 +88,7 @@ def by_windows(
 def _state(rows: NDArray, track: YawSpline, unit: float, step: float) -> BoundaryState:
     """The state at a node whose first three coefficients of h, and two of yaw where it is free, are in these rows."""
     cubic = rows[:, 0] * unit
-    h, slope, bend = (cubic[0] + 4 * cubic[1] + cubic[2]) / 6, (cubic[2] - cubic[0]) / 2, np.diff(cubic, 2)[0]
+    h, slope, bend = node_values(*cubic)
     yaw, dyaw = track.yaw[0], track.dyaw[0]
     if rows.shape[1] == 2:
         yaw, dyaw = (rows[0, 1] + rows[1, 1]) / 2, (rows[1, 1] - rows[0, 1]) / step
