@@ -1,7 +1,7 @@
-"""Read tests/data/hard_paths.yaml: paths that once were, or by their shape are, hard to plan.
+"""Read tests/data/hard_paths.yaml: paths that are, or once were, hard to plan.
 
-A test takes them as `@pytest.mark.parametrize("case", hard_paths("expert"))`: one parameter for each limit set and yaw
-mode that an entry names, marked slow where the entry is.
+A test takes them by `@pytest.mark.parametrize("case", hard_paths("expert"))`: one parameter for each limit set and yaw
+mode of an entry, marked slow where the entry is.
 """
 
 import itertools
@@ -26,14 +26,14 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 
 FILE = File(__file__).parent / "data" / "hard_paths.yaml"
-KEYS = {"name", "why", "limits", "yaw", "nodes", "change", "expect", "slow"}
+KEYS = {"name", "limits", "yaw", "nodes", "change", "expect", "slow"}
 SHAPES = {"waypoints", "random", "dataset", "coil", "spaced"}
 EXPECTATIONS = {"path", "expert", "plan"}
 
 
 @dataclass(frozen=True)
 class HardPath:
-    """One path with the limits and the yaw mode to plan it with, and what must come of it."""
+    """One path, the limits and the yaw mode to plan it with, and what to expect."""
 
     name: str
     shape: dict[str, Any]  # one of SHAPES and what it says
@@ -65,7 +65,7 @@ class HardPath:
 
 
 def hard_paths(expectation: str) -> list[Any]:
-    """Return a pytest parameter for each case that says what to expect of "path", "expert" or "plan"."""
+    """Return a pytest parameter for each case with an expectation of "path", "expert" or "plan"."""
     return [
         pytest.param(case, id=f"{case.name}, {case.limit_set}, {case.yaw}", marks=[pytest.mark.slow] * is_slow)
         for case, is_slow in _cases()
