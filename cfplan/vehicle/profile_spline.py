@@ -26,7 +26,8 @@ AT_NODE = np.array([[1 / 6, 4 / 6, 1 / 6, 0], [-1 / 2, 0, 1 / 2, 0], [1, -2, 1, 
 
 def spline_profile(coefficients: NDArray, end: float, yaw: YawSpline) -> SpeedProfile:
     """Return the profile whose h is the spline with these coefficients, (N+3,), on the grid from 0 to `end`."""
-    return SpeedProfile(*_on_grid(coefficients, end), yaw.yaw, yaw.dyaw, yaw.ddyaw)
+    s, h, dh, ddh, dddh = _on_grid(coefficients, end)
+    return SpeedProfile(s, h, dh, ddh, dddh, yaw.yaw, yaw.dyaw, yaw.ddyaw)
 
 
 @njit

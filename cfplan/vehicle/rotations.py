@@ -8,6 +8,7 @@ attitude of a thrust axis and a yaw: a turn by yaw about the vertical, then the 
 yaw (ZYX), which `yaw_of` gives, differs from it by a little that vanishes with tilt.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -79,15 +80,45 @@ def product(first: Quaternion, second: Quaternion) -> tuple[Scalar, Scalar, Scal
 @njit
 def matrix_of(quaternion: NDArray) -> NDArray:
     """Return the (3, 3) matrix of a unit quaternion, (4,): its columns are the body's axes."""
-    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     matrix = np.empty((3, 3))
-    matrix[0, 0] = 1 - 2 * (y * y + z * z)
-    matrix[0, 1] = 2 * (x * y - z * w)
-    matrix[0, 2] = 2 * (x * z + y * w)
-    matrix[1, 0] = 2 * (x * y + z * w)
-    matrix[1, 1] = 1 - 2 * (x * x + z * z)
-    matrix[1, 2] = 2 * (y * z - x * w)
-    matrix[2, 0] = 2 * (x * z - y * w)
-    matrix[2, 1] = 2 * (y * z + x * w)
-    matrix[2, 2] = 1 - 2 * (x * x + y * y)
+    _write_matrix(matrix, quaternion, 2.0)
     return matrix
+
+
+@njit(error_model="numpy")
+def matrices_of(quaternions: NDArray) -> NDArray:
+    """Return the (N, 3, 3) matrices of quaternions (N, 4), which need not be of unit length."""
+    out = np.empty((len(quaternions), 3, 3))
+    for n in range(len(quaternions)):
+        x, y, z, w = quaternions[n, 0], quaternions[n, 1], quaternions[n, 2], quaternions[n, 3]
+        _write_matrix(out[n], quaternions[n], 2.0 / (x * x + y * y + z * z + w * w))
+    return out
+
+
+@register_jitable
+def _write_matrix(out: NDArray, quaternion: NDArray, scale: float) -> None:
+    """Write the matrix of a quaternion; `scale` is 2 over its squared length."""
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    out[0, 0], out[0, 1], out[0, 2] = 1 - scale * (y * y + z * z), scale * (x * y - z * w), scale * (x * z + y * w)
+    out[1, 0], out[1, 1], out[1, 2] = scale * (x * y + z * w), 1 - scale * (x * x + z * z), scale * (y * z - x * w)
+    out[2, 0], out[2, 1], out[2, 2] = scale * (x * z - y * w), scale * (y * z + x * w), 1 - scale * (x * x + y * y)
+
+
+@register_jitable
+def write_quaternion(out: NDArray, matrix: NDArray) -> None:
+    """Write the quaternion, (4,), of a rotation matrix, by way of its largest component (Shepperd 1978)."""
+    trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
+    i = 0 if matrix[0, 0] >= matrix[1, 1] and matrix[0, 0] >= matrix[2, 2] else 1 if matrix[1, 1] >= matrix[2, 2] else 2
+    j, k = (i + 1) % 3, (i + 2) % 3
+    if trace >= matrix[i, i]:
+        twice = math.sqrt(1.0 + trace)
+        for axis in range(3):
+            before, behind = (axis + 1) % 3, (axis + 2) % 3
+            out[axis] = (matrix[behind, before] - matrix[before, behind]) / (2.0 * twice)
+        out[3] = twice / 2.0
+    else:
+        twice = math.sqrt(1.0 + matrix[i, i] - matrix[j, j] - matrix[k, k])
+        out[i] = twice / 2.0
+        out[j] = (matrix[j, i] + matrix[i, j]) / (2.0 * twice)
+        out[k] = (matrix[k, i] + matrix[i, k]) / (2.0 * twice)
+        out[3] = (matrix[k, j] - matrix[j, k]) / (2.0 * twice)

@@ -1,12 +1,16 @@
 """The table of limited quantities: consistent in itself, and read by everything that holds motion to limits."""
 
 from dataclasses import fields, replace
+from pathlib import Path
 
 import casadi
 import numpy as np
 import pytest
 
+from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints import stop_certificate
+from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.geometry.min_snap import min_snap
 from cfplan.planners.expert.intersample import DensePath, violates_at_nodes
 from cfplan.safety import quantities
@@ -14,6 +18,7 @@ from cfplan.safety.certificate import certify, shares
 from cfplan.safety.feasibility import hover_violation, infeasible_limit, violated_limit
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.safety.limits import FlightLimits, PlanLimits
+from cfplan.safety.limits_file import load_limits
 from cfplan.safety.quantities import AT_MOST, QUANTITIES
 from cfplan.vehicle import measures
 from cfplan.vehicle.trajectory import Trajectory
@@ -113,6 +118,32 @@ def test_a_limit_that_hovering_breaks_is_named(quantity):
     assert hover_violation(AIRFRAME, LIMITS) is None
     assert hover_violation(AIRFRAME, broken) is quantity
     assert quantity.limit in infeasible_limit(AIRFRAME, broken)
+
+
+@each_quantity
+def test_bytes_are_judged_by_what_a_setpoint_tells(quantity, trajectory):
+    wide, tight = tightened(quantity, trajectory)
+    encoded = encode_trajectory(trajectory)
+    check_bytes(encoded, trajectory, wide)
+    if quantity.jumps:
+        check_bytes(encoded, trajectory, tight)
+    else:
+        with pytest.raises(NotCertifiedError, match=quantity.noun):
+            check_bytes(encoded, trajectory, tight)
+
+
+@each_quantity
+def test_stops_are_judged_by_the_table(quantity, trajectory):
+    slower = Trajectory(trajectory.path, trajectory.profile.slowed(0.5), AIRFRAME)
+    stops = encode_stops(encode_trajectory(slower).payloads, RATE)
+    safety = load_limits(Path(__file__).parents[2] / "safety.yaml")
+    found = stop_certificate.certify_stops(stops, safety, RATE)
+    found.require(safety)
+    assert (quantity.name in found.worst) == (quantity.in_stop is not None)
+    if quantity.in_stop:
+        beyond = quantity.in_stop(safety) + quantity.side
+        with pytest.raises(NotCertifiedError, match=quantity.noun):
+            replace(found, worst=found.worst | {quantity.name: beyond}).require(safety)
 
 
 def test_what_stops_may_reach_is_said_of_all_but_two():

@@ -44,3 +44,13 @@ def test_the_hopf_quaternion_is_a_turn_by_yaw_then_the_least_turn_to_the_thrust_
     least = normal / np.linalg.norm(normal, axis=1)[:, None] * np.arccos(axes[:, 2])[:, None]
     expected = Rotation.from_rotvec(least) * Rotation.from_euler("Z", yaw[:, None])
     np.testing.assert_allclose(Rotation.from_quat(made).as_matrix(), expected.as_matrix(), atol=1e-9)
+
+
+def test_matrices_of_quaternions_of_any_length_lead_back_to_them():
+    quaternions = ATTITUDES.as_quat()
+    matrices = rotations.matrices_of(3.0 * quaternions)
+    np.testing.assert_allclose(matrices, ATTITUDES.as_matrix(), atol=1e-12)
+    for matrix, quaternion in zip(matrices, quaternions, strict=True):
+        found = np.empty(4)
+        rotations.write_quaternion(found, matrix)
+        np.testing.assert_allclose(found * np.sign(found @ quaternion), quaternion, atol=1e-12)

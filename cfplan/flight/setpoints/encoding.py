@@ -19,7 +19,10 @@ from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, encode
 from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
+from cfplan.safety.quantities import INSTANT
 from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.measures import measures_of
+from cfplan.vehicle.rotations import heading_of, matrices_of, write_quaternion
 from cfplan.vehicle.trajectory import FullState, Trajectory
 
 RATE = 100.0  # Hz
@@ -163,9 +166,9 @@ def _check_values(
 def _check_attitude(decoded: FullStateSetpoints, planned: FullState, require: Callable[..., None]) -> None:
     """Check the quaternion, and the attitude that the controller makes of it and of the thrust vector."""
     force = decoded.acceleration + _GRAVITY
-    turned = _angles(_frames(decoded.quaternion), _frames(command_quaternion(planned.quaternion)))
+    turned = _angles(matrices_of(decoded.quaternion), matrices_of(command_quaternion(planned.quaternion)))
     require(turned <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", turned)
-    made = _angles(controller_attitude(force, decoded.quaternion), _frames(planned.quaternion))
+    made = _angles(controller_attitude(force, decoded.quaternion), matrices_of(planned.quaternion))
     # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(tilt) as far.
     level = force[:, 2] / np.linalg.norm(force, axis=1)
     require(made * level <= ATTITUDE_QUANTUM, "the controller would not make the planned attitude, off by rad", made)
@@ -178,18 +181,21 @@ def _check_limits(
     quantum = np.sqrt(3) * HALF_QUANTUM + _ROUNDING
     force = decoded.acceleration + _GRAVITY
     thrust = np.linalg.norm(force, axis=1)
-    require(thrust >= limits.specific_thrust_min - quantum, "too little specific thrust in the packet, m/s²", thrust)
-    for name, vector, limit in (
-        ("speed", decoded.velocity, limits.speed),
-        ("acceleration", acceleration, limits.acceleration),
-        ("angular velocity", decoded.body_rate, limits.angular_velocity),
-    ):
-        size = np.linalg.norm(vector, axis=1)
-        require(size <= limit + quantum, f"{name} in the packet exceeds its limit, {limit:g}, with", size)
-    tilt = np.arccos(np.clip(force[:, 2] / thrust, -1.0, 1.0))
-    require(
-        tilt <= limits.tilt + quantum / thrust, f"tilt in the packet exceeds its limit, {limits.tilt:.4g}, with", tilt
+    measured = measures_of(
+        velocity=decoded.velocity,
+        acceleration=acceleration,
+        body_rate=decoded.body_rate,
+        thrust_axis=force / thrust[:, None],
+        specific_thrust=thrust,
     )
+    for quantity in INSTANT:
+        value, limit = quantity.worst(measured), quantity.allowed(limits)
+        rounding = quantum / thrust if quantity.unit == "rad" else quantum  # an error turns the thrust vector so far
+        require(
+            quantity.excess(value, limit) <= rounding,
+            f"{quantity.noun} in the packet breaks its limit, {limit:.4g} {quantity.unit}, with",
+            value,
+        )
 
 
 def _require_hover(last: FullStateSetpoints, trajectory: Trajectory, count: int) -> None:
@@ -218,27 +224,12 @@ def _angles(first: NDArray, second: NDArray) -> NDArray:
 
 
 @njit(error_model="numpy")
-def _frames(quaternions: NDArray) -> NDArray:
-    """Return (N, 3, 3), whose columns are the body axes of attitudes (N, 4), not zero."""
-    out = np.empty((len(quaternions), 3, 3))
-    for n in range(len(quaternions)):
-        x, y, z, w = quaternions[n, 0], quaternions[n, 1], quaternions[n, 2], quaternions[n, 3]
-        scale = 2.0 / (x * x + y * y + z * z + w * w)
-        out[n, 0, 0], out[n, 1, 1] = 1.0 - scale * (y * y + z * z), 1.0 - scale * (x * x + z * z)
-        out[n, 2, 2] = 1.0 - scale * (x * x + y * y)
-        out[n, 0, 1], out[n, 1, 0] = scale * (x * y - z * w), scale * (x * y + z * w)
-        out[n, 0, 2], out[n, 2, 0] = scale * (x * z + y * w), scale * (x * z - y * w)
-        out[n, 1, 2], out[n, 2, 1] = scale * (y * z - x * w), scale * (y * z + x * w)
-    return out
-
-
-@njit(error_model="numpy")
 def _attitudes(thrusts: NDArray, quaternions: NDArray) -> NDArray:
     """Return what controller_attitude gives: z along the thrust, y along z × [cos yaw, sin yaw, 0]."""
     out = np.empty((len(thrusts), 3, 3))
     for n in range(len(thrusts)):
-        x, y, z, w = quaternions[n, 0], quaternions[n, 1], quaternions[n, 2], quaternions[n, 3]
-        cos, sin = _direction(1.0 - 2.0 * (y * y + z * z), 2.0 * (w * z + x * y))  # of yaw
+        x, y = heading_of(quaternions[n])
+        cos, sin = _direction(x, y)  # of yaw
         a, b, c = thrusts[n, 0], thrusts[n, 1], thrusts[n, 2]
         norm = math.sqrt(a * a + b * b + c * c)
         a, b, c = a / norm, b / norm, c / norm
@@ -255,7 +246,7 @@ def _attitudes(thrusts: NDArray, quaternions: NDArray) -> NDArray:
 def _commands(quaternions: NDArray) -> NDArray:
     """Return what command_quaternion gives: z as planned, x above [cos yaw, sin yaw]."""
     out = np.empty((len(quaternions), 4))
-    planned = _frames(quaternions)
+    planned = matrices_of(quaternions)
     for n in range(len(quaternions)):
         frame = planned[n]
         a, b, c = frame[0, 2], frame[1, 2], frame[2, 2]
@@ -265,7 +256,7 @@ def _commands(quaternions: NDArray) -> NDArray:
         p, q, r = cos / norm, sin / norm, rise / norm
         frame[0, 0], frame[1, 0], frame[2, 0] = p, q, r
         frame[0, 1], frame[1, 1], frame[2, 1] = b * r - c * q, c * p - a * r, a * q - b * p
-        _write_quaternion(out[n], frame)
+        write_quaternion(out[n], frame)
     return out
 
 
@@ -274,23 +265,3 @@ def _direction(x: float, y: float) -> tuple[float, float]:
     """Return cosine and sine of atan2(y, x)."""
     size = math.sqrt(x * x + y * y)
     return (1.0, 0.0) if size == 0.0 else (x / size, y / size)
-
-
-@njit(error_model="numpy")
-def _write_quaternion(out: NDArray, frame: NDArray) -> None:
-    """Write x y z w of a rotation matrix, by way of the largest component (Shepperd 1978)."""
-    trace = frame[0, 0] + frame[1, 1] + frame[2, 2]
-    i = 0 if frame[0, 0] >= frame[1, 1] and frame[0, 0] >= frame[2, 2] else 1 if frame[1, 1] >= frame[2, 2] else 2
-    j, k = (i + 1) % 3, (i + 2) % 3
-    if trace >= frame[i, i]:
-        twice = math.sqrt(1.0 + trace)
-        for axis in range(3):
-            before, behind = (axis + 1) % 3, (axis + 2) % 3
-            out[axis] = (frame[behind, before] - frame[before, behind]) / (2.0 * twice)
-        out[3] = twice / 2.0
-    else:
-        twice = math.sqrt(1.0 + frame[i, i] - frame[j, j] - frame[k, k])
-        out[i] = twice / 2.0
-        out[j] = (frame[j, i] + frame[i, j]) / (2.0 * twice)
-        out[k] = (frame[k, i] + frame[i, k]) / (2.0 * twice)
-        out[3] = (frame[k, j] - frame[j, k]) / (2.0 * twice)
