@@ -126,7 +126,7 @@ def _progress(as_json: bool) -> "Progress":
 @options.as_json
 def info(folder: Path, as_json: bool) -> None:
     """Show counts, failures, and distributions of length, time, speed and active limits of the dataset DIR."""
-    from cfplan.learning.dataset_info import DISTRIBUTIONS, PERCENTILES, describe
+    from cfplan.learning.dataset import DISTRIBUTIONS, PERCENTILES, describe
 
     found = describe(folder)
     if as_json:

@@ -1,4 +1,4 @@
-"""What a training leaves behind each epoch, so that it can go on after a kill: a checkpoint, and a table of epochs."""
+"""Checkpoints from which a killed training resumes, and the log of epochs as a table and a picture."""
 
 import csv
 import io
@@ -17,25 +17,22 @@ CHECKPOINT, LOG = "checkpoint.pt", "log.csv"
 
 @dataclass(frozen=True, slots=True)
 class Epoch:
-    """What an epoch came to; a row of log.csv."""
+    """The losses and errors after an epoch; a row of log.csv."""
 
     epoch: int
     loss: float
     unseen_loss: float
-    time_error: float
-    # mean of the relative errors of travel time, whole unseen paths, as a chain flies them
-    time_error_mean: float
-    # of their absolute values
+    time_error: float  # mean relative error of travel time on unseen paths, planned whole
+    time_error_mean: float  # of the absolute errors
     time_error_p95: float
     rate: float
-    seconds: float
-    # that the epoch took
+    seconds: float  # duration of the epoch
 
 
 def save_checkpoint(
     folder: Path, identity: dict[str, Any], network: nn.Module, optimiser: optim.Optimizer, log: list[Epoch]
 ) -> None:
-    """Everything that going on needs, and the log as a table; each whole or not at all."""
+    """Write all that resuming needs, and the log as a table; each file whole or not at all."""
     content = {
         "identity": identity,
         "network": network.state_dict(),
@@ -58,7 +55,7 @@ def save_checkpoint(
 def resume(
     folder: Path, identity: dict[str, Any], network: nn.Module, optimiser: optim.Optimizer, place: torch.device
 ) -> list[Epoch]:
-    """Go on from the folder's checkpoint, where it has one: its log, which is empty where there is none.
+    """Load the folder's checkpoint into network and optimiser, if there is one; return its log.
 
     Raises:
         InputError: a damaged checkpoint, or that of another training.
@@ -96,3 +93,22 @@ def resume(
     ) as error:
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"cannot be read: {reason}", where=str(file), hint="delete it to begin again") from None
+
+
+def draw_curves(log: list[Epoch], file: Path) -> None:
+    """Draw the losses and the errors of travel time on unseen paths by epoch, as a PNG."""
+    from matplotlib.figure import Figure
+
+    epochs = [epoch.epoch for epoch in log]
+    figure = Figure(figsize=(9, 3.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.semilogy(epochs, [epoch.loss for epoch in log], label="learned from")
+    left.semilogy(epochs, [epoch.unseen_loss for epoch in log], label="unseen")
+    left.set(xlabel="epoch", ylabel="loss")
+    right.semilogy(epochs, [100 * epoch.time_error_mean for epoch in log], label="mean")
+    right.semilogy(epochs, [100 * epoch.time_error_p95 for epoch in log], label="95th percentile")
+    right.set(xlabel="epoch", ylabel="travel time, |error| on unseen paths, %")
+    for axes in (left, right):
+        axes.legend()
+        axes.grid(alpha=0.3)
+    figure.savefig(file, dpi=120)

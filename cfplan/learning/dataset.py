@@ -1,4 +1,4 @@
-"""Datasets on disk: made shard by shard by any number of workers, resumed where they stopped, read back whole.
+"""Datasets on disk: made shard by shard by any number of workers, resumed where they stopped, read and summarised.
 
 A folder holds dataset.json, shards/NNNNN.parquet (the rows), and timing/NNNNN.parquet (how long each solve took, which
 no two runs repeat, and which is therefore kept apart from the rows that every run repeats to the byte).
@@ -6,21 +6,35 @@ no two runs repeat, and which is therefore kept apart from the rows that every r
 
 import io
 import socket
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cfplan.errors import CfplanError, ExitCode, InputError
 from cfplan.learning.dataset_spec import SPEC_FILE, DatasetSpec, load_spec, require_same
 from cfplan.learning.labels import make_rows
+from cfplan.planners.solution import Status
 
 SHARDS, TIMING = "shards", "timing"
 SCHEDULER_PATIENCE = 10  # s
+PERCENTILES = (0, 10, 50, 90, 99, 100)
+DISTRIBUTIONS = {
+    "length": "m",
+    "travel_time": "s",
+    "peak_speed": "m/s",
+    "mean_speed": "m/s",
+    "iterations": "",
+    "solve_seconds": "s",
+}
 
 
 class SchedulerError(CfplanError):
@@ -37,7 +51,7 @@ def make_dataset(
     scheduler: str | None = None,
     on_rows: Callable[[int], None] = lambda _: None,
 ) -> DatasetSpec:
-    """Make what is missing of a dataset. `on_rows` hears how many more rows are on disk.
+    """Make the missing shards of a dataset. `on_rows` is called with the number of rows that were added on disk.
 
     Stopped at any moment, it loses the shards under way and no more; the next call makes those.
     Raises InputError where the folder holds another dataset or cannot be written, SchedulerError where the scheduler
@@ -62,19 +76,44 @@ def make_dataset(
 
 
 def read_dataset(folder: Path) -> tuple[DatasetSpec, pa.Table]:
-    """All rows there are, in order. Raises InputError where the folder is no dataset or a shard is damaged."""
+    """Read all rows that exist, in order. Raises InputError where the folder is no dataset or a shard is damaged."""
     spec = load_spec(folder)
     return spec, _read(folder, SHARDS)
 
 
 def read_timing(folder: Path) -> pa.Table:
-    """How long each row's solve took, as far as rows are there."""
+    """Read how long the solve of each existing row took."""
     load_spec(folder)
     return _read(folder, TIMING)
 
 
+def describe(folder: Path) -> dict[str, Any]:
+    """Return counts, failures and distributions as plain data. Raises InputError where the folder is no dataset."""
+    spec, rows = read_dataset(folder)
+    timing = read_timing(folder)
+    solved = rows.filter(pa.compute.equal(rows["status"], Status.SOLVED.name))
+    share = _numbers(solved, "certified_share")
+    values = {name: _numbers(solved, name) for name in ("length", "travel_time", "peak_speed", "iterations")}
+    values["mean_speed"] = values["length"] / values["travel_time"]
+    values["solve_seconds"] = _numbers(timing, "solve_seconds")
+    active = Counter(name for names in solved["active_limits"].to_pylist() for name in names)
+    return {
+        "folder": str(folder),
+        "spec": asdict(spec),
+        "rows": rows.num_rows,
+        "rows_wanted": spec.rows,
+        "solved": solved.num_rows,
+        "failed": dict(Counter(status for status in rows["status"].to_pylist() if status != Status.SOLVED.name)),
+        "certified_as_they_are": int(np.sum(share >= 1.0)),
+        "certified_when_slowed": int(np.sum((share > 0.0) & (share < 1.0))),
+        "never_certified": int(np.sum(share <= 0.0)),
+        "percentiles": {name: _percentiles(values[name]) for name in DISTRIBUTIONS},
+        "active_limits": {name: count / max(1, solved.num_rows) for name, count in active.most_common()},
+    }
+
+
 def label_shard(spec: DatasetSpec, number: int) -> tuple[int, bytes, bytes]:
-    """A worker's task: the shard's number, and the bytes of its two files."""
+    """Label a shard, as a worker does: return its number and the bytes of its two files."""
     rows, timing = make_rows(spec, spec.shard(number))
     return number, _parquet(rows), _parquet(timing)
 
@@ -100,7 +139,7 @@ Labelled = Iterator[tuple[int, bytes, bytes]]
 
 @contextmanager
 def _pool(workers: int, scheduler: str | None) -> Iterator[Callable[[DatasetSpec, list[int]], Labelled]]:
-    """Something that labels shards, on this machine or on a cluster, and gives them as they are done."""
+    """Yield a function that labels shards on this machine or on a cluster, and yields them as they are done."""
     from joblib import Parallel, delayed, parallel_config
 
     def run(spec: DatasetSpec, numbers: list[int]) -> Labelled:
@@ -141,12 +180,12 @@ def _client(scheduler: str) -> Iterator[object]:
 
 
 def _require_listening(scheduler: str) -> None:
-    """Dask tries for long and logs much where nothing listens; ask first."""
+    """Check that something listens there: Dask would try for long and log much."""
     parts = urlsplit(scheduler)
     try:
         if parts.scheme != "tcp" or parts.hostname is None or parts.port is None:
             raise ValueError("an address has the form tcp://host:port")
-        # In a thread, because looking up a name has no timeout of its own.
+        # In a thread, because looking up a name has no timeout.
         lookup = ThreadPoolExecutor(1)
         lookup.submit(_touch, parts.hostname, parts.port).result(timeout=SCHEDULER_PATIENCE)
         lookup.shutdown(wait=False)
@@ -173,7 +212,7 @@ def _parquet(table: pa.Table) -> bytes:
 
 
 def _write(file: Path, content: bytes) -> None:
-    """Whole or not at all."""
+    """Write a file, whole or not at all."""
     temporary = file.with_suffix(".new")
     try:
         temporary.write_bytes(content)
@@ -195,3 +234,15 @@ def _read(folder: Path, part: str) -> pa.Table:
                 f"damaged ({error})", where=str(file), hint="delete it and give `cfplan dataset make` again"
             ) from None
     return pa.concat_tables(tables)
+
+
+def _numbers(table: pa.Table, name: str) -> np.ndarray:
+    return table[name].to_numpy().astype(float)
+
+
+def _percentiles(values: np.ndarray) -> dict[str, float | None]:
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return {str(percentile): None for percentile in PERCENTILES}
+    found = np.percentile(known, PERCENTILES)
+    return {str(percentile): float(value) for percentile, value in zip(PERCENTILES, found, strict=True)}

@@ -1,4 +1,4 @@
-"""What a dataset is made of: everything that decides its rows, kept beside them as dataset.json.
+"""DatasetSpec: everything that decides the rows of a dataset, kept beside them as dataset.json.
 
 A path's perturbed copies with the clean path's label are the paper's noise injection.
 """
@@ -16,7 +16,7 @@ SPEC_FILE = "dataset.json"
 
 
 class Relabel(StrEnum):
-    """What a perturbed copy of a path is labelled with."""
+    """The label of a perturbed copy of a path."""
 
     SOLVE = "solve"  # its own solution
     KEEP = "keep"  # the clean path's label, as the paper's noise injection has it
@@ -26,22 +26,16 @@ class Relabel(StrEnum):
 class DatasetSpec:
     """Two datasets with equal specs have equal rows, whoever makes them and with however many workers."""
 
-    count: int
-    # clean paths
+    count: int  # clean paths
     seed: int
-    limits: str
-    # name of a limit set, which names its vehicle too
+    limits: str  # name of a limit set, which names its vehicle too
     boxes: tuple[tuple[float, float, float], ...] = ((10.0, 10.0, 10.0), (4.5, 8.0, 2.0))
-    # m, where waypoints are drawn; paths take them in turn
-    waypoints: tuple[int, int] = (3, 6)
-    # least and most
-    nodes: int = 100
-    # grid intervals
+    """Sides, m, of where waypoints are drawn; paths take the boxes in turn."""
+    waypoints: tuple[int, int] = (3, 6)  # least and most
+    nodes: int = 100  # grid intervals
     yaw: YawMode = YawMode.FREE
-    epsilon: float = 0.0
-    # m, perturbation of the copies at each node
-    copies: int = 0
-    # perturbed copies of each path
+    epsilon: float = 0.0  # m, perturbation of the copies at each node
+    copies: int = 0  # perturbed, of each path
     relabel: Relabel = Relabel.SOLVE
     shard_rows: int = 100
     version: str = __version__
@@ -69,16 +63,16 @@ class DatasetSpec:
 
     @property
     def rows(self) -> int:
-        """Clean paths and their copies."""
+        """Return the number of rows: clean paths and their copies."""
         return self.count * (1 + self.copies)
 
     @property
     def shards(self) -> int:
-        """How many files the rows fill."""
+        """Return the number of files that the rows fill."""
         return -(-self.rows // self.shard_rows)
 
     def shard(self, number: int) -> range:
-        """The rows of one file."""
+        """Return the rows of one file."""
         return range(number * self.shard_rows, min(self.rows, (number + 1) * self.shard_rows))
 
     def save(self, folder: Path) -> None:
@@ -93,7 +87,7 @@ def _is_box(sides: tuple[float, ...]) -> bool:
 
 
 def load_spec(folder: Path) -> DatasetSpec:
-    """The spec of a dataset folder. Raises InputError where there is none or it cannot be read."""
+    """Read the spec of a dataset folder. Raises InputError where there is none or it cannot be read."""
     file = folder / SPEC_FILE
     if not file.is_file():
         raise InputError(
@@ -115,7 +109,11 @@ def load_spec(folder: Path) -> DatasetSpec:
 
 
 def require_same(existing: DatasetSpec, wanted: DatasetSpec, folder: Path) -> None:
-    """Refuse to mix rows of two kinds in one folder, naming what differs. More rows of the same kind are no mix."""
+    """Refuse to mix rows of two specs in one folder, naming the differences.
+
+    Raises:
+        InputError: the specs differ.
+    """
     different = [
         f"{field.name} {getattr(existing, field.name)} there, {getattr(wanted, field.name)} here"
         for field in fields(DatasetSpec)

@@ -1,10 +1,10 @@
-"""What the networks see of a path, and how their answer becomes h: one way for training and for flight.
+"""Features: the inputs of the networks, and how their output becomes h and yaw; the same in training and in flight.
 
-Everything is told per step of the grid, so that only the geometry of the nodes counts: with g⁽ᵏ⁾ = γ⁽ᵏ⁾Δsᵏ, neither
-the place nor the heading of a window matters, nor in what unit s runs. h is told as the coefficients of its cubic
-B-spline on the grid (uᵢ = hᵢ - h″ᵢΔs²/6), as log √u/Δs, intervals a second, less a cheap reference: what each limit
-alone would allow if h stood still, a soft minimum (expert/guess.py has the same bounds). Where the path rests, only its
-fourth derivative bounds the reference, as it bounds h.
+Everything is given per step of the grid, so that only the geometry of the nodes counts: with g⁽ᵏ⁾ = γ⁽ᵏ⁾Δsᵏ, neither
+the place nor the heading of a window matters, nor the unit of s. h is given as the coefficients of its cubic B-spline
+on the grid (uᵢ = hᵢ - h″ᵢΔs²/6), as log √u/Δs, intervals a second, less a cheap reference: what each limit alone would
+allow at constant h, as a soft minimum (planners/expert/initial_guess.py has the same bounds). Where the path rests,
+only its fourth derivative bounds the reference, as it bounds h.
 """
 
 import math
@@ -20,41 +20,31 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import node_coefficients
 
-VERSION = 1
-# of everything in this file: a model only understands the features that it was trained on
-SOFTNESS = 6.0
-# power of the soft minimum
-ROOM = 4.0
-# in log, beyond which a bound that is far from binding is not told apart
-TINY = 1e-9
-# m, below which a derivative per step counts as this
-LEAST_SHARE = 0.1
-# of h, to which a coefficient is held from below where h bends sharply within a step
+VERSION = 1  # of all features here: a model works only with those that it was trained on
+SOFTNESS = 6.0  # power of the soft minimum
+ROOM = 4.0  # in log, at which the distance of a limit's bound from the reference is cut off
+TINY = 1e-9  # m, least size of a derivative per step
+LEAST_SHARE = 0.1  # of h, least coefficient where h bends sharply within a step
 
 # Columns of a node table: g, g', g'', g''', the reference rate, and how far above it each limit's own bound is.
 POSITION, REFERENCE, ROOMS, COLUMNS = slice(0, 3), 12, slice(13, 17), 17
 # After them, the same in every row of a window: rest at start and end, start known, its rate and two differences, its
 # yaw from the heading, as cos and sin of twice it because half a turn changes nothing, and its change of yaw a step.
 INPUTS = COLUMNS + 9
-OUTPUTS = 3
-# a node: log rate over the reference, cos and sin of the yaw turned since the start of the window
+OUTPUTS = 3  # at a node: log rate over the reference, cos and sin of the yaw turned since the start of the window
 
 
 class Bounds(NamedTuple):
-    """What the limits come to for motion with h' = 0 and the thrust axis about vertical."""
+    """The limits as bounds on the path's derivatives, for h' = 0 and a thrust axis near the vertical."""
 
-    speed: float
-    # m/s, |γ'|√h
-    acceleration: float
-    # m/s², |γ''|h
-    jerk: float
-    # m/s³, |γ'''|h^1.5
-    snap: float
-    # m/s⁴, |γ''''|h²
+    speed: float  # m/s, |γ'|√h
+    acceleration: float  # m/s², |γ''|h
+    jerk: float  # m/s³, |γ'''|h^1.5
+    snap: float  # m/s⁴, |γ''''|h²
 
 
 def bounds(airframe: Airframe, limits: PlanLimits) -> Bounds:
-    """The bounds of a vehicle within limits."""
+    """Return the bounds of a vehicle within limits."""
     up = limits.motor_thrust_max - airframe.hover_thrust
     down = airframe.hover_thrust - limits.motor_thrust_min
     turning = 2.0 * min(up, down) * airframe.arm / max(airframe.inertia[:2])
@@ -67,18 +57,18 @@ def bounds(airframe: Airframe, limits: PlanLimits) -> Bounds:
 
 
 def start_coefficients(state: BoundaryState, step: float) -> tuple[float, float, float]:
-    """u₋₁, u₀, u₁ of the spline with this state at its first node."""
+    """Return u₋₁, u₀, u₁ of the spline with this state at its first node."""
     return node_coefficients(state.h, state.dh * step, state.ddh * step * step)
 
 
 def start_logs(state: BoundaryState, step: float) -> tuple[float, float, float]:
-    """log √u/Δs of the three."""
+    """Return log √u/Δs of u₋₁, u₀, u₁ for this state."""
     return coefficient_logs(state.h, state.dh * step, state.ddh * step * step, step)
 
 
 @njit
 def coefficient_logs(h: float, slope: float, bend: float, step: float) -> tuple[float, float, float]:
-    """log √u/Δs of u₋₁, u₀, u₁ from h, h'Δs, h''Δs²; what would be hardly positive is raised."""
+    """Return log √u/Δs of u₋₁, u₀, u₁ from h, h'Δs, h''Δs²; coefficients near or below zero are raised."""
     least, unit = LEAST_SHARE * h, math.log(step)
     before, here, after = node_coefficients(h, slope, bend)
     return (
@@ -89,20 +79,20 @@ def coefficient_logs(h: float, slope: float, bend: float, step: float) -> tuple[
 
 
 @njit
-def told(before: float, first: float, after: float) -> tuple[float, float, float]:
-    """The start of a window as the network hears of it: a log rate, and its first and second difference."""
+def start_features(before: float, first: float, after: float) -> tuple[float, float, float]:
+    """Return the features of a window's start: a log rate, and its first and second difference."""
     return first, after - before, after + before - 2.0 * first
 
 
 def rests(path: Path, s: float) -> bool:
-    """Whether the path stands still there."""
+    """Return whether the path rests at s."""
     return math.hypot(*path(s, 1)) < TINY
 
 
-def node_table(path: Path, first: float, step: float, count: int, bound: Bounds) -> NDArray:
-    """(count, COLUMNS): what is told of the nodes first, first + step, …"""
+def node_features(path: Path, first: float, step: float, count: int, bound: Bounds) -> NDArray:
+    """Return (count, COLUMNS): the features of the nodes first, first + step, …"""
     table = np.empty((count, COLUMNS))
-    fill_nodes(table, path.breaks, path.coefficients, first, step, bound)
+    fill_node_features(table, path.breaks, path.coefficients, first, step, bound)
     return table
 
 
@@ -114,9 +104,9 @@ def window_inputs(
     yaw: float = 0.0,
     turning: float = 0.0,
 ) -> NDArray:
-    """(len(table), INPUTS) float32: the nodes of one window as the network takes them.
+    """Return (W+1, INPUTS) float32: the inputs of the network for one window, from the features of its nodes.
 
-    `start` is as from told(); `yaw`, rad, and `turning`, ψ'Δs, are those at the first node.
+    `start` is from start_features(); `yaw`, rad, and `turning`, ψ'Δs, are those at the first node.
     """
     out = np.empty((len(table), INPUTS), dtype=np.float32)
     known = start is not None
@@ -125,8 +115,10 @@ def window_inputs(
 
 
 @njit(error_model="numpy")
-def fill_nodes(out: NDArray, breaks: NDArray, coefficients: NDArray, first: float, step: float, bound: Bounds) -> None:
-    """See node_table. Beyond its end a path stays where it ends, by the derivatives that it has there."""
+def fill_node_features(
+    out: NDArray, breaks: NDArray, coefficients: NDArray, first: float, step: float, bound: Bounds
+) -> None:
+    """See node_features. Nodes beyond the path's end get the features of its end."""
     pieces, powers = coefficients.shape[0], coefficients.shape[1]
     piece = 0
     g = np.empty((5, 3))
@@ -190,8 +182,8 @@ def fill_inputs(
 
 
 @njit
-def turn(yaw: NDArray, first: float, answer: NDArray) -> None:
-    """Write yaw at a window's first nodes, (K,) rad, not wrapped: `first`, then as the network's answer turns."""
+def fill_yaw(yaw: NDArray, first: float, answer: NDArray) -> None:
+    """Write yaw at a window's first nodes, (K,) rad, not wrapped: `first`, then turned as the network answers."""
     before = math.atan2(answer[0, 2], answer[0, 1])
     yaw[0] = first
     for n in range(1, len(yaw)):

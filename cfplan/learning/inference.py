@@ -1,7 +1,7 @@
-"""The networks without torch: one thread, no autograd, compiled loops over weights laid out for them.
+"""Evaluate the networks without torch: one thread, compiled loops over weights laid out for them.
 
-What does not depend on the step before, the input projections of a layer, is one matrix product; what does is a loop
-over the steps in which eight rows of the recurrent weights are added up at a time.
+The input projections of a layer do not depend on the step before and are one matrix product. The recurrence is a loop
+over the steps in which eight rows of the recurrent weights are added up at once.
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ class Network(Protocol):
     """A network ready to answer."""
 
     def __call__(self, inputs: NDArray) -> NDArray:
-        """(W+1, INPUTS) float32 to (W+1, OUTPUTS) float32."""
+        """Map (W+1, INPUTS) float32 to (W+1, OUTPUTS) float32."""
 
 
 class Layer:
@@ -41,13 +41,13 @@ class Layer:
         bias = [weights[f"{prefix}bias_ih{end}"] + weights[f"{prefix}bias_hh{end}"] for end in endings]
         self.inward = np.ascontiguousarray(np.concatenate([weights[f"{prefix}weight_ih{end}"] for end in endings]).T)
         self.bias = np.concatenate(bias)
-        # (directions, H, 4H): a row is what one hidden number adds to all gates
+        # (directions, H, 4H): a row is what one hidden unit adds to all gates
         self.recurrent = np.ascontiguousarray(
             np.stack([weights[f"{prefix}weight_hh{end}"] for end in endings]).transpose(0, 2, 1)
         )
 
     def __call__(self, inputs: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """(T, I) to (T, directions · H), and the last hidden and cell numbers, (directions, H)."""
+        """Map (T, I) to (T, directions · H); return also the last hidden and cell states, (directions, H)."""
         directions, hidden = self.recurrent.shape[:2]
         out = np.empty((len(inputs), directions * hidden), np.float32)
         h, c = np.zeros((directions, hidden), np.float32), np.zeros((directions, hidden), np.float32)
@@ -71,8 +71,8 @@ class BiLstm:
         return values @ self.head + self.bias
 
 
-class Attention:
-    """See networks.Attention."""
+class EncoderDecoder:
+    """See networks.EncoderDecoder."""
 
     def __init__(self, weights: Mapping[str, NDArray]) -> None:
         count = _layers(weights, "encoder.")
@@ -105,12 +105,7 @@ class Attention:
         return out
 
 
-NETWORKS: Mapping[str, type[BiLstm] | type[Attention]] = {"bilstm": BiLstm, "attention": Attention}
-
-
-def warm_up(network: Network, window: int) -> None:
-    """Have everything compiled that answering needs."""
-    network(np.zeros((window + 1, INPUTS), np.float32))
+NETWORKS: Mapping[str, type[BiLstm] | type[EncoderDecoder]] = {"bilstm": BiLstm, "attention": EncoderDecoder}
 
 
 def _layers(weights: Mapping[str, NDArray], prefix: str) -> int:
@@ -118,7 +113,7 @@ def _layers(weights: Mapping[str, NDArray], prefix: str) -> int:
 
 
 def _normalise(layer: Layer, weights: Mapping[str, NDArray]) -> None:
-    """Let the layer take inputs as they are."""
+    """Fold the normalisation of the inputs into the layer's weights."""
     inward = layer.inward.astype(float) * weights["scale"].astype(float)[:, None]
     layer.bias = (layer.bias - weights["mean"].astype(float) @ inward).astype(np.float32)
     layer.inward = inward.astype(np.float32)
@@ -134,7 +129,7 @@ def _tanh(x: np.float32) -> np.float32:
 
 @njit(fastmath=True, error_model="numpy")
 def _run(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, cell: NDArray) -> None:
-    """An LSTM layer over all steps; gates in torch's order: input, forget, cell, output."""
+    """Run an LSTM layer over all steps; gates in torch's order: input, forget, cell, output."""
     steps, hidden = out.shape[0], last.shape[1]
     gates = np.empty(4 * hidden, np.float32)
     for direction in range(recurrent.shape[0]):
@@ -168,8 +163,8 @@ def _run(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, ce
                 out[t, column + k] = h[k]
 
 
-def shapes(architecture: str, hidden: int, layers: int) -> dict[str, tuple[int, ...]]:
-    """The tensors that a network of this kind has, as torch names them."""
+def tensor_shapes(architecture: str, hidden: int, layers: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a network's tensors, by the names that torch gives them."""
     parts: dict[str, list[tuple[str, int, tuple[str, ...]]]] = {
         "bilstm": [("lstm.", INPUTS, ("", "_reverse"))],
         "attention": [("encoder.", INPUTS, ("",)), ("decoder.", OUTPUTS, ("",))],

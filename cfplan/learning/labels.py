@@ -1,4 +1,4 @@
-"""One row of a dataset: a path from its seed, and the expert's answer to it."""
+"""Label a row of a dataset: a path from its seed, and the expert's solution."""
 
 from dataclasses import asdict
 from functools import lru_cache
@@ -21,8 +21,7 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.vehicle.trajectory import Trajectory
 
-ACTIVE_SHARE = 0.98
-# of a limit: what reaches this much of it somewhere is counted as active
+ACTIVE_SHARE = 0.98  # of a limit, from which it counts as active
 
 _NUMBERS = pa.list_(pa.float64())
 SCHEMA = pa.schema(
@@ -60,9 +59,9 @@ TIMING_SCHEMA = pa.schema([("row", pa.int64()), ("solve_seconds", pa.float64())]
 
 
 def make_rows(spec: DatasetSpec, rows: range) -> tuple[pa.Table, pa.Table]:
-    """Label these rows. What was measured rather than computed, the solve times, is a table of its own.
+    """Label these rows. Return their table, and a second one of solve times, which are measured and not computed.
 
-    Nothing outside `spec` and the row's number decides a row, so that any worker makes the same.
+    Only `spec` and its number decide a row, so that any worker makes the same.
     """
     labelled = [_row(spec, row) for row in rows]
     metadata = {"cfplan.limits": repr(asdict(LIMIT_SETS[spec.limits].limits)), "cfplan.version": spec.version}
@@ -72,13 +71,13 @@ def make_rows(spec: DatasetSpec, rows: range) -> tuple[pa.Table, pa.Table]:
 
 
 def clean_path(spec: DatasetSpec, number: int) -> Path:
-    """The path of that number, from the dataset's seed."""
+    """Return the path of that number, from the dataset's seed."""
     half = np.array(spec.boxes[number % len(spec.boxes)]) / 2
     return min_snap(random_waypoints(_seed(spec, number, 0), np.array([-half, half]), spec.waypoints))
 
 
 def row_path(spec: DatasetSpec, row: int) -> Path:
-    """The path of a row: a clean one, or a perturbed copy of one."""
+    """Return the path of a row: a clean one, or a perturbed copy of one."""
     number, copy = divmod(row, 1 + spec.copies)
     path = clean_path(spec, number)
     return path if copy == 0 else perturbed(path, spec.epsilon, _seed(spec, number, copy))
@@ -117,7 +116,7 @@ def _solve(spec: DatasetSpec, path: Path) -> Solution:
 
 @lru_cache(maxsize=1)
 def _clean_solution(spec: DatasetSpec, number: int) -> Solution:
-    """The clean path's label, for its copies, which follow it row by row."""
+    """Return the clean path's label, cached for its copies, which are the next rows."""
     return _solve(spec, clean_path(spec, number))
 
 
@@ -144,7 +143,7 @@ def _label(path: Path, solution: Solution, limits: str) -> dict[str, Any]:
 
 
 def _certified_speed_factor(trajectory: Trajectory, limits: PlanLimits) -> float:
-    """Of its speed; 0 where no slowing helps."""
+    """Return the factor on speed at which the trajectory passes; 0 if no slowing helps."""
     try:
         return slow_until_certified(trajectory, limits).speed_factor
     except CfplanError:

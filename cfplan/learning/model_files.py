@@ -1,7 +1,7 @@
-"""Models as folders: weights.safetensors, and card.json that says what they are of and good for.
+"""Model folders: weights.safetensors, and card.json with its provenance and what it may be used for.
 
-A card names its weights by their hash, and everything that decides whether they may be used: the vehicle, the limits
-with their numbers, the window, and the version of the features. What does not fit is an error, never a flight.
+A card names its weights by their hash, and all that decides whether they may be used: the vehicle, the limits, the
+window, and the version of the features. A model that does not fit is an error, never a flight.
 """
 
 import hashlib
@@ -19,43 +19,35 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InputError
 from cfplan.learning import features
-from cfplan.learning.inference import NETWORKS, Network, shapes
+from cfplan.learning.inference import NETWORKS, Network, tensor_shapes
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 
 WEIGHTS, CARD = "weights.safetensors", "card.json"
 FORMAT = 1
-TIGHTEST = 0.5
-# of a model's limit: plans for still tighter ones would be more repair than model
+TIGHTEST = 0.5  # of a model's limit: for tighter ones repair would do more than the model
 _RETRAIN = "train it again with `cfplan train`"
 _RESTORE = "restore both files from where the model came, or train it again with `cfplan train`"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Card:
-    """What a model is of, and what it scored."""
+    """The provenance of a model, what it is for, and its scores."""
 
     name: str
-    architecture: str
-    # bilstm or attention
+    architecture: str  # an Architecture
     hidden: int
     layers: int
-    window: int
-    # intervals
-    features: int
-    # version of features.py
+    window: int  # intervals
+    features: int  # version of features.py
     weights_sha256: str
     airframe: Airframe
     limits: PlanLimits
-    data: dict[str, Any]
-    # the dataset's spec, and how many of its rows were learned from
-    training: dict[str, Any]
-    # the command and its options
-    scores: dict[str, float]
-    # on paths that were not learned from
+    data: dict[str, Any]  # the dataset's spec, and how many of its rows were learned from
+    training: dict[str, Any]  # the command and its options
+    scores: dict[str, float]  # on paths that were not learned from
     date: str
-    version: str
-    # of cfplan
+    version: str  # of cfplan
     format: int = FORMAT
 
 
@@ -72,29 +64,29 @@ class Model:
 
     @property
     def window(self) -> int:
-        """Intervals"""
+        """Return the intervals of a window."""
         return self.card.window
 
     def limits_within(self, limits: PlanLimits) -> PlanLimits:
-        """Of these limits, as much as the model knows: where they are looser, its own."""
+        """Return these limits, but the model's own where its own are tighter."""
         both = ((name, getattr(self.card.limits, name), getattr(limits, name)) for name in PlanLimits.__slots__)
         return PlanLimits(**{name: (max if name.endswith("_min") else min)(own, other) for name, own, other in both})
 
     def differences(self, limits: PlanLimits) -> tuple[str, ...]:
-        """In what these limits are not those that the model was trained with, a sentence each."""
-        said = []
+        """Return how these limits differ from those that the model was trained with, a sentence each."""
+        sentences = []
         for name, own in asdict(self.card.limits).items():
             wanted = getattr(limits, name)
             if math.isclose(own, wanted, rel_tol=1e-9):
                 continue
             tighter = wanted > own if name.endswith("_min") else wanted < own
-            meaning = "tighter: repair sees to it" if tighter else "looser: used only as far as the model knows"
-            said.append(f"{name} is {wanted:.4g}, the model {self.name} was trained with {own:.4g} ({meaning})")
-        return tuple(said)
+            meaning = "tighter: repair keeps it" if tighter else "looser: the model's own is kept"
+            sentences.append(f"{name} is {wanted:.4g}, the model {self.name} was trained with {own:.4g} ({meaning})")
+        return tuple(sentences)
 
 
 def save_model(folder: Path, card: Card, weights: Mapping[str, NDArray]) -> Card:
-    """Write both files, each whole or not at all; the card as written, with the hash of the weights."""
+    """Write both files, each whole or not at all. Return the card as written, with the hash of the weights."""
     from safetensors.numpy import save
 
     content = save({name: np.ascontiguousarray(values) for name, values in weights.items()})
@@ -108,7 +100,7 @@ def save_model(folder: Path, card: Card, weights: Mapping[str, NDArray]) -> Card
 
 
 def load_card(folder: Path) -> Card:
-    """What a model folder says of itself.
+    """Read the card of a model folder.
 
     Raises:
         InputError: no card, one that cannot be read, or of another format or version of the features.
@@ -141,7 +133,7 @@ def load_card(folder: Path) -> Card:
 
 
 def load_model(folder: Path, airframe: Airframe | None = None) -> Model:
-    """A model, checked: the card's hash, and the names, shapes and finiteness of the weights.
+    """Load a model and check it: the card's hash, and the names, shapes and finiteness of the weights.
 
     Raises:
         InputError: damaged or foreign weights, a card of others, or a model for another vehicle than `airframe`.
@@ -163,7 +155,7 @@ def load_model(folder: Path, airframe: Airframe | None = None) -> Model:
         weights = load(content)
     except (SafetensorError, ValueError, KeyError) as error:
         raise InputError(f"not weights: {error}", where=where, hint=_RESTORE) from None
-    expected = shapes(card.architecture, card.hidden, card.layers)
+    expected = tensor_shapes(card.architecture, card.hidden, card.layers)
     if {name: values.shape for name, values in weights.items()} != expected:
         raise InputError(
             f"not the weights of a {card.architecture} of {card.layers} x {card.hidden}, as the card says",
@@ -182,7 +174,7 @@ def load_model(folder: Path, airframe: Airframe | None = None) -> Model:
 
 
 def other_vehicle(card: Card, airframe: Airframe) -> str:
-    """In what an airframe differs from the model's; empty where it is the same."""
+    """Return how an airframe differs from the model's; empty if it is the same."""
     differs = [
         f"{field.name} {getattr(card.airframe, field.name)} there, {getattr(airframe, field.name)} here"
         for field in fields(Airframe)
@@ -193,7 +185,7 @@ def other_vehicle(card: Card, airframe: Airframe) -> str:
 
 @lru_cache(maxsize=1)
 def models_folder() -> Path:
-    """Where the models are that come with cfplan: in a checkout beside the package, else where pip put them."""
+    """Return the folder of the models that come with cfplan: beside the package in a checkout, else as pip put it."""
     checkout = Path(__file__).parents[2]
     if (checkout / "pyproject.toml").is_file():
         return checkout / "models"
@@ -201,8 +193,10 @@ def models_folder() -> Path:
 
 
 def find_model(airframe: Airframe, limits: PlanLimits, folder: Path | None = None) -> Model | None:
-    """Of the models in a folder, else of those that come with cfplan, the one for this vehicle and nearest to these
-    limits; None where no vehicle fits, or a limit is less than half of what the model knows.
+    """Load the model for this vehicle that is nearest to these limits.
+
+    Searched is a folder, else the models that come with cfplan. None if none is for this vehicle, or if a limit is less
+    than half of the model's.
 
     Raises:
         InputError: a model that fits is damaged.
@@ -222,7 +216,7 @@ def _find(airframe: Airframe, limits: PlanLimits, folder: Path) -> Model | None:
 
 
 def _distance(own: PlanLimits, wanted: PlanLimits) -> float:
-    """How far limits are from a model's, infinite where it is no use for them."""
+    """Return how far limits are from a model's; infinite where the model is of no use for them."""
     total = 0.0
     for name in ("speed", "acceleration", "angular_velocity", "angular_acceleration", "tilt", "motor_thrust_max"):
         known, asked = getattr(own, name), getattr(wanted, name)

@@ -1,7 +1,7 @@
-"""The networks, in torch: a bidirectional LSTM, and the paper's encoder-decoder LSTM with attention.
+"""The networks in torch: a bidirectional LSTM, and the paper's encoder-decoder LSTM with attention.
 
-From the features of a window they compute three numbers for each node (see sampling.Batch.targets). Both normalise
-their inputs by numbers that belong to their weights. How they compute without torch is in inference.py.
+Each maps the features of a window to three numbers a node (see training_set.Batch.targets), and normalises them by
+numbers that are stored with its weights. inference.py computes the same without torch.
 """
 
 from enum import StrEnum
@@ -14,14 +14,14 @@ from cfplan.learning.features import INPUTS, OUTPUTS
 
 
 class Architecture(StrEnum):
-    """Which network."""
+    """The architectures by name, as on the command line and in model cards."""
 
     BILSTM = "bilstm"  # sees the whole window from both sides, answers for all nodes at once
-    ATTENTION = "attention"  # the paper's: encoder, dot-product attention, autoregressive decoder
+    ENCODER_DECODER = "attention"  # the paper's: encoder, dot-product attention, autoregressive decoder
 
 
 class BiLstm(nn.Module):
-    """A bidirectional LSTM with a linear head for each node."""
+    """A bidirectional LSTM with a linear head at each node."""
 
     def __init__(self, hidden: int, layers: int) -> None:
         super().__init__()
@@ -31,13 +31,16 @@ class BiLstm(nn.Module):
         self.head = nn.Linear(2 * hidden, OUTPUTS)
 
     def forward(self, inputs: Tensor, _: Tensor | None = None) -> Tensor:
-        """(B, W+1, INPUTS) to (B, W+1, OUTPUTS)."""
+        """Map (B, W+1, INPUTS) to (B, W+1, OUTPUTS)."""
         hidden, _state = self.lstm((inputs - self.mean) * self.scale)
         return self.head(hidden)
 
 
-class Attention(nn.Module):
-    """The paper's LSTM encoder-decoder: each answer is an input of the next, attention has no parameters."""
+class EncoderDecoder(nn.Module):
+    """The paper's LSTM encoder-decoder: each answer is an input of the next, attention has no parameters.
+
+    No model that comes with cfplan uses it; it is kept to train and to compare with the paper.
+    """
 
     def __init__(self, hidden: int, layers: int) -> None:
         super().__init__()
@@ -48,7 +51,7 @@ class Attention(nn.Module):
         self.head = nn.Linear(2 * hidden, OUTPUTS)
 
     def forward(self, inputs: Tensor, targets: Tensor | None = None) -> Tensor:
-        """(B, W+1, INPUTS) to (B, W+1, OUTPUTS); with targets, each step is fed the true answer before it."""
+        """Map (B, W+1, INPUTS) to (B, W+1, OUTPUTS); with targets, each step is fed the true answer before it."""
         memory, state = self.encoder((inputs - self.mean) * self.scale)
         first = inputs.new_zeros(len(inputs), 1, OUTPUTS)
         if targets is not None:
@@ -64,12 +67,12 @@ class Attention(nn.Module):
         return self.head(torch.cat([decoded, weights @ memory], dim=2))
 
 
-NETWORKS: dict[Architecture, type[BiLstm] | type[Attention]] = {
+NETWORKS: dict[Architecture, type[BiLstm] | type[EncoderDecoder]] = {
     Architecture.BILSTM: BiLstm,
-    Architecture.ATTENTION: Attention,
+    Architecture.ENCODER_DECODER: EncoderDecoder,
 }
 
 
 def build(architecture: Architecture, hidden: int, layers: int) -> Any:
-    """A network with random weights, by torch's seed."""
+    """Return a network with random weights, by torch's seed."""
     return NETWORKS[architecture](hidden, layers)

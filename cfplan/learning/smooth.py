@@ -1,8 +1,8 @@
-"""From a network's answer to a smooth profile: the coefficients of a cubic B-spline, one window at a time.
+"""Smooth a network's answer into the coefficients of a cubic B-spline, one window at a time.
 
 A window's answers are joined to the three coefficients that are settled already, or to a rest, and smoothed by the
-least sum of squared changes and squared third differences of log √u. What the second weigh depends on how long an
-interval takes: motion is smoothed over the same time whatever the grid. Where the path rests, four coefficients are
+least sum of squared changes and squared third differences of log √u. The weight of the second depends on how long an
+interval takes, so that motion is smoothed over the same time on any grid. Where the path rests, four coefficients are
 equal, so that h stays constant over the first or last interval (see planners/expert/expert.py).
 """
 
@@ -14,16 +14,13 @@ from numpy.typing import NDArray
 from cfplan.machine_code import njit
 from cfplan.vehicle.profile_spline import weights_at
 
-DURATION = 0.07
-# s, over which answers are smoothed
-STIFFEST = 1e6
-# of third differences against changes, at most
-_BAND = 3
-# of the normal equations
+DURATION = 0.07  # s, over which answers are smoothed
+MAX_STIFFNESS = 1e6  # weight of third differences against changes
+_BAND = 3  # width of the normal equations
 
 
 class Begin(IntEnum):
-    """What holds at the first node of a window."""
+    """How a window begins."""
 
     REST = 0
     KNOWN = 1  # u₋₁, u₀, u₁ are settled
@@ -32,7 +29,7 @@ class Begin(IntEnum):
 
 @njit(error_model="numpy")
 def smoothed(rates: NDArray, settled: NDArray, begin: int, rest_end: bool, duration: float = DURATION) -> NDArray:
-    """(W+3,) log √u/Δs at nodes -1 … W+1 from answers, (W+1,), and what is settled, (3,)."""
+    """Return (W+3,) log √u/Δs at nodes -1 … W+1 from answers, (W+1,), and the settled ones, (3,)."""
     count = len(rates) + 2
     first = 3 if begin == 0 else 0
     last = count - 4 if rest_end else count - 1
@@ -47,7 +44,7 @@ def smoothed(rates: NDArray, settled: NDArray, begin: int, rest_end: bool, durat
             right[row] += rates[n - 1]
     weights = (-1.0, 3.0, -3.0, 1.0)
     for n in range(count - 3):
-        stiffness = min((duration * np.exp(rates[min(n, len(rates) - 1)])) ** 6, STIFFEST)
+        stiffness = min((duration * np.exp(rates[min(n, len(rates) - 1)])) ** 6, MAX_STIFFNESS)
         for i in range(4):
             row = min(max(n + i, first), last) - first
             for j in range(4):
@@ -71,7 +68,7 @@ def smoothed(rates: NDArray, settled: NDArray, begin: int, rest_end: bool, durat
 
 @njit(error_model="numpy")
 def _solve(band: NDArray, right: NDArray) -> None:
-    """Cholesky in place of a banded matrix, then both substitutions."""
+    """Solve by Cholesky's method for a banded matrix, in place."""
     size = len(right)
     for n in range(size):
         pivot = np.sqrt(band[n, 0])
@@ -92,7 +89,7 @@ def _solve(band: NDArray, right: NDArray) -> None:
 
 
 def travel_time(coefficients: NDArray, step: float) -> float:
-    """s, of a spline of h, by four-point Gauss quadrature on every interval."""
+    """Return the travel time, s, of a spline of h, by four-point Gauss quadrature on every interval."""
     places, shares = np.polynomial.legendre.leggauss(4)
     last = len(coefficients) - 3
     h = sum(w[:, None] * coefficients[k : last + k] for k, w in enumerate(weights_at((places + 1.0) / 2.0)))

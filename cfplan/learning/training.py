@@ -1,12 +1,14 @@
-"""Train a model by imitation: from a dataset of the expert's profiles to a model folder.
+"""Train a network by imitation: from a dataset of the expert's profiles to a model folder.
 
-Every epoch draws its windows by a seed of its own and is followed by a checkpoint, so that a training that was killed
-goes on as if it had not been. Under torchrun each process takes its share of the windows, and the first one writes.
+Every epoch draws its windows by its own seed and ends with a checkpoint, so that a training that was killed resumes
+with the same result. Under torchrun each process takes its share of the windows, and the first one writes.
 """
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,46 +23,39 @@ from torch.nn.parallel import DistributedDataParallel
 from cfplan import __version__
 from cfplan.errors import InputError
 from cfplan.learning import features, inference
-from cfplan.learning.checkpoints import Epoch, resume, save_checkpoint
+from cfplan.learning.checkpoints import Epoch, draw_curves, resume, save_checkpoint
 from cfplan.learning.learned import predict
-from cfplan.learning.loss import loss
 from cfplan.learning.model_files import Card, save_model
 from cfplan.learning.networks import Architecture, build
-from cfplan.learning.processes import processes
-from cfplan.learning.sampling import Labels, Material, draw, read_material, split
 from cfplan.learning.smooth import travel_time
+from cfplan.learning.training_set import Labels, TrainingSet, draw, read_training_set, split
 from cfplan.learning.windows import WINDOW
 from cfplan.safety.limit_sets import LIMIT_SETS
 
 CURVES = "curves.png"
-CHUNK = 4096
-# windows drawn at a time
-WARM_UP = 0.05
-# of the steps, over which the learning rate rises; then it falls to nothing along a cosine
-CLIP = 1.0
-# norm of the gradient, at most
-NOISE_EPOCHS = 5
-# after which paths are perturbed anew
-_DATA, _NOISE, _JUDGED = 1, 2, 3
-# streams of random numbers of one seed
+CHUNK = 4096  # windows drawn at once
+WARM_UP = 0.05  # of the steps, over which the learning rate rises; then it falls to nothing along a cosine
+CLIP = 1.0  # largest norm of the gradient
+NOISE_EPOCHS = 5  # between perturbations of the paths
+_DATA, _NOISE, _UNSEEN = 1, 2, 3  # streams of random numbers of one seed
+# Weights in the loss of squared errors, against those of the values: of the first and second difference between nodes,
+# of the window's time (relative), and of the cosine and sine of yaw
+SLOPES, BENDS, DURATION, YAW = 2.0, 5.0, 1.0, 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """What decides a training, beside the dataset and the machine."""
+    """Options of a training: with the dataset they decide its result."""
 
     architecture: Architecture = Architecture.BILSTM
     hidden: int = 32
     layers: int = 2
     window: int = WINDOW
     epochs: int = 40
-    windows: int = 2
-    # of each path, an epoch
+    windows: int = 2  # drawn from each path in an epoch
     batch: int = 64
-    rate: float = 2e-3
-    # of learning, at its highest
-    epsilon: float = 0.0
-    # m, by which the paths of half the windows are perturbed, with the clean path's answers
+    rate: float = 2e-3  # the highest learning rate
+    epsilon: float = 0.0  # m, noise injection: the paths of half the windows are perturbed by at most this
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -93,15 +88,15 @@ def train(
     command: str = "",
     on_epoch: Callable[[Epoch], None] = lambda _: None,
 ) -> Card | None:
-    """Train, or go on with the training that the folder holds, and write the model. None in all processes but one.
+    """Train, or resume the training in the folder, and write the model. Returns None in all processes but the first.
 
     Raises:
         InputError: a dataset without usable rows, another training in the folder, a device that is not there, or
             a loss that is not a number.
     """
-    material = read_material(dataset)
+    training_set = read_training_set(dataset)
     with processes(device) as (rank, world, place):
-        run = _Run(material, folder, options, rank, world, place)
+        run = _Run(training_set, folder, options, rank, world, place)
         try:
             for epoch in run.epochs():
                 on_epoch(epoch)
@@ -118,15 +113,15 @@ class _Run:
     """One process's part in a training."""
 
     def __init__(
-        self, material: Material, folder: Path, options: Options, rank: int, world: int, place: torch.device
+        self, training_set: TrainingSet, folder: Path, options: Options, rank: int, world: int, place: torch.device
     ) -> None:
         self.folder, self.options, self.rank, self.world, self.place = folder, options, rank, world, place
         self.identity: dict[str, Any] = {
             "options": _plain(options),
-            "data": _plain(material.spec),
+            "data": _plain(training_set.spec),
             "features": features.VERSION,
         }
-        self.seen, self.unseen = split(material, options.seed)
+        self.seen, self.unseen = split(training_set, options.seed)
         self.noise: tuple[int, Labels] | None = None
         torch.manual_seed(options.seed)
         self.network = build(options.architecture, options.hidden, options.layers)
@@ -137,11 +132,11 @@ class _Run:
         per_process = len(self.seen.rows) * options.windows // world
         self.batch = max(1, min(options.batch // world, per_process))
         self.batches = per_process // self.batch
-        self.unseen_windows = self._windows(self.unseen, np.tile(np.arange(len(self.unseen.rows)), 2), _JUDGED, 0)
+        self.unseen_windows = self._windows(self.unseen, np.tile(np.arange(len(self.unseen.rows)), 2), _UNSEEN, 0)
         self.log = resume(folder, self.identity, self.network, self.optimiser, place)
 
     def epochs(self) -> Iterator[Epoch]:
-        """Train, an epoch at a time."""
+        """Train and yield epoch by epoch."""
         for number in range(len(self.log) + 1, self.options.epochs + 1):
             began = time.perf_counter()
             learned = self._learn(number)
@@ -159,9 +154,7 @@ class _Run:
                 distributed.barrier()
 
     def finish(self, command: str) -> Card:
-        """Write the model, the log and its picture."""
-        from cfplan.learning.curves import draw_curves
-
+        """Write the model and the picture of its log; return its card."""
         spec, last, options = self.seen.spec, self.log[-1], self.options
         chosen = LIMIT_SETS[spec.limits]
         card = Card(
@@ -214,13 +207,13 @@ class _Run:
             raise InputError(f"the loss of epoch {number} is not a number", where="training", hint="try a lower --rate")
         return mean
 
-    def _windows(self, material: Material, rows: NDArray, *stream: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _windows(self, training_set: TrainingSet, rows: NDArray, *stream: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         random = np.random.default_rng([self.options.seed, *stream])
-        labels = material.labels
-        batch = draw(labels, material.bound, rows, self.options.window, random)
-        if self.options.epsilon > 0.0 and material is self.seen:
+        labels = training_set.labels
+        batch = draw(labels, training_set.bound, rows, self.options.window, random)
+        if self.options.epsilon > 0.0 and training_set is self.seen:
             other = draw(
-                self._noisy(stream[1]), material.bound, rows, self.options.window,
+                self._noisy(stream[1]), training_set.bound, rows, self.options.window,
                 np.random.default_rng([self.options.seed, *stream]),
             )  # fmt: skip
             batch.inputs[::2] = other.inputs[::2]
@@ -228,7 +221,7 @@ class _Run:
         return parts[0], parts[1], parts[2], parts[3]
 
     def _noisy(self, number: int) -> Labels:
-        """The paths perturbed, anew every few epochs."""
+        """Return the labels on perturbed paths, perturbed anew every few epochs."""
         age = (number - 1) // NOISE_EPOCHS
         if self.noise is None or self.noise[0] != age:
             seed = np.random.SeedSequence([self.options.seed, _NOISE, age])
@@ -248,7 +241,7 @@ class _Run:
         return float(loss(self.network(inputs), targets, weights, times)[0])
 
     def _time_errors(self) -> NDArray:
-        """Relative error of the travel time of each unseen path, as flights would have it."""
+        """Return the relative error of travel time on each unseen path, planned whole as for a flight."""
         network = inference.NETWORKS[str(self.options.architecture)](self._weights())
         unseen, window = self.unseen, self.options.window
         nodes = max(window, unseen.spec.nodes)
@@ -259,7 +252,7 @@ class _Run:
         return np.array(found) / unseen.travel_time - 1.0
 
     def _normalise(self) -> None:
-        inputs = self._windows(self.seen, np.arange(len(self.seen.rows))[:CHUNK], _JUDGED, 1)[0]
+        inputs = self._windows(self.seen, np.arange(len(self.seen.rows))[:CHUNK], _UNSEEN, 1)[0]
         spread = inputs.std(dim=(0, 1))
         self.network.mean.copy_(inputs.mean(dim=(0, 1)))
         self.network.scale.copy_(torch.where(spread > 1e-6, 1.0 / spread, torch.ones_like(spread)))
@@ -269,6 +262,51 @@ class _Run:
 
 
 def _plain(content: Any) -> dict[str, Any]:
-    """As a card has it: JSON knows no tuples."""
+    """Return a dataclass as the card stores it: JSON has no tuples."""
     plain: dict[str, Any] = json.loads(json.dumps(asdict(content)))
     return plain
+
+
+def loss(answers: Tensor, targets: Tensor, weights: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the loss of B windows, and the relative error of the time of each, (B,); see training_set.Batch.
+
+    To the errors of log √u are added those of its differences, on which accelerations and jerks depend, and the error
+    of the window's time, which is what matters in the end.
+    """
+    error = answers[..., 0] - targets[..., 0]
+    slope = error[:, 1:] - error[:, :-1]
+    bend = slope[:, 1:] - slope[:, :-1]
+    total = (
+        _weighted_mean(error, weights)
+        + SLOPES * _weighted_mean(slope, weights[:, 1:])
+        + BENDS * _weighted_mean(bend, weights[:, 2:])
+    )
+    late = (times * (-error).exp()).sum(dim=1) - 1.0
+    yaw = (answers[..., 1:] - targets[..., 1:]).square().sum(dim=2)
+    return total + DURATION * late.square().mean() + YAW * yaw.mean(), late
+
+
+def _weighted_mean(error: Tensor, weights: Tensor) -> Tensor:
+    return (weights * error.square()).sum() / weights.sum()
+
+
+@contextmanager
+def processes(device: str) -> Iterator[tuple[int, int, torch.device]]:
+    """Join the processes that torchrun started, if it did: yield rank, number of processes, and this one's device."""
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    local = int(os.environ.get("LOCAL_RANK", "0"))
+    try:
+        place = torch.device(f"{device}:{local}" if device == "cuda" else device)
+        torch.zeros(1, device=place)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(
+            f"no device {device!r}: {' '.join(str(error).split())[:120]}", where="--device", hint="cpu always works"
+        ) from None
+    if world == 1:
+        yield 0, 1, place
+        return
+    distributed.init_process_group("nccl" if place.type == "cuda" else "gloo")
+    try:
+        yield distributed.get_rank(), distributed.get_world_size(), place
+    finally:
+        distributed.destroy_process_group()

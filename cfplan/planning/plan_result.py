@@ -1,4 +1,4 @@
-"""What planning comes to; apart from how it is found, so that a plan is read without any planner."""
+"""Plan: the result of planning, importable without any planner."""
 
 from dataclasses import dataclass
 
@@ -19,20 +19,15 @@ class Plan:
     limits: Limits
     trajectory: Trajectory
     certificate: Certificate
-    planner: str
-    # the one whose profile it is
-    nodes: int
-    # intervals of the profile
+    planner: str  # whose profile it is
+    nodes: int  # intervals of the profile
     repair_speed_factor: float  # on the planner's speed, at which the plan passes; 1: not slowed
     speed_factor: float  # on that speed, as asked for; 1: not slowed
-    seconds: float
-    # s that planning took, all tries and certificates included
-    notes: tuple[str, ...]
-    # what a reader should know, one sentence each
+    seconds: float  # s that planning took, all tries and certificates included
+    notes: tuple[str, ...]  # what a reader should know, one sentence each
     lower_bound: float | None = None
-    # s, no flight within speed, acceleration and collective thrust takes less; None where it was not asked for
-    joints: tuple[float, ...] = ()
-    # s, where the windows of a profile meet that was made window by window
+    """s, below which no flight keeps the limits of speed, acceleration and collective thrust; None: not computed"""
+    joints: tuple[float, ...] = ()  # s, where the windows of a long profile meet
 
     @property
     def profile(self) -> SpeedProfile:

@@ -1,4 +1,4 @@
-"""From any profile to a certified trajectory, by the least change that does it.
+"""Repair: turn any profile into a certified trajectory, by the least change.
 
 A profile that passes stays as it is. One that does not is refined: the expert's problem, searched from there, which
 lowers the speed where a limit is exceeded and raises it beside, with yaw and grid left alone. What cannot be refined
@@ -19,32 +19,25 @@ from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import duration_of
 from cfplan.vehicle.trajectory import Trajectory
 
-NOTICEABLE = 0.01
-# share of the speed by which a place must have changed to be told
+NOTICEABLE = 0.01  # relative change of speed at a place, from which it is reported
 
 
 @dataclass(frozen=True, slots=True)
 class Repaired:
-    """A certified trajectory and what became of the profile on the way to it."""
+    """A certified trajectory, and how repair changed the profile."""
 
     trajectory: Trajectory
     certificate: Certificate
     speed_factor: float  # on the whole; 1: not slowed
-    before: float
-    # s of flight before repair
-    slower: float = 0.0
-    # share of the path along which refining made it slower by more than NOTICEABLE
-    most: float = 0.0
-    # by how much at most, of the speed
-    where: float = 0.0
-    # s, there
-    failed: str = ""
-    # why it could not be refined, where that was tried
-    joints: tuple[float, ...] | None = None
-    # s, where the windows meet in which it was refined; None where it was not
+    before: float  # s of flight before repair
+    slower: float = 0.0  # share of the path along which refining slowed it by more than NOTICEABLE
+    most: float = 0.0  # the largest of these changes, relative to the speed
+    where: float = 0.0  # s, of that largest change
+    failed: str = ""  # why refining failed, if it did
+    joints: tuple[float, ...] | None = None  # s, where the windows of refining meet; None: not refined
 
     def describe(self) -> str:
-        """One sentence, empty where nothing was changed."""
+        """Return one sentence, empty if nothing was changed."""
         duration = self.trajectory.duration
         cost = f"{self.before:.3f} s became {duration:.3f} s ({duration / self.before - 1:+.2%})"
         if self.speed_factor < 1.0:

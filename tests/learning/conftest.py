@@ -7,7 +7,7 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.learning import features, labels
 from cfplan.learning.dataset import make_dataset
 from cfplan.learning.dataset_spec import DatasetSpec
-from cfplan.learning.inference import shapes
+from cfplan.learning.inference import tensor_shapes
 from cfplan.learning.model_files import Card, load_model, save_model
 from cfplan.planners.baselines.min_snap import plan_min_snap
 from cfplan.safety.limit_sets import LIMIT_SETS
@@ -43,7 +43,7 @@ def weights(architecture="bilstm", hidden=8, layers=1, seed=0, size=0.05) -> dic
     random = np.random.default_rng(seed)
     made = {
         name: random.normal(scale=size, size=shape).astype(np.float32)
-        for name, shape in shapes(architecture, hidden, layers).items()
+        for name, shape in tensor_shapes(architecture, hidden, layers).items()
     }
     return made | {"scale": np.full(features.INPUTS, 0.3, np.float32)}
 

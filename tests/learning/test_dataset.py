@@ -14,8 +14,7 @@ from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.path import Path as Curve
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import dataset
-from cfplan.learning.dataset import SchedulerError, label_shard, make_dataset, read_dataset, read_timing
-from cfplan.learning.dataset_info import describe
+from cfplan.learning.dataset import SchedulerError, describe, label_shard, make_dataset, read_dataset, read_timing
 from cfplan.learning.dataset_spec import DatasetSpec, Relabel, load_spec
 from cfplan.learning.labels import row_path
 

@@ -14,13 +14,13 @@ from cfplan.learning.features import (
     ROOM,
     bounds,
     coefficient_logs,
-    node_table,
+    node_features,
     rests,
     start_coefficients,
-    told,
+    start_features,
     window_inputs,
 )
-from cfplan.learning.sampling import draw, read_material
+from cfplan.learning.training_set import draw, read_training_set
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.vehicle.profile import BoundaryState
 
@@ -31,20 +31,20 @@ START = (2.0, 0.1, 0.01)
 
 
 def inputs(path: Path, first: float, step: float, count: int = 20, yaw: float = 0.3) -> np.ndarray:
-    table = node_table(path, first, step, count, BOUND)
+    table = node_features(path, first, step, count, BOUND)
     return window_inputs(table, first == 0.0, False, START if first > 0 else None, yaw, 0.01)
 
 
 def test_derivatives_are_those_of_the_path_per_step():
     step, first = 0.07, 0.3
-    table = node_table(PATH, first, step, 30, BOUND)
+    table = node_features(PATH, first, step, 30, BOUND)
     s = first + step * np.arange(30)
     for order in range(4):
         np.testing.assert_allclose(table[:, 3 * order : 3 * order + 3], PATH(s, order) * step**order, atol=1e-12)
 
 
 def test_the_last_piece_and_beyond_stay_at_the_end():
-    table = node_table(PATH, PATH.end - 0.1, 0.05, 6, BOUND)
+    table = node_features(PATH, PATH.end - 0.1, 0.05, 6, BOUND)
     np.testing.assert_allclose(table[2:, POSITION], np.tile(PATH(PATH.end), (4, 1)), atol=1e-9)
 
 
@@ -77,7 +77,7 @@ def test_the_unit_of_s_does_not_matter(first):
 def test_the_reference_is_within_every_bound_and_near_the_least():
     """Against the limits themselves: at h = reference² Δs², with h' = 0, none is exceeded."""
     step = 0.05
-    table = node_table(PATH, 0.0, step, 100, BOUND)
+    table = node_features(PATH, 0.0, step, 100, BOUND)
     h = np.exp(2 * table[:, REFERENCE]) * step**2
     s = step * np.arange(100)
     sizes = [np.linalg.norm(PATH(s, order), axis=1) * h ** (order / 2) for order in (1, 2, 3, 4)]
@@ -107,22 +107,19 @@ def test_a_start_is_told_by_the_spline_that_it_begins():
     assert (u[2] - 2 * u[1] + u[0]) / step**2 == pytest.approx(state.ddh)
     logs = coefficient_logs(state.h, state.dh * step, state.ddh * step**2, step)
     np.testing.assert_allclose(np.exp(2 * np.array(logs)) * step**2, u)
-    rate, slope, bend = told(*logs)
+    rate, slope, bend = start_features(*logs)
     assert math.exp(rate) == pytest.approx(math.sqrt(u[1]) / step)
     assert math.exp(slope) == pytest.approx(math.sqrt(u[2] / u[0]))
     assert math.exp(bend) == pytest.approx(math.sqrt(u[2] * u[0]) / u[1])
 
 
-def test_training_sees_what_flight_sees(tiny, monkeypatch):
+def test_training_sees_what_flight_sees(tiny):
     """Windows at a path's start, from a dataset's rows and from the paths rebuilt as the planner has them."""
-    material = read_material(tiny)
-    monkeypatch.setattr("cfplan.learning.sampling.AT_START", 0.9)
-    monkeypatch.setattr("cfplan.learning.sampling.AT_END", 0.0)
-    monkeypatch.setattr("cfplan.learning.sampling.CLOSEST", 1e9)
-    monkeypatch.setattr("cfplan.learning.sampling.WIDEST", 1e9)  # one window takes all of a path
-    rows = np.arange(len(material.rows))
-    batch = draw(material.labels, material.bound, rows, 30, np.random.default_rng(0))
-    for row, path in enumerate(material.paths):
-        table = node_table(path, 0.0, path.end / 30, 31, BOUND)
-        yaw = material.labels.yaw[row, 0, 0]
+    training_set = read_training_set(tiny)
+    one_window = {"at_start": 0.9, "at_end": 0.0, "closest": 1e9, "widest": 1e9}  # takes all of a path
+    rows = np.arange(len(training_set.rows))
+    batch = draw(training_set.labels, training_set.bound, rows, 30, np.random.default_rng(0), **one_window)
+    for row, path in enumerate(training_set.paths):
+        table = node_features(path, 0.0, path.end / 30, 31, BOUND)
+        yaw = training_set.labels.yaw[row, 0, 0]
         np.testing.assert_allclose(batch.inputs[row], window_inputs(table, True, True, None, yaw), atol=1e-6)

@@ -29,7 +29,9 @@ def test_both_agree(architecture, hidden, layers, window):
 @pytest.mark.parametrize("architecture", Architecture)
 def test_shapes_are_those_of_torch(architecture):
     state = build(architecture, 12, 2).state_dict()
-    assert inference.shapes(str(architecture), 12, 2) == {name: tuple(values.shape) for name, values in state.items()}
+    assert inference.tensor_shapes(str(architecture), 12, 2) == {
+        name: tuple(values.shape) for name, values in state.items()
+    }
     assert set(inference.NETWORKS) == {str(kind) for kind in networks.NETWORKS}
 
 
@@ -42,7 +44,7 @@ def test_the_hyperbolic_tangent_is_one():
 def test_the_decoder_is_fed_its_own_answers():
     """With the true answers before it, the attention network answers otherwise, and in one go."""
     torch.manual_seed(0)
-    network = build(Architecture.ATTENTION, 8, 1)
+    network = build(Architecture.ENCODER_DECODER, 8, 1)
     inputs = torch.randn(1, 9, INPUTS)
     with torch.no_grad():
         own = network(inputs)

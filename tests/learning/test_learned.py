@@ -12,9 +12,9 @@ from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import learned
-from cfplan.learning.features import REFERENCE, bounds, start_logs, told
+from cfplan.learning.features import REFERENCE, bounds, start_features, start_logs
 from cfplan.learning.learned import plan_learned, predict
-from cfplan.learning.windows import chain, kept
+from cfplan.learning.windows import chain, kept_intervals
 from cfplan.planners.solution import Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.limit_sets import LIMIT_SETS
@@ -98,11 +98,11 @@ def test_each_window_begins_where_the_one_before_was_left(model):
     nodes = 200
     solution = plan(replace(model, network=listening), path, nodes=nodes)
     profile, step = solution.profile, path.end / nodes
-    windows = list(chain(nodes, model.window, kept(model.window)))
+    windows = list(chain(nodes, model.window, kept_intervals(model.window)))
     assert len(heard) == len(windows) > 5
     for seen, window in zip(heard[1:], windows[1:], strict=True):
         state = profile.boundary(window.first)
-        rate, slope, bend = told(*start_logs(state, step))
+        rate, slope, bend = start_features(*start_logs(state, step))
         np.testing.assert_allclose(seen[20:23], [rate - seen[REFERENCE], slope, bend], atol=1e-4)
 
 

@@ -132,7 +132,7 @@ def test_what_differs_in_limits_is_said(model):
     tighter, looser = model.differences(replace(HARDWARE.limits, speed=1.5, motor_thrust_min=0.0))
     assert "speed is 1.5" in tighter
     assert "repair" in tighter
-    assert "as far as the model knows" in looser
+    assert "the model's own is kept" in looser
 
 
 def test_limits_are_used_as_far_as_the_model_knows(model):

@@ -16,12 +16,11 @@ from cfplan.errors import InputError
 from cfplan.learning import training
 from cfplan.learning.checkpoints import CHECKPOINT, LOG
 from cfplan.learning.dataset_spec import load_spec
-from cfplan.learning.loss import loss
 from cfplan.learning.model_files import load_model
 from cfplan.learning.networks import Architecture
-from cfplan.learning.sampling import read_material, split
 from cfplan.learning.smooth import travel_time
-from cfplan.learning.training import CURVES, Options, train
+from cfplan.learning.training import CURVES, Options, loss, train
+from cfplan.learning.training_set import read_training_set, split
 from cfplan.vehicle.timing import measure
 
 SMALL = Options(hidden=6, layers=1, window=16, epochs=3, windows=16, batch=8)
@@ -104,7 +103,7 @@ def test_a_damaged_checkpoint_is_named(tiny, tmp_path, damage):
     assert error.value.where.endswith(CHECKPOINT)
 
 
-@pytest.mark.parametrize("options", [{"architecture": Architecture.ATTENTION}, {"epsilon": 0.01}])
+@pytest.mark.parametrize("options", [{"architecture": Architecture.ENCODER_DECODER}, {"epsilon": 0.01}])
 def test_the_other_ways_train_too(tiny, tmp_path, options):
     card = train(tiny, tmp_path, replace(SMALL, epochs=1, **options))
     assert math.isfinite(card.scores["time_error_mean"])
@@ -112,7 +111,7 @@ def test_the_other_ways_train_too(tiny, tmp_path, options):
 
 
 def test_a_loss_that_is_no_number_ends_the_training(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr("cfplan.learning.loss.SLOPES", math.nan)
+    monkeypatch.setattr(training, "loss", lambda *_: (torch.tensor(math.nan, requires_grad=True), None))
     with pytest.raises(InputError, match=r"epoch 1 is not a number"):
         train(tiny, tmp_path, SMALL)
     assert not (tmp_path / CHECKPOINT).exists()
@@ -134,8 +133,10 @@ def test_a_device_that_is_not_there_is_named(tiny, tmp_path, device):
 
 
 def test_copies_of_a_path_are_all_learned_from_or_all_kept_apart(tiny):
-    material = read_material(tiny)
-    copied = replace(material, spec=replace(material.spec, epsilon=0.01, copies=3))  # sixteen rows of four paths
+    training_set = read_training_set(tiny)
+    copied = replace(
+        training_set, spec=replace(training_set.spec, epsilon=0.01, copies=3)
+    )  # sixteen rows of four paths
     seen, unseen = split(copied, 0)
     assert set(seen.rows // 4).isdisjoint(unseen.rows // 4)
     assert len(seen.rows) + len(unseen.rows) == 16

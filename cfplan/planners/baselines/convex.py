@@ -1,10 +1,10 @@
-"""Convex time-optimal path parameterisation (TOPP): the lower bound on any flight time, and a planner.
+"""Convex time-optimal path parameterisation (TOPP): a proven lower bound on the time of flight, and a planner.
 
-Limits are those on speed, acceleration and collective thrust. Without attitude the problem is convex in b = (ds/dt)² by
-arc length and is solved by reachability analysis (copp-py). From outside its polygons and its steps only ever allow
-more than a flight may do, so its time is a lower bound; from inside it gives a profile that is made smooth enough to
-fly. Motors and body rates are not asked: where the acceleration jumps the profile breaks them, and is as slow after
-repair as that costs.
+With speed, acceleration and collective thrust as the only limits, and no attitude, the problem is convex in
+b = (ds/dt)² by arc length and is solved by reachability analysis (copp-py). From outside, its polygons and its steps
+only ever allow more than a flight may do, so its time is a lower bound; from inside, it gives a profile that is
+smoothed to be flyable. It knows nothing of motors and body rates: where the acceleration jumps the profile breaks their
+limits, and is as slow after repair as that costs.
 """
 
 import time
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InfeasibleError
-from cfplan.planners.baselines.convex_profile import smooth_profile, window
+from cfplan.planners.baselines.convex_profile import smooth_profile, smoothing_half_width
 from cfplan.planners.baselines.convex_rows import Rows, inner_rows, outer_rows
 from cfplan.planners.baselines.convex_stations import Stations, stations
 from cfplan.planners.baselines.selection import select_fastest
@@ -25,16 +25,13 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.yaw_spline import YawSpline
 
+# Between stations, m and rad: what discretisation costs the bound falls with both, to 0.3 % of time at 2 m/s
 BOUND_SPACING, BOUND_TURN = 0.005, 0.004
-# m and rad between stations: what discretisation costs the bound falls with both, to 0.3 % of time at 2 m/s
-PLAN_SPACING, PLAN_TURN = 0.03, 0.03
-# coarser, as what the planner makes of it is certified and not proven
+PLAN_SPACING, PLAN_TURN = 0.03, 0.03  # coarser, as what the planner makes of it is certified and not proven
+# Of the width at which a jump of acceleration takes the whole of a limit; wider rounds tight corners off too much
 WINDOW_SHARES = (0.25, 0.5, 1.0)
-# of the width at which a jump of acceleration takes the whole of a limit; wider rounds tight corners off too much
-BOUNDARY_SLACK = 1.01
-# on b where a segment hands over: what is on a limit from inside may be over the polygon's
-Boundary = tuple[float | None, float | None]
-# m²/s² at the start and the end of the path, None where it is free
+BOUNDARY_SLACK = 1.01  # on b where a segment hands over: what is on a limit from inside may be over the polygon's
+Boundary = tuple[float | None, float | None]  # m²/s² at the start and the end of the path, None where it is free
 
 
 def lower_bound(task: PlanningTask) -> float:
@@ -54,14 +51,17 @@ def lower_bound(task: PlanningTask) -> float:
 
 
 def _outer_top(at: Stations, airframe: Airframe, limits: PlanLimits, boundary: Boundary) -> NDArray:
-    """(M,) m²/s²: b is no greater at the stations. The second pass knows from the first how fast drag can be met."""
+    """Return (M,) m²/s², the most that b can be at the stations.
+
+    The second pass bounds drag by the speeds that the first allows.
+    """
     fastest = np.full(len(at.length), limits.speed)
     top = _reachable_top(at, outer_rows(at, airframe, limits, fastest), boundary)
     return _reachable_top(at, outer_rows(at, airframe, limits, _fastest(at, top, limits)), boundary)
 
 
 def _fastest(at: Stations, top: NDArray, limits: PlanLimits) -> NDArray:
-    """(M,) m/s: no faster anywhere in the two intervals beside each station."""
+    """Return (M,) m/s, above which no speed can be in the two intervals beside each station."""
     spacing = np.diff(at.length)
     inside = np.maximum(top[:-1], top[1:]) + 2 * limits.acceleration * spacing
     around = np.maximum(np.append(inside, inside[-1]), np.insert(inside, 0, inside[0]))
@@ -79,7 +79,7 @@ def plan_convex(task: PlanningTask) -> Solution:
     except InfeasibleError as error:
         return Solution(Status.INFEASIBLE, None, str(error))
     along = YawSpline.along(task.path, task.nodes, task.yaw, task.yaw_angle)
-    width = window(airframe, limits)
+    width = smoothing_half_width(airframe, limits)
     profiles = (smooth_profile(task.path, at, speeds, share * width, task.nodes, along) for share in WINDOW_SHARES)
     profile = select_fastest(task, profiles)
     stats: dict[str, float | int | str] = {
@@ -140,7 +140,7 @@ def _solved(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
 
 
 def _least_times(at: Stations, top: NDArray, limits: PlanLimits) -> NDArray:
-    """(M-1,) s: the least time of each interval with b at most `top` at its ends and |b'| at most 2 a_max inside."""
+    """Return (M-1,) s, the least time of each interval with b at most `top` at its ends and |b'| at most 2 a_max."""
     spacing = np.diff(at.length)
     left, right = top[:-1], top[1:]
     gain = 2 * limits.acceleration
@@ -153,7 +153,7 @@ def _least_times(at: Stations, top: NDArray, limits: PlanLimits) -> NDArray:
 
 
 def _rush(b: NDArray, distance: NDArray, gain: float, cap: NDArray) -> NDArray:
-    """s to cover a distance when b grows by `gain` a metre until it reaches `cap`."""
+    """Return the time, s, to cover a distance when b grows by `gain` a metre until it reaches `cap`."""
     cap = np.maximum(cap, b)
     rising = np.minimum(distance, (cap - b) / gain)
     peak = np.sqrt(b + gain * rising)

@@ -1,4 +1,4 @@
-"""From the convex problem's bang-bang speed to a profile that a vehicle can follow.
+"""Smooth the convex problem's bang-bang speed into a profile that a vehicle can follow.
 
 The time law of the distance flown, l(t), is averaged over a triangular window in time. That keeps its speed limit,
 bounds jerk and snap where acceleration jumps, and from rest makes l grow as t⁴: just what a finite h does at a rest
@@ -21,8 +21,8 @@ TIME_STEPS_PER_WINDOW = 200
 H_STIFFNESS = 1e-4
 
 
-def window(airframe: Airframe, limits: PlanLimits) -> float:
-    """s: half the width of the window that turns a jump from one acceleration to its opposite into a fair motion.
+def smoothing_half_width(airframe: Airframe, limits: PlanLimits) -> float:
+    """Return half the width, s, of the window that turns a jump of acceleration to its opposite into feasible motion.
 
     Over w a jump of 2a makes a jerk of 2a/w and a snap of at most 4a/w², and g times the thrust axis's first and second
     derivative are about that: to be met by body rate, and by the torque that motors have to spare in hover.
@@ -47,7 +47,7 @@ def smooth_profile(path: Path, at: Stations, b: NDArray, half_width: float, node
 
 
 def _averaged(length: NDArray, b: NDArray, half_width: float) -> tuple[NDArray, NDArray]:
-    """Distance, m, and speed, m/s, at close times after averaging speed over the triangular window."""
+    """Return distance, m, and speed, m/s, at close times after averaging speed over the triangular window."""
     speed = np.sqrt(np.maximum(b, 0.0))
     duration = np.concatenate([[0.0], np.cumsum(2 * np.diff(length) / (speed[1:] + speed[:-1]))])
     step = half_width / TIME_STEPS_PER_WINDOW
@@ -63,6 +63,6 @@ def _averaged(length: NDArray, b: NDArray, half_width: float) -> tuple[NDArray, 
 
 
 def _graded(distance: NDArray, total: float) -> NDArray:
-    """Distance so stretched that a rest end, where it grows as s⁴ and as t⁴, looks linear in s and in t."""
+    """Return distance so stretched that a rest end, where it grows as s⁴ and as t⁴, looks linear in s and in t."""
     half, inside = total / 2, np.clip(distance, 0.0, total)
     return np.where(inside < half, inside**0.25, 2 * half**0.25 - (total - inside) ** 0.25)

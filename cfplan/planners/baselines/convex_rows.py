@@ -19,26 +19,21 @@ from cfplan.planners.baselines.convex_stations import Stations
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
-DIRECTIONS = 64
-# of the polygon about a disc: outside by 0.12 % at the corners, inside by as much at the sides
+DIRECTIONS = 64  # of the polygon about a disc: outside by 0.12 % at the corners, inside by as much at the sides
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
     """first b + second ½b' ≤ most at each of M stations, and b ≤ ceiling there."""
 
-    first: NDArray
-    # (M, R) 1/m
-    second: NDArray
-    # (M, R) 1
-    most: NDArray
-    # (M, R) m/s²
-    ceiling: NDArray
-    # (M,) m²/s²
+    first: NDArray  # (M, R) 1/m
+    second: NDArray  # (M, R) 1
+    most: NDArray  # (M, R) m/s²
+    ceiling: NDArray  # (M,) m²/s²
 
 
 def outer_rows(at: Stations, airframe: Airframe, limits: PlanLimits, fastest: NDArray) -> Rows:
-    """Rows that every feasible motion meets, also with ½b' its mean over either interval beside the station.
+    """Return rows that every feasible motion meets, also with ½b' its mean over either interval beside the station.
 
     A limit holds for the mean of a motion over an interval as it does at each of its points, because discs are
     convex. The mean of b there is within a_max Δ of b at the station because |½b'| ≤ a_max; curvature and the frame
@@ -78,7 +73,7 @@ def outer_rows(at: Stations, airframe: Airframe, limits: PlanLimits, fastest: ND
 
 
 def inner_rows(at: Stations, airframe: Airframe, limits: PlanLimits, fastest: NDArray) -> Rows:
-    """Rows that allow no more than the limits do at the stations, where speed is at most `fastest`, (M,) m/s."""
+    """Return rows that allow no more than the limits do at the stations, where speed is at most `fastest`, (M,) m/s."""
     x, y = _directions()
     w = fastest[:, None]
     inside = np.cos(np.pi / DIRECTIONS)

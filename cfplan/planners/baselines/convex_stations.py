@@ -1,4 +1,4 @@
-"""A path by arc length, as the convex problem sees it: curvature and the frame of flight, bounded around stations.
+"""Stations: a path by arc length with curvature and the frame of flight, bounded around each station.
 
 By arc length l the motion is v = √b T and a = ½b' T + b k with the curvature vector k = κN, so every limit on the
 norm of a, or of a + g e₃, lies in the plane of T and N. At a rest end γ' vanishes and h may grow without bound while
@@ -16,44 +16,30 @@ SAMPLES_PER_STATION = 5  # fine samples between stations at nominal speed, 1 m/s
 SAMPLES_MIN, SAMPLES_MAX = 2_000, 500_000
 STATION_GROWTH = 0.05  # of the distance from the path's nearer end: curvature is unbounded at a rest end
 FIRST_STATION = 1e-5  # m from an end
-SWING = 0.2
-# of e₃·N around a station: more than that and samples do not bound it
+SWING = 0.2  # of e₃·N around a station: more than that and samples do not bound it
 
 
 @dataclass(frozen=True, slots=True)
 class Stations:
     """What holds around each of M stations. low and high bound it over both intervals that touch the station."""
 
-    length: NDArray
-    # (M,) m along the path, from 0
-    s: NDArray
-    # (M,)
-    curvature: NDArray
-    # (M,) 1/m
-    curvature_low: NDArray
-    # (M,) 1/m
-    curvature_high: NDArray
-    # (M,) 1/m
-    slope: NDArray
-    # (M,) e₃·T
-    slope_low: NDArray
-    # (M,)
-    slope_high: NDArray
-    # (M,)
-    normal: NDArray
-    # (M,) e₃·N
-    normal_low: NDArray
-    # (M,)
-    normal_high: NDArray
-    # (M,)
-    binormal_square: NDArray
-    # (M,) (e₃·B)²
-    binormal_square_low: NDArray
-    # (M,)
+    length: NDArray  # (M,) m along the path, from 0
+    s: NDArray  # (M,)
+    curvature: NDArray  # (M,) 1/m
+    curvature_low: NDArray  # (M,) 1/m
+    curvature_high: NDArray  # (M,) 1/m
+    slope: NDArray  # (M,) e₃·T
+    slope_low: NDArray  # (M,)
+    slope_high: NDArray  # (M,)
+    normal: NDArray  # (M,) e₃·N
+    normal_low: NDArray  # (M,)
+    normal_high: NDArray  # (M,)
+    binormal_square: NDArray  # (M,) (e₃·B)²
+    binormal_square_low: NDArray  # (M,)
 
 
 def stations(path: Path, *, spacing: float, turn: float) -> Stations:
-    """At most `spacing`, m, apart and `turn`, rad, of the path's direction; closer towards its ends."""
+    """Return stations at most `spacing`, m, and `turn`, rad of direction, apart; closer towards the path's ends."""
     samples = int(np.clip(SAMPLES_PER_STATION * path.end / spacing, SAMPLES_MIN, SAMPLES_MAX))
     # Graded towards both ends, so that a rest end's first micrometres are resolved.
     x = np.linspace(0.0, 1.0, samples + 1)
@@ -89,7 +75,10 @@ def stations(path: Path, *, spacing: float, turn: float) -> Stations:
 
 
 def frame(path: Path, s: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Arc length, curvature, e₃·T and e₃·N at each s, (N,). At a rest end the frame is that of the nearest sample."""
+    """Return arc length, curvature, e₃·T and e₃·N at each s, (N,).
+
+    At a rest end the frame is that of the nearest sample that moves.
+    """
     first, second = path(s, 1), path(s, 2)
     speed = np.linalg.norm(first, axis=1)
     moving = speed > 1e-9 * speed.max()

@@ -1,4 +1,4 @@
-"""The plain baseline: the min-snap path at its own nominal timing, scaled as a whole until it is certified."""
+"""The min-snap baseline: the path at its nominal timing, scaled as a whole until it is certified."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""Which of several profiles a certificate would cost least."""
+"""Select the fastest of several profiles, by what each loses when it is slowed to its certificate."""
 
 from collections.abc import Iterable
 

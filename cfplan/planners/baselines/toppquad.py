@@ -1,7 +1,7 @@
-"""TOPPQuad as a planner: the reference that the reduced expert and the learned planner are compared with.
+"""TOPPQuad as a planner: the paper's, with which the expert and the learned planner are compared.
 
 Of the solver's answer only h and yaw at the grid points are kept: attitude, rates and thrusts follow from them through
-flatness, as the paper recovers them, so whatever the solver believed of them does not count.
+flatness, as the paper recovers them, so the solver's own values of them are dropped.
 """
 
 import time
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.baselines.selection import select_fastest
-from cfplan.planners.baselines.toppquad_nlp import H_LEAST, ROWS, STEP_ROWS, VARIABLES, Program, program
+from cfplan.planners.baselines.toppquad_nlp import H_LEAST, ROWS, STEP_ROWS, VARIABLES, ToppquadNlp, build_toppquad
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.limits import PlanLimits
@@ -24,14 +24,13 @@ from cfplan.vehicle.yaw_spline import YawSpline
 
 NODES_LEAST = 8
 MAX_ITERATIONS = 1000
-MAX_SECONDS = 30.0
-# of one attempt
-GUESS_SPEEDS = (1.0, 0.5)
+MAX_SECONDS = 30.0  # of one attempt
 # ds/dt of the min-snap timing to start from: the paper's, which solved 98 % of its paths, and one for a second attempt
+GUESS_SPEEDS = (1.0, 0.5)
 END_NODES = 2
 END_SHARE = 0.5
+# Of the spline through h: the grid of the paper is too coarse to say how h goes on between its points
 H_STIFFNESSES = (1e-2, 1e-1, 1.0, 10.0, 100.0)
-# of the spline through h: the grid of the paper is too coarse to say how h goes on between its points
 YAW_STIFFNESS = 1e-2
 
 
@@ -45,7 +44,7 @@ def plan_toppquad(task: PlanningTask) -> Solution:
     if nodes < NODES_LEAST:
         return Solution(Status.NOT_CONVERGED, None, f"{nodes} intervals are too few, take {NODES_LEAST} at least")
     begun = time.perf_counter()
-    prepared = program(nodes + 1, airframe, limits.angular_acceleration, MAX_ITERATIONS, MAX_SECONDS)
+    nlp = build_toppquad(nodes + 1, airframe, limits.angular_acceleration, MAX_ITERATIONS, MAX_SECONDS)
     built = time.perf_counter()
     grid = np.linspace(0.0, path.end, nodes + 1)
     if task.start is not None and yaw is YawMode.FREE:
@@ -56,12 +55,12 @@ def plan_toppquad(task: PlanningTask) -> Solution:
     guesses = [_guess(path, grid, airframe, angles, _guessed_h(path, grid, limits, speed)) for speed in GUESS_SPEEDS]
     parameters = _parameters(path, grid, angles)
 
-    attempts = [_solve(prepared, guesses[0], parameters, asked)]
+    attempts = [_solve(nlp, guesses[0], parameters, asked)]
     if not attempts[-1].solved:
         # With yaw held the problem is far easier, and what it finds is a good guess, and no wrong answer, for free yaw.
-        attempts.append(_solve(prepared, guesses[1], parameters, held))
+        attempts.append(_solve(nlp, guesses[1], parameters, held))
         if attempts[-1].solved and yaw is YawMode.FREE:
-            attempts.append(_solve(prepared, attempts[-1].x, parameters, asked))
+            attempts.append(_solve(nlp, attempts[-1].x, parameters, asked))
     found = next((attempt for attempt in reversed(attempts) if attempt.solved), attempts[0])
     solved = time.perf_counter()
     stats: dict[str, float | int | str] = {
@@ -70,11 +69,11 @@ def plan_toppquad(task: PlanningTask) -> Solution:
         "solve_seconds": solved - built,
         "tries": len(attempts),
         "iterations": sum(attempt.iterations for attempt in attempts),
-        "said": found.said,
+        "message": found.message,
     }
     if not found.solved:
-        status = Status.INFEASIBLE if "Infeasible" in found.said else Status.NOT_CONVERGED
-        return Solution(status, None, f"IPOPT: {found.said}", stats)
+        status = Status.INFEASIBLE if "Infeasible" in found.message else Status.NOT_CONVERGED
+        return Solution(status, None, f"IPOPT: {found.message}", stats)
     if yaw is YawMode.FREE:
         angles = np.unwrap(2 * np.arctan2(found.x[:, 4], found.x[:, 5]), period=4 * np.pi)
     profiles = (
@@ -90,18 +89,16 @@ def plan_toppquad(task: PlanningTask) -> Solution:
 
 @dataclass(frozen=True, slots=True)
 class _Attempt:
-    x: NDArray
-    # (N+1, 16)
+    x: NDArray  # (N+1, 16)
     solved: bool
-    said: str
-    # by the solver
+    message: str  # the solver's
     iterations: int
 
 
-def _solve(prepared: Program, guess: NDArray, parameters: NDArray, bounds: dict[str, NDArray]) -> _Attempt:
-    answer = prepared.solver(x0=guess.ravel(), p=parameters, **bounds)
-    report = prepared.solver.stats()
-    x = np.array(answer["x"]).reshape(prepared.nodes, VARIABLES)
+def _solve(nlp: ToppquadNlp, guess: NDArray, parameters: NDArray, bounds: dict[str, NDArray]) -> _Attempt:
+    answer = nlp.solver(x0=guess.ravel(), p=parameters, **bounds)
+    report = nlp.solver.stats()
+    x = np.array(answer["x"]).reshape(nlp.nodes, VARIABLES)
     return _Attempt(x, bool(report["success"]), str(report["return_status"]), int(report["iter_count"]))
 
 
@@ -146,7 +143,7 @@ def _bounds(task: PlanningTask, grid: NDArray, yaw: YawMode) -> dict[str, NDArra
 
 
 def _end_caps(path: Path, grid: NDArray, airframe: Airframe, limits: PlanLimits) -> NDArray:
-    """(N+1,) most h at the END_NODES grid points at each end, no bound elsewhere.
+    """Return (N+1,) the most that h may be at the END_NODES grid points at each end; unbounded elsewhere.
 
     Between the last two grid points of a rest end γ'' grows from nothing, so the equations at the points alone let h
     grow without bound there. At constant h the thrust axis turns at h^(3/2) |γ'''| / g and its rate grows by
@@ -166,13 +163,13 @@ def _end_caps(path: Path, grid: NDArray, airframe: Airframe, limits: PlanLimits)
 
 
 def _guessed_h(path: Path, grid: NDArray, limits: PlanLimits, speed: float) -> float:
-    """h of the min-snap timing at that speed, or less where it would break the speed limit."""
+    """Return h of the min-snap timing at that speed, or less where it would break the speed limit."""
     fastest = float(np.linalg.norm(path(grid, 1), axis=1).max())
     return min(speed, speed * limits.speed / max(fastest, 1e-9)) ** 2
 
 
 def _guess(path: Path, grid: NDArray, airframe: Airframe, angles: NDArray, h: float) -> NDArray:
-    """(N+1, 16): the min-snap timing h = const, its attitude, and rates by inverting Eq. 23."""
+    """Return (N+1, 16): the min-snap timing h = const, its attitude, and rates by inverting Eq. 23."""
     step = grid[1] - grid[0]
     force = h * path(grid, 2) + np.array([0.0, 0.0, GRAVITY])
     specific = np.linalg.norm(force, axis=1)

@@ -25,32 +25,28 @@ from typing import Any
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 VARIABLES = 16
-ROWS = 13
-# a node: 3 force, 3 torque, acceleration², angular velocity², tilt, specific thrust, yaw fixed, yaw at the start,
+# A node: 3 force, 3 torque, acceleration², angular velocity², tilt, specific thrust, yaw fixed, yaw at the start,
 # angular acceleration² as a share
-STEP_ROWS = 8
-# an interval: h, q, ω
+ROWS = 13
+STEP_ROWS = 8  # an interval: h, q, ω
 H_LEAST = 1e-3
-PENALTY = 1e-4
-# λ
+PENALTY = 1e-4  # λ
 CACHED_PROBLEMS = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Program:
-    """The solver and where its numbers go. Variables by node, then constraints: rows by node, steps, ‖q₀‖² = 1."""
+class ToppquadNlp:
+    """The program in IPOPT. Variables by node; constraints: rows by node, steps, ‖q₀‖² = 1."""
 
-    solver: Any
-    # casadi.Function: x0, p, lbx, ubx, lbg, ubg
-    nodes: int
-    # grid points, one more than intervals
+    solver: Any  # casadi.Function: x0, p, lbx, ubx, lbg, ubg
+    nodes: int  # grid points, one more than intervals
 
 
 @lru_cache(maxsize=CACHED_PROBLEMS)
-def program(
+def build_toppquad(
     nodes: int, airframe: Airframe, angular_acceleration: float, max_iterations: int, max_seconds: float
-) -> Program:
-    """Built once for a number of grid points, an airframe and its limit of angular acceleration, rad/s².
+) -> ToppquadNlp:
+    """Build the program, once for a number of grid points, an airframe and a limit of angular acceleration, rad/s².
 
     Path, grid and the other limits are parameters and bounds. That limit is not, because without one its row must go:
     left in, but unbounded, it takes IPOPT ten times as long.
@@ -58,8 +54,7 @@ def program(
     import casadi
 
     x = casadi.MX.sym("x", VARIABLES, nodes)
-    path = casadi.MX.sym("path", 8, nodes)
-    # γ' and γ'', cosine and sine of half the yaw where it is fixed
+    path = casadi.MX.sym("path", 8, nodes)  # γ' and γ'', cosine and sine of half the yaw where it is fixed
     step = casadi.MX.sym("step")
 
     rows = _node(airframe, angular_acceleration).map(nodes)(x, path)
@@ -86,11 +81,11 @@ def program(
             "linear_solver": "mumps",
         },
     }
-    return Program(casadi.nlpsol("toppquad", "ipopt", nlp, options), nodes)
+    return ToppquadNlp(casadi.nlpsol("toppquad", "ipopt", nlp, options), nodes)
 
 
 def _node(airframe: Airframe, angular_acceleration: float) -> Any:
-    """What holds at one grid point: rows of the dynamics in units of g and of a motor's hover torque, then limits."""
+    """Return the rows of one grid point: the dynamics in units of g and of a motor's hover torque, then limits."""
     import casadi
 
     x, path = casadi.SX.sym("x", VARIABLES), casadi.SX.sym("path", 8)
@@ -126,7 +121,7 @@ def _node(airframe: Airframe, angular_acceleration: float) -> Any:
 
 
 def _interval() -> Any:
-    """What one step leaves over: zero where x at its end follows from x at its start."""
+    """Return the residual of one step: zero where x at its end follows from x at its start."""
     import casadi
 
     x, after, step = casadi.SX.sym("x", VARIABLES), casadi.SX.sym("after", VARIABLES), casadi.SX.sym("step")

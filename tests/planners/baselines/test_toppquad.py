@@ -119,9 +119,9 @@ def test_it_starts_from_the_state_it_is_given(path):
 
 
 def test_the_problem_is_built_once_for_a_size(free, path):
-    before = toppquad_nlp.program.cache_info().misses
+    before = toppquad_nlp.build_toppquad.cache_info().misses
     again = plan_toppquad(task(path.placed([1.0, 0.0, 0.0])))
-    assert toppquad_nlp.program.cache_info().misses == before
+    assert toppquad_nlp.build_toppquad.cache_info().misses == before
     np.testing.assert_allclose(again.profile.h, free.profile.h, rtol=1e-4)
 
 

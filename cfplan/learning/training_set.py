@@ -1,7 +1,7 @@
-"""What a network is trained on: windows drawn from the labelled paths of a dataset, afresh for each epoch.
+"""The training set: windows drawn from the labelled paths of a dataset, afresh for each epoch.
 
 A window begins at the path's start, ends at its end, or lies anywhere between, with nodes as close as flights have
-them or as wide as the labels, and its start is told a little wrong, as it will be in a chain.
+them or as wide as the labels. The start state that the network is given is a little wrong, as it is in a chain.
 """
 
 from dataclasses import dataclass, replace
@@ -26,96 +26,75 @@ from cfplan.learning.features import (
     bounds,
     coefficient_logs,
     fill_inputs,
-    fill_nodes,
-    told,
+    fill_node_features,
+    start_features,
 )
 from cfplan.machine_code import njit
 from cfplan.planners.solution import Status
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.vehicle.profile import h_within, yaw_within
 
-LEAST_CERTIFIED = 0.97
-# share of its speed at which a label must be certified to be learned from
-LONGEST = 100.0
-# m; the few longer paths are min-snap's excursions to hundreds of metres, and long flights are chains of windows anyway
-CLOSEST = 0.08
-# m of path between nodes, the closest windows
-WIDEST = 1.05
-# times the label's own interval, the widest
-AT_START, AT_END = 0.25, 0.25
-# shares of the windows
-UNKNOWN = 0.05
-# share of windows inside a path whose start is not told
-START_NOISE = (0.01, 0.01, 0.005)
-# standard deviations of what is told of the start: rate, slope, bend
-TAIL = 16
-# nodes at the end of a window inside a path, whose speed is decided by what the window does not show
-TAIL_WEIGHT = 0.1
-UNSEEN_SHARE, UNSEEN_MOST = 0.1, 500
-# of the paths, kept apart to be judged on
-SPLIT_STREAM = 0
-# of a seed's random numbers
+MIN_SPEED_FACTOR = 0.97  # at which a label must be certified to be learned from
+# m: the few longer paths are excursions of min-snap to hundreds of metres, and long flights are chains of windows
+MAX_LENGTH = 100.0
+CLOSEST = 0.08  # m of path between the nodes of the closest windows
+WIDEST = 1.05  # spacing of the widest windows, over the label's
+AT_START, AT_END = 0.25, 0.25  # shares of windows that begin, or end, where the path does
+UNKNOWN = 0.05  # share of windows inside a path whose start state is withheld
+START_NOISE = (0.01, 0.01, 0.005)  # standard deviations of the noise on the start state: rate, slope, bend
+TAIL = 16  # nodes at the end of a window inside a path, whose speed depends on what lies behind the window
+TAIL_WEIGHT = 0.1  # of the last of them in the loss
+UNSEEN_SHARE, MAX_UNSEEN = 0.1, 500  # of the paths, held out for validation
+SPLIT_STREAM = 0  # number of this stream of a seed's random numbers
 
 
 class Labels(NamedTuple):
-    """R labelled paths side by side."""
+    """R labelled paths in flat arrays, as compiled loops take them."""
 
-    pieces: NDArray
-    # (R+1,) where each path's coefficients begin
-    breaks: NDArray
-    # (sum of pieces + R,) path by path
-    coefficients: NDArray
-    # (sum of pieces, D, 3)
-    length: NDArray
-    # (R,) m
-    h: NDArray
-    # (R, 4, N+1) h, h', h'', h'''
-    yaw: NDArray
-    # (R, 3, N+1) ψ, ψ', ψ''
+    pieces: NDArray  # (R+1,) where each path's coefficients begin
+    breaks: NDArray  # (sum of pieces + R,) path by path
+    coefficients: NDArray  # (sum of pieces, D, 3)
+    length: NDArray  # (R,) m
+    h: NDArray  # (R, 4, N+1) h, h', h'', h'''
+    yaw: NDArray  # (R, 3, N+1) ψ, ψ', ψ''
 
 
 class Batch(NamedTuple):
     """B windows."""
 
-    inputs: NDArray
-    # (B, W+1, INPUTS) float32
-    targets: NDArray
-    # (B, W+1, OUTPUTS) float32
-    weights: NDArray
-    # (B, W+1) float32, of the squared errors
-    times: NDArray
-    # (B, W+1) float32, share of the window's time that is spent about each node
+    inputs: NDArray  # (B, W+1, INPUTS) float32
+    targets: NDArray  # (B, W+1, OUTPUTS) float32
+    weights: NDArray  # (B, W+1) float32, of the squared errors
+    times: NDArray  # (B, W+1) float32, share of the window's time that is spent about each node
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Material:
-    """The usable rows of a dataset, and what their labels were made for."""
+class TrainingSet:
+    """The usable rows of a dataset, and the bounds that their labels keep."""
 
     spec: DatasetSpec
     bound: Bounds
-    rows: NDArray
-    # (R,) numbers of the rows
+    rows: NDArray  # (R,) numbers of the rows
     paths: tuple[Path, ...]
     labels: Labels
-    travel_time: NDArray
-    # (R,) s
+    travel_time: NDArray  # (R,) s
 
-    def part(self, chosen: NDArray) -> "Material":
-        """Some of the rows, by index."""
+    def part(self, chosen: NDArray) -> "TrainingSet":
+        """Return some of the rows, by index."""
         paths = tuple(self.paths[i] for i in chosen)
         h, yaw, length = self.labels.h[chosen], self.labels.yaw[chosen], self.labels.length[chosen]
         labels = Labels(*_joined(paths), length, h, yaw)
         return replace(self, rows=self.rows[chosen], paths=paths, labels=labels, travel_time=self.travel_time[chosen])
 
     def noisy(self, epsilon: float, seed: np.random.SeedSequence) -> Labels:
-        """The labels with every path perturbed by at most epsilon, m: same answers to slightly other questions."""
+        """Return the labels with every path perturbed by at most epsilon, m: noise injection, the answers kept."""
         seeds = seed.spawn(len(self.paths))
         paths = tuple(perturbed(path, epsilon, own) for path, own in zip(self.paths, seeds, strict=True))
         return Labels(*_joined(paths), *self.labels[3:])
 
 
-def read_material(folder: FilePath) -> Material:
-    """What can be learned from in a dataset.
+def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> TrainingSet:
+    """Read the rows of a dataset that can be learned from.
 
     Raises:
         InputError: no dataset, a damaged one, or no row that was solved and certified.
@@ -125,13 +104,13 @@ def read_material(folder: FilePath) -> Material:
         raise InputError(f"unknown limit set {spec.limits!r}", where=str(folder), hint="make the dataset again")
     usable = rows.filter(
         (pa.compute.field("status") == Status.SOLVED.name)
-        & (pa.compute.field("certified_share") >= LEAST_CERTIFIED)
-        & (pa.compute.field("length") <= LONGEST)
+        & (pa.compute.field("certified_share") >= MIN_SPEED_FACTOR)
+        & (pa.compute.field("length") <= max_length)
     )
     if usable.num_rows < 2:
         raise InputError(
-            f"{usable.num_rows} of {rows.num_rows} rows are usable (solved, certified at {LEAST_CERTIFIED:.0%} of "
-            f"their speed, and no longer than {LONGEST:g} m); two are the least",
+            f"{usable.num_rows} of {rows.num_rows} rows are usable (solved, certified at {MIN_SPEED_FACTOR:.0%} of "
+            f"their speed, and no longer than {max_length:g} m); two are the least",
             where=str(folder),
             hint="see `cfplan dataset info`, and make another",
         )
@@ -139,18 +118,18 @@ def read_material(folder: FilePath) -> Material:
     paths = tuple(
         Path(np.array(b), np.array(c).reshape(len(b) - 1, -1, 3)) for b, c in zip(breaks, coefficients, strict=True)
     )
-    h = np.stack([_table(usable, name, spec.nodes) for name in ("h", "dh", "ddh", "dddh")], axis=1)
-    yaw = np.stack([_table(usable, name, spec.nodes) for name in ("yaw", "dyaw", "ddyaw")], axis=1)
+    h = np.stack([_column(usable, name, spec.nodes) for name in ("h", "dh", "ddh", "dddh")], axis=1)
+    yaw = np.stack([_column(usable, name, spec.nodes) for name in ("yaw", "dyaw", "ddyaw")], axis=1)
     chosen = LIMIT_SETS[spec.limits]
     length, travel_time = usable["length"].to_numpy(), usable["travel_time"].to_numpy()
-    return Material(
+    return TrainingSet(
         spec, bounds(chosen.airframe, chosen.limits), usable["row"].to_numpy(), paths,
         Labels(*_joined(paths), length, h, yaw), travel_time,
     )  # fmt: skip
 
 
-def _table(rows: pa.Table, name: str, nodes: int) -> NDArray:
-    """(R, N+1); what has a value an interval is padded at the end."""
+def _column(rows: pa.Table, name: str, nodes: int) -> NDArray:
+    """Return (R, N+1); a column of N values a row is padded at the end."""
     values = np.array(rows[name].to_pylist())
     return np.pad(values, ((0, 0), (0, nodes + 1 - values.shape[1])), mode="edge")
 
@@ -164,27 +143,38 @@ def _joined(paths: tuple[Path, ...]) -> tuple[NDArray, NDArray, NDArray]:
     return pieces, np.concatenate([path.breaks for path in paths]), coefficients
 
 
-def split(material: Material, seed: int) -> tuple[Material, Material]:
-    """What is learned from, and what is judged on: a path's perturbed copies go where it goes."""
-    paths = material.rows // (1 + material.spec.copies)
+def split(training_set: TrainingSet, seed: int) -> tuple[TrainingSet, TrainingSet]:
+    """Return what to learn from and, held out for validation, the unseen. A path's copies go where it goes."""
+    paths = training_set.rows // (1 + training_set.spec.copies)
     known = np.unique(paths)
     order = np.random.default_rng([seed, SPLIT_STREAM]).permutation(known)
-    count = min(UNSEEN_MOST, max(1, round(UNSEEN_SHARE * len(known))))
+    count = min(MAX_UNSEEN, max(1, round(UNSEEN_SHARE * len(known))))
     if count >= len(known):
         raise InputError("only one path to learn from and to be judged on", where="dataset", hint="make more paths")
     apart = np.isin(paths, order[:count])
-    return material.part(np.flatnonzero(~apart)), material.part(np.flatnonzero(apart))
+    return training_set.part(np.flatnonzero(~apart)), training_set.part(np.flatnonzero(apart))
 
 
-def draw(labels: Labels, bound: Bounds, rows: NDArray, window: int, random: np.random.Generator) -> Batch:
-    """One window from each of these rows, (B,)."""
+def draw(
+    labels: Labels,
+    bound: Bounds,
+    rows: NDArray,
+    window: int,
+    random: np.random.Generator,
+    *,
+    at_start: float = AT_START,
+    at_end: float = AT_END,
+    closest: float = CLOSEST,
+    widest: float = WIDEST,
+) -> Batch:
+    """Draw one window from each of these rows, (B,)."""
     count, nodes = len(rows), labels.h.shape[2] - 1
-    widest = WIDEST * labels.length[rows] / nodes
-    spacing = np.exp(random.uniform(np.log(np.minimum(CLOSEST, 0.8 * widest)), np.log(widest)))
+    most = widest * labels.length[rows] / nodes  # m between nodes
+    spacing = np.exp(random.uniform(np.log(np.minimum(closest, 0.8 * most)), np.log(most)))
     share = np.minimum(spacing / labels.length[rows], 1.0 / window)  # of the path, an interval
     where = random.uniform(size=count)
     room = 1.0 - window * share
-    first = room * np.clip((where - AT_START) / (1.0 - AT_START - AT_END), 0.0, 1.0)
+    first = room * np.clip((where - at_start) / (1.0 - at_start - at_end), 0.0, 1.0)
     knows = random.uniform(size=count) >= UNKNOWN
     noise = random.normal(size=(count, 3)) * START_NOISE
     batch = Batch(
@@ -209,7 +199,7 @@ def _fill(
         breaks = labels.breaks[low + row : high + row + 1]
         end = breaks[-1]
         step = share[b] * end
-        fill_nodes(table, breaks, labels.coefficients[low:high], first[b] * end, step, bound)
+        fill_node_features(table, breaks, labels.coefficients[low:high], first[b] * end, step, bound)
         rest_start, rest_end = first[b] <= 0.0, first[b] + (count - 1) * share[b] >= 1.0 - 1e-9
         total = yaw = turning = 0.0
         start = (0.0, 0.0, 0.0)
@@ -221,7 +211,7 @@ def _fill(
             h, dh, ddh, _ = h_within(x, h0, h1, h2, h3)
             slope, bend = dh * step, ddh * step * step
             if n == 0:
-                start = told(*coefficient_logs(h, slope, bend, step))
+                start = start_features(*coefficient_logs(h, slope, bend, step))
                 start = (start[0] + noise[b, 0], start[1] + noise[b, 1], start[2] + noise[b, 2])
             rate = coefficient_logs(h, slope, bend, step)[1]
             psi, dpsi, _ = yaw_within(x, labels.yaw[row, 0, i], labels.yaw[row, 1, i], labels.yaw[row, 2, i])

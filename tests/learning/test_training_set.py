@@ -6,25 +6,24 @@ import pyarrow.parquet as pq
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.learning import sampling
 from cfplan.learning.dataset import read_dataset
 from cfplan.learning.features import COLUMNS, REFERENCE
-from cfplan.learning.sampling import START_NOISE, draw, read_material
+from cfplan.learning.training_set import START_NOISE, draw, read_training_set
 
 
 @pytest.fixture(scope="module")
-def material(tiny):
-    return read_material(tiny)
+def training_set(tiny):
+    return read_training_set(tiny)
 
 
-def batch(material, rows, seed=0):
-    return draw(material.labels, material.bound, np.array(rows), 24, np.random.default_rng(seed))
+def batch(training_set, rows, seed=0):
+    return draw(training_set.labels, training_set.bound, np.array(rows), 24, np.random.default_rng(seed))
 
 
-def test_targets_and_reference_give_the_label_back(material, tiny):
+def test_targets_and_reference_give_the_label_back(training_set, tiny):
     """These labels have one speed: every coefficient of the spline is that h."""
     _, rows = read_dataset(tiny)
-    found = batch(material, np.arange(16))
+    found = batch(training_set, np.arange(16))
     rates = found.inputs[:, :, REFERENCE] + found.targets[:, :, 0]  # log √u/Δs
     for row, label in enumerate(rows.to_pylist()):
         np.testing.assert_allclose(rates[row], rates[row][0], atol=1e-4)
@@ -32,14 +31,14 @@ def test_targets_and_reference_give_the_label_back(material, tiny):
         assert 0 < step <= 1.06 * label["end"] / 40
 
 
-def test_times_are_the_shares_of_the_window(material):
-    found = batch(material, np.arange(16))
+def test_times_are_the_shares_of_the_window(training_set):
+    found = batch(training_set, np.arange(16))
     np.testing.assert_allclose(found.times.sum(axis=1), 1.0, rtol=1e-5)
     np.testing.assert_allclose(found.times[:, 1:-1], 1 / 24, rtol=1e-3)  # of one speed
 
 
-def test_windows_lie_at_both_ends_and_between(material):
-    flags = batch(material, np.tile(np.arange(16), 20)).inputs[:, 0, COLUMNS : COLUMNS + 3]
+def test_windows_lie_at_both_ends_and_between(training_set):
+    flags = batch(training_set, np.tile(np.arange(16), 20)).inputs[:, 0, COLUMNS : COLUMNS + 3]
     at_start, at_end, knows = flags.mean(axis=0)
     assert 0.2 < at_start < 0.45
     assert 0.2 < at_end < 0.45
@@ -47,35 +46,39 @@ def test_windows_lie_at_both_ends_and_between(material):
     assert not (flags[:, 0] * flags[:, 2]).any(), "a rest has no state to tell"
 
 
-def test_the_start_is_told_a_little_wrong(material):
-    found = batch(material, np.tile(np.arange(16), 40))
+def test_the_start_is_told_a_little_wrong(training_set):
+    found = batch(training_set, np.tile(np.arange(16), 40))
     knows = found.inputs[:, 0, COLUMNS + 2] == 1.0
     error = found.inputs[knows, 0, COLUMNS + 3] - found.targets[knows, 0, 0]
     assert error.std() == pytest.approx(START_NOISE[0], rel=0.2)
     assert found.inputs[knows, 0, COLUMNS + 4].std() == pytest.approx(START_NOISE[1], rel=0.2)
 
 
-def test_the_tail_inside_a_path_counts_little(material):
-    found = batch(material, np.tile(np.arange(16), 5))
+def test_the_tail_inside_a_path_counts_little(training_set):
+    found = batch(training_set, np.tile(np.arange(16), 5))
     inside = found.inputs[:, 0, COLUMNS + 1] == 0.0
     assert np.all(found.weights[~inside] == 1.0)
     assert np.all(found.weights[inside, -1] < 0.2)
     assert np.all(found.weights[inside, 0] == 1.0)
 
 
-def test_the_same_seed_draws_the_same_windows(material):
-    first, again, other = batch(material, [0, 1, 2]), batch(material, [0, 1, 2]), batch(material, [0, 1, 2], seed=1)
+def test_the_same_seed_draws_the_same_windows(training_set):
+    first, again, other = (
+        batch(training_set, [0, 1, 2]),
+        batch(training_set, [0, 1, 2]),
+        batch(training_set, [0, 1, 2], seed=1),
+    )
     for one, two in zip(first, again, strict=True):
         np.testing.assert_array_equal(one, two)
     assert np.abs(first.inputs - other.inputs).max() > 0.01
 
 
-def test_noise_moves_paths_by_at_most_epsilon_and_keeps_the_answers(material):
-    noisy = material.noisy(0.01, np.random.SeedSequence(1))
+def test_noise_moves_paths_by_at_most_epsilon_and_keeps_the_answers(training_set):
+    noisy = training_set.noisy(0.01, np.random.SeedSequence(1))
     rows = np.arange(16)
-    clean = draw(material.labels, material.bound, rows, 24, np.random.default_rng(0))
-    moved = draw(noisy, material.bound, rows, 24, np.random.default_rng(0))
-    np.testing.assert_array_equal(noisy.h, material.labels.h)
+    clean = draw(training_set.labels, training_set.bound, rows, 24, np.random.default_rng(0))
+    moved = draw(noisy, training_set.bound, rows, 24, np.random.default_rng(0))
+    np.testing.assert_array_equal(noisy.h, training_set.labels.h)
     np.testing.assert_allclose(
         clean.targets[:, :, 0] + clean.inputs[:, :, REFERENCE], moved.targets[:, :, 0] + moved.inputs[:, :, REFERENCE],
         atol=1e-4,
@@ -84,11 +87,10 @@ def test_noise_moves_paths_by_at_most_epsilon_and_keeps_the_answers(material):
     assert 0 < heights.max() <= 0.02  # both ends of a difference moved
 
 
-def test_what_is_longer_than_a_flight_is_not_learned_from(tiny, material, monkeypatch):
-    longest = np.sort(material.labels.length)[-3]
-    monkeypatch.setattr(sampling, "LONGEST", longest)
-    kept = read_material(tiny)
-    assert len(kept.rows) == len(material.rows) - 2
+def test_what_is_longer_than_a_flight_is_not_learned_from(tiny, training_set):
+    longest = np.sort(training_set.labels.length)[-3]
+    kept = read_training_set(tiny, max_length=longest)
+    assert len(kept.rows) == len(training_set.rows) - 2
     assert kept.labels.length.max() == longest
 
 
@@ -99,6 +101,6 @@ def test_a_dataset_without_usable_rows_is_refused(tiny, tmp_path):
     failed = rows.set_column(rows.schema.get_field_index("status"), "status", pa.array(["NOT_CONVERGED"] * 16))
     pq.write_table(failed, tmp_path / "shards" / "00000.parquet")
     with pytest.raises(InputError, match="0 of 16 rows are usable") as error:
-        read_material(tmp_path)
+        read_training_set(tmp_path)
     assert error.value.hint
     assert error.value.where == str(tmp_path)
