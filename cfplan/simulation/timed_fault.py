@@ -1,4 +1,4 @@
-"""What the faults of vehicle, radio and cameras have in common: each goes wrong for a time and by a size."""
+"""The base of the simulated faults of vehicle, radio and cameras: a kind, a start, a duration and a size."""
 
 import math
 from collections.abc import Mapping
@@ -21,9 +21,9 @@ class TimedFault:
 
     def __post_init__(self) -> None:
         if math.isnan(self.start) or not self.duration > 0 or (self.size is not None and not math.isfinite(self.size)):
-            raise InputError(f"{self} makes no sense", hint="a fault has a start, a positive duration and a size")
+            raise InputError(f"{self} is not a fault", hint="a fault has a start, a positive duration and a size")
 
     @property
     def strength(self) -> float:
-        """The size, or the usual one."""
+        """The size, or the usual one if none is given."""
         return self.usual.get(self.kind, 0.0) if self.size is None else self.size

@@ -1,7 +1,7 @@
-"""Setpoints, controller and body in one compiled loop: what the vehicle does with the bytes that it is sent.
+"""The closed loop of setpoints, controller and body, compiled: what the vehicle does with the bytes that it is sent.
 
 At each millisecond, in this order: the newest setpoint that has arrived; every second time the controller, on the
-estimate as it is now; the body. So the firmware's recorded flights were made.
+estimate as it is now; the body. The firmware's recorded flights were made the same way.
 """
 
 from dataclasses import dataclass
@@ -43,11 +43,11 @@ _STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)
 
 @dataclass(frozen=True, slots=True)
 class EstimateErrors:
-    """How what the controller believes differs from the truth; attitude and body rate are believed as they are."""
+    """Errors of the controller's estimate of position and velocity; its attitude and body rate are exact."""
 
     latency: float = 0.0  # s by which position and velocity are late
     position_noise: float = 0.0  # m, standard deviation, anew each 10 ms
-    velocity_noise: float = 0.0  # m/s, likewise
+    velocity_noise: float = 0.0  # m/s, standard deviation, anew each 10 ms
     seed: int = 0
 
 
@@ -56,7 +56,7 @@ PERFECT = EstimateErrors()
 
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
-    """What the vehicle did, every millisecond from the start to the end."""
+    """The vehicle's motion, every millisecond from the start to the end."""
 
     time: NDArray  # (N,) s
     states: NDArray  # (N, 17) as in `body`
@@ -104,7 +104,7 @@ def fly_setpoints(
 ) -> ClosedLoop:
     """Fly setpoints that arrive at `times` + `delay`, (N,) s, from the state `start`, (17,), for `duration` s.
 
-    Until the first arrives, the controller holds it all the same. `gains` are the airframe's where not given; `wind`
+    Until the first arrives, the controller holds the first. `gains` are the airframe's where not given; `wind`
     (3,) m/s and motor `efficiency` (4,) are constant.
     """
     steps = round(duration / TIME_STEP)

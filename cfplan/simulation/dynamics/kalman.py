@@ -1,4 +1,4 @@
-"""The firmware's Kalman filter: what the vehicle believes of itself, from gyroscope, accelerometer and external poses.
+"""The firmware's Kalman filter: the vehicle's state estimate from gyroscope, accelerometer and external poses.
 
 Mueller, Hamer and D'Andrea, "Fusing ultra-wideband range measurements with accelerometers and rate gyroscopes for
 quadrocopter state estimation" (2015); Mueller, Hehn and D'Andrea, "Covariance correction step for Kalman filtering
@@ -27,10 +27,10 @@ PREDICTION_PERIOD = 10  # ticks of 1 ms
 
 _TICK = 0.001  # s
 _SIZE = 9
-_LEAST_COVARIANCE, _MOST_COVARIANCE = 1e-6, 100.0
+_SMALLEST_COVARIANCE, _LARGEST_COVARIANCE = 1e-6, 100.0
 _INITIAL_DEVIATIONS = (100.0, 100.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
-_ATTITUDE_REVERSION = 0.001  # share a prediction by which a vehicle that does not fly is taken to stand level
-_LEAST_CORRECTION = 1e-4  # rad
+_ATTITUDE_REVERSION = 0.001  # share per prediction by which a vehicle that does not fly reverts to level
+_SMALLEST_CORRECTION = 1e-4  # rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Prior:
     drag_z: float = 0.0  # 1/s
 
     def pack(self) -> NDArray:
-        """(16,) for the functions below."""
+        """Return the parameters (16,) for the functions below."""
         return np.array(astuple(self))
 
 
@@ -66,7 +66,7 @@ class Prior:
 
 
 class Filter(NamedTuple):
-    """Changed in place."""
+    """The filter's state; changed in place."""
 
     state: NDArray  # (9,)
     quaternion: NDArray  # (4,) body→world x y z w
@@ -76,7 +76,7 @@ class Filter(NamedTuple):
 
 
 def new_filter(prior: NDArray) -> Filter:
-    """A filter as it is after power-up."""
+    """Return a filter in its state after power-up."""
     made = Filter(np.zeros(_SIZE), np.zeros(4), np.zeros((_SIZE, _SIZE)), np.zeros(7), np.zeros(4))
     reset(made, prior)
     return made
@@ -84,7 +84,7 @@ def new_filter(prior: NDArray) -> Filter:
 
 @njit
 def reset(kalman: Filter, prior: NDArray) -> None:
-    """Forget everything: stand still at the prior's place, quite unsure where that is."""
+    """Reset the filter: at rest at the prior's place, with a large variance."""
     for row in range(_SIZE):
         kalman.state[row] = prior[_X + row] if row < 3 else 0.0
         for column in range(_SIZE):
@@ -101,9 +101,9 @@ def reset(kalman: Filter, prior: NDArray) -> None:
 def step_filter(
     kalman: Filter, prior: NDArray, gyro: NDArray, acceleration: NDArray, poses: NDArray, tick: int, flying: bool
 ) -> bool:
-    """One tick of 1 ms; False when the state had left its bounds and was reset.
+    """Step the filter by 1 ms; return False if the state had left its bounds and was reset.
 
-    `gyro` (3,) rad/s and `acceleration` (3,) m/s² as measured in body axes; `poses` (n, 9) those that came since the
+    `gyro` (3,) rad/s and `acceleration` (3,) m/s² as measured in body axes; `poses` (n, 9) are those since the
     last tick: position 0:3, quaternion 3:7, standard deviations of position, m, and attitude, rad. A pose whose
     quaternion is zero gives a position alone.
     """
@@ -161,7 +161,7 @@ def _within_bounds(kalman: Filter, prior: NDArray) -> bool:
 
 @njit
 def _predict(kalman: Filter, prior: NDArray, flying: bool) -> None:
-    """One step of PREDICTION_PERIOD with the means in `sums`.
+    """Predict over PREDICTION_PERIOD with the means in `sums`.
 
     In body axes dv/dt = f − ω × v − g Rᵀe₃ − drag v, where in flight f is along z alone.
     """
@@ -197,7 +197,7 @@ def _predict(kalman: Filter, prior: NDArray, flying: bool) -> None:
 
 @njit
 def _linearised(state: NDArray, turn: NDArray, gyro: NDArray, prior: NDArray, dt: float, flying: bool) -> NDArray:
-    """(9, 9) how small changes of the state go through one prediction."""
+    """Return the (9, 9) Jacobian of one prediction."""
     step = np.zeros((_SIZE, _SIZE))
     for axis in range(_SIZE):
         step[axis, axis] = 1.0
@@ -237,7 +237,7 @@ def _rotate_error(step: NDArray, x: float, y: float, z: float) -> None:
 
 @njit
 def _carry(covariance: NDArray, step: NDArray) -> None:
-    """P ← A P Aᵀ."""
+    """Propagate the covariance: P ← A P Aᵀ."""
     half = np.zeros((_SIZE, _SIZE))
     for row in range(_SIZE):
         for column in range(_SIZE):
@@ -267,10 +267,10 @@ def _bound(covariance: NDArray) -> None:
     for row in range(_SIZE):
         for column in range(row, _SIZE):
             value = 0.5 * (covariance[row, column] + covariance[column, row])
-            if not value <= _MOST_COVARIANCE:
-                value = _MOST_COVARIANCE
-            elif row == column and value < _LEAST_COVARIANCE:
-                value = _LEAST_COVARIANCE
+            if not value <= _LARGEST_COVARIANCE:
+                value = _LARGEST_COVARIANCE
+            elif row == column and value < _SMALLEST_COVARIANCE:
+                value = _SMALLEST_COVARIANCE
             covariance[row, column] = value
             covariance[column, row] = value
 
@@ -296,7 +296,7 @@ def _fuse_pose(kalman: Filter, poses: NDArray, row: int) -> None:
 
 @njit
 def _fuse(kalman: Filter, measured: int, error: float, deviation: float) -> None:
-    """A direct measurement of one state: with c = P e and k = c / (eᵀc + σ²), P ← P − k cᵀ."""
+    """Fuse a direct measurement of one state: with c = P e and k = c / (eᵀc + σ²), P ← P − k cᵀ."""
     covariance = kalman.covariance
     spread = covariance[measured, measured] + deviation * deviation
     column = np.empty(_SIZE)
@@ -314,7 +314,7 @@ def _fuse(kalman: Filter, measured: int, error: float, deviation: float) -> None
 def _absorb_attitude_error(kalman: Filter) -> None:
     x, y, z = kalman.state[6], kalman.state[7], kalman.state[8]
     most = max(abs(x), abs(y), abs(z))
-    if most > _LEAST_CORRECTION and most < 10.0:
+    if most > _SMALLEST_CORRECTION and most < 10.0:
         _turn_by(kalman.quaternion, x, y, z)
         step = np.zeros((_SIZE, _SIZE))
         for axis in range(6):

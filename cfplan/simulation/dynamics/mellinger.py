@@ -37,7 +37,7 @@ FULL_STATE = np.array([ABSOLUTE, ABSOLUTE, ABSOLUTE, DISABLE, DISABLE, DISABLE, 
 ON_BOARD = np.array([ABSOLUTE, ABSOLUTE, ABSOLUTE, DISABLE, DISABLE, ABSOLUTE, DISABLE])
 NOTHING = np.zeros(7, dtype=np.int64)  # of the null setpoint: motors off
 
-FULL_COMMAND = 65535  # a motor at its most
+FULL_COMMAND = 65535  # of one motor
 _MOMENT_LIMIT = 32000.0
 
 
@@ -66,7 +66,7 @@ class MellingerGains:
     kd_omega_rp: float = 200.0
 
     def pack(self) -> NDArray:
-        """(19,) for `step_mellinger`."""
+        """Return the gains (19,) for `step_mellinger`."""
         return np.array(astuple(self))
 
 
@@ -77,13 +77,13 @@ class MellingerGains:
 
 
 def gains_for(airframe: Airframe) -> MellingerGains:
-    """Default gains with the vehicle's own mass and thrust scale, as the pilot sets them."""
+    """Return the default gains with the vehicle's own mass and thrust scale, as the pilot sets them."""
     return MellingerGains(mass=airframe.mass, mass_thrust=airframe.command_per_thrust)
 
 
 @njit
 def level_out(setpoint: NDArray, mode: NDArray) -> None:
-    """The supervisor's override when setpoints stop coming, in place: level, no yaw rate, height kept."""
+    """Apply the supervisor's override when setpoints stop coming, in place: level, no yaw rate, height kept."""
     mode[MODE_X] = mode[MODE_Y] = DISABLE
     mode[MODE_ROLL] = mode[MODE_PITCH] = ABSOLUTE
     mode[MODE_YAW] = VELOCITY_MODE
@@ -95,7 +95,7 @@ def level_out(setpoint: NDArray, mode: NDArray) -> None:
 def step_mellinger(
     control: NDArray, memory: NDArray, gains: NDArray, setpoint: NDArray, mode: NDArray, state: NDArray
 ) -> None:
-    """One step of the controller, every CONTROL_PERIOD: writes `control` and carries `memory` on."""
+    """Step the controller by CONTROL_PERIOD: write `control` and update `memory`."""
     pull = np.empty(3)  # force that the errors of position call for
     for axis in range(3):
         kp, kd = (gains[_KP_XY], gains[_KD_XY]) if axis < 2 else (gains[_KP_Z], gains[_KD_Z])
@@ -161,7 +161,7 @@ def step_mellinger(
 
 @njit
 def distribute_power(control: NDArray, motors: NDArray) -> None:
-    """Motor commands (4,) in [0, FULL_COMMAND] of a control: mixing, then all lowered by what the most has too much."""
+    """Mix a control into motor commands (4,), in [0, FULL_COMMAND]: all are lowered by the excess of the largest."""
     half_roll, half_pitch = np.trunc(control[1] / 2), np.trunc(control[2] / 2)
     motors[0] = np.trunc(control[0] - half_roll + half_pitch + control[3])
     motors[1] = np.trunc(control[0] - half_roll - half_pitch - control[3])
@@ -181,13 +181,13 @@ def _clamp(value: float, limit: float) -> float:
 
 @register_jitable
 def _along(a: NDArray, i: int, b: NDArray, j: int) -> float:
-    """Column i of `a` times column j of `b`."""
+    """Return the dot product of column i of `a` and column j of `b`."""
     return a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
 
 
 @njit
 def _attitude(roll: float, pitch: float, yaw: float) -> NDArray:
-    """Rotation of Euler angles ZYX."""
+    """Return the (3, 3) rotation of Euler angles ZYX, rad."""
     cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
     frame = np.empty((3, 3))
     frame[0, 0], frame[0, 1], frame[0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
@@ -198,7 +198,7 @@ def _attitude(roll: float, pitch: float, yaw: float) -> NDArray:
 
 @njit
 def _thrust_frame(x: float, y: float, z: float, yaw: float) -> NDArray:
-    """Rotation whose z axis is along a force and whose x axis lies over the direction of yaw."""
+    """Return the (3, 3) rotation whose z axis is along a force and whose x axis lies over the direction of yaw."""
     norm = np.sqrt(x * x + y * y + z * z)
     zx, zy, zz = x / norm, y / norm, z / norm
     yx, yy, yz = -zz * np.sin(yaw), zz * np.cos(yaw), zx * np.sin(yaw) - zy * np.cos(yaw)

@@ -1,8 +1,10 @@
-"""A virtual lab in a process of its own: a virtual Crazyflie and a room with motion capture, in real time.
+"""The virtual lab in its own process: a virtual Crazyflie and a room with motion capture, in real time.
 
 The lab speaks CRTP over UDP on the loopback, one datagram a packet, as cflib's own UDP driver does; the room's poses
-come from the next port. Where it listens stands in the environment, so that child processes find it. It ends with the
-process that started it, however that ends.
+come from the next port. It ends with the process that started it.
+
+A lab announces its address in the environment variable CFPLAN_SIM_n, because `sim://n` alone must find it: cflib makes
+its link drivers itself, from nothing but the URI, in the pilot's process and in users' scripts.
 """
 
 import os
@@ -31,14 +33,14 @@ _START_TIMEOUT = 180.0  # s; the first start on a machine compiles
 _ANSWER_TIMEOUT = 10.0  # s
 _CLOSE_TIMEOUT = 3.0  # s
 
-# Where each value lies in a row of what the lab records of the truth, 100 rows a second.
+# Columns of the lab's record of the truth, 100 rows a second.
 TIME, STATE, MOTORS, OFF_IN_AIR, SUPERVISOR = 0, slice(1, 18), slice(18, 22), 22, 23
 ROW_SIZE = 24
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What really happened: for tests and reports, never for a pilot. One row every 10 ms."""
+    """The true motion: for tests and reports, never for a pilot. One row every 10 ms."""
 
     time: NDArray  # (N,) s on the clock of time.monotonic()
     position: NDArray  # (N, 3) m
@@ -52,7 +54,7 @@ class Truth:
 
     @staticmethod
     def of(rows: NDArray, locked: bool) -> "Truth":
-        """From the rows as the lab records them."""
+        """Return the truth of rows as the lab records them."""
         state = rows[:, STATE]
         return Truth(
             time=rows[:, TIME],
@@ -81,7 +83,7 @@ class Lab:
         self.number = number
         self.uri = f"sim://{number}"
         self.port = port
-        self.mocap_uri = mocap_uri  # of the vehicle in the virtual Vicon; "" where the room has none
+        self.mocap_uri = mocap_uri  # of the vehicle in the virtual Vicon; "" if the room has none
         self._process = process
         self._connection = connection
         self._address = f"127.0.0.1:{port}"
@@ -97,11 +99,11 @@ class Lab:
         return self._process.poll() is None
 
     def truth(self) -> Truth:
-        """What really happened so far; for tests and reports. Raises LinkError where the lab has died."""
+        """Return the truth so far; for tests and reports. Raises LinkError if the lab has died."""
         return self._ask(TRUTH)
 
     def latest(self) -> Truth:
-        """The last row of it."""
+        """Return the last row of the truth."""
         return self._ask(LATEST)
 
     def _ask(self, request: str) -> Truth:
@@ -122,7 +124,7 @@ class Lab:
             self._connection.send(fault)
 
     def close(self) -> None:
-        """End it; may be called twice."""
+        """End the lab; may be called twice."""
         with suppress(OSError):  # closed or dead already
             self._connection.send(CLOSE)
         self._connection.close()
@@ -156,7 +158,7 @@ def start_lab(
 ) -> Lab:
     """Start a lab with a vehicle of this airframe as `sim://number`, and as `udp://127.0.0.1:port`; 0 takes a free one.
 
-    Raises LinkError where it does not come up, InputError where the port or the one above it is taken.
+    Raises LinkError if the lab does not start, InputError if the port or the one above it is taken.
 
     A lab that had that number is hidden until this one is closed. A plain child process rather than one of
     multiprocessing's, so that it can be started from a daemonic process and from a script without a main guard.

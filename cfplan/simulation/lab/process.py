@@ -1,4 +1,4 @@
-"""The lab's own process: runs the virtual Crazyflie and the room in real time, against absolute deadlines."""
+"""The lab's process: it runs the virtual Crazyflie and the room in real time, against absolute deadlines."""
 
 import gc
 import math
@@ -31,7 +31,7 @@ from cfplan.vehicle.airframe import Airframe
 _WARM_UP = 200  # ms
 _VICON_STEP = 2  # ms between wakes for the virtual Vicon
 _RECORD_PERIOD = 10  # ms
-_MOST_BEHIND = 0.25  # s that a stall may be caught up with; beyond, simulated time is lost
+_LARGEST_LAG = 0.25  # s of a stall that are caught up with; beyond, simulated time is lost
 _SILENCE = 2.0  # s after which a client has gone
 _LARGEST_DATAGRAM = 64
 EXTERNAL_POSE = b"\x08"
@@ -56,7 +56,7 @@ class Recorder:
         self._count += 1
 
     def rows(self, first: int = 0) -> bytes:
-        """All of it, or from a row on; negative ones count from the end."""
+        """Return all rows, or those from `first` on; negative numbers count from the end."""
         return self._rows[: self._count][first:].tobytes()
 
 
@@ -82,12 +82,12 @@ class LabLoop:
         self._radio: Radio | None = None  # None while the link is perfect
 
     def _warm_up(self) -> None:
-        """Compile, and let the supervisor pass its checks, before anyone looks."""
+        """Compile, and let the supervisor pass its checks, before a client connects."""
         self.vehicle.advance(_WARM_UP)
         self.vehicle.sent()
 
     def run(self, control: Connection) -> None:
-        """Until told to end, or until whoever started this has gone."""
+        """Run until told to end, or until the parent process has ended."""
         parent = os.getppid()
         sources: list[int] = [self.link.fileno(), self.poses.fileno(), control.fileno()]
         self._origin = time.monotonic() - self.vehicle.tick / 1000
@@ -103,7 +103,7 @@ class LabLoop:
                 return
 
     def _due(self) -> float:
-        """When something happens next that is seen outside; whatever comes in wakes it besides."""
+        """Return when, s, the loop must wake next for something visible outside; incoming packets wake it too."""
         tick = self.vehicle.tick
         if self._radio is not None and self._radio.busy:
             return self._origin + (tick + 1) / 1000
@@ -115,7 +115,7 @@ class LabLoop:
 
     def _catch_up(self) -> None:
         now = time.monotonic()
-        if now - self._origin - self.vehicle.tick / 1000 > _MOST_BEHIND:
+        if now - self._origin - self.vehicle.tick / 1000 > _LARGEST_LAG:
             self._origin = now - self.vehicle.tick / 1000
         target = int((now - self._origin) * 1000)
         while self.vehicle.tick < target:
@@ -132,7 +132,7 @@ class LabLoop:
         self._send_out(now)
 
     def _look(self, now: float) -> None:
-        """Let the virtual Vicon see the vehicle, where it is time."""
+        """Let the virtual Vicon see the vehicle when it is due."""
         if self.vicon is not None and now >= self.vicon.next_look:
             truth = self.vehicle.stabilizer.loop.truth.tolist()
             self.vicon.look(now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]))
@@ -164,7 +164,7 @@ class LabLoop:
 
     def _read_link(self) -> None:
         for packet, sender in _datagrams(self.link):
-            if packet == NULL_PACKET:  # a scan, or a driver that looks whether anyone is there
+            if packet == NULL_PACKET:  # a scan, or a driver that checks for a vehicle
                 self.link.sendto(pack(Port.LINK, 3, b""), sender)
                 continue
             self._client, self._heard = sender, time.monotonic()
@@ -184,7 +184,7 @@ class LabLoop:
     def _obey(self, control: Connection) -> bool:
         try:
             request = control.recv()
-        except (EOFError, OSError):  # whoever started this has gone
+        except (EOFError, OSError):  # the parent process has ended
             return False
         if request in (TRUTH, LATEST):
             rows = self.record.rows(-1 if request == LATEST else 0)
@@ -209,7 +209,7 @@ def _datagrams(source: socket.socket) -> list[tuple[bytes, _Address]]:
 
 
 def _adjacent_sockets() -> tuple[socket.socket, socket.socket]:
-    """Two UDP sockets on the loopback, the second one port above the first."""
+    """Return two UDP sockets on the loopback, the second one port above the first."""
     while True:
         first = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         first.bind(("127.0.0.1", 0))
@@ -226,7 +226,7 @@ def _adjacent_sockets() -> tuple[socket.socket, socket.socket]:
 
 
 def _sockets_at(port: int) -> tuple[socket.socket, socket.socket]:
-    """The same at a port. Raises InputError where it cannot be had."""
+    """Return the same two sockets at a port. Raises InputError if it is not available."""
     found = []
     for number in (port, port + 1):
         made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -234,7 +234,7 @@ def _sockets_at(port: int) -> tuple[socket.socket, socket.socket]:
             made.bind(("127.0.0.1", number))
         except (OSError, OverflowError) as why:
             raise InputError(
-                f"port {number} cannot be had: {why}", where="virtual vehicle", hint="name another with --port"
+                f"port {number} is not available: {why}", where="virtual vehicle", hint="choose another with --port"
             ) from why
         made.setblocking(False)
         found.append(made)
@@ -242,7 +242,7 @@ def _sockets_at(port: int) -> tuple[socket.socket, socket.socket]:
 
 
 def serve(control: Connection) -> None:
-    """Make the lab that the other side asks for, say on which port it listens, and run it."""
+    """Make the lab that the parent asks for, tell it the port, and run the lab."""
     airframe, vehicle, room, port = control.recv()
     try:
         loop = LabLoop(airframe, vehicle, room, port)
@@ -259,7 +259,7 @@ def serve(control: Connection) -> None:
 
 
 def _take_priority() -> None:
-    """Be on time on a busy computer, where permitted: it stands for hardware, which would not wait either."""
+    """Take priority on a busy computer if permitted: the lab stands for hardware, which would not wait either."""
     lock_memory()
     if hasattr(os, "sched_setscheduler"):
         with suppress(PermissionError):
@@ -267,8 +267,8 @@ def _take_priority() -> None:
 
 
 def main() -> None:
-    """`python -m cfplan.simulation.lab.process FD`: the other end of FD is whoever started this."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the pilot's to handle; the vehicle stays there to land
+    """Run `python -m cfplan.simulation.lab.process FD`: the other end of FD is the parent process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the pilot; the vehicle must still land
     serve(Connection(int(sys.argv[1])))
 
 

@@ -1,4 +1,4 @@
-"""The radio between computer and vehicle: polled, retried until acknowledged, and sometimes dead.
+"""The simulated radio between computer and vehicle: polled, retried until acknowledged, and sometimes dead.
 
 A Crazyradio sends one packet, gets at most one back with the acknowledgement, and repeats both until it has got it
 (cflib's safelink). Loss therefore costs time and nothing else, until one side's queue is full: the computer's holds
@@ -22,7 +22,7 @@ _VEHICLE_QUEUE = 120
 
 
 class RadioFaultKind(StrEnum):
-    """What goes wrong."""
+    """Kinds of faults."""
 
     LOSS = "loss"  # a share of `size` of the transmissions fails
     DELAY = "delay"  # packets take `size` s longer, either way
@@ -39,11 +39,11 @@ class RadioFault(TimedFault):
     def __post_init__(self) -> None:
         TimedFault.__post_init__(self)
         if self.strength < 0.0 or (self.kind is RadioFaultKind.LOSS and self.strength >= 1.0):
-            raise InputError(f"{self} makes no sense", hint="loss is a share from 0 to less than 1, delay in s")
+            raise InputError(f"{self} is out of range", hint="loss is a share from 0 to less than 1, delay in s")
 
 
 class Radio:
-    """Both directions. Whoever owns it lets time go on with `step`, in s on any clock."""
+    """Both directions of a link. The owner advances it with `step`, in s on any clock."""
 
     def __init__(self, now: float, seed: int = 11):
         self._chance = np.random.default_rng(seed)
@@ -53,7 +53,7 @@ class Radio:
         self._down: deque[bytes] = deque()
         self._on_way_up: deque[tuple[float, bytes]] = deque()
         self._on_way_down: deque[tuple[float, bytes]] = deque()
-        self.dropped = 0  # packets that a full queue turned away
+        self.dropped = 0  # packets dropped by a full queue
 
     def inject(self, fault: RadioFault, now: float) -> None:
         """Let something go wrong; its start counts from now."""
@@ -61,30 +61,30 @@ class Radio:
 
     @property
     def full(self) -> bool:
-        """Whether the computer's queue takes no more."""
+        """Whether the computer's queue is full."""
         return len(self._up) >= COMPUTER_QUEUE
 
     @property
     def busy(self) -> bool:
-        """Whether anything is on its way."""
+        """Whether any packet is on its way."""
         return bool(self._up or self._down or self._on_way_up or self._on_way_down)
 
     def send(self, packet: bytes) -> None:
-        """From the computer; turned away where the queue is full."""
+        """Send a packet from the computer; it is dropped if the queue is full."""
         if self.full:
             self.dropped += 1
         else:
             self._up.append(packet)
 
     def answer(self, packet: bytes) -> None:
-        """From the vehicle, likewise."""
+        """Send a packet from the vehicle; it is dropped if the queue is full."""
         if len(self._down) >= _VEHICLE_QUEUE:
             self.dropped += 1
         else:
             self._down.append(packet)
 
     def step(self, now: float) -> tuple[list[bytes], list[bytes]]:
-        """What reaches the vehicle, and what the computer, by now."""
+        """Return the packets that have reached the vehicle by now, and those that have reached the computer."""
         if not (self._up or self._down):
             self._next = max(self._next, now)
         while self._next <= now and (self._up or self._down):

@@ -1,7 +1,7 @@
-"""A room with motion capture: poses of the simulated vehicle with noise, rate and latency, and their PoseSource.
+"""A simulated room with motion capture: poses of the vehicle with noise, rate and latency, and their PoseSource.
 
-The poses come over a UDP port of their own, next to the one on which the lab speaks to the radio's side, so that a
-pilot in another process gets them as it would from a real system: late, noisy, and by no other way.
+The poses come over a separate UDP port, next to that of the radio, so that a pilot in another process gets them as it
+would from a real system: late and noisy.
 """
 
 import os
@@ -27,7 +27,7 @@ _POSE = struct.Struct("<dI7d")  # time s, number, position m, quaternion x y z w
 
 @dataclass(frozen=True, slots=True)
 class RoomSettings:
-    """What the motion capture is like."""
+    """Settings of the room's motion capture."""
 
     rate: float = 100.0  # Hz
     position_noise: float = 0.001  # m, standard deviation of each axis
@@ -41,11 +41,14 @@ class RoomSettings:
         for name in ("rate", "position_noise", "attitude_noise", "latency"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0) or (name == "rate" and not 1 <= value <= 1000):
-                raise InputError(f"{name} {value} of the simulated room makes no sense", hint="rate 1 to 1000 Hz")
+                raise InputError(
+                    f"{name} {value} of the simulated room is out of range",
+                    hint="rate 1 to 1000 Hz, the others at least 0",
+                )
 
 
 class MotionCapture:
-    """Sees the vehicle `rate` times a second, from the tick `begin` on; what it saw comes out `latency` later."""
+    """Sees the vehicle `rate` times a second, from the tick `begin` on; each pose comes out `latency` later."""
 
     def __init__(self, settings: RoomSettings, begin: int = 0):
         self._settings = settings
@@ -56,7 +59,7 @@ class MotionCapture:
 
     @property
     def next_tick(self) -> int:
-        """The tick of 1 ms at which it looks next."""
+        """The tick of 1 ms at which the cameras look next."""
         return self._begin + round(self._number * 1000 / self._settings.rate)
 
     def look(self, time: float, truth: NDArray) -> None:
@@ -69,11 +72,11 @@ class MotionCapture:
 
     @staticmethod
     def measured(packet: bytes) -> tuple[float, ...]:
-        """Position and quaternion of a packet."""
+        """Return position and quaternion of a packet."""
         return _POSE.unpack(packet)[2:]
 
     def ready(self, time: float) -> list[bytes]:
-        """The packets that leave the room by now."""
+        """Return the packets that leave the room by now."""
         count = sum(1 for due, _ in self._waiting if due <= time)
         out = [packet for _, packet in self._waiting[:count]]
         del self._waiting[:count]
@@ -81,7 +84,7 @@ class MotionCapture:
 
     @property
     def next_due(self) -> float:
-        """When the next packet leaves, s; infinity where none waits."""
+        """When the next packet leaves, s; infinity if none waits."""
         return self._waiting[0][0] if self._waiting else np.inf
 
 
@@ -95,19 +98,19 @@ def _turned(quaternion: NDArray, angle: NDArray) -> NDArray:
 
 
 def lab_address(number: int) -> tuple[str, int] | None:
-    """Where the lab of that number listens, None where there is none. Raises InputError on nonsense."""
+    """Return the address of the lab of that number, None if there is none. Raises InputError if it is malformed."""
     name = lab_variable(number)
     text = os.environ.get(name)
     if text is None:
         return None
     host, _, port = text.rpartition(":")
     if not host or not port.isdigit():
-        raise InputError(f"{text!r} is no host:port", where=name, hint="let a lab set this variable")
+        raise InputError(f"{text!r} is not host:port", where=name, hint="let a lab set this variable")
     return host, int(port)
 
 
 def lab_variable(number: int) -> str:
-    """The environment variable that says where a lab listens."""
+    """Return the environment variable with the address of a lab."""
     return f"CFPLAN_SIM_{number}"
 
 
@@ -149,11 +152,11 @@ class RoomPoseSource:
             while True:
                 stamp, _, *pose = _POSE.unpack(self._socket.recv(256))
                 found.append(Pose(stamp, now, (pose[0], pose[1], pose[2]), (pose[3], pose[4], pose[5], pose[6])))
-        except (BlockingIOError, ConnectionRefusedError):  # nothing more; or the lab has gone, and nothing comes
+        except (BlockingIOError, ConnectionRefusedError):  # nothing more; or the lab has ended
             return found
 
     def tell_attitude(self, attitude: tuple[float, float, float, float]) -> None:
-        """These poses are never turned over."""
+        """Ignore the attitude: these poses are never flipped."""
 
     def close(self) -> None:
         if self._socket is not None:

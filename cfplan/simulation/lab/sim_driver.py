@@ -1,6 +1,6 @@
 """A cflib link driver for `sim://0`: unmodified cflib connects to the virtual Crazyflie of a lab.
 
-Where the environment names no lab, the link starts one of its own and ends it when it closes.
+If the environment names no lab, the link starts its own, and ends it when it closes.
 """
 
 import re
@@ -27,18 +27,18 @@ _OWN_LAB_AIRFRAME = "crazyflie-2.1+"
 _PROBE_TIMEOUT = 1.0  # s
 _SCAN_TIMEOUT = 0.1  # s
 _SCANNED = 8  # labs that a scan looks for
-_MOST_SILENCE = 2.0  # s without an answer, while there were questions
+_LONGEST_SILENCE = 2.0  # s without an answer to packets sent
 _BUFFER = 1 << 20  # bytes
 
 
 def register_sim_driver() -> None:
-    """Let cflib find `sim://`; does nothing the second time."""
+    """Register this driver with cflib, once."""
     if SimDriver not in cflib.crtp.CLASSES:
         cflib.crtp.CLASSES.insert(0, SimDriver)
 
 
 class SimDriver(CRTPDriver):
-    """One link. Packets are read in cflib's own thread; no thread of its own."""
+    """One link. Packets are read in cflib's thread."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class SimDriver(CRTPDriver):
     def connect(
         self, uri: str, radio_link_statistics_callback: object, link_error_callback: Callable[[str], None] | None
     ) -> None:
-        """Raises WrongUriType where the URI is not ours, a CfplanError where no vehicle answers."""
+        """Connect. Raises WrongUriType if the URI is of another driver, a CfplanError if no vehicle answers."""
         if not uri.startswith(_SCHEME):
             raise WrongUriType(f"not a {_SCHEME} URI")
         if self._socket is not None:
@@ -74,7 +74,7 @@ class SimDriver(CRTPDriver):
         self._asked = self._heard = time.monotonic()
 
     def receive_packet(self, wait: float = 0) -> CRTPPacket | None:
-        """The next packet, None after `wait` s (for ever if negative) or when the link closes."""
+        """Return the next packet, None after `wait` s (never if negative) or when the link closes."""
         with self._reading:
             link = self._socket
             if link is None:
@@ -99,13 +99,13 @@ class SimDriver(CRTPDriver):
         return CRTPPacket(data[0], bytearray(data[1:])) if data and data != NULL_PACKET else None
 
     def _silence(self) -> str:
-        """Silent for long although asked since; cflib pings ten times a second."""
-        if self._asked > self._heard and time.monotonic() - self._heard > _MOST_SILENCE:
-            return f"The virtual lab has not answered for {_MOST_SILENCE:.0f} s"
+        """Return an error if the lab has not answered for long; cflib pings ten times a second."""
+        if self._asked > self._heard and time.monotonic() - self._heard > _LONGEST_SILENCE:
+            return f"The virtual lab has not answered for {_LONGEST_SILENCE:.0f} s"
         return ""
 
     def send_packet(self, pk: CRTPPacket) -> None:
-        """Send; a failure is told from the receiving thread, as the sender may hold locks."""
+        """Send a packet; a failure is reported from the receiving thread, as the sender may hold locks."""
         link = self._socket
         if link is None:
             return
@@ -139,7 +139,7 @@ class SimDriver(CRTPDriver):
         return f"{self.uri}: {'open' if self._socket is not None else 'closed'}"
 
     def scan_interface(self, address: object = None) -> list[list[str]]:
-        """The labs that the environment names and that answer."""
+        """Return the labs that the environment names and that answer."""
         found = []
         for number in range(_SCANNED):
             place = lab_address(number)
@@ -156,7 +156,7 @@ class SimDriver(CRTPDriver):
 
 
 def lab_number(uri: str) -> int:
-    """N of sim://N. Raises InputError."""
+    """Return N of sim://N. Raises InputError."""
     match = re.fullmatch(r"sim://(\d{1,3})", uri)
     if match is None:
         raise InputError("no such virtual vehicle", where=uri, hint="sim://0, sim://1, …")
@@ -179,6 +179,6 @@ def _answers(link: socket.socket, timeout: float) -> bool:
             if select.select([link], [], [], timeout / 4)[0]:
                 link.recv(64)
                 return True
-    except OSError:  # refused: nobody listens
+    except OSError:  # refused
         return False
     return False

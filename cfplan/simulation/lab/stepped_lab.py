@@ -1,7 +1,7 @@
-"""The virtual lab without real time: vehicle, radio and cameras on a clock that goes on only while a pilot sleeps.
+"""The stepped lab, without real time: vehicle, radio and cameras on a clock that runs only while the pilot sleeps.
 
-The same virtual Crazyflie, packets, pose sorting and pilot as in a lab of processes, in one thread: every flight can be
-repeated to the last bit, and takes a fraction of its time.
+It has the same virtual Crazyflie, packets, pose classification and pilot as a lab of processes, in one thread: every
+flight can be repeated to the last bit, and takes a fraction of its time.
 """
 
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from cfplan.vehicle.airframe import Airframe
 
 BEGIN = 1000.0  # s, where the clock starts
 _WARM_UP = 200  # ms
-_RECONNECTS_AFTER = 0.3  # s from when the cameras' connection is possible again
+_RECONNECTS_AFTER = 0.3  # s after the cameras' connection is possible again
 
 
 class SteppedLab:
-    """`clock` and `sleep` are the pilot's; `heard` takes what comes from the vehicle over the radio."""
+    """A stepped lab: `clock` and `sleep` are for the pilot, `heard` is called with each packet from the vehicle."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class SteppedLab:
         return self.now
 
     def sleep(self, duration: float) -> None:
-        """Let time go by, and more of it where the pilot's computer stands still."""
+        """Let time pass, and more of it if the pilot's computer stands still."""
         end = self.now + max(duration, 0.0)
         self._run_until(end)
         while self._stalled:
@@ -62,13 +62,13 @@ class SteppedLab:
             self._run_until(end)
 
     def stall(self, duration: float) -> None:
-        """The pilot's computer stands still for so long, s, from its next sleep on."""
+        """Let the pilot's computer stand still for `duration`, s, from its next sleep on."""
         self._stalled += duration
 
-    # What others do.
+    # Events and faults.
 
     def at(self, time: float, action: Callable[[], None]) -> None:
-        """Call it when the clock gets there; what it raises comes out of the pilot's sleep."""
+        """Call `action` at a time, s; what it raises comes out of the pilot's sleep."""
         self._events.append((time, action))
         self._events.sort(key=lambda event: event[0])
 
@@ -82,12 +82,12 @@ class SteppedLab:
             self.cameras.inject(fault, self.now)
 
     def pictures(self) -> list[tuple[float, Picture]]:
-        """What the cameras sent since the last call, each with the time at which it came."""
+        """Return what the cameras sent since the last call, each with the time at which it came."""
         found, self._pictures = self._pictures, []
         return found
 
     def truth(self) -> Truth:
-        """What really happened so far."""
+        """Return the truth so far."""
         rows = np.array(self._rows).reshape(-1, ROW_SIZE)
         return Truth.of(rows, self.vehicle.supervisor.ever_locked)
 
@@ -99,7 +99,7 @@ class SteppedLab:
         self._advance(end)
 
     def _advance(self, end: float) -> None:
-        """Vehicle by milliseconds, from one moment at which something happens to the next."""
+        """Advance the vehicle by milliseconds, from one event to the next."""
         target = int((end - self._origin) * 1000 + 1e-6)
         while self.vehicle.tick < target:
             tick = self.vehicle.tick

@@ -1,4 +1,4 @@
-"""The pilot's link and poses in a stepped lab: the pilot's own code on both, and no thread, socket or process."""
+"""The pilot's link and poses in a stepped lab: the real code, without threads, sockets or processes."""
 
 import struct
 from collections.abc import Callable
@@ -28,7 +28,7 @@ _LOG_TYPES = {"int16_t": (5, "h"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "
 
 
 class SteppedLink(Link):
-    """Sends and hears as the real one does, by the same functions; waits by letting the lab's time go on."""
+    """A link that sends and receives by the real link's functions, and waits by advancing the lab's clock."""
 
     def __init__(self, lab: SteppedLab, report: Callable[[Telemetry], None]):
         self._lab = lab
@@ -46,7 +46,7 @@ class SteppedLink(Link):
         super().__init__(endpoint, URI, report, clock=lab.clock)
 
     def send_soon(self, packet: Any) -> None:
-        """As the radio's driver: wait a moment for its queue, then give the packet up."""
+        """Send a packet as the radio's driver does: wait briefly for its queue, then drop the packet."""
         until = self._lab.now + PATIENCE
         while self._lab.radio.full and self._lab.now < until:
             self._lab.sleep(_STEP)
@@ -91,7 +91,7 @@ class SteppedLink(Link):
         self._lab.heard = lambda _: None
 
     def _ask(self, port: Port, channel: int, payload: bytes, head: bytes, patience: float) -> bytes:
-        """Send until it is answered. Raises LinkError where it never is."""
+        """Send until an answer comes, and return it. Raises LinkError if none comes."""
         end = self._lab.now + patience
         self._answers.clear()
         while self._lab.now < end:
@@ -120,7 +120,7 @@ class SteppedLink(Link):
 
 
 def connect(lab: SteppedLab, report: Callable[[Telemetry], None]) -> SteppedLink:
-    """As `cfplan.flight.radio.connection.connect`."""
+    """Connect, as `cfplan.flight.radio.connection.connect` does."""
     lab.sleep(0.1)
     link = SteppedLink(lab, report)
     link.release_priority()
@@ -134,7 +134,7 @@ def connect(lab: SteppedLab, report: Callable[[Telemetry], None]) -> SteppedLink
 
 
 class SteppedPoses(MocapSource):
-    """The pilot's source of poses on the lab's cameras: dated and sorted as they are in the air."""
+    """The pilot's source of poses from the lab's cameras, dated and classified as in a real flight."""
 
     def __init__(self, lab: SteppedLab, limits: PoseLimits, subject: str = "cf1"):
         super().__init__(parse_uri(f"vicon://lab/{subject}", subject_needed=True), limits)

@@ -9,11 +9,12 @@ _RESISTANCE = 0.2  # Ω: 4.2 V at rest and 3.30 V at 4.44 A, Bitcraze's table of
 _CURRENT, _AT_THRUST = 4.44, 0.568  # A at N, the same table
 _IDLE_CURRENT = 0.15  # A
 _EMPTY, _FULL = 3.5, 4.18  # V at rest
-_WHOLE_ABOVE, _LOSS = 3.066, 0.106 / 0.12  # V, from where a motor gives all it is asked for; share a V below that
+# V, above which a motor gives all that it is asked for; share lost per V below that
+_FULL_ABOVE, _LOSS = 3.066, 0.106 / 0.12
 
 
 class Battery:
-    """`charge` is the share of the capacity that is left."""
+    """A battery; `charge` is the share of the capacity that is left."""
 
     def __init__(self, charge: float = 1.0):
         self.charge = charge
@@ -25,12 +26,12 @@ class Battery:
         return _EMPTY + (_FULL - _EMPTY) * self.charge
 
     def drain(self, thrust: float, seconds: float) -> None:
-        """Give `thrust` N, of all motors together, for a while."""
+        """Draw the current for `thrust`, N, of all motors together, for some seconds."""
         current = _IDLE_CURRENT + _CURRENT * (max(thrust, 0.0) / _AT_THRUST) ** 1.5
         self.charge = max(0.0, self.charge - current * seconds / _CAPACITY)
         self.voltage = self._at_rest - _RESISTANCE * current - self.sag
 
     @property
     def strength(self) -> float:
-        """Share of its largest thrust that a motor can give at this voltage."""
-        return min(1.0, max(0.0, 1.0 - _LOSS * (_WHOLE_ABOVE - self.voltage)))
+        """The share of its largest thrust that a motor can give at this voltage."""
+        return min(1.0, max(0.0, 1.0 - _LOSS * (_FULL_ABOVE - self.voltage)))

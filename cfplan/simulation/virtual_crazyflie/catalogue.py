@@ -1,4 +1,4 @@
-"""The names of what a Crazyflie logs and what can be set on it, as crazyflie-firmware 2026.08 has them.
+"""The names of a Crazyflie's log variables and parameters in crazyflie-firmware 2026.08.
 
 One group a line (indented lines go on): `group: type name name; type name`. Behind a parameter's name, `*` says that
 it can be stored and `!` that it can only be read.

@@ -1,4 +1,4 @@
-"""Whose setpoint counts: the priorities of the firmware's commander."""
+"""The firmware's commander: which setpoint counts, by priority."""
 
 from collections.abc import Callable
 from enum import IntEnum
@@ -7,7 +7,7 @@ from cfplan.simulation.virtual_crazyflie.setpoints import Setpoint
 
 
 class Priority(IntEnum):
-    """Who may be overruled by whom; it never sinks by itself."""
+    """A higher priority overrules a lower one; it never falls by itself."""
 
     DISABLE = 0
     HIGH_LEVEL = 1
@@ -15,7 +15,7 @@ class Priority(IntEnum):
 
 
 class Commander:
-    """Keeps the latest setpoint of the highest priority yet seen."""
+    """Keeps the latest setpoint of the highest priority so far."""
 
     def __init__(self, stop_planner: Callable[[], None]):
         self.setpoint = Setpoint()
@@ -23,7 +23,7 @@ class Commander:
         self._stop_planner = stop_planner
 
     def offer(self, setpoint: Setpoint, priority: Priority, tick: int) -> bool:
-        """Take the setpoint unless a higher priority holds; one from the radio stops the on-board planner."""
+        """Take the setpoint unless a higher priority holds, and return if so; one from the radio stops the planner."""
         if priority < self.priority:
             return False
         setpoint.tick = tick
@@ -33,5 +33,5 @@ class Commander:
         return True
 
     def relax(self) -> None:
-        """What notify_setpoint_stop does: the on-board planner may speak again."""
+        """Let the on-board planner's setpoints count again, as notify_setpoint_stop does."""
         self.priority = Priority.HIGH_LEVEL

@@ -1,4 +1,4 @@
-"""What can go wrong with a vehicle in the air, each for a time and by a size."""
+"""Faults of a vehicle in the air, each for a time and by a size."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ from cfplan.simulation.timed_fault import TimedFault
 
 
 class VehicleFaultKind(StrEnum):
-    """What goes wrong."""
+    """Kinds of faults."""
 
     MOTOR = "motor"  # the first motor gives `size` of its thrust
-    MASS = "mass"  # the vehicle weighs `size` times what it did
+    MASS = "mass"  # the vehicle's mass is `size` times its own
     GUST = "gust"  # air moves with `size` m/s along y
-    BATTERY = "battery"  # the voltage falls to `size` V as it is loaded now, and by as much afterwards
+    BATTERY = "battery"  # the voltage under the present load falls to `size` V, and stays that much lower
     TUMBLE = "tumble"  # both left motors stop
     LOCK = "lock"  # the supervisor locks, for good
 

@@ -51,7 +51,7 @@ class PlannerState(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """Where the planner wants the vehicle at one moment. Columns x, y, z, yaw."""
+    """The planner's goal at one moment. Columns x, y, z, yaw."""
 
     position: NDArray  # (4,)
     velocity: NDArray  # (4,)
@@ -76,7 +76,7 @@ class _Piece:
         return _Piece(self.duration * factor, self.coefficients / factor ** _ORDERS[:, None])
 
     def reversed(self) -> "_Piece":
-        """The same curve backwards, again from time zero on."""
+        """Return the same curve backwards, again from time zero on."""
         shift = np.array([[math.comb(j, i) * self.duration ** max(j - i, 0) for j in range(8)] for i in range(8)])
         return _Piece(self.duration, (shift @ self.coefficients) * (-1.0) ** _ORDERS[:, None])
 
@@ -87,7 +87,7 @@ class _Piece:
 
 
 def septic(duration: float, start: Goal, end: Goal) -> _Piece:
-    """The polynomial between two states in `duration`, without jerk at either end."""
+    """Return the polynomial between two states in `duration`, s, with zero jerk at both ends."""
     scale = duration ** np.arange(3)
     lower = np.zeros((4, 4))
     lower[0], lower[1], lower[2] = start.position, start.velocity * scale[1], start.acceleration * scale[2] / 2
@@ -111,7 +111,7 @@ def _wrapped(angle: float) -> float:
 
 
 class HighLevelCommander:
-    """Carries out commands one at a time; from idle a curve starts `where` the vehicle believes that it is."""
+    """Carries out commands one at a time; from idle a curve starts at the vehicle's own estimate, `where`."""
 
     def __init__(self, memory: bytearray, where: Callable[[], Goal]):
         self.state = PlannerState.IDLE
@@ -124,20 +124,20 @@ class HighLevelCommander:
         self._definitions: dict[int, tuple[int, int]] = {}
 
     def stop(self) -> None:
-        """Go idle at once."""
+        """Become idle at once."""
         self.state = PlannerState.IDLE
 
     def finished(self, time: float) -> bool:
-        """Whether the last curve has been flown to its end."""
+        """Return whether the last curve has been flown to its end."""
         return time - self._begin >= sum(piece.duration for piece in self._pieces)
 
     def setpoint(self, time: float) -> Setpoint:
-        """What to do now, asked every 10 ms."""
+        """Return the setpoint of a time, s; called every 10 ms."""
         if self.state is PlannerState.LANDING and self.finished(time):
             self.state = PlannerState.IDLE
         if self.state is PlannerState.IDLE:
             return Setpoint()
-        with np.errstate(all="ignore"):  # what a client sends may be no number
+        with np.errstate(all="ignore"):  # a client may send NaN
             goal = self._goal(time)
             body_rate = _body_rate(goal)
         self._last = goal
@@ -158,7 +158,7 @@ class HighLevelCommander:
         return _at_rest(self._pieces[-1].at(self._pieces[-1].duration).position)
 
     def receive(self, payload: bytes, time: float, *, blocked: bool) -> bytes:
-        """Carry out a command; the answer has the return code in its fourth byte."""
+        """Carry out a command; return the answer, with the return code in its fourth byte."""
         with np.errstate(all="ignore"):
             code = self._command(payload[0], payload[1:], time, blocked) if payload else errno.ENOEXEC
         return payload[:3].ljust(3, b"\0") + bytes((code,))
@@ -179,7 +179,7 @@ class HighLevelCommander:
             if blocked:
                 return errno.EBUSY
             return self._move(command, data, time) if self._mine(data[0]) else 0
-        except (error, IndexError):  # a length that no client sends
+        except (error, IndexError):  # a wrong length
             return errno.ENOEXEC
 
     def _mine(self, group: int) -> bool:
@@ -265,7 +265,7 @@ class HighLevelCommander:
 
 
 def _body_rate(goal: Goal) -> NDArray:
-    """(3,) rad/s, of the attitude that the goal's acceleration, jerk and yaw ask for."""
+    """Return the body rate (3,), rad/s, of the attitude for the goal's acceleration, jerk and yaw."""
     force = goal.acceleration[:3] + np.array([0.0, 0.0, GRAVITY])
     size = np.sqrt(force @ force)
     z = force / size

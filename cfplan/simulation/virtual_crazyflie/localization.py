@@ -1,4 +1,4 @@
-"""Poses from outside (CRTP port 6), on their way to the filter."""
+"""External positions and poses (CRTP port 6), collected for the filter."""
 
 from struct import iter_unpack, unpack
 
@@ -25,7 +25,7 @@ class Localization:
         self._waiting: list[tuple[float, ...]] = []
 
     def take(self, position_deviation: float, attitude_deviation: float) -> NDArray:
-        """(n, 9) what came since the last call, for the filter."""
+        """Return the measurements (n, 9) since the last call, for the filter."""
         rows = [(*row, position_deviation, attitude_deviation) for row in self._waiting]
         self._waiting.clear()
         return np.array(rows, dtype=float).reshape(-1, 9)

@@ -18,7 +18,7 @@ _FLOATING = "fe"
 _TYPE_MASK = 0x0F
 _TOC, _SETTINGS, DATA_CHANNEL = range(3)
 _CREATE, _APPEND, _DELETE, _START, _STOP, _RESET, _CREATE_2, _APPEND_2, _START_2 = range(9)
-_NO_VARIABLE = 0xFFFF  # an address in memory instead; there is none to read here
+_NO_VARIABLE = 0xFFFF  # means an address in memory, which is not simulated
 
 MOST_BLOCKS = 16
 MOST_VARIABLES = 128
@@ -28,7 +28,7 @@ Getter = Callable[[], float]
 
 
 def log_toc() -> Toc:
-    """The table of all log variables."""
+    """Return the table of all log variables."""
     variables = [Variable(group, name, *_TYPES[kind]) for group, kind, name in read_catalogue(LOG_VARIABLES)]
     return make_toc(tuple(variables), trailer=bytes((MOST_BLOCKS, MOST_VARIABLES)))
 
@@ -50,7 +50,7 @@ def _nothing() -> float:
 
 
 class LogBlocks:
-    """Blocks as a client makes them. `getters` give the values, by name; a variable without one stays zero."""
+    """The log blocks of a client. `getters` return the values, by name; a variable without one stays zero."""
 
     def __init__(self, getters: Mapping[str, Getter]):
         self.toc = log_toc()
@@ -62,7 +62,7 @@ class LogBlocks:
         self._blocks: dict[int, _Block] = {}
 
     def receive(self, channel: int, payload: bytes, tick: int) -> bytes | None:
-        """The payload that answers, on the same channel; None where the firmware is silent."""
+        """Take a packet; return the answer's payload, on the same channel, None where the firmware is silent."""
         if channel == _TOC:
             return self.toc.answer(payload)
         if channel != _SETTINGS or not payload:
@@ -115,7 +115,7 @@ class LogBlocks:
         return 0
 
     def due(self, tick: int) -> list[bytes]:
-        """The payloads, on DATA_CHANNEL, of the blocks whose time has come."""
+        """Return the payloads, on DATA_CHANNEL, of the blocks that are due."""
         ready = [(number, block) for number, block in self._blocks.items() if self._is_due(block, tick)]
         return [self._sample(number, block, tick) for number, block in ready]
 
@@ -133,7 +133,7 @@ class LogBlocks:
 
 
 def _encode(layout: str, value: float) -> bytes:
-    """A value as the wire has it; what does not fit is infinite, or cut to the type's bits, as in C."""
+    """Return a value as bytes; a value out of range becomes infinite, or is cut to the type's bits, as in C."""
     if layout in _FLOATING:
         try:
             return bytes_of("<" + layout, value)

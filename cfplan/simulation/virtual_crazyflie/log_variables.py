@@ -27,7 +27,7 @@ def _element(array: NDArray, place: int, scale: float = 1.0) -> Getter:
 
 
 def euler(quaternion: NDArray) -> tuple[float, float, float]:
-    """Roll, pitch, yaw in degrees; pitch in the firmware's legacy sign, nose up positive."""
+    """Return roll, pitch, yaw in degrees; pitch in the firmware's legacy sign, nose up positive."""
     roll, pitch = roll_pitch_of(quaternion)
     return float(np.degrees(roll)), float(-np.degrees(pitch)), float(np.degrees(yaw_of(quaternion)))
 
@@ -96,7 +96,7 @@ def _attitude(belief: NDArray) -> dict[str, Getter]:
 
 
 def _accelerations(loop: Loop) -> dict[str, Getter]:
-    """World axes: stateEstimate in g without gravity, stateEstimateZ in mm/s² with it."""
+    """Accelerations in world axes: stateEstimate in g without gravity, stateEstimateZ in mm/s² with it."""
 
     def world(axis: int, scale: float, gravity: float) -> float:
         return float(matrix_of(loop.belief[6:10])[axis] @ loop.acceleration - gravity) * scale

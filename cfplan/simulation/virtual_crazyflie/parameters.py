@@ -21,7 +21,7 @@ _IS_STORED_TYPE = 1
 
 
 def parameter_toc(without: Collection[str] = ()) -> Toc:
-    """The table of all parameters but those that this firmware lacks."""
+    """Return the table of all parameters except those that this firmware lacks."""
     variables = []
     for group, kind, marked in read_catalogue(PARAMETERS):
         code, layout = _TYPES[kind]
@@ -34,9 +34,9 @@ def parameter_toc(without: Collection[str] = ()) -> Toc:
 
 
 class Parameters:
-    """The values, by name. `watch` has a function called with each new value that a client writes.
+    """The values of the parameters, by name; `watch` tells when a client writes one.
 
-    `without` are those that this firmware lacks, `stubborn` those that writing does not change.
+    `without` are parameters that this firmware lacks, `stubborn` those that writing does not change.
     """
 
     def __init__(self, defaults: Mapping[str, float], *, without: Collection[str] = (), stubborn: Collection[str] = ()):
@@ -60,12 +60,12 @@ class Parameters:
         self._values[number] = unpack_from(layout, bytes_of(layout, value if layout == "<f" else int(value)))[0]
 
     def watch(self, name: str, changed: Callable[[float], None]) -> None:
-        """Call `changed` with the new value whenever a client writes it; never where this firmware lacks it."""
+        """Call `changed` with the new value whenever a client writes it; ignored if this firmware lacks it."""
         if name in self._ids:
             self._watchers[self._ids[name]] = changed
 
     def receive(self, channel: int, payload: bytes) -> bytes | None:
-        """The payload that answers, on the same channel; None where the firmware is silent."""
+        """Take a packet; return the answer's payload, on the same channel, None where the firmware is silent."""
         if channel == _TOC:
             return self.toc.answer(payload)
         if channel == _MISC:
@@ -89,7 +89,7 @@ class Parameters:
             return None
         try:
             (value,) = unpack_from(entry.format, payload, 2)
-        except error:  # too short: the firmware takes whatever its buffer holds; here nothing changes
+        except error:  # too short: the firmware takes what its buffer holds; here nothing changes
             return None
         self._set(number, value)
         return payload

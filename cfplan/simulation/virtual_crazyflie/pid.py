@@ -35,7 +35,7 @@ _X, _Y, _Z, _VX, _VY, _VZ, _ROLL, _PITCH, _YAW, _ROLL_RATE, _PITCH_RATE, _YAW_RA
 _KP, _KI, _KD, _INTEGRAL_LIMIT, OUTPUT_LIMIT = range(5)
 _MOST_ROLL, _MOST_PITCH, _THRUST_BASE, _THRUST_MIN, _MOST_YAW_LAG = range(5)
 
-OVERHEAD = 1.1  # of the limits of speed and tilt, inside the loops
+OVERHEAD = 1.1  # factor on the limits of speed and tilt inside the loops
 _THRUST_SCALE = 1000.0
 _POSITION_TICKS = 10
 _SLOW, _FAST = 0.01, 0.002  # s
@@ -43,7 +43,7 @@ _LARGEST = 32767.0
 
 
 def default_gains() -> NDArray:
-    """(12, 5) of crazyflie-firmware 2026.08 for the Crazyflie 2.x."""
+    """Return the gains (12, 5) of crazyflie-firmware 2026.08 for the Crazyflie 2.x."""
     gains = np.zeros((LOOPS, 5))
     gains[:, _INTEGRAL_LIMIT] = 5000.0
     gains[_X, :3] = gains[_Y, :3] = 2.0, 0.0, 0.0
@@ -61,7 +61,7 @@ def default_gains() -> NDArray:
 
 
 def default_limits() -> NDArray:
-    """(5,)"""
+    """Return the limits (5,) of the same."""
     return np.array([20.0, 20.0, 36000.0, 20000.0, 0.0])
 
 
@@ -77,7 +77,7 @@ def step_pid(
     state: NDArray,
     tick: int,
 ) -> None:
-    """One step, every 2 ms: writes `control` and carries `memory` on; the other arrays as in `mellinger`."""
+    """Step the controller by 2 ms: write `control` and update `memory`; the other arrays as in `mellinger`."""
     roll, pitch = roll_pitch_of(state[6:10])
     roll, pitch, yaw = np.degrees(roll), -np.degrees(pitch), np.degrees(yaw_of(state[6:10]))
 
@@ -87,9 +87,9 @@ def step_pid(
         memory[28 + place] = mode[place]
     memory[35] = 1.0
     if changed:
-        _begin_anew(memory, state, roll, pitch, yaw)
+        _reset(memory, state, roll, pitch, yaw)
 
-    _want_yaw(memory, limits, setpoint, mode, yaw)
+    _update_yaw(memory, limits, setpoint, mode, yaw)
     if tick % _POSITION_TICKS == 0:
         _position(memory, gains, limits, setpoint, mode, velocity_in_body, state, yaw)
     if mode[MODE_Z] == DISABLE:
@@ -111,12 +111,12 @@ def step_pid(
     if not control[0] > 0.0:
         for place in range(4):
             control[place] = 0.0
-        _begin_anew(memory, state, roll, pitch, yaw)
+        _reset(memory, state, roll, pitch, yaw)
         memory[26] = yaw
 
 
 @njit
-def _begin_anew(memory: NDArray, state: NDArray, roll: float, pitch: float, yaw: float) -> None:
+def _reset(memory: NDArray, state: NDArray, roll: float, pitch: float, yaw: float) -> None:
     for place in range(2 * LOOPS):
         memory[place] = 0.0
     memory[LOOPS + _X], memory[LOOPS + _Y], memory[LOOPS + _Z] = state[0], state[1], state[2]
@@ -125,7 +125,7 @@ def _begin_anew(memory: NDArray, state: NDArray, roll: float, pitch: float, yaw:
 
 
 @njit
-def _want_yaw(memory: NDArray, limits: NDArray, setpoint: NDArray, mode: NDArray, yaw: float) -> None:
+def _update_yaw(memory: NDArray, limits: NDArray, setpoint: NDArray, mode: NDArray, yaw: float) -> None:
     if mode[MODE_YAW] == VELOCITY_MODE:
         memory[26] = _wrapped(memory[26] + np.degrees(setpoint[15]) * _FAST)
         most = limits[_MOST_YAW_LAG]
@@ -149,7 +149,7 @@ def _position(
     state: NDArray,
     yaw: float,
 ) -> None:
-    """From position over velocity to tilt and thrust, in axes that turn with yaw."""
+    """Control position and velocity: write the wanted tilt and thrust, in axes that turn with yaw."""
     c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
     vx, vy, vz = setpoint[3], setpoint[4], setpoint[5]
     if not velocity_in_body:
@@ -189,5 +189,5 @@ def _pid(memory: NDArray, gains: NDArray, loop: int, wanted: float, measured: fl
 
 @register_jitable
 def _wrapped(angle: float) -> float:
-    """Into ±180 degrees."""
+    """Wrap an angle into ±180 degrees."""
     return angle - 360.0 * np.floor((angle + 180.0) / 360.0)

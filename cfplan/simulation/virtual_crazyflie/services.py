@@ -1,4 +1,4 @@
-"""What a client asks first: who is there (CRTP ports 15 and 13), and the memories (port 4)."""
+"""Services that a client asks for first: link and versions (CRTP ports 15 and 13), and memories (port 4)."""
 
 from struct import unpack_from
 
@@ -21,7 +21,7 @@ _IO_ERROR = 5
 
 
 def answer_link(channel: int, payload: bytes) -> bytes | None:
-    """Link control: echo, name, and the null packet that scans send."""
+    """Answer link control: echo, name, and the null packet that scans send."""
     if channel == _ECHO:
         return payload
     if channel == _SOURCE:
@@ -30,7 +30,7 @@ def answer_link(channel: int, payload: bytes) -> bytes | None:
 
 
 def answer_platform(channel: int, payload: bytes, *, protocol: int, firmware: str) -> bytes | None:
-    """Platform service: versions. Its commands (continuous wave, notifications) are echoed and do nothing."""
+    """Answer the platform service: versions. Its commands (continuous wave, notifications) are only echoed."""
     if channel == _PLATFORM_COMMAND:
         return payload
     if channel != _VERSION or not payload:
@@ -53,7 +53,7 @@ class Memories:
         self._trajectory_id = 1
 
     def receive(self, channel: int, payload: bytes) -> bytes | None:
-        """The payload that answers, on the same channel; None where the firmware is silent."""
+        """Take a packet; return the answer's payload, on the same channel, None where the firmware is silent."""
         if channel == _MEMORY_INFO and payload:
             return self._info(payload)
         if channel == _MEMORY_READ and len(payload) >= 6:

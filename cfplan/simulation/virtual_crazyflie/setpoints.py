@@ -1,4 +1,4 @@
-"""What the stabilizer is asked to do, and how each setpoint packet (CRTP ports 3 and 7) says it."""
+"""Setpoints of the stabilizer, decoded from the packets of CRTP ports 3 and 7."""
 
 from dataclasses import dataclass, field
 from math import radians
@@ -42,7 +42,7 @@ _LAYOUTS = {
 
 
 class FirmwareAssert(Exception):
-    """A packet on which the firmware stops for ever."""
+    """The firmware stops for ever on this packet."""
 
 
 @dataclass(slots=True)
@@ -56,7 +56,10 @@ class Setpoint:
 
 
 def decode_setpoint(payload: bytes) -> Setpoint:
-    """A packet of port 7, channel 0. Raises FirmwareAssert on a wrong length; an unknown type asks for nothing."""
+    """Decode a packet of port 7, channel 0; an unknown type asks for nothing.
+
+    Raises FirmwareAssert on a wrong length.
+    """
     setpoint = Setpoint()
     kind, content = payload[0], payload[1:]
     if kind == FULL_STATE_TYPE:
@@ -144,7 +147,7 @@ class AttitudeSetpoints:
         self._locked = True
 
     def decode(self, payload: bytes, *, first: bool) -> Setpoint | None:
-        """The setpoint, None where the packet is too short. `first` says that no setpoint has yet come at all."""
+        """Decode a packet, None if it is too short. `first` says that no setpoint has come before."""
         if len(payload) < 14:
             return None
         roll, pitch, turn, thrust = unpack("<fffH", payload[:14])

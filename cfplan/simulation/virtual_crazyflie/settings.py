@@ -1,4 +1,4 @@
-"""What a virtual Crazyflie is made of and how it starts."""
+"""Settings of a virtual Crazyflie: its sensors, firmware and state at start."""
 
 from dataclasses import dataclass, field
 
@@ -7,9 +7,9 @@ from cfplan.simulation.virtual_crazyflie.services import FIRMWARE_VERSION, PROTO
 
 @dataclass(frozen=True, slots=True)
 class Sensors:
-    """What is wrong with the inertial sensors.
+    """Errors of the inertial sensors.
 
-    Chosen so that the estimate, left without poses in hover, drifts as the firmware's filter was seen to: 0.8, 1.8,
+    Chosen so that the estimate in hover without poses drifts as the firmware's filter was measured to: 0.8, 1.8,
     5 and 15 cm after 0.05, 0.2, 0.5 and 1 s, on average.
     """
 
@@ -21,7 +21,7 @@ class Sensors:
 
 @dataclass(frozen=True, slots=True)
 class VehicleSettings:
-    """How the vehicle stands there when it is switched on."""
+    """How the vehicle is when it is switched on."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m; its height is that of the floor
     yaw: float = 0.0  # rad
@@ -33,5 +33,5 @@ class VehicleSettings:
     firmware: str = FIRMWARE_VERSION
     seed: int = 1  # of the sensors' noise
     stubborn: tuple[str, ...] = ()  # parameters that writing does not change
-    parameter_delay: float = 0.0  # s that it takes to answer a write
-    busy: bool = False  # it refuses every command to the on-board commander
+    parameter_delay: float = 0.0  # s until it answers a write
+    busy: bool = False  # the vehicle refuses every command to the on-board commander

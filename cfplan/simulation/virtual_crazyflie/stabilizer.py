@@ -1,4 +1,4 @@
-"""The inner loop: sensors and body at 1 kHz, controller at 500 Hz on the estimate, compiled.
+"""The stabilizer, compiled: sensors and body at 1 kHz, controller at 500 Hz on the estimate.
 
 Nothing but the sensors and the recorder sees the true state; the controller flies on what the filter believes.
 """
@@ -40,7 +40,7 @@ OFF_TICKS, OFF_IN_AIR_TICKS, RESETS = range(3)
 
 NO_MELLINGER = np.zeros(0)  # in place of its gains where the PID controller flies
 IN_AIR = 0.05  # m above the floor; a landing ends a little above it
-_NOISE_ROWS = 8191  # ms after which the sensors' noise repeats; a prime, so that it beats with nothing
+_NOISE_ROWS = 8191  # ms after which the sensors' noise repeats; a prime, so that it has no common period with anything
 
 
 class Loop(NamedTuple):
@@ -87,22 +87,22 @@ class Stabilizer:
         self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N
 
     def reset_controller(self) -> None:
-        """Forget the integrals, as when another controller is chosen."""
+        """Clear the integrals, as the choice of another controller does."""
         self.loop.memory[:] = 0.0
         self.loop.pid_memory[:] = 0.0
 
     def limit_speed(self, axis: int, most: float) -> None:
-        """The PID controller's most speed along an axis, m/s."""
+        """Set the PID controller's largest speed along an axis, m/s."""
         self.pid_gains[axis, OUTPUT_LIMIT] = (max(most, 0.5) if axis == 2 else most) * OVERHEAD
 
     def reset_estimator(self) -> None:
-        """Let the filter begin anew, at the place that its parameters name."""
+        """Reset the filter to the place that its parameters name."""
         reset(self.loop.kalman, self.prior)
 
     def run(
         self, tick: int, ticks: int, setpoint: Setpoint, poses: NDArray, *, allowed: bool, level: bool, flying: bool
     ) -> None:
-        """Carry on from `tick` by `ticks` of 1 ms; `poses` (n, 9) as in `estimator`."""
+        """Advance from `tick` by `ticks` of 1 ms; `poses` (n, 9) as in `kalman`."""
         values, mode = setpoint.values, setpoint.mode
         if level:
             values, mode = values.copy(), mode.copy()
@@ -169,14 +169,14 @@ def _run(
 
 @njit
 def _drive(loop: Loop, body: NDArray, allowed: bool, per_command: float, asked: bool) -> None:
-    """Turn the motors, move the body, and note what an accelerometer there feels.
+    """Turn the motors, move the body, and note what its accelerometer measures.
 
-    Motors count as off where nothing asks them to turn, not where the controller wants no thrust for a moment.
+    Motors count as off if nothing asks them to turn, not if the controller wants no thrust for a moment.
     """
     off = True
     command = np.empty(4)
     for motor in range(4):
-        if not (allowed and loop.motors[motor] > 0.0):  # so that not-a-number is off, as its cast to an integer is
+        if not (allowed and loop.motors[motor] > 0.0):  # NaN is off too, as its cast to an integer is
             loop.motors[motor] = 0.0
         off = off and loop.motors[motor] == 0.0
         command[motor] = loop.motors[motor] * per_command

@@ -1,6 +1,6 @@
-"""The supervisor: when the motors may turn, and what happens when setpoints stop, the vehicle tumbles or a hand waves.
+"""The supervisor: when the motors may turn, and what happens when setpoints stop or the vehicle tumbles.
 
-Twelve states, looked at 25 times a second, with the firmware's order of transitions.
+Twelve states, updated 25 times a second, with the firmware's order of transitions.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ _STAYS_ARMED = _MAY_FLY | {State.ARMING}
 PERIOD = 40  # ms
 LEVEL_OUT_AFTER, SHUT_DOWN_AFTER = 500, 2000  # ms without a setpoint
 _FLYING_HYSTERESIS = 2000  # ms without thrust
-_EMERGENCY_KEEP_ALIVE = 1000  # ms between signs of life, once there was one
+_KEEP_ALIVE_WITHIN = 1000  # ms between keep-alive packets, after the first one
 _TILTED, _TILTED_FOR = 0.5, 1000  # g along the body's z axis, ms
 _UPSIDE_DOWN, _UPSIDE_DOWN_FOR = -0.2, 100
 _WEIGHTLESS = 0.1  # g
@@ -42,7 +42,7 @@ _WEIGHTLESS = 0.1  # g
 
 @dataclass(slots=True)
 class Settings:
-    """What parameters of the groups supervisor and stabilizer set."""
+    """Parameters of the groups supervisor and stabilizer."""
 
     tumble_check: bool = True
     preflight_timeout: int = 30000  # ms armed without a flight
@@ -64,7 +64,7 @@ class _Conditions:
 
 
 class Supervisor:
-    """`say` prints a line on the console."""
+    """The firmware's supervisor; `say` prints a line on the console."""
 
     def __init__(self, *, auto_arming: bool, say: Callable[[str], None]):
         self.state = State.NOT_INITIALIZED
@@ -103,7 +103,7 @@ class Supervisor:
         return self.state is State.LOCKED
 
     def request_arming(self, arm: bool) -> bool:
-        """Arm or disarm; disarming in flight cuts the motors. False where arming is not possible now."""
+        """Arm or disarm; disarming in flight cuts the motors. Return False if arming is not possible now."""
         if arm != self.armed:
             if arm and self.state is not State.CHECKS_PASSED:
                 return False
@@ -111,37 +111,37 @@ class Supervisor:
         return True
 
     def request_recovery(self) -> bool:
-        """After a crash, once upright again."""
+        """Recover after a crash; return False if the vehicle is not upright."""
         if self.crashed and self.tumbled:
             return False
         self.crashed = False
         return True
 
     def emergency_stop(self) -> None:
-        """Latched: only a restart helps."""
+        """Stop the motors for good: only a restart helps."""
         self._emergency = True
 
     def keep_alive(self, tick: int) -> None:
-        """A sign of life for the emergency-stop watchdog; from the first on they must not stop."""
+        """Feed the emergency-stop watchdog; after the first call, calls must not stop."""
         self._keep_alive = tick
 
     def lock(self) -> None:
-        """What an assertion in the firmware comes to."""
+        """Lock, as an assertion in the firmware does."""
         self._enter(State.LOCKED, 0)
 
     def update(self, tick: int, setpoint_tick: int, acceleration: NDArray, motors: NDArray) -> None:
-        """One look: `acceleration` (3,) g in body axes as measured, `motors` (4,) the commands as they are."""
-        conditions = self._look(tick, setpoint_tick, acceleration, motors)
+        """Update the state: `acceleration` (3,) g in body axes as measured, `motors` (4,) the commands of now."""
+        conditions = self._conditions(tick, setpoint_tick, acceleration, motors)
         self.tumbled = conditions.tumbled
         state = self._next(conditions)
         if state is not self.state:
             self._enter(state, tick)
 
-    def _look(self, tick: int, setpoint_tick: int, acceleration: NDArray, motors: NDArray) -> _Conditions:
+    def _conditions(self, tick: int, setpoint_tick: int, acceleration: NDArray, motors: NDArray) -> _Conditions:
         if np.any(motors > 0):
             self._thrust_tick = tick
         age = tick - setpoint_tick
-        starved = self._keep_alive is not None and tick >= self._keep_alive + _EMERGENCY_KEEP_ALIVE
+        starved = self._keep_alive is not None and tick >= self._keep_alive + _KEEP_ALIVE_WITHIN
         return _Conditions(
             armed=self.armed,
             flying=self._thrust_tick is not None and tick - self._thrust_tick < _FLYING_HYSTERESIS,
@@ -237,7 +237,7 @@ class Supervisor:
             self.armed = True
 
     def info(self, *, planner_active: bool, planner_finished: bool) -> int:
-        """The bits of supervisor.info."""
+        """Return the bits of supervisor.info."""
         bits = (
             self.state is State.CHECKS_PASSED,
             self.armed,

@@ -1,4 +1,4 @@
-"""Tables of contents: which variables there are, and the packets (version 2) by which a client asks for them."""
+"""Tables of contents of log variables and parameters, and the packets (version 2) by which a client reads them."""
 
 import zlib
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Toc:
     trailer: bytes = b""  # what follows the checksum in the answer about the table
 
     def answer(self, request: bytes) -> bytes | None:
-        """The payload that answers a request on channel 0, None where the firmware is silent."""
+        """Return the payload that answers a request on channel 0, None where the firmware is silent."""
         if request[:1] == bytes((_GET_INFO,)):
             return bytes_of("<BHI", _GET_INFO, len(self.variables), self.checksum) + self.trailer
         if request[:1] == bytes((_GET_ITEM,)) and len(request) >= 3:
@@ -45,12 +45,12 @@ class Toc:
         return None
 
     def index(self) -> dict[str, int]:
-        """Ids by full name."""
+        """Return the ids by full name."""
         return {entry.full_name: number for number, entry in enumerate(self.variables)}
 
 
 def make_toc(variables: tuple[Variable, ...], trailer: bytes = b"") -> Toc:
-    """The table of these variables."""
+    """Return the table of these variables."""
     text = b"".join(bytes((entry.code,)) + _names(entry) for entry in variables)
     return Toc(variables, zlib.crc32(text), trailer)
 
@@ -60,7 +60,7 @@ def _names(entry: Variable) -> bytes:
 
 
 def read_catalogue(text: str) -> list[tuple[str, str, str]]:
-    """(group, type, name with marks) of every entry of a text like those in `catalogue`."""
+    """Return (group, type, name with marks) of every entry of a text like those in `catalogue`."""
     entries = []
     group = ""
     kind = ""

@@ -1,4 +1,4 @@
-"""The virtual Crazyflie: packets go in and come out, time goes on when it is told to. No threads, no clock."""
+"""The virtual Crazyflie: it takes packets, advances by milliseconds when told to, and returns packets."""
 
 import re
 from functools import partial
@@ -39,7 +39,7 @@ from cfplan.simulation.virtual_crazyflie.wire import LARGEST_PAYLOAD, Port, pack
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import yaw_of
 
-COMMANDER_PERIOD = 10  # ticks of 1 ms between looks at planner and log blocks
+COMMANDER_PERIOD = 10  # ticks of 1 ms between runs of planner and log blocks
 
 _SETPOINT_CHANNEL, _META_CHANNEL = 0, 1
 _NOTIFY_SETPOINT_STOP = 0
@@ -49,9 +49,9 @@ _RESPONSE = 0x80
 _LEGACY_ARM, _LEGACY_RECOVER = 1, 2  # platform commands
 _NO_POSES = np.zeros((0, 9))
 
-_SUPERVISOR_SINCE = 12  # protocol: before it there is no such port
+_SUPERVISOR_SINCE = 12  # protocol with which the port came
 _DRAG_SINCE = (2026, 4)  # firmware
-_RESIDUAL_RIGHT_SINCE = (2025, 9, 1)
+_RESIDUAL_CORRECT_SINCE = (2025, 9, 1)
 
 
 class VirtualCrazyflie:
@@ -80,7 +80,7 @@ class VirtualCrazyflie:
         self.setpoint = Setpoint()  # what the controller is given
         self._attitude_setpoints = AttitudeSetpoints()
         self._out: list[bytes] = []
-        # to writes of parameters, with the tick from which on they may leave
+        # to writes of parameters, each with the tick from which it may leave
         self._answers: list[tuple[int, bytes]] = []
         self.log = LogBlocks(
             log_variables(
@@ -93,11 +93,11 @@ class VirtualCrazyflie:
             )
         )
         self._airframe = airframe
-        self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks of their begin and end
+        self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks at which they begin and end
         self._watch_parameters()
 
     def use_kalman(self) -> None:
-        """As a positioning deck asks for at start."""
+        """Choose the Kalman filter, as a positioning deck does at start."""
         self.parameters["stabilizer.estimator"] = KALMAN
 
     def inject(self, fault: VehicleFault) -> None:
@@ -106,7 +106,7 @@ class VirtualCrazyflie:
         self._faults.append((begin, begin + 1000 * fault.duration, fault))
 
     def sent(self) -> list[bytes]:
-        """The packets sent since the last call."""
+        """Return the packets sent since the last call."""
         packets, self._out = self._out, []
         return packets
 
@@ -117,7 +117,7 @@ class VirtualCrazyflie:
             self._send(Port.CONSOLE, 0, line[start : start + LARGEST_PAYLOAD])
 
     def advance(self, ticks: int) -> None:
-        """Let `ticks` milliseconds go by."""
+        """Advance by `ticks` milliseconds."""
         end = self.tick + ticks
         while self.tick < end:
             if self.tick % COMMANDER_PERIOD == 0:
@@ -127,7 +127,7 @@ class VirtualCrazyflie:
             self.tick += step
 
     def receive(self, packet: bytes) -> None:
-        """Take a packet; what answers it is in `sent`."""
+        """Take a packet; its answer comes out of `sent`."""
         if not packet:
             return
         port, channel, payload = packet[0] >> 4, packet[0] & 3, packet[1 : 1 + LARGEST_PAYLOAD]
@@ -161,7 +161,7 @@ class VirtualCrazyflie:
             self._send(Port(port), channel, answer)
 
     def info(self) -> int:
-        """The bits of supervisor.info."""
+        """Return the bits of supervisor.info."""
         return self.supervisor.info(
             planner_active=self.planner.state is not PlannerState.IDLE,
             planner_finished=self.planner.finished(self.tick / 1000),
@@ -171,8 +171,8 @@ class VirtualCrazyflie:
         self._out.append(pack(port, channel, payload))
 
     def _command(self) -> None:
-        """The slower loops: planner and log blocks at 100 Hz, supervisor at 25 Hz."""
-        self._suffer()
+        """Run the slower loops: planner and log blocks at 100 Hz, supervisor at 25 Hz."""
+        self._apply_faults()
         loop = self.stabilizer.loop
         can_fly = self.supervisor.can_fly
         if can_fly:
@@ -190,8 +190,8 @@ class VirtualCrazyflie:
         for payload in self.log.due(self.tick):
             self._send(Port.LOG, DATA_CHANNEL, payload)
 
-    def _suffer(self) -> None:
-        """What the faults of this moment make of the vehicle."""
+    def _apply_faults(self) -> None:
+        """Apply the faults of this moment to the vehicle."""
         if not self._faults:
             return
         loop, mass = self.stabilizer.loop, self._airframe.mass
@@ -218,8 +218,8 @@ class VirtualCrazyflie:
         supervisor = self.supervisor
         self.setpoint = self.commander.setpoint if supervisor.motors_allowed else Setpoint()
         poses = self.localization.take(self.parameters["locSrv.extPosStdDev"], self.parameters["locSrv.extQuatStdDev"])
-        if len(poses) and self._version < _RESIDUAL_RIGHT_SINCE:
-            _take_in_world_axes(poses, self.stabilizer.loop.belief[6:10])
+        if len(poses) and self._version < _RESIDUAL_CORRECT_SINCE:
+            _reproduce_residual_error(poses, self.stabilizer.loop.belief[6:10])
         self.stabilizer.run(
             self.tick,
             ticks,
@@ -344,11 +344,11 @@ class VirtualCrazyflie:
             self.parameters["kalman.resetEstimation"] = 0
 
 
-def _take_in_world_axes(poses: NDArray, belief: NDArray) -> None:
-    """Change measured quaternions so that their residual, in body axes, is what it should be in world axes.
+def _reproduce_residual_error(poses: NDArray, belief: NDArray) -> None:
+    """Change measured quaternions so that their residual in body axes is the correct one in world axes.
 
-    So the filter erred before 2025.09.1 (crazyflie-firmware #1292): with yaw beyond 90° it corrects roll and pitch the
-    wrong way.
+    This was the filter's error before 2025.09.1 (crazyflie-firmware #1292): with yaw beyond 90° it corrected roll and
+    pitch the wrong way.
     """
     believed = Rotation.from_quat(belief)
     for row in poses:

@@ -1,13 +1,13 @@
-"""CRTP packets as they go over the air: a header of port and channel, then at most 30 bytes."""
+"""CRTP packets on the air: a header of port and channel, then at most 30 bytes."""
 
 from enum import IntEnum
 
 LARGEST_PAYLOAD = 30
-NULL_PACKET = b"\xff"  # asks for nothing; whoever is there answers something
+NULL_PACKET = b"\xff"  # asks for nothing; a vehicle answers it
 
 
 class Port(IntEnum):
-    """Who a packet is for."""
+    """The service that a packet is for."""
 
     CONSOLE = 0
     PARAMETERS = 2
@@ -23,5 +23,5 @@ class Port(IntEnum):
 
 
 def pack(port: Port, channel: int, payload: bytes) -> bytes:
-    """The datagram of a packet."""
+    """Return a packet as bytes."""
     return bytes((port << 4 | 0x0C | channel,)) + payload

@@ -1,7 +1,6 @@
-"""The cameras of the virtual Vicon: what they make of where the bodies are, and when it leaves.
+"""The cameras of the virtual Vicon: they turn the bodies' poses into frames, with noise, latency and faults.
 
-Nothing in it waits and nothing has a clock of its own: whoever owns it tells it where the vehicle is at each moment of
-`next_look`.
+Nothing here waits or reads a clock: the owner says where the vehicle is at each `next_look`.
 """
 
 import math
@@ -21,7 +20,7 @@ _LEVEL: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class ViconSettings:
-    """What the virtual Vicon is like."""
+    """Settings of the virtual Vicon."""
 
     subject: str = "cf1"  # the vehicle's name
     segment: str = ""  # of the vehicle's root segment; "" for the subject's own name
@@ -31,7 +30,7 @@ class ViconSettings:
     attitude_noise: float = math.radians(0.2)  # rad, standard deviation about each axis
     latency: float = 0.010  # s from the moment of a pose to its leaving; also what the server says about itself
     y_up: bool = False
-    spare: bool = False  # what has not changed is not sent again
+    spare: bool = False  # do not repeat what has not changed
     port: int = 0  # 0 takes a free one
     first_frame: int = 1000
     faults: tuple[ViconFault, ...] = ()  # from the server's start
@@ -41,14 +40,19 @@ class ViconSettings:
         for name in ("rate", "position_noise", "attitude_noise", "latency"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0) or (name == "rate" and not 1 <= value <= 1000):
-                raise InputError(f"{name} {value} of the virtual Vicon makes no sense", hint="rate 1 to 1000 Hz")
+                raise InputError(
+                    f"{name} {value} of the virtual Vicon is out of range",
+                    hint="rate 1 to 1000 Hz, the others at least 0",
+                )
 
 
 class Cameras:
-    """See the bodies, and hold each picture back until it is due."""
+    """See the bodies, and hold each picture back until it is due.
+
+    `start`, s, is on the clock of every other call.
+    """
 
     def __init__(self, settings: ViconSettings, start: float):
-        # start in s on the clock that every other call is on
         self._settings, self._start = settings, start
         self._chance = np.random.default_rng(settings.seed)
         self._faults = Faults()
@@ -68,9 +72,9 @@ class Cameras:
         self._faults.add(fault, now)
 
     def look(self, time: float, position: Triple, quaternion: Quaternion) -> None:
-        """The vehicle is here; see it."""
+        """See the vehicle where it is at a time, s."""
         settings, faults = self._settings, self._faults
-        # Frames that nobody had time to take are counted, and missing.
+        # Frames that the owner had no time to take are counted, and missing.
         self._looks = max(self._looks, round((time - self._start) * settings.rate)) + 1
         if self._last is not None and faults.acting(FaultKind.REPEAT, time):
             self._queue(time, self._last)
@@ -80,11 +84,11 @@ class Cameras:
         self._queue(time, self._picture(seen, truth))
 
     def cut_off(self, now: float) -> bool:
-        """Whether no connection is possible."""
+        """Return whether no connection is possible now."""
         return self._faults.acting(FaultKind.CLOSE, now) is not None
 
     def due(self, now: float) -> list[Picture]:
-        """The pictures that leave by now."""
+        """Return the pictures that leave by now."""
         found = []
         while self._waiting and self._waiting[0][0] <= now:
             found.append(self._waiting.popleft()[1])

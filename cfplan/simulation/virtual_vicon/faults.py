@@ -1,4 +1,4 @@
-"""What can go wrong with motion capture, each for a time and by a size."""
+"""Faults of motion capture, each for a time and by a size, and their effect on what the cameras see."""
 
 import math
 from collections.abc import Mapping
@@ -13,23 +13,23 @@ Seen = tuple[Triple, Quaternion]  # position m, body→world x y z w
 
 
 class FaultKind(StrEnum):
-    """What goes wrong."""
+    """Kinds of faults."""
 
     OCCLUDE = "occlude"  # the body is not seen
-    STALL = "stall"  # no packet comes; frames go on being counted
+    STALL = "stall"  # no packet comes; frames are still counted
     FREEZE = "freeze"  # new frames with the old pose
     REPEAT = "repeat"  # the same frame again and again
     JUMP = "jump"  # the pose is off by `size` m along x
     FLIP = "flip"  # the body is turned by `size` rad about its own z
     BREAK = "break"  # the pose is not a number
-    SWAP = "swap"  # two bodies bear each other's names
+    SWAP = "swap"  # two bodies have each other's names
     DELAY = "delay"  # packets come `size` s later
     CLOSE = "close"  # connections are reset and new ones refused
 
 
 @dataclass(frozen=True, slots=True)
 class ViconFault(TimedFault):
-    """One fault of motion capture; one that is there from the start counts from the server's."""
+    """One fault of motion capture; one of the settings starts with the server."""
 
     kind: FaultKind
     subject: str | None = None  # None: every body
@@ -37,25 +37,25 @@ class ViconFault(TimedFault):
 
 
 class Faults:
-    """The faults of one server, and what they make of what the cameras see."""
+    """The faults of one server, applied to what the cameras see."""
 
     def __init__(self) -> None:
         self._all: list[tuple[float, float, ViconFault]] = []
         self._held: dict[str, Seen] = {}
 
     def add(self, fault: ViconFault, now: float) -> None:
-        """A fault whose start counts from now."""
+        """Add a fault; its start counts from now."""
         self._all.append((now + fault.start, now + fault.start + fault.duration, fault))
 
     def acting(self, kind: FaultKind, time: float, subject: str | None = None) -> ViconFault | None:
-        """A fault of this kind that acts on this body at this time."""
+        """Return a fault of this kind that acts on this body at this time; None if there is none."""
         for start, end, fault in self._all:
             if fault.kind is kind and start <= time < end and fault.subject in (None, subject):
                 return fault
         return None
 
     def seen(self, time: float, truth: Mapping[str, Seen]) -> dict[str, Seen]:
-        """What the cameras make of where the bodies are; without those that they do not see."""
+        """Return the bodies as the cameras see them, from where they are; hidden ones are left out."""
         names = list(truth)
         if len(names) > 1 and self.acting(FaultKind.SWAP, time):
             truth = dict(truth) | {names[0]: truth[names[1]], names[1]: truth[names[0]]}

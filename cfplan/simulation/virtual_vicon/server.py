@@ -1,4 +1,4 @@
-"""The server's side of Vicon's DataStream: connections, and frames as packets. Nothing here waits."""
+"""The server's side of Vicon's DataStream protocol: connections, and frames as packets. Nothing here waits."""
 
 import math
 import socket
@@ -55,10 +55,9 @@ class Picture:
 
 
 class Connection:
-    """One client."""
+    """One client. With `spare`, what has not changed is not sent again."""
 
     def __init__(self, client: socket.socket, *, spare: bool):
-        # spare: what has not changed is not sent again
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket, self._spare = client, spare
@@ -71,7 +70,7 @@ class Connection:
         self._send(packet((Block.OBJECT_ENUMS, kinds(_OFFERED))))
 
     def read(self) -> None:
-        """Do what the client asks."""
+        """Read the client's requests and obey them."""
         try:
             while data := self._socket.recv(1 << 16):
                 self._received += data
@@ -93,7 +92,7 @@ class Connection:
             self._send(self._encoded(picture))
 
     def close(self, *, reset: bool = False) -> None:
-        """End; with a reset as from a crash where that is wanted."""
+        """Close the connection; with `reset` as a crash would."""
         if reset:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()

@@ -1,7 +1,7 @@
 """A virtual Vicon: cameras, their faults, and a DataStream server that Vicon's own client accepts.
 
-Nothing in it waits and nothing has a clock of its own: whoever owns it tells it where the bodies are at each moment of
-`next_look`, and lets it send with `step` every few milliseconds. `serve` does both from a thread.
+Nothing here waits or reads a clock, except `serve`: the owner says where the vehicle is at each `next_look`, and calls
+`step` every few milliseconds. `serve` does both from a thread.
 """
 
 import socket
@@ -23,17 +23,16 @@ _STEP = 0.001  # s
 
 
 class VirtualVicon(Cameras):
-    """Cameras and server."""
+    """Cameras and server. `start`, s, is on the clock of every other call."""
 
     def __init__(self, settings: ViconSettings, start: float):
-        # start in s on the clock that every other call is on
         super().__init__(settings, start)
         self._connections: list[Connection] = []
         self._listener: socket.socket | None = None
         self.port = self._listen(settings.port)
 
     def step(self, now: float) -> None:
-        """Accept clients, hear them, and send what is due."""
+        """Accept clients, read their requests, and send the pictures that are due."""
         if self.cut_off(now):
             self._stop_listening()
         elif self._listener is None:
@@ -49,10 +48,8 @@ class VirtualVicon(Cameras):
             self._connections.remove(connection)
 
     def close(self) -> None:
-        """End; may be called twice."""
+        """Close all connections; may be called twice."""
         self._stop_listening()
-
-    # The listening socket.
 
     def _listen(self, port: int) -> int:
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -62,7 +59,7 @@ class VirtualVicon(Cameras):
         except OSError as why:
             listener.close()
             raise InputError(
-                f"port {port} cannot be had: {why.strerror}", where="virtual Vicon", hint="port 0 takes a free one"
+                f"port {port} is not available: {why.strerror}", where="virtual Vicon", hint="port 0 takes a free one"
             ) from why
         listener.listen()
         listener.setblocking(False)
@@ -78,7 +75,7 @@ class VirtualVicon(Cameras):
             self._connections.append(Connection(client, spare=self._settings.spare))
 
     def _stop_listening(self) -> None:
-        """No new connections, and the old ones reset."""
+        """Accept no new connections, and reset the old ones."""
         if self._listener is not None:
             self._listener.close()
             self._listener = None
@@ -92,7 +89,7 @@ def serve(
     settings: ViconSettings | None = None,
     pose: Callable[[float], Seen] = lambda _: ((0.0, 0.0, 0.0), _LEVEL),
 ) -> Iterator["Served"]:
-    """A virtual Vicon in a thread; `pose` gives the vehicle's at a time in s since the start."""
+    """Run a virtual Vicon in a thread; `pose` returns the vehicle's pose at a time, s, since the start."""
     served = Served(settings or ViconSettings(), pose)
     thread = threading.Thread(target=served.run, name="virtual vicon", daemon=True)
     thread.start()
@@ -116,11 +113,11 @@ class Served:
 
     @property
     def uri(self) -> str:
-        """Of its vehicle."""
+        """The URI of its vehicle."""
         return self.uri_of(self.settings.subject)
 
     def uri_of(self, subject: str, system: str = "vicon") -> str:
-        """Of any body, through any client."""
+        """Return the URI of any body, through any client."""
         return f"{system}://{_HOST}:{self.vicon.port}/{subject}"
 
     def inject(self, fault: ViconFault) -> None:
@@ -128,7 +125,7 @@ class Served:
         self._injected.append(fault)
 
     def run(self) -> None:
-        """Until ended."""
+        """Run until `ended` is set."""
         vicon = self.vicon
         while not self.ended.wait(_STEP):
             now = time.monotonic()

@@ -51,7 +51,7 @@ def refused(tmp_path, monkeypatch, capsys):
     ("uri", "what"),
     [
         ("radio//0/80", "not the URI of a vehicle"),
-        ("radio://0/80/3M/E7E7E7E7E7", "no rate"),
+        ("radio://0/80/3M/E7E7E7E7E7", "not a rate"),
         ("radio://0/126/2M", "not a channel"),
         ("udp://127.0.0.1", "port"),
         ("sim://nonsense", "no such virtual vehicle"),

@@ -240,7 +240,7 @@ def test_settings_that_make_no_sense_are_refused(settings):
 
 
 def test_a_port_that_is_taken_is_an_error():
-    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InputError, match="cannot be had"):
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InputError, match="not available"):
         VirtualVicon(ViconSettings(port=taken.getsockname()[1]), 0.0)
 
 
