@@ -2,7 +2,7 @@
 
 Studies: bench, feasibility, scaling, learned, long_paths; flights, lateness, faults, random_faults. They stand on
 result, provenance, machine and docs_tables (what a study returns, and where it goes), trials (one planner on one path),
-missions, real_time and sleeper (flights in the virtual lab), fault_scenarios (the faults).
+real_time and sleeper (flights in the virtual lab), fault_scenarios (the faults).
 """
 
 __all__ = [
