@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -201,6 +202,21 @@ def random_faults(path_files: tuple[Path, ...], count: int, first_seed: int, **g
         return random_flights(missions, seeds=range(first_seed, first_seed + count), **rest)
 
     _measure(run, "flying", given)
+
+
+@study.command(epilog="Example: cfplan study link-loss flights/line.yaml flights/helix.yaml -o results/link-loss.json")
+@_paths
+@click.option(
+    "--speed", "speeds", type=click.FloatRange(0, 1, min_open=True), multiple=True,
+    help="Factor on the speed that the limits allow; may be given several times.  [default: 1, 0.6, 0.3]",
+)  # fmt: skip
+@_output
+@options.as_json
+def link_loss(path_files: tuple[Path, ...], **given: Any) -> None:
+    """Simulate where the vehicle comes down if the pilot or the radio dies at the worst moment along each PATH."""
+    from cfplan.studies.link_losses import link_losses
+
+    _measure(partial(link_losses, path_files, _safety_file), "simulating", given)
 
 
 @study.command(short_help="Write the tables of docs/ from results/.")

@@ -1,0 +1,65 @@
+"""Simulate where the vehicle comes down after link loss: path files at several speeds, with and without watchdog."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+from cfplan.preparation.prepare_flight import encode_flight
+from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.link_loss import simulate_link_loss
+from cfplan.studies.result import Column, StudyResult, Table, collect
+
+SPEEDS = (1.0, 0.6, 0.3)  # factors on the speed that the limits allow
+COLUMNS = (
+    Column("path", "path"),
+    Column("speed_factor", "speed", "", "g", meaning="factor on the speed that the limits allow, as by `--speed`"),
+    Column("moment", "worst moment", "s", ".1f", meaning="to lose the link, from the first setpoint"),
+    Column("distance", "comes down", "m", ".1f", meaning="horizontally from the last setpoint, from the worst moment"),
+    Column("beyond", "beyond the walls", "m", ".1f", meaning="negative inside"),
+    Column("watchdog_distance", "with watchdog: comes down", "m", ".1f"),
+    Column("watchdog_beyond", "with watchdog: beyond the walls", "m", ".1f"),
+)
+
+
+def link_losses(
+    path_files: Sequence[Path],
+    find_safety_file: Callable[[Path], Path],
+    *,
+    speeds: Sequence[float] = SPEEDS,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> StudyResult:
+    """Lose the link at moments all along each path at each speed. An interrupt keeps what is done by then.
+
+    Raises what planning and encoding raise.
+    """
+
+    def measure() -> Iterator[dict[str, Any]]:
+        for done, (file, speed) in enumerate(product(path_files, speeds)):
+            yield _row(file, find_safety_file(file), speed)
+            progress(done + 1, len(path_files) * len(speeds))
+
+    rows, interrupted = collect(measure())
+    table = Table("link-loss", "Link loss at the worst moment", COLUMNS, tuple(rows))
+    settings = {"paths": [file.stem for file in path_files], "speeds": list(speeds)}
+    return StudyResult("link-loss", settings, (table,), interrupted=interrupted)
+
+
+def _row(path_file: Path, safety_file: Path, speed: float) -> dict[str, Any]:
+    limits = load_limits(safety_file)
+    encoded = encode_flight(plan_flight(path_file, limits, FlightOptions(speed_factor=speed)))
+    without, with_watchdog = (
+        simulate_link_loss(encoded.payloads, replace(limits, firmware=replace(limits.firmware, watchdog=watchdog)))
+        for watchdog in (False, True)
+    )
+    return {
+        "path": path_file.stem,
+        "speed_factor": speed,
+        "moment": without.moment,
+        "distance": without.distance,
+        "beyond": without.beyond,
+        "watchdog_distance": with_watchdog.distance,
+        "watchdog_beyond": with_watchdog.beyond,
+    }

@@ -1,0 +1,33 @@
+"""The study of link loss: slower flights and the watchdog both bring the vehicle down nearer."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cfplan.studies.link_losses import link_losses
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def line():
+    path = REPOSITORY / "flights" / "line.yaml"
+    return link_losses([path], lambda _: REPOSITORY / "safety.yaml", speeds=(1.0, 0.3))
+
+
+def test_a_slower_flight_comes_down_nearer(line):
+    fast, slow = line.table("link-loss").rows
+    assert slow["distance"] < 0.2 * fast["distance"]
+    assert slow["beyond"] < 0 < fast["beyond"]
+
+
+def test_with_the_watchdog_it_comes_down_nearer(line):
+    for row in line.table("link-loss").rows:
+        assert row["watchdog_distance"] < row["distance"]
+        assert row["watchdog_beyond"] <= row["beyond"]
+
+
+def test_the_result_survives_json(line):
+    (table,) = json.loads(json.dumps(line.to_json(), allow_nan=False))["tables"]
+    assert [row[:2] for row in table["rows"]] == [["line", 1.0], ["line", 0.3]]
