@@ -69,7 +69,7 @@ def make_dataset(
                 raise InputError(
                     f"cannot write: {error.strerror}",
                     where=str(folder),
-                    hint="make room and give the same command again: what is there is kept",
+                    hint="make room and give the same command again: finished shards are kept",
                 ) from None
             on_rows(len(spec.shard(number)))
     return spec

@@ -1,7 +1,7 @@
 """Plans as Parquet files: samples for any reader, and in the metadata what is needed to certify the plan again.
 
-Path and profile are kept exactly (JSON writes every float so that it is read back the same), so a plan that was loaded
-is the plan that was saved. What a file says of its own certificate is for readers; loading certifies anew.
+Path and profile are kept exactly (JSON writes every float so that it reads back the same), so a loaded plan equals the
+saved one. The certificate in the file is for other readers; loading certifies anew.
 """
 
 import json
@@ -25,7 +25,7 @@ from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import FullState, Trajectory
 
-FORMAT = 2
+FORMAT = 2  # its keys "slowed" and "speed_share" are a Plan's repair_speed_factor and speed_factor
 RATE = 100  # Hz, of the samples
 _KEY = b"cfplan"
 _AXES = ("x", "y", "z", "w")
@@ -79,7 +79,7 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
 
 
 def load_plan(file: FilePath | str) -> Plan:
-    """The plan that was saved, certified anew.
+    """Load a plan and certify it anew.
 
     Raises:
         InputError: not there, truncated, not a plan, of another format, or at odds with itself.
@@ -115,7 +115,7 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
     path = Path(np.array(metadata["path"]["breaks"]), np.array(metadata["path"]["coefficients"]))
     profile = SpeedProfile(**{f.name: np.array(metadata["profile"][f.name], dtype=float) for f in fields(SpeedProfile)})
     trajectory = Trajectory(path, profile, airframe)
-    joints = tuple(map(float, metadata.get("joints", ())))  # older files tell of none
+    joints = tuple(map(float, metadata.get("joints", ())))  # older files have none
     if not all(0.0 < joint < path.end for joint in joints):
         raise ValueError("a joint lies outside the path")
     return Plan(
@@ -140,7 +140,7 @@ def _times(trajectory: Trajectory) -> np.ndarray:
 
 
 def _columns(trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """One column a number, vectors by their components."""
+    """Return the samples as columns, vectors by their components."""
     state = trajectory.at(_times(trajectory))
     columns = {}
     for field in fields(FullState):
@@ -154,7 +154,7 @@ def _columns(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 
 def _check_samples(plan: Plan, table: Any, where: str) -> None:
-    """The samples must be those of the plan, so that a reader of either sees the same flight."""
+    """Check that the samples are those of the plan, so that a reader of either sees the same flight."""
     if table.num_rows != len(_times(plan.trajectory)):
         raise InputError("its samples are not those of its plan", where=where, hint=_HINT)
     columns = _columns(plan.trajectory)

@@ -31,5 +31,5 @@ class Plan:
 
     @property
     def profile(self) -> SpeedProfile:
-        """The profile as flown, slowing included."""
+        """Return the profile as flown, slowing included."""
         return self.trajectory.profile

@@ -150,7 +150,7 @@ def _take(step: Step, task: PlanningTask, nodes: int | None, space: Space) -> tu
 
 
 def ask(planner: str, task: PlanningTask, space: Space) -> Found | str:
-    """Return a planner's profile, repaired; or why nothing came of it."""
+    """Return a planner's profile, repaired; or why there is none."""
     solution = find_planner(planner)(task)
     if solution.profile is None:
         return _failure(planner, task.nodes, solution)

@@ -115,6 +115,6 @@ def _directions() -> tuple[NDArray, NDArray]:
 
 
 def _drag(airframe: Airframe) -> tuple[float, float]:
-    """1/s: drag in the rotor plane over mass, and the size of what drag along the thrust axis differs by."""
+    """Return, 1/s, drag in the rotor plane over mass, and by how much drag along the thrust axis differs."""
     plane, axial = airframe.drag
     return plane / airframe.mass, abs(axial - plane) / airframe.mass

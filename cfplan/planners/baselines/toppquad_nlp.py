@@ -1,4 +1,4 @@
-"""The paper's TOPPQuad as a nonlinear program: 16 variables a node, its equations as they stand.
+"""The paper's TOPPQuad as a nonlinear program: its equations as printed, 16 variables at each node.
 
     h, h', q (4), ω (3), α (3), u (4)           ω and α spatial: per s, not per second
 
@@ -12,7 +12,7 @@ after Mao, Spasojevic, Hsieh and Kumar, "TOPPQuad" (IROS 2024) with the changes 
 Quadrotor Trajectory Optimization", appendix "Dataset Generation". Added here, because the certificate asks for it: the
 airframe's drag (zero drag gives back the equations above), tilt, least specific thrust and angular acceleration.
 
-Rest: at a rest end γ' = γ'' = 0, so the vehicle is level and still there whatever h is, and h is left free but for its
+Rest: at a rest end γ' = γ'' = 0, so the vehicle is level and still there for any h, and h is left free but for its
 least value. Fixing h = 0 there would leave no way out of rest, since ω is per s. Body rates at the ends are free
 as well: a first step of Eq. 23 from ω = 0 could not tilt the vehicle.
 """
