@@ -38,7 +38,7 @@ _ALLOWANCE = 2.0 / 8.0  # of the second difference
 
 @dataclass(frozen=True, slots=True)
 class Margin:
-    """How near the trajectory comes to one limit, at the worst."""
+    """How near the trajectory comes to one limit at its worst moment."""
 
     name: str
     unit: str
@@ -51,13 +51,13 @@ class Margin:
 
     @property
     def passed(self) -> bool:
-        """False for NaN too."""
+        """Return whether the limit holds; False for NaN."""
         return bool(self.share <= 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """Every limit with its margin. Holds for this trajectory and these limits, nothing else."""
+    """Every limit with its margin. It holds for this trajectory and these limits alone."""
 
     margins: tuple[Margin, ...]
     duration: float  # s
@@ -65,16 +65,16 @@ class Certificate:
 
     @property
     def passed(self) -> bool:
-        """Whether no limit is exceeded anywhere."""
+        """Return whether no limit is exceeded anywhere."""
         return all(margin.passed for margin in self.margins)
 
     @property
     def worst(self) -> Margin:
-        """The margin with the largest share; one that is not a number before all others."""
+        """Return the margin with the largest share; one that is not a number before all others."""
         return max(self.margins, key=lambda margin: np.inf if np.isnan(margin.share) else margin.share)
 
     def rows(self) -> list[tuple[str, str, str, str, str, str]]:
-        """For a table: limit, worst value, allowed, share, time, place."""
+        """Return rows of a table: limit, worst value, allowed, share, time, place."""
         return [
             (
                 margin.name,
@@ -88,7 +88,7 @@ class Certificate:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON; what is not finite becomes None."""
+        """Return what JSON takes; numbers that are not finite become None."""
         return {
             "passed": self.passed,
             "duration": self.duration,
@@ -179,7 +179,7 @@ def _stretches(trajectory: Trajectory) -> Stretches:
 def _cut(
     s: NDArray, intervals: NDArray, nodes: NDArray, breaks: NDArray, every: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """What `_stretches` gives, of the timing's pieces, which end at `s`, and its profile's table."""
+    """Return what `_stretches` does, of the timing's pieces, which end at `s`, and its profile's table."""
     edges, count = every.copy(), 1
     for n in range(1, len(every)):
         if every[n] - every[n - 1] > 1e-12 * every[-1]:
@@ -211,7 +211,7 @@ def _search(
     table: NDArray, walls: NDArray, batch: int, body: Body, coefficients: NDArray, origins: NDArray, nodes: NDArray,
     left: NDArray, right: NDArray, interval: NDArray, piece: NDArray, counts: NDArray,
 ) -> tuple[NDArray, NDArray]:  # fmt: skip
-    """Peak of each of the table's quantities, and s there; about `batch` samples at a time."""
+    """Return the peak of each of the table's quantities, and s there; takes about `batch` samples at a time."""
     values, places = np.full(len(table), -np.inf), np.zeros(len(table))
     most = 0
     for n in range(len(counts)):
@@ -266,7 +266,7 @@ def _raise_peaks(values: NDArray, places: NDArray, table: NDArray, rows: NDArray
 
 @njit
 def _peak(row: NDArray, sign: int, lift: NDArray, peak: float) -> tuple[int, float]:
-    """Index of the largest of `sign` times (N,), and that with what may rise above it between samples.
+    """Return the index of the largest of `sign` times (N,), and that with the allowance for what lies between samples.
 
     Where that exceeds `peak`; else -1, and `peak`. NaN is larger than everything.
     """

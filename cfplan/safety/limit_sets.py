@@ -18,8 +18,7 @@ class LimitSet:
     limits: PlanLimits
 
 
-MOTOR_RESERVE = 0.2
-# share of a motor's range that a plan for hardware leaves to feedback at either end
+MOTOR_RESERVE = 0.2  # share of a motor's range that a plan for hardware leaves to feedback at either end
 _FLOWN, _SIMULATED = AIRFRAMES["crazyflie-2.1+"], AIRFRAMES["crazyflie-2.0"]
 
 
@@ -66,5 +65,5 @@ LIMIT_SETS = MappingProxyType(
         ),
     }
 )
+# m, where random waypoints are drawn: the paper's motion capture room and its training box.
 BOXES = MappingProxyType({"4.5x8x2": (4.5, 8.0, 2.0), "10x10x10": (10.0, 10.0, 10.0)})
-# m, where random waypoints are drawn: the paper's motion capture room and its training box

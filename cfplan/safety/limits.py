@@ -1,4 +1,4 @@
-"""What safety.yaml allows: `plan` binds planned motion, `flight` binds measured motion."""
+"""Limits, as safety.yaml gives them: `plan` binds planned motion, `flight` binds measured motion."""
 
 import math
 from dataclasses import dataclass
@@ -9,29 +9,21 @@ from cfplan.vehicle.airframe import Airframe
 
 @dataclass(frozen=True, slots=True)
 class PlanLimits:
-    """What binds planned motion, everywhere on the path. All positive."""
+    """Limits of planned motion, everywhere on the path; all positive. quantities.py says how each is computed."""
 
-    speed: float
-    # m/s, norm
-    acceleration: float
-    # m/s², norm, gravity not counted
-    angular_velocity: float
-    # rad/s, norm of the body rates
-    tilt: float
-    # rad, between the thrust axis and the vertical
-    motor_thrust_min: float
-    # N, each motor
-    motor_thrust_max: float
-    # N, each motor, the reserve for feedback taken off
-    specific_thrust_min: float
-    # m/s², collective thrust over mass
-    angular_acceleration: float = math.inf
-    # rad/s², norm: what lags behind in torque, with motors that take a tenth of a second
+    speed: float  # m/s, norm
+    acceleration: float  # m/s², norm, gravity not counted
+    angular_velocity: float  # rad/s, norm of the body rates
+    tilt: float  # rad, between the thrust axis and the vertical
+    motor_thrust_min: float  # N, each motor
+    motor_thrust_max: float  # N, each motor, the reserve for feedback taken off
+    specific_thrust_min: float  # m/s², collective thrust over mass
+    angular_acceleration: float = math.inf  # rad/s², norm: motors take a tenth of a second to follow
 
 
 @dataclass(frozen=True, slots=True)
 class Ladder:
-    """From which measured value on the pilot brakes to a hover, lands, cuts the motors."""
+    """Measured values above which the pilot brakes to a hover, lands, cuts the motors."""
 
     brake: float
     land: float
@@ -40,86 +32,60 @@ class Ladder:
 
 @dataclass(frozen=True, slots=True)
 class FlightLimits:
-    """What binds measured motion."""
+    """Limits of measured motion."""
 
-    deviation: Ladder
-    # m, from where the setpoint is
-    fence: Ladder
-    # m, beyond the space less its margin; the floor is no fence
-    speed: Ladder
-    # m/s
-    acceleration: Ladder
-    # m/s², gravity not counted
-    angular_velocity: Ladder
-    # rad/s
-    patience: float
-    # s, for which speed, acceleration and angular velocity must last before they count
+    deviation: Ladder  # m, from where the setpoint is
+    fence: Ladder  # m, beyond the space less its margin; the floor is no fence
+    speed: Ladder  # m/s
+    acceleration: Ladder  # m/s², gravity not counted
+    angular_velocity: Ladder  # rad/s
+    patience: float  # s, for which speed, acceleration and angular velocity must last before they count
 
 
 @dataclass(frozen=True, slots=True)
 class BatteryLimits:
-    """A cell must last from take-off to landing."""
+    """Limits of the battery, which must last from take-off to landing."""
 
-    at_rest: float
-    # V, least before take-off
-    under_load: float
-    # V, land below
-    under_load_seconds: float
-    # s, over which the loaded voltage is averaged
-    endurance: float
-    # s in the air
+    at_rest: float  # V, least before take-off
+    under_load: float  # V, land below
+    under_load_seconds: float  # s, over which the loaded voltage is averaged
+    endurance: float  # s in the air
 
 
 @dataclass(frozen=True, slots=True)
 class PoseLimits:
-    """What is asked of motion capture."""
+    """What motion capture must deliver."""
 
-    rate: float
-    # Hz, expected
-    rate_min: float
-    # Hz, least before take-off
-    latency: float
-    # s, from the camera to this computer, by which poses are dated back
-    age_warning: float
-    # s
-    age_brake: float
-    # s
-    age_land: float
-    # s
-    jump: float
-    # m, between a pose and where the last ones led, at most
-    agreement: float
-    # m, between pose and the vehicle's own estimate, at most
-    yaw_agreement: float
-    # rad
+    rate: float  # Hz, expected
+    rate_min: float  # Hz, least before take-off
+    latency: float  # s, from the camera to this computer, by which poses are dated back
+    age_warning: float  # s
+    age_brake: float  # s
+    age_land: float  # s
+    jump: float  # m, between a pose and where the last ones led, at most
+    agreement: float  # m, between pose and the vehicle's own estimate, at most
+    yaw_agreement: float  # rad
 
 
 @dataclass(frozen=True, slots=True)
 class FirmwareSettings:
-    """What the pilot sets on the vehicle and reads back."""
+    """Settings that the pilot writes to the vehicle and reads back."""
 
-    controller: int
-    # stabilizer.controller
-    estimator: int
-    # stabilizer.estimator
-    oldest: tuple[int, ...]
-    # the oldest firmware that may fly
+    controller: int  # stabilizer.controller
+    estimator: int  # stabilizer.estimator
+    oldest: tuple[int, ...]  # the oldest firmware that may fly
     watchdog: bool = False
-    # motors stop 1 s after the pilot's last sign of life, in the air and after landing: then it must be restarted
+    """Whether motors stop 1 s after the pilot's last sign of life, also after landing: then restart the vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroundManoeuvres:
-    """How the pilot takes off, goes to the start, and lands."""
+    """Heights and speeds of take-off, the way to the start, and landing."""
 
-    take_off_height: float
-    # m
-    take_off_speed: float
-    # m/s, mean
-    go_to_speed: float
-    # m/s, mean
-    land_speed: float
-    # m/s, mean
+    take_off_height: float  # m
+    take_off_speed: float  # m/s, mean
+    go_to_speed: float  # m/s, mean
+    land_speed: float  # m/s, mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,5 +101,4 @@ class Limits:
     pose: PoseLimits
     firmware: FirmwareSettings
     ground: GroundManoeuvres
-    lateness: float = 0.005
-    # s, by which this computer may miss its deadlines before take-off, 99th percentile
+    lateness: float = 0.005  # s, by which this computer may miss its deadlines before take-off, 99th percentile

@@ -59,12 +59,12 @@ class Quantity:
 
     @property
     def noun(self) -> str:
-        """The name without its side."""
+        """Return the name without its side."""
         return self.name.split(",")[0]
 
     @property
     def which(self) -> slice:
-        """Its measures."""
+        """Return where its measures are."""
         return slice(self.measure, self.measure + self.count)
 
     def allowed(self, limits: PlanLimits) -> float:

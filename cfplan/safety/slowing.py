@@ -13,8 +13,8 @@ from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
-RESOLUTION = 1e-4  # of the share that is sought
-LEAST_SHARE = 3e-3  # slower than this is no flight
+RESOLUTION = 1e-4  # of the speed factor that is sought
+LEAST_SPEED_FACTOR = 3e-3  # slower than this is no flight
 _AIM = RESOLUTION / 2  # below a limit, so that the search ends from the passing side
 _TRIALS = 60
 
@@ -29,10 +29,10 @@ class Slowed:
 
 
 def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Slowed:
-    """The trajectory itself where it passes, else at the largest share of its speed that does, within RESOLUTION.
+    """Return the trajectory itself where it passes, else at the largest speed factor that does, within RESOLUTION.
 
     Raises:
-        InfeasibleError: no share passes, because hovering or the path itself breaks a limit; says which.
+        InfeasibleError: no speed factor passes, because hovering or the path itself breaks a limit; says which.
     """
     certificate = certify(trajectory, limits, space)
     if certificate.passed:
@@ -40,7 +40,7 @@ def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Spac
     _check_hover(trajectory.airframe, limits)
     _check_place(certificate)
 
-    # False position between hover and what failed, in the square of the share: so rise accelerations.
+    # False position between hover and what failed, in the square of the factor: accelerations grow with it.
     low, low_excess = 0.0, _hover_share(trajectory.airframe, limits) - 1.0
     high, high_excess = 1.0, _excess(certificate)
     best: Slowed | None = None
@@ -61,7 +61,7 @@ def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Spac
                 break
         else:
             high, high_excess = square, _excess(certificate)
-        if high < LEAST_SHARE**2 or (best is not None and high - low <= 2.0 * RESOLUTION * high):
+        if high < LEAST_SPEED_FACTOR**2 or (best is not None and high - low <= 2.0 * RESOLUTION * high):
             break
     if best is None:
         raise InfeasibleError(
@@ -73,7 +73,7 @@ def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Spac
 
 
 def _excess(certificate: Certificate) -> float:
-    """By how much the worst share exceeds 1. Not a number (no thrust, upside down) is infinitely much."""
+    """Return by how much the worst share exceeds 1. Not a number (no thrust, upside down) is infinitely much."""
     share = certificate.worst.share
     return np.inf if np.isnan(share) else share - 1.0
 

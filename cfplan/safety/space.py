@@ -1,4 +1,4 @@
-"""The room to fly in."""
+"""The space to fly in, and the check that a path stays within it."""
 
 from dataclasses import dataclass
 
@@ -16,15 +16,12 @@ _AXES = ("x", "y", "z")
 class Space:
     """A box, and the distance that plans keep from its walls."""
 
-    low: tuple[float, float, float]
-    # m
-    high: tuple[float, float, float]
-    # m
-    margin: float
-    # m, positive
+    low: tuple[float, float, float]  # m
+    high: tuple[float, float, float]  # m
+    margin: float  # m, positive
 
     def beyond(self, positions: ArrayLike) -> NDArray:
-        """(N, 3) m: how far each coordinate lies beyond the box less its margin; negative inside."""
+        """Return (N, 3) m: how far each coordinate lies beyond the box less its margin; negative inside."""
         points = np.asarray(positions, dtype=float)
         return np.maximum(np.array(self.low) + self.margin - points, points - (np.array(self.high) - self.margin))
 

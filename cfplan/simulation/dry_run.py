@@ -36,32 +36,19 @@ _HINT = "plan with lower limits, or check mass, thrust and motor lag of the airf
 class DryRun:
     """What came of it."""
 
-    reason: str
-    # why it failed; empty when it passed
-    deviation: float
-    # m, worst distance from where the trajectory is at that time
-    deviation_time: float
-    # s, when that was
-    deviation_rms: float
-    # m, while it moves
-    path_distance: float
-    # m, worst distance from the path, whenever it is there
-    final_error: float
-    # m, from the end of the path when the simulation ends
-    settle_time: float
-    # s, from the end of the motion until it stays within SETTLED; inf when it never does
-    speed: float
-    # m/s, highest that lasts for the limits' patience
-    acceleration: float
-    # m/s², likewise
-    angular_velocity: float
-    # rad/s, likewise
-    saturation: float
-    # share of the time for which the motor that fares worst is at either end of its range
-    real_time_factor: float
-    # simulated seconds a second
-    loop: ClosedLoop
-    # the whole flight
+    reason: str  # why it failed; empty when it passed
+    deviation: float  # m, worst distance from where the trajectory is at that time
+    deviation_time: float  # s, when that was
+    deviation_rms: float  # m, while it moves
+    path_distance: float  # m, worst distance from the path, whenever it is there
+    final_error: float  # m, from the end of the path when the simulation ends
+    settle_time: float  # s, from the end of the motion until it stays within SETTLED; inf when it never does
+    speed: float  # m/s, highest that lasts for the limits' patience
+    acceleration: float  # m/s², likewise
+    angular_velocity: float  # rad/s, likewise
+    saturation: float  # share of the time for which the motor that fares worst is at either end of its range
+    real_time_factor: float  # simulated seconds a second
+    loop: ClosedLoop  # the whole flight
 
     @property
     def passed(self) -> bool:

@@ -16,29 +16,21 @@ class Airframe:
     """A quadrotor in X configuration."""
 
     name: str
-    mass: float
-    # kg, as flown
-    inertia: tuple[float, float, float]
-    # kg m², diagonal, body axes
-    arm: float
-    # m, distance of a motor from the x and from the y axis
-    thrust_to_torque: float
-    # m, yaw torque per thrust
-    motor_thrust_min: float
-    # N, least thrust of a running motor
-    motor_thrust_max: float
-    # N, most thrust of one motor
-    motor_time_constant: float
-    # s, first-order lag of thrust
-    drag: tuple[float, float]
-    # N s/m, linear rotor drag in the rotor plane and along the thrust axis
+    mass: float  # kg, as flown
+    inertia: tuple[float, float, float]  # kg m², diagonal, body axes
+    arm: float  # m, distance of a motor from the x and from the y axis
+    thrust_to_torque: float  # m, yaw torque per thrust
+    motor_thrust_min: float  # N, least thrust of a running motor
+    motor_thrust_max: float  # N, most thrust of one motor
+    motor_time_constant: float  # s, first-order lag of thrust
+    drag: tuple[float, float]  # N s/m, linear rotor drag in the rotor plane and along the thrust axis
     source: str
     rotor_reaction: float = 0.0
-    # N m s/N, yaw torque per rate of change of thrust: the inertia of a rotor over the slope of its thrust by its speed
+    """N m s/N, yaw torque per rate of change of thrust: a rotor's inertia over the slope of its thrust by its speed."""
 
     @property
     def hover_thrust(self) -> float:
-        """N, what each motor gives in hover."""
+        """Return the thrust of each motor in hover, N."""
         return self.mass * GRAVITY / 4
 
     @property
@@ -48,6 +40,6 @@ class Airframe:
 
     @property
     def mixing(self) -> NDArray:
-        """(4, 4): [collective thrust, torque x, y, z] = mixing @ motor thrusts."""
+        """Return (4, 4): [collective thrust, torque x, y, z] = mixing @ motor thrusts."""
         levers = np.array([self.arm, self.arm, self.thrust_to_torque])
         return np.vstack([np.ones(4), levers[:, None] * MOTOR_TORQUE_SIGNS])

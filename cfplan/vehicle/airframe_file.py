@@ -1,4 +1,4 @@
-"""An airframe of one's own, by a YAML file with the fields and units of Airframe."""
+"""Read an airframe from a YAML file with the fields and units of Airframe."""
 
 from pathlib import Path
 from typing import Annotated
@@ -30,7 +30,7 @@ class _AirframeFile(BaseModel):
 
 
 def read_airframe(file: Path | str) -> Airframe:
-    """The airframe that a file describes.
+    """Read the airframe that a file describes.
 
     Raises:
         InputError: with `file:line:column`, also for one that cannot hover.

@@ -1,4 +1,4 @@
-"""Airframes by name, each number with its source, and one's own by a file.
+"""Known airframes by name, each number with its source; others are read from a file.
 
 Sources:
   RotorPy    `rotorpy.vehicles.crazyflie_params` and `crazyfliebrushless_params` of RotorPy 3.0.0
@@ -81,7 +81,7 @@ AIRFRAMES = MappingProxyType(
 
 
 def load_airframe(name_or_file: str | Path) -> Airframe:
-    """The airframe of that name, or the one that a YAML file describes. Raises InputError."""
+    """Return the airframe of that name, or read the one that a YAML file describes. Raises InputError."""
     text = str(name_or_file)
     if text in AIRFRAMES:
         return AIRFRAMES[text]

@@ -159,7 +159,7 @@ def _place(
     panel: NDArray, first: int, curves: NDArray, nodes: NDArray, places: NDArray, interval: NDArray, begin: int,
     lanes: int,
 ) -> None:  # fmt: skip
-    """Points from `begin` on, whose path is known from its row `first` on."""
+    """Write the points from `begin` on; `curves` holds rows of the path from number `first` on."""
     for row in range(len(curves)):
         for n in range(lanes):
             panel[(_CURVE + first + row) * WIDTH + n] = curves[row, begin + n]
@@ -210,7 +210,7 @@ def _write_curve(panel: NDArray, axis: int, n: int, p: Derivatives) -> None:
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
 def _begun(x: float, c3: float, c4: float, c5: float, c6: float, c7: float) -> Derivatives:
-    """Five steps from nothing, less what would multiply zeros."""
+    """Take the first five steps of Horner's scheme, without products with zero."""
     p1, p0 = c7, x * c7 + c6
     p2, p1, p0 = p1, x * p1 + p0, x * p0 + c5
     p3, p2, p1, p0 = p2, x * p2 + p1, x * p1 + p0, x * p0 + c4
@@ -219,7 +219,7 @@ def _begun(x: float, c3: float, c4: float, c5: float, c6: float, c7: float) -> D
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
 def _flat_at(panel: NDArray, body: Body, node: _Node, n: int) -> tuple[Flat, float]:
-    """The full state, and yaw, from path and profile."""
+    """Return the full state, and yaw, from path and profile."""
     x = panel[_X * WIDTH + n]
     h, yaw = h_within(x, node[0], node[1], node[2], node[3]), yaw_within(x, node[4], node[5], node[6])
     derivatives = _vector(panel, 3, n), _vector(panel, 6, n), _vector(panel, 9, n), _vector(panel, 12, n)
@@ -228,20 +228,20 @@ def _flat_at(panel: NDArray, body: Body, node: _Node, n: int) -> tuple[Flat, flo
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
 def _node(node: NDArray) -> _Node:
-    """The profile where an interval begins, from its row of the profile's table."""
+    """Return the profile where an interval begins, from its row of the profile's table."""
     return node[1], node[2], node[3], node[4], node[5], node[6], node[7]
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
 def _node_at(panel: NDArray, n: int) -> _Node:
-    """The same, of a point's own interval."""
+    """Return the profile where a point's own interval begins."""
     (h, dh, ddh), (dddh, yaw, dyaw) = _vector(panel, _NODE, n), _vector(panel, _NODE + 3, n)
     return h, dh, ddh, dddh, yaw, dyaw, panel[(_NODE + 6) * WIDTH + n]
 
 
 @register_jitable(fastmath=ROUNDING)
 def _flatten(panel: NDArray, body: Body, lanes: int) -> None:
-    """The results from path and profile."""
+    """Write the measures of points in intervals of their own."""
     lanes = min(lanes, WIDTH)
     for n in range(lanes):
         flat, _ = _flat_at(panel, body, _node_at(panel, n), n)
@@ -250,7 +250,7 @@ def _flatten(panel: NDArray, body: Body, lanes: int) -> None:
 
 @register_jitable(fastmath=ROUNDING)
 def _flatten_stretch(panel: NDArray, body: Body, node: _Node, lanes: int) -> None:
-    """The same where all points lie in one interval."""
+    """Write the measures of points that all lie in one interval."""
     lanes = min(lanes, WIDTH)
     for n in range(lanes):
         flat, _ = _flat_at(panel, body, node, n)
@@ -266,7 +266,7 @@ def _write_measures(panel: NDArray, n: int, flat: Flat) -> None:
 
 @register_jitable(fastmath=ROUNDING)
 def _flatten_whole(panel: NDArray, body: Body, lanes: int) -> None:
-    """The full state from path and profile, as STATES has it but for the position."""
+    """Write the full state as STATES has it, but for the position."""
     lanes = min(lanes, WIDTH)
     for n in range(lanes):
         flat, yaw = _flat_at(panel, body, _node_at(panel, n), n)

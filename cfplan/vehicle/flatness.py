@@ -14,9 +14,9 @@ from numba.extending import register_jitable
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import Scalar, Vector
 
+# What a compiler may do to compiled arithmetic: multiply and add at once, divide by way of a reciprocal, drop the
+# sign of a zero. It may not change the order of operations, nor assume that numbers are finite.
 ROUNDING = {"contract", "arcp", "nsz"}
-# what a compiler may do to compiled arithmetic: multiply and add at once, divide by way of a reciprocal, drop the
-# sign of a zero. Nothing about order, infinities or what is not a number.
 
 
 # Compiled into the loop that calls it, so that the loop can work on several points at once.
@@ -24,7 +24,7 @@ _within_the_loop = register_jitable(forceinline=True, fastmath=ROUNDING)
 
 
 class Body(NamedTuple):
-    """What the map needs of an airframe, in a form that compiles; fields as in Airframe."""
+    """The part of an airframe that the map needs, in a form that compiles; fields as in Airframe."""
 
     mass: Scalar
     inertia: Vector
@@ -34,24 +34,18 @@ class Body(NamedTuple):
 
 
 class Flat(NamedTuple):
-    """What the path, the speed profile and yaw determine, component by component."""
+    """The full state that path, speed profile and yaw determine, component by component."""
 
     velocity: Vector
     acceleration: Vector
     jerk: Vector
     snap: Vector
-    specific_thrust: Scalar
-    # m/s², collective thrust over mass
-    thrust_axis: Vector
-    # b₃, unit
-    body_rate: Vector
-    # rad/s, body axes
-    angular_acceleration: Vector
-    # rad/s², body axes
-    torque: Vector
-    # N m
-    motor_thrust: tuple[Scalar, Scalar, Scalar, Scalar]
-    # N
+    specific_thrust: Scalar  # m/s², collective thrust over mass
+    thrust_axis: Vector  # b₃, unit
+    body_rate: Vector  # rad/s, body axes
+    angular_acceleration: Vector  # rad/s², body axes
+    torque: Vector  # N m
+    motor_thrust: tuple[Scalar, Scalar, Scalar, Scalar]  # N
 
 
 @_within_the_loop
@@ -76,7 +70,7 @@ def _dot(a: Vector, b: Vector) -> Scalar:
 
 @_within_the_loop
 def motion(d1: Vector, d2: Vector, h: Scalar, dh: Scalar) -> tuple[Vector, Vector]:
-    """Velocity and acceleration from γ', γ'', h, h'."""
+    """Return velocity and acceleration from γ', γ'', h, h'."""
     return _scaled(h**0.5, d1), _sum2(h, d2, 0.5 * dh, d1)
 
 
@@ -89,7 +83,7 @@ def flat_state(
     cos: Any,
     sin: Any,
 ) -> Flat:
-    """The full state where `derivatives` are γ' to γ'''', `h` is (h, h', h'', h''') and `yaw` is (ψ, ψ', ψ'').
+    """Return the full state where `derivatives` are γ' to γ'''', `h` is (h, h', h'', h''') and `yaw` is (ψ, ψ', ψ'').
 
     `cos` and `sin` are those of the arithmetic in use. h must be positive.
     """
@@ -156,7 +150,7 @@ def flat_state(
 def motor_thrusts(
     airframe: Airframe | Body, collective: Scalar, torque: Vector
 ) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Thrust of motors 1 to 4, N, that gives the collective thrust, N, and the torque, N m."""
+    """Return the thrust of motors 1 to 4, N, that gives the collective thrust, N, and the torque, N m."""
     roll, pitch, yaw = (
         torque[0] / (4.0 * airframe.arm),
         torque[1] / (4.0 * airframe.arm),
@@ -172,7 +166,7 @@ def motor_thrusts(
 
 
 def compiled_body(airframe: Airframe) -> Body:
-    """The airframe for compiled code, which is made for one type of each number."""
+    """Return the airframe for compiled code, which takes floats alone."""
     (jx, jy, jz), (planar, axial) = airframe.inertia, airframe.drag
     return Body(
         float(airframe.mass), (float(jx), float(jy), float(jz)), float(airframe.arm),

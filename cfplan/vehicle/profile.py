@@ -39,7 +39,7 @@ class ProfileSample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SpeedProfile:
-    """On a grid uniform in s: h a cubic and yaw a parabola in each interval, so C² and C¹ over the whole.
+    """A profile on a grid uniform in s: h is a cubic and yaw a parabola in each interval, so C² and C¹ over the whole.
 
     The jumps of h''' and ψ'' at the grid points are jumps of angular acceleration: check both sides.
     """

@@ -1,4 +1,4 @@
-"""When the vehicle is where: t(s) = ∫ ds/√h and its inverse, both within 1e-9.
+"""Timing: t(s) = ∫ ds/√h and its inverse, both within 1e-9.
 
 Each interval of the profile is split until eight-point Gauss-Legendre quadrature agrees with itself on the two halves
 and until a polynomial of degree 7 in time, which matches s and three time derivatives at both ends, gives s(t) back.
@@ -31,30 +31,25 @@ class Timing:
     """The map between s and time in K pieces, each within one interval of the profile."""
 
     profile: SpeedProfile
-    s: NDArray
-    # (K+1,)
-    time: NDArray
-    # (K+1,) s, from 0 to the duration
-    interval: NDArray
-    # (K,) of the profile
-    polynomial: NDArray
-    # (K, 8) s less that of the piece's start, by the share of the piece's duration
-    nodes: NDArray
-    # the profile as its table() has it
+    s: NDArray  # (K+1,)
+    time: NDArray  # (K+1,) s, from 0 to the duration
+    interval: NDArray  # (K,) of the profile
+    polynomial: NDArray  # (K, 8) s less that of the piece's start, by the share of the piece's duration
+    nodes: NDArray  # the profile as its table() has it
 
     def time_at(self, s: ArrayLike) -> NDArray:
-        """s of time at which the vehicle is at s."""
+        """Return the time, s, at which the vehicle is at s."""
         places = np.array(s, dtype=float)
         return _times(self.s, self.time, self.interval, self.nodes, places.ravel()).reshape(places.shape)
 
     def s_at(self, time: ArrayLike) -> NDArray:
-        """Where on the path the vehicle is at each time."""
+        """Return where on the path the vehicle is at each time."""
         times = np.array(time, dtype=float)
         return _places(self.s, self.time, self.polynomial, times.ravel()).reshape(times.shape)
 
 
 def measure(profile: SpeedProfile) -> Timing:
-    """The timing of a profile. Raises NotCertifiedError where h is not positive or not smooth."""
+    """Measure the timing of a profile. Raises NotCertifiedError where h is not positive or not smooth."""
     nodes = check(profile)
     left, duration, interval, polynomial, stuck = _split(nodes)
     if not np.isnan(stuck):
@@ -73,15 +68,16 @@ def measure(profile: SpeedProfile) -> Timing:
 
 
 def duration_of(profile: SpeedProfile) -> float:
-    """s that a profile takes, by one quadrature an interval: within 1e-6 of it where h changes less than tenfold there.
+    """Return the time, s, that a profile takes, by one quadrature an interval.
 
-    Raises NotCertifiedError as measure() does, but for speeds that fall to almost zero.
+    It is within 1e-6 of the duration where h changes less than tenfold in an interval. Raises NotCertifiedError as
+    measure() does, but for speeds that fall to almost zero.
     """
     return float(_duration(check(profile)))
 
 
 def check(profile: SpeedProfile) -> NDArray:
-    """The profile's table. Raises NotCertifiedError unless it is finite, smooth as promised, and h positive."""
+    """Return the profile's table. Raises NotCertifiedError unless it is finite, smooth as promised, and h positive."""
     intervals = len(profile.s) - 1
     for name in SpeedProfile.__slots__:
         values = getattr(profile, name)
@@ -117,8 +113,8 @@ def _node(nodes: NDArray, bad: NDArray) -> str:
 
 @njit(error_model="numpy")
 def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
-    """Whether nothing is wrong; the least h in each interval, (N,); by how much h, h', h'', yaw and yaw' jump at its
-    end, (N, 5), and by how much they may, (5,)."""
+    """Return whether nothing is wrong; the least h in each interval, (N,); jumps at its end, (N, 5), and the largest
+    that are allowed, (5,), of h, h', h'', yaw and yaw'."""
     count = len(nodes) - 1
     least, jumps, allowed = np.empty(count), np.empty((count, 5)), np.zeros(5)
     for k in range(count + 1):
@@ -152,7 +148,7 @@ def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
 
 @njit(error_model="numpy")
 def _split(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
-    """Start, duration, interval and inverse of each piece; and where pieces never get short enough, else NaN."""
+    """Return start, duration, interval and inverse of each piece; and where pieces never get short enough, else NaN."""
     room = 2 * len(nodes) + 100
     starts, durations, polynomials = np.empty(room), np.empty(room), np.empty((room, 8))
     intervals = np.empty(room, dtype=np.int64)
@@ -231,7 +227,7 @@ def _places(edges: NDArray, time: NDArray, polynomial: NDArray, times: NDArray) 
 
 @njit(error_model="numpy")
 def _piece(edges: NDArray, value: float, guess: int) -> int:
-    """The piece in which the value lies, an edge in the one on its right; found fast a little behind the guess."""
+    """Return the piece that holds the value, an edge the one on its right; fast where it is near the guess."""
     last = len(edges) - 2
     if edges[guess] <= value:
         for piece in range(guess, min(guess + 4, last)):
@@ -249,14 +245,14 @@ def _piece(edges: NDArray, value: float, guess: int) -> int:
 
 @njit(error_model="numpy")
 def _h(node: NDArray, s: float) -> float:
-    """h at s in the interval that begins with this row of a profile's table."""
+    """Return h at s in the interval that begins with this row of a profile's table."""
     x = s - node[0]
     return h_within(x, node[1], node[2], node[3], node[4])[0]
 
 
 @njit(error_model="numpy")
 def _quadrature(node: NDArray, left: float, right: float) -> float:
-    """s of time from `left` to `right`, both in the interval."""
+    """Return the time, s, from `left` to `right`, both in the interval."""
     width = right - left
     total = 0.0
     for k in range(len(_NODES)):
@@ -266,7 +262,7 @@ def _quadrature(node: NDArray, left: float, right: float) -> float:
 
 @njit(error_model="numpy")
 def _invert(polynomial: NDArray, node: NDArray, left: float, right: float, duration: float) -> None:
-    """Coefficients of s(t): ds/dt = √h, d²s/dt² = h'/2, d³s/dt³ = √h h''/2."""
+    """Write the coefficients of s(t): ds/dt = √h, d²s/dt² = h'/2, d³s/dt³ = √h h''/2."""
     near, far = _time_derivatives(node, left, duration), _time_derivatives(node, right, duration)
     low1, low2, low3 = near[0], near[1] / 2.0, near[2] / 6.0
     polynomial[0], polynomial[1], polynomial[2], polynomial[3] = 0.0, low1, low2, low3
@@ -284,7 +280,7 @@ def _invert(polynomial: NDArray, node: NDArray, left: float, right: float, durat
 
 @njit(error_model="numpy")
 def _time_derivatives(node: NDArray, s: float, unit: float) -> tuple[float, float, float]:
-    """The first three time derivatives of s, with time in units of `unit`."""
+    """Return the first three time derivatives of s, with time in units of `unit`."""
     h, dh, ddh, _ = h_within(s - node[0], node[1], node[2], node[3], node[4])
     speed = np.sqrt(h)
     return speed * unit, dh / 2.0 * unit**2, speed * ddh / 2.0 * unit**3
@@ -292,7 +288,7 @@ def _time_derivatives(node: NDArray, s: float, unit: float) -> tuple[float, floa
 
 @njit(error_model="numpy")
 def _inverse_error(polynomial: NDArray, node: NDArray, left: float, duration: float) -> float:
-    """The most by which the inverse misses at the probes, the larger of s and of seconds."""
+    """Return the largest error of the inverse at the probes, the larger of s and of seconds."""
     worst = 0.0
     for share in _PROBES:
         place = left + _horner(polynomial, share)

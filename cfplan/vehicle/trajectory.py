@@ -1,4 +1,4 @@
-"""A speed profile along a path as motion in time: the full state at any time."""
+"""Trajectory: a speed profile along a path as motion in time, the full state at any time."""
 
 from dataclasses import dataclass, field
 
@@ -18,38 +18,23 @@ _SAME_S = 1e-9  # ends of path and profile nearer than this are the same
 
 @dataclass(frozen=True, slots=True)
 class FullState:
-    """Everything that the vehicle does at N moments. For a scalar time the leading axis is absent."""
+    """The full state of the vehicle at N times. For a scalar time the leading axis is absent."""
 
-    time: NDArray
-    # (N,) s from the start
-    s: NDArray
-    # (N,) where on the path
-    position: NDArray
-    # (N, 3) m
-    velocity: NDArray
-    # (N, 3) m/s
-    acceleration: NDArray
-    # (N, 3) m/s², without gravity
-    jerk: NDArray
-    # (N, 3) m/s³
-    snap: NDArray
-    # (N, 3) m/s⁴
-    quaternion: NDArray
-    # (N, 4) body→world, x y z w, continuous
-    yaw: NDArray
-    # (N,) rad, of the Hopf fibration, not wrapped
-    body_rate: NDArray
-    # (N, 3) rad/s, body axes
-    angular_acceleration: NDArray
-    # (N, 3) rad/s², body axes
-    torque: NDArray
-    # (N, 3) N m, body axes
-    specific_thrust: NDArray
-    # (N,) m/s², collective thrust over mass
-    thrust_axis: NDArray
-    # (N, 3) body z in the world
-    motor_thrust: NDArray
-    # (N, 4) N, motors 1 to 4
+    time: NDArray  # (N,) s from the start
+    s: NDArray  # (N,) where on the path
+    position: NDArray  # (N, 3) m
+    velocity: NDArray  # (N, 3) m/s
+    acceleration: NDArray  # (N, 3) m/s², without gravity
+    jerk: NDArray  # (N, 3) m/s³
+    snap: NDArray  # (N, 3) m/s⁴
+    quaternion: NDArray  # (N, 4) body→world, x y z w, continuous
+    yaw: NDArray  # (N,) rad, of the Hopf fibration, not wrapped
+    body_rate: NDArray  # (N, 3) rad/s, body axes
+    angular_acceleration: NDArray  # (N, 3) rad/s², body axes
+    torque: NDArray  # (N, 3) N m, body axes
+    specific_thrust: NDArray  # (N,) m/s², collective thrust over mass
+    thrust_axis: NDArray  # (N, 3) body z in the world
+    motor_thrust: NDArray  # (N, 4) N, motors 1 to 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,19 +59,19 @@ class Trajectory:
 
     @property
     def duration(self) -> float:
-        """s"""
+        """Return the duration, s."""
         return float(self.timing.time[-1])
 
     def time_at(self, s: ArrayLike) -> NDArray:
-        """s of time at which the vehicle is at s, (N,); within 1e-9 s. s is held within the path."""
+        """Return the time, s, at which the vehicle is at s, (N,); within 1e-9 s. s is held within the path."""
         return self.timing.time_at(s)
 
     def s_at(self, time: ArrayLike) -> NDArray:
-        """Where on the path the vehicle is at each time, (N,); within 1e-9. Time is held within the flight."""
+        """Return where on the path the vehicle is at each time, (N,); within 1e-9. Time is held within the flight."""
         return self.timing.s_at(time)
 
     def at(self, time: ArrayLike) -> FullState:
-        """The full state at each time, s from the start."""
+        """Return the full state at each time, s from the start."""
         times = np.asarray(time, dtype=float)
         flat = times.reshape(-1)
         s = self.s_at(flat)
@@ -106,7 +91,7 @@ def state_at(
     time: NDArray,
     interval: NDArray | None = None,
 ) -> FullState:
-    """The full state at s, (N,), by the polynomials of `interval` where given (see SpeedProfile.at)."""
+    """Return the full state at s, (N,), by the polynomials of `interval` where given (see SpeedProfile.at)."""
     if interval is None:
         interval = profile.interval(s)
     table = flat_states(airframe, path, profile, s, interval)

@@ -10,8 +10,8 @@ import numpy as np
 from numba.extending import register_jitable
 
 PER_QUARTER = 2.0 / math.pi
+# π/2 in parts, the first two with zeros at their ends, so that a small multiple of them is exact.
 QUARTER = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
-# π/2 in parts, the first two with zeros at their ends, so that a small multiple of them is exact
 SINE = (
     -1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04, 2.75573137070700676789e-06,
     -2.50507602534068634195e-08, 1.58969099521155010221e-10,
@@ -24,13 +24,13 @@ COSINE = (
 
 @register_jitable(forceinline=True)
 def sine(angle: float) -> float:
-    """Of an angle, rad."""
+    """Return it for an angle, rad."""
     return _wave(angle, 0.0)
 
 
 @register_jitable(forceinline=True)
 def cosine(angle: float) -> float:
-    """Of an angle, rad."""
+    """Return it for an angle, rad."""
     return _wave(angle, 1.0)
 
 
