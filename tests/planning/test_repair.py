@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hard_paths import hard_paths
 
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.expert.expert import plan_expert
@@ -18,6 +19,9 @@ from cfplan.studies.trials import random_path
 from cfplan.vehicle.trajectory import Trajectory
 
 HARDWARE = LIMIT_SETS["hardware"]
+SHARP_TURNS = [
+    case for (case,) in (p.values for p in hard_paths("plan")) if "random" in case.shape and case.yaw == "fixed"
+]
 
 
 def test_a_profile_that_passes_stays_as_it_is():
@@ -28,19 +32,18 @@ def test_a_profile_that_passes_stays_as_it_is():
     assert repaired.describe() == ""
 
 
-@pytest.mark.parametrize("name", ["hardware", "simulation"])
-def test_what_exceeds_limits_between_points_after_refining_is_refined_on_not_slowed(name):
-    chosen = LIMIT_SETS[name]
+@pytest.mark.parametrize("limit_set", LIMIT_SETS)
+def test_what_exceeds_limits_between_points_after_refining_is_refined_on_not_slowed(limit_set):
     between = 0
-    for seed in (11, 71, 99, 124):  # with sharp turns
-        path = random_path(seed, "4.5x8x2")
-        profile = plan_learned(PlanningTask(path, chosen.airframe, chosen.limits)).profile
-        first = refine(PlanningTask(path, chosen.airframe, chosen.limits), profile, passes=lambda _: True).profile
-        between += not certify(Trajectory(path, first, chosen.airframe), chosen.limits).passed
-        repaired = repair(PlanningTask(path, chosen.airframe, chosen.limits), profile)
-        assert repaired.speed_factor == 1.0
-        assert certify(repaired.trajectory, chosen.limits).passed
-        assert repaired.trajectory.duration < 1.01 * Trajectory(path, first, chosen.airframe).duration
+    for case in SHARP_TURNS:
+        if case.limit_set == limit_set:
+            profile = plan_learned(case.task).profile
+            first = refine(case.task, profile, passes=lambda _: True).profile
+            between += not certify(Trajectory(case.path, first, case.airframe), case.limits).passed
+            repaired = repair(case.task, profile)
+            assert repaired.speed_factor == 1.0
+            assert certify(repaired.trajectory, case.limits).passed
+            assert repaired.trajectory.duration < 1.01 * Trajectory(case.path, first, case.airframe).duration
     assert between > 0  # else this would test nothing
 
 
