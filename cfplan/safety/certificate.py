@@ -22,7 +22,7 @@ from cfplan.safety.quantities import AT_LEAST, QUANTITIES, Quantity
 from cfplan.safety.space import Space
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.dense import Stretches
+from cfplan.vehicle.dense import Segments
 from cfplan.vehicle.flatness import Body
 from cfplan.vehicle.measures import measures_of
 from cfplan.vehicle.profile import h_within
@@ -110,16 +110,16 @@ class _Bound(NamedTuple):
 
 def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Certificate:
     """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
-    stretches, (bounds, table) = _stretches(trajectory), _bounds(trajectory.airframe, limits, space)
+    segments, (bounds, table) = _segments(trajectory), _bounds(trajectory.airframe, limits, space)
     walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
     arrays = dense.arrays_of(trajectory.airframe, trajectory.path, trajectory.profile)
-    values, places = _search(table, walls, BATCH, *arrays, *stretches)
+    values, places = _search(table, walls, BATCH, *arrays, *segments)
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     peaks = zip(bounds, values.tolist(), when, places.tolist(), where, strict=True)
     return Certificate(
         margins=tuple(_margin(*each) for each in peaks),
         duration=trajectory.duration,
-        samples=int(stretches.counts.sum()),
+        samples=int(segments.counts.sum()),
     )
 
 
@@ -168,18 +168,18 @@ def _margin(bound: _Bound, peak: float, time: float, s: float, position: Sequenc
     )
 
 
-def _stretches(trajectory: Trajectory) -> Stretches:
+def _segments(trajectory: Trajectory) -> Segments:
     """Cut at the grid points, at the breaks of the path, and where the timing was refined because h changes fast."""
     timing, path = trajectory.timing, trajectory.path
     every = np.sort(np.concatenate((timing.s, path.breaks)))
-    return Stretches(*_cut(timing.s, timing.interval, timing.nodes, path.breaks, every))
+    return Segments(*_cut(timing.s, timing.interval, timing.nodes, path.breaks, every))
 
 
 @njit(error_model="numpy")
 def _cut(
     s: NDArray, intervals: NDArray, nodes: NDArray, breaks: NDArray, every: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """Return what `_stretches` does, of the timing's pieces, which end at `s`, and its profile's table."""
+    """Return what `_segments` does, of the timing's pieces, which end at `s`, and its profile's table."""
     edges, count = every.copy(), 1
     for n in range(1, len(every)):
         if every[n] - every[n - 1] > 1e-12 * every[-1]:
@@ -241,12 +241,12 @@ def _search(
 def _raise_peaks(values: NDArray, places: NDArray, table: NDArray, rows: NDArray, s: NDArray, counts: NDArray) -> None:
     """Update the running maxima with this batch. `table`, (Q, 3): first row, how many, and side.
 
-    Stretches have `counts` samples each, at least three, one stretch behind the other.
+    Segments have `counts` samples each, at least three, one segment behind the other.
     """
     total = 0
     for n in range(len(counts)):
         total += counts[n]
-    lift = np.zeros(total)  # infinite at the ends of stretches
+    lift = np.zeros(total)  # infinite at the ends of segments
     at = 0
     for n in range(len(counts)):
         lift[at] = np.inf
@@ -270,7 +270,7 @@ def _peak(row: NDArray, sign: int, lift: NDArray, peak: float) -> tuple[int, flo
 
     Where that exceeds `peak`; else -1, and `peak`. NaN is larger than everything.
     """
-    # Each inner sample answers for both gaps beside it, so all gaps of a stretch are covered.
+    # Each inner sample answers for both gaps beside it, so all gaps of a segment are covered.
     before, here, after, lift = row[:-2], row[1:-1], row[2:], lift[1:-1]
     index, higher = -1, 0  # counted first, which takes several samples at once; a search is seldom needed
     for n in range(len(here)):

@@ -44,7 +44,7 @@ _BLOCK = 8  # coefficients at a time
 _Node = tuple[float, float, float, float, float, float, float]
 
 
-class Stretches(NamedTuple):
+class Segments(NamedTuple):
     """Parts of a flight on which everything is smooth, (K,) each, and how many samples are taken of each."""
 
     left: NDArray  # s
@@ -130,7 +130,7 @@ def _states(out: NDArray, body: Body, curves: NDArray, nodes: NDArray, places: N
 def sample(
     out: NDArray, body: Body, curve: NDArray, origin: float, node: NDArray, left: float, right: float
 ) -> None:  # fmt: skip
-    """Fill in one stretch's samples, (SAMPLED_ROWS, count), of a piece of the path and an interval of the profile."""
+    """Fill in one segment's samples, (SAMPLED_ROWS, count), of a piece of the path and an interval of the profile."""
     panel, s = np.empty(_SIZE), np.empty(WIDTH)
     last, width, last_s = out.shape[1] - 1, right - left, np.nextafter(right, -np.inf)
     profile = _node(node)
@@ -142,7 +142,7 @@ def sample(
         _trace(panel, curve, lanes)
         for n in range(lanes):
             panel[_X * WIDTH + n] = s[n] - node[0]
-        _flatten_stretch(panel, body, profile, lanes)
+        _flatten_segment(panel, body, profile, lanes)
         count = min(WIDTH, last + 1 - done)
         for row in range(MEASURES):
             for n in range(count):
@@ -249,7 +249,7 @@ def _flatten(panel: NDArray, body: Body, lanes: int) -> None:
 
 
 @register_jitable(fastmath=ROUNDING)
-def _flatten_stretch(panel: NDArray, body: Body, node: _Node, lanes: int) -> None:
+def _flatten_segment(panel: NDArray, body: Body, node: _Node, lanes: int) -> None:
     """Write the measures of points that all lie in one interval."""
     lanes = min(lanes, WIDTH)
     for n in range(lanes):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
-from cfplan.safety.certificate import _raise_peaks, _stretches, certify
+from cfplan.safety.certificate import _raise_peaks, _segments, certify
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
@@ -130,15 +130,15 @@ def test_one_value_that_is_not_finite_fails(wrong):
 
 
 def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval(trajectory):
-    stretches = _stretches(trajectory)
+    segments = _segments(trajectory)
     body, coefficients, origins, nodes = dense.arrays_of(AIRFRAME, trajectory.path, trajectory.profile)
-    sampled = [np.empty((dense.SAMPLED_ROWS, count)) for count in stretches.counts]
-    for rows, left, right, interval, piece, _ in zip(sampled, *stretches, strict=True):
+    sampled = [np.empty((dense.SAMPLED_ROWS, count)) for count in segments.counts]
+    for rows, left, right, interval, piece, _ in zip(sampled, *segments, strict=True):
         dense.sample(rows, body, coefficients[piece], origins[piece], nodes[interval], left, right)
     s = np.concatenate(sampled, axis=1)[dense.PLACE]
     assert np.diff(trajectory.time_at(s)).max() <= 1.001e-3
-    assert np.bincount(np.repeat(stretches.interval, stretches.counts)).min() >= 10
-    assert len(stretches.counts) >= len(np.union1d(trajectory.profile.s, trajectory.path.breaks)) - 1
+    assert np.bincount(np.repeat(segments.interval, segments.counts)).min() >= 10
+    assert len(segments.counts) >= len(np.union1d(trajectory.profile.s, trajectory.path.breaks)) - 1
     fast = Trajectory(trajectory.path, trajectory.profile.slowed(50.0), AIRFRAME)
     assert certify(fast, LIMITS).samples >= 10 * (len(trajectory.profile.s) - 1)
 
@@ -153,7 +153,7 @@ def plainly(trajectory, limits):
     """The certificate's rule, sample by sample, on the flatness map in plain numpy: the worst of each quantity."""
     path, profile = trajectory.path, trajectory.profile
     worst = {}
-    for left, right, interval, _, count in zip(*_stretches(trajectory), strict=True):
+    for left, right, interval, _, count in zip(*_segments(trajectory), strict=True):
         s = np.append((left + np.arange(count) / (count - 1) * (right - left))[:-1], np.nextafter(right, 0))
         at = profile.at(s, np.full(count, interval))
         derivatives = tuple(tuple(path(s, order).T) for order in (1, 2, 3, 4))
