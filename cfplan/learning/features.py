@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path, horner_step
 from cfplan.machine_code import njit
+from cfplan.safety.feasibility import spare_thrust, spare_turning
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile import BoundaryState
@@ -45,14 +46,12 @@ class Bounds(NamedTuple):
 
 def bounds(airframe: Airframe, limits: PlanLimits) -> Bounds:
     """Return the bounds of a vehicle within limits."""
-    up = limits.motor_thrust_max - airframe.hover_thrust
-    down = airframe.hover_thrust - limits.motor_thrust_min
-    turning = 2.0 * min(up, down) * airframe.arm / max(airframe.inertia[:2])
+    up, _ = spare_thrust(airframe, limits)
     return Bounds(
         speed=float(limits.speed),
         acceleration=float(min(limits.acceleration, GRAVITY * math.tan(min(limits.tilt, 1.0)), 4 * up / airframe.mass)),
         jerk=float(GRAVITY * limits.angular_velocity),
-        snap=float(GRAVITY * min(limits.angular_acceleration, turning)),
+        snap=float(GRAVITY * min(limits.angular_acceleration, 0.5 * spare_turning(airframe, limits))),
     )
 
 

@@ -1,4 +1,4 @@
-"""Feasibility before any search: limits that exclude hovering, boundary states that violate a limit by themselves."""
+"""Feasibility before any search: whether hovering keeps the limits and what it spares; boundary states beyond them."""
 
 import math
 
@@ -10,6 +10,7 @@ from cfplan.vehicle.flatness import flat_state
 from cfplan.vehicle.measures import measures
 from cfplan.vehicle.profile import BoundaryState
 
+LEAST_SPARE = 1e-3  # N, what motors are taken to spare at least, so that no estimate divides by zero
 BOUNDARY_TOLERANCE = 1e-3  # share by which a boundary state may exceed a limit: what its own planner rounds
 
 
@@ -28,6 +29,17 @@ def describe_hover(quantity: Quantity, airframe: Airframe, limits: PlanLimits) -
         f"hovering takes a {quantity.noun} of {quantity.hover(airframe):.3g} {quantity.unit}, {quantity.limit} asks "
         f"for {side} {quantity.allowed(limits):.3g} {quantity.unit}"
     )
+
+
+def spare_thrust(airframe: Airframe, limits: PlanLimits) -> tuple[float, float]:
+    """Return what each motor may add to its thrust in hover, and what it may take from it, N."""
+    return limits.motor_thrust_max - airframe.hover_thrust, airframe.hover_thrust - limits.motor_thrust_min
+
+
+def spare_turning(airframe: Airframe, limits: PlanLimits) -> float:
+    """Return the angular acceleration about roll or pitch, rad/s², that motors give with what they spare in hover."""
+    spare = max(min(spare_thrust(airframe, limits)), LEAST_SPARE)
+    return 4 * airframe.arm * spare / max(airframe.inertia[:2])
 
 
 def infeasible_limit(airframe: Airframe, limits: PlanLimits) -> str:

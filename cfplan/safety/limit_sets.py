@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from cfplan.safety.limits import PlanLimits
+from cfplan.safety.limits import PlanLimits, within_reserve
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.airframes import AIRFRAMES
 
@@ -22,14 +22,6 @@ MOTOR_RESERVE = 0.2  # share of a motor's range that a plan for hardware leaves 
 _FLOWN, _SIMULATED = AIRFRAMES["crazyflie-2.1+"], AIRFRAMES["crazyflie-2.0"]
 
 
-def _within_reserve(airframe: Airframe, reserve: float) -> dict[str, float]:
-    room = reserve * (airframe.motor_thrust_max - airframe.motor_thrust_min)
-    return {
-        "motor_thrust_min": airframe.motor_thrust_min + room,
-        "motor_thrust_max": airframe.motor_thrust_max - room,
-    }
-
-
 LIMIT_SETS = MappingProxyType(
     {
         # The paper's hardware data (appendix, "Hardware Experiment Dataset"), with what real flight adds: tilt, thrust
@@ -44,7 +36,7 @@ LIMIT_SETS = MappingProxyType(
                 tilt=math.radians(30.0),
                 specific_thrust_min=0.5 * GRAVITY,
                 angular_acceleration=35.0,
-                **_within_reserve(_FLOWN, MOTOR_RESERVE),
+                **within_reserve(_FLOWN, MOTOR_RESERVE),
             ),
         ),
         # The paper's simulation data: 5 m/s, and the motors bind. The paper leaves feedback no reserve; where motors
@@ -60,7 +52,7 @@ LIMIT_SETS = MappingProxyType(
                 tilt=math.radians(60.0),
                 specific_thrust_min=0.5 * GRAVITY,
                 angular_acceleration=40.0,
-                **_within_reserve(_SIMULATED, 0.15),
+                **within_reserve(_SIMULATED, 0.15),
             ),
         ),
     }

@@ -21,6 +21,15 @@ class PlanLimits:
     angular_acceleration: float = math.inf  # rad/s², norm: motors take a tenth of a second to follow
 
 
+def within_reserve(airframe: Airframe, reserve: float) -> dict[str, float]:
+    """Return limits of motor thrust that leave `reserve`, a share of the motors' range, to feedback at both ends."""
+    room = reserve * (airframe.motor_thrust_max - airframe.motor_thrust_min)
+    return {
+        "motor_thrust_min": airframe.motor_thrust_min + room,
+        "motor_thrust_max": airframe.motor_thrust_max - room,
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class Ladder:
     """Measured values above which the pilot brakes to a hover, lands, cuts the motors."""

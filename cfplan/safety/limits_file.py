@@ -20,6 +20,7 @@ from cfplan.safety.limits import (
     Limits,
     PlanLimits,
     PoseLimits,
+    within_reserve,
 )
 from cfplan.safety.quantities import ON_LADDER
 from cfplan.safety.space import Space
@@ -169,16 +170,14 @@ def _vehicle(name: str, folder: Path, places: Places) -> Airframe:
 
 
 def _plan_limits(plan: _Plan, airframe: Airframe) -> PlanLimits:
-    reserve = plan.motor_reserve * (airframe.motor_thrust_max - airframe.motor_thrust_min)
     return PlanLimits(
         speed=plan.speed,
         acceleration=plan.acceleration,
         angular_velocity=plan.angular_velocity,
         tilt=math.radians(plan.tilt_deg),
-        motor_thrust_min=airframe.motor_thrust_min + reserve,
-        motor_thrust_max=airframe.motor_thrust_max - reserve,
         specific_thrust_min=plan.specific_thrust,
         angular_acceleration=plan.angular_acceleration,
+        **within_reserve(airframe, plan.motor_reserve),
     )
 
 

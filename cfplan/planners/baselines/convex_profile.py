@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 from cfplan.planners.baselines.convex_stations import Stations
+from cfplan.safety.feasibility import spare_turning
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile import SpeedProfile
@@ -27,8 +28,7 @@ def smoothing_half_width(airframe: Airframe, limits: PlanLimits) -> float:
     Over w a jump of 2a makes a jerk of 2a/w and a snap of at most 4a/w², and g times the thrust axis's first and second
     derivative are about that: to be met by body rate, and by the torque that motors have to spare in hover.
     """
-    spare = min(limits.motor_thrust_max - airframe.hover_thrust, airframe.hover_thrust - limits.motor_thrust_min)
-    turning = min(4 * airframe.arm * max(spare, 1e-3) / max(airframe.inertia[:2]), limits.angular_acceleration)
+    turning = min(spare_turning(airframe, limits), limits.angular_acceleration)
     most = min(limits.acceleration, 4 * limits.motor_thrust_max / airframe.mass)
     rate, acceleration = GRAVITY * limits.angular_velocity, GRAVITY * turning
     return max(2 * most / rate, (4 * most / acceleration) ** 0.5)

@@ -16,6 +16,7 @@ from cfplan.planners.baselines.selection import select_fastest
 from cfplan.planners.baselines.toppquad_nlp import H_LEAST, ROWS, STEP_ROWS, VARIABLES, ToppquadNlp, build_toppquad
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
+from cfplan.safety.feasibility import spare_turning
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile_spline import profile_through
@@ -150,10 +151,7 @@ def _end_caps(path: Path, grid: NDArray, airframe: Airframe, limits: PlanLimits)
     h² |γ''''| / g: these stay within the body rate and within a share of what motors can give beside hover.
     """
     caps = np.full(len(grid), np.inf)
-    spare = min(limits.motor_thrust_max - airframe.hover_thrust, airframe.hover_thrust - limits.motor_thrust_min)
-    turning = END_SHARE * min(
-        4 * airframe.arm * max(spare, 1e-3) / max(airframe.inertia[:2]), limits.angular_acceleration
-    )
+    turning = END_SHARE * min(spare_turning(airframe, limits), limits.angular_acceleration)
     for ends in (range(END_NODES), range(len(grid) - END_NODES, len(grid))):
         near = np.linspace(grid[max(ends[0] - 1, 0)], grid[min(ends[-1] + 1, len(grid) - 1)], 8 * END_NODES)
         third, fourth = (float(np.linalg.norm(path(near, order), axis=1).max()) for order in (3, 4))
