@@ -2,8 +2,8 @@
 
 A virtual machine whose host is busy stands still for tenths of seconds, and a flight in real time then ends as it
 should: the vehicle brakes, or preflight refuses. Such a test is repeated, if possible in a calmer moment, but only
-where a process that does nothing but sleep was late meanwhile: a fault of our own fails at once on a computer that
-keeps time, and on any in the end. A flight that several tests look at is flown once, and anew for a test that is
+if a process that does nothing but sleep was late meanwhile: a fault of cfplan fails at once on a computer that keeps
+time, and on any in the end. A flight that several tests look at is flown once, and anew for a test that is
 repeated.
 """
 
@@ -31,18 +31,18 @@ Result = TypeVar("Result")
 
 
 class Standstills:
-    """When this computer stood still, by a process that only sleeps."""
+    """Standstills of this computer, as seen by a process that only sleeps."""
 
     def __init__(self) -> None:
         self._sleeper = Sleeper(RATE, first=True).__enter__()
         self.since = 0.0  # by time.monotonic(), when the act began that the present attempt at a test looks at
 
     def seen(self) -> bool:
-        """Whether there was one in what the present attempt looks at."""
+        """Return whether there was one in what the present attempt looks at."""
         return max(self._sleeper.late(begin=self.since), default=0.0) > STANDSTILL
 
     def settle(self) -> None:
-        """Wait until there has been none for a while, but not for ever."""
+        """Wait until there has been none for CALM, but at most for PATIENCE."""
         end = time.monotonic() + PATIENCE
         while (now := time.monotonic()) < end:
             if max(self._sleeper.late(begin=now - CALM), default=0.0) <= STANDSTILL:
@@ -58,7 +58,7 @@ _standstills = pytest.StashKey[Standstills]()
 
 @pytest.hookimpl(trylast=True)  # when what is not selected has gone
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Whatever runs in real time may be repeated."""
+    """Let every test in real time be repeated."""
     in_real_time = [item for item in items if item.get_closest_marker("integration")]
     if in_real_time and not config.option.collectonly:
         watch = config.stash[_standstills] = Standstills()

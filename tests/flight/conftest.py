@@ -6,13 +6,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+from septic_flight import septic_payloads
 
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.pilot import Pilot
 from cfplan.flight.radio.link import GO_TO, LAND, TAKE_OFF
-from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
+from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Estimate, Event, Phase, PhaseEntered, Telemetry, VehicleStatus
 from cfplan.safety.limits import (
@@ -59,21 +60,7 @@ def make_limits() -> Limits:
 
 def make_payloads(distance: float = 2.0, duration: float = 2.0, height: float = 1.0) -> np.ndarray:
     """A straight flight along x, from rest to rest, with its yaw turning by 0.5 rad."""
-    u = np.linspace(0.0, 1.0, round(duration * 100) + 1)
-    along = distance * (35 * u**4 - 84 * u**5 + 70 * u**6 - 20 * u**7)
-    speed = distance * (140 * u**3 - 420 * u**4 + 420 * u**5 - 140 * u**6) / duration
-    slope = distance * (420 * u**2 - 1680 * u**3 + 2100 * u**4 - 840 * u**5) / duration**2
-    yaw = 0.5 * along / distance
-    zero = np.zeros_like(u)
-    return encode(
-        FullStateSetpoints(
-            position=np.stack([along - distance / 2, zero, zero + height], axis=1),
-            velocity=np.stack([speed, zero, zero], axis=1),
-            acceleration=np.stack([slope, zero, zero], axis=1),
-            quaternion=np.stack([zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1),
-            body_rate=np.zeros((len(u), 3)),
-        )
-    )
+    return septic_payloads(distance, duration, height, turn=0.5)
 
 
 @dataclass

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from septic_flight import septic_payloads
 
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.process import fly
-from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, Telemetry
 from cfplan.safety.limits import GroundManoeuvres, Limits
@@ -24,20 +24,7 @@ SAFETY_FILE = Path(__file__).parents[2] / "safety.yaml"
 
 def short_payloads(distance: float = 1.5, duration: float = 2.5, height: float = 0.6) -> np.ndarray:
     """Straight along x from rest to rest with a peak of 1.3 m/s, then half a second of hover."""
-    u = np.linspace(0.0, 1.0, round(duration * 100) + 1)
-    along = distance * (35 * u**4 - 84 * u**5 + 70 * u**6 - 20 * u**7)
-    speed = distance * (140 * u**3 - 420 * u**4 + 420 * u**5 - 140 * u**6) / duration
-    slope = distance * (420 * u**2 - 1680 * u**3 + 2100 * u**4 - 840 * u**5) / duration**2
-    zero = np.zeros_like(u)
-    moving = encode(
-        FullStateSetpoints(
-            position=np.stack([along - distance / 2, zero, zero + height], axis=1),
-            velocity=np.stack([speed, zero, zero], axis=1),
-            acceleration=np.stack([slope, zero, zero], axis=1),
-            quaternion=np.stack([zero, zero, zero, zero + 1.0], axis=1),
-            body_rate=np.zeros((len(u), 3)),
-        )
-    )
+    moving = septic_payloads(distance, duration, height)
     return np.concatenate([moving, np.repeat(moving[-1:], 50, axis=0)])
 
 

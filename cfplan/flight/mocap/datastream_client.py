@@ -32,8 +32,8 @@ _NO_VICON = "is Vicon Tracker running there, and is this computer in its network
 class DataStreamClient:
     """A `Driver` for Vicon's DataStream; `where` names it in errors."""
 
-    def __init__(self, host: str, port: int, where: str):
-        self._host, self._port, self._where = host, port, where
+    def __init__(self, host: str, port: int, where: str, *, frame_timeout: float = FRAME_TIMEOUT):
+        self._host, self._port, self._where, self._frame_timeout = host, port, where, frame_timeout
         self._socket: socket.socket | None = None
         self._buffer = bytearray()
         self._decoder = Decoder()
@@ -42,7 +42,7 @@ class DataStreamClient:
         """Connect and ask for frames. Raises InputError if name or server is wrong, LinkError if nothing answers."""
         self._socket = open_connection(self._host, self._port, self._where, _NO_VICON)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.settimeout(FRAME_TIMEOUT)
+        self._socket.settimeout(self._frame_timeout)
         self._buffer, self._decoder = bytearray(), Decoder()
         try:
             offered = [read_kinds(data) for kind, data in read_blocks(self._packet()) if kind == Block.OBJECT_ENUMS]
@@ -92,7 +92,7 @@ class DataStreamClient:
                 data = self._socket.recv(1 << 16)
             except TimeoutError as why:
                 raise LinkError(
-                    f"connected, but nothing came for {FRAME_TIMEOUT:.0f} s",
+                    f"connected, but nothing came for {self._frame_timeout:g} s",
                     where=self._where,
                     hint="is the system live, and is nothing else listening on this port?",
                 ) from why

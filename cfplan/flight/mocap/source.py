@@ -14,16 +14,16 @@ from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn, par
 from cfplan.flight.telemetry import Quaternion
 from cfplan.safety.limits import PoseLimits
 
-OPEN_WITHIN = 3.5  # s
+OPEN_WITHIN = 3.5  # s to see the first good poses
 _RATE_SLACK = 1.2  # times the expected rate may be forwarded; more only burdens the radio
 _FARTHEST = 30.0  # m from the origin; no lab is larger, but a lab in millimetres is
 _LARGEST_TILT = math.radians(45)  # of a vehicle that stands on the floor
 _ENOUGH = 5  # good poses that prove a body
 
 
-def pose_source(uri: str, limits: PoseLimits) -> "MocapSource":
+def pose_source(uri: str, limits: PoseLimits, *, open_within: float = OPEN_WITHIN) -> "MocapSource":
     """Return a source of the poses of the body that a URI names. Raises InputError if the URI is wrong."""
-    return MocapSource(parse_uri(uri, subject_needed=True), limits)
+    return MocapSource(parse_uri(uri, subject_needed=True), limits, open_within=open_within)
 
 
 class MocapSource:
@@ -33,8 +33,8 @@ class MocapSource:
     then there is silence.
     """
 
-    def __init__(self, uri: MocapUri, limits: PoseLimits):
-        self._uri, self._limits = uri, limits
+    def __init__(self, uri: MocapUri, limits: PoseLimits, *, open_within: float = OPEN_WITHIN):
+        self._uri, self._limits, self._open_within = uri, limits, open_within
         self._feed: Feed | None = None
         self._first: list[Pose] = []
         self._begin()
@@ -68,7 +68,7 @@ class MocapSource:
     def open(self) -> None:
         """Connect, and check that the body is seen upright and in metres. Raises a CfplanError within 5 s otherwise."""
         self._begin()
-        deadline = time.monotonic() + OPEN_WITHIN
+        deadline = time.monotonic() + self._open_within
         self._feed = Feed(self._uri)
         try:
             self._feed.start()
@@ -162,13 +162,13 @@ class MocapSource:
         where = str(self._uri)
         if not total:
             return LinkError(
-                f"no frame within {OPEN_WITHIN:g} s ({self._feed.stage})",
+                f"no frame within {self._open_within:g} s ({self._feed.stage})",
                 where=where,
                 hint="is the system live and streaming, and is this computer in its network?",
             )
         worst, count = counts.most_common(1)[0]
         if self._uri.system == "vrpn" and worst is Verdict.OCCLUDED and count == total:
-            return nothing_by_vrpn(self._uri, OPEN_WITHIN)
+            return nothing_by_vrpn(self._uri, self._open_within)
         hints = {
             Verdict.OCCLUDED: "are its markers in view, and is its name right? `cfplan mocap` lists the bodies",
             Verdict.FROZEN: "is the system paused, or playing nothing?",
@@ -178,7 +178,7 @@ class MocapSource:
             Verdict.FLIPPED: "make the pattern of its markers less symmetric",
         }
         return InputError(
-            f"no good pose of {self._uri.subject!r} within {OPEN_WITHIN:g} s: {count} of {total} {worst}",
+            f"no good pose of {self._uri.subject!r} within {self._open_within:g} s: {count} of {total} {worst}",
             where=where,
             hint=hints.get(worst, "too few frames: is the rate of the cameras right?"),
         )

@@ -149,7 +149,7 @@ def talker():
     listener = socket.create_server(("127.0.0.1", 0))
     clients = []
 
-    def say(data, *, close):
+    def say(data, *, close, **settings):
         def run():
             client, _ = listener.accept()
             clients.append(client)
@@ -158,7 +158,7 @@ def talker():
                 client.close()
 
         threading.Thread(target=run, daemon=True).start()
-        return DataStreamClient("127.0.0.1", listener.getsockname()[1], "vicon://here")
+        return DataStreamClient("127.0.0.1", listener.getsockname()[1], "vicon://here", **settings)
 
     yield say
     for client in clients:
@@ -175,10 +175,9 @@ def test_another_server_is_told_from_vicon(talker):
     assert caught.value.hint
 
 
-def test_a_silent_server_is_given_up(talker, monkeypatch):
-    monkeypatch.setattr("cfplan.flight.mocap.datastream_client.FRAME_TIMEOUT", 0.05)
+def test_a_silent_server_is_given_up(talker):
     with pytest.raises(LinkError, match="nothing came"):
-        talker(b"", close=False).connect()
+        talker(b"", close=False, frame_timeout=0.05).connect()
 
 
 def test_a_stream_that_ends_is_a_lost_link(talker):

@@ -219,10 +219,9 @@ def test_a_segment_named_otherwise_is_told_or_does_not_matter():
     ],
     ids=["millimetres", "y up", "hidden", "broken", "paused", "stalled"],
 )
-def test_poses_that_cannot_be_flown_by_are_an_error_in_time(settings, pose, words, monkeypatch):
-    monkeypatch.setattr("cfplan.flight.mocap.source.OPEN_WITHIN", 1.6)
+def test_poses_that_cannot_be_flown_by_are_an_error_in_time(settings, pose, words):
     with serve(settings, lambda _: pose) as vicon, pytest.raises((InputError, LinkError), match=words) as caught:
-        pose_source(vicon.uri, LIMITS).open()
+        pose_source(vicon.uri, LIMITS, open_within=1.6).open()
     assert caught.value.hint
     assert caught.value.where == vicon.uri
 
