@@ -23,7 +23,6 @@ from cfplan.safety.space import Space
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.dense import Segments
-from cfplan.vehicle.flatness import Body
 from cfplan.vehicle.measures import measures_of
 from cfplan.vehicle.profile import h_within
 from cfplan.vehicle.trajectory import Trajectory
@@ -112,8 +111,8 @@ def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = No
     """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
     segments, (bounds, table) = _segments(trajectory), _bounds(trajectory.airframe, limits, space)
     walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
-    arrays = dense.arrays_of(trajectory.airframe, trajectory.path, trajectory.profile)
-    values, places = _search(table, walls, BATCH, *arrays, *segments)
+    source = dense.sample_source(trajectory.airframe, trajectory.path, trajectory.profile)
+    values, places = _search(table, walls, BATCH, source, segments)
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     peaks = zip(bounds, values.tolist(), when, places.tolist(), where, strict=True)
     return Certificate(
@@ -208,12 +207,11 @@ def _cut(
 
 @njit(error_model="numpy")
 def _search(
-    table: NDArray, walls: NDArray, batch: int, body: Body, coefficients: NDArray, origins: NDArray, nodes: NDArray,
-    left: NDArray, right: NDArray, interval: NDArray, piece: NDArray, counts: NDArray,
-) -> tuple[NDArray, NDArray]:  # fmt: skip
+    table: NDArray, walls: NDArray, batch: int, source: dense.SampleSource, segments: Segments
+) -> tuple[NDArray, NDArray]:
     """Return the peak of each of the table's quantities, and s there; takes about `batch` samples at a time."""
     values, places = np.full(len(table), -np.inf), np.zeros(len(table))
-    most = 0
+    counts, most = segments.counts, 0
     for n in range(len(counts)):
         most = max(most, counts[n])
     rows = np.empty((dense.SAMPLED_ROWS, batch + most))
@@ -221,9 +219,10 @@ def _search(
     while begin < len(counts):
         end, samples = begin, 0
         while end < len(counts) and samples < batch:
+            piece = segments.piece[end]
             dense.sample(
-                rows[:, samples : samples + counts[end]], body, coefficients[piece[end]], origins[piece[end]],
-                nodes[interval[end]], left[end], right[end],
+                rows[:, samples : samples + counts[end]], source.body, source.coefficients[piece],
+                source.origins[piece], source.nodes[segments.interval[end]], segments.left[end], segments.right[end],
             )  # fmt: skip
             samples += counts[end]
             end += 1

@@ -54,6 +54,15 @@ class Segments(NamedTuple):
     counts: NDArray  # samples, evenly spaced, both ends included; at least two
 
 
+class SampleSource(NamedTuple):
+    """The part of a trajectory that sample() reads, in a form that compiles."""
+
+    body: Body
+    coefficients: NDArray  # (M, D, 3) of the path, D a multiple of _BLOCK
+    origins: NDArray  # (M,) of its pieces
+    nodes: NDArray  # the profile as its table() has it
+
+
 def dense_rows(
     airframe: Airframe, derivatives: NDArray, profile: SpeedProfile, places: NDArray, interval: NDArray
 ) -> NDArray:
@@ -86,13 +95,13 @@ def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArra
     return out
 
 
-def arrays_of(airframe: Airframe, path: Path, profile: SpeedProfile) -> tuple[Body, NDArray, NDArray, NDArray]:
-    """Return what sample() takes: the body, the path's coefficients and their origins, the profile's table."""
+def sample_source(airframe: Airframe, path: Path, profile: SpeedProfile) -> SampleSource:
+    """Return what sample() reads of a trajectory."""
     coefficients = path.coefficients
     if missing := -coefficients.shape[1] % _BLOCK:
         coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
         coefficients.setflags(write=False)  # as a path's are: one type for the compiler
-    return compiled_body(airframe), coefficients, path.origins, profile.table()
+    return SampleSource(compiled_body(airframe), coefficients, path.origins, profile.table())
 
 
 @njit(error_model="numpy", fastmath=ROUNDING)

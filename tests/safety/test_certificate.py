@@ -131,7 +131,7 @@ def test_one_value_that_is_not_finite_fails(wrong):
 
 def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval(trajectory):
     segments = _segments(trajectory)
-    body, coefficients, origins, nodes = dense.arrays_of(AIRFRAME, trajectory.path, trajectory.profile)
+    body, coefficients, origins, nodes = dense.sample_source(AIRFRAME, trajectory.path, trajectory.profile)
     sampled = [np.empty((dense.SAMPLED_ROWS, count)) for count in segments.counts]
     for rows, left, right, interval, piece, _ in zip(sampled, *segments, strict=True):
         dense.sample(rows, body, coefficients[piece], origins[piece], nodes[interval], left, right)
