@@ -18,7 +18,7 @@ from cfplan.vehicle.trajectory import Trajectory
 STEP = 0.01  # s, of the grid on which time is first looked for
 NEARBY = 0.2  # s, around what the grid says, where time is looked for closely
 SPEED_SPAN = 0.025  # s, before and after
-_LONGEST_GAP = 0.1  # s between poses, over which a straight line still tells where the vehicle was
+_LONGEST_GAP = 0.1  # s between poses, over which a straight line still approximates where the vehicle was
 _ALIKE = 0.5  # of the plan's own variance: where more is left, log and plan hardly are the same flight
 
 
@@ -120,7 +120,7 @@ def align(subject: LoggedSubject, reference: Reference) -> Alignment:
     It is the time at which the difference of log and plan varies least, so that neither a shift of the
     laboratory's origin nor what was flown before and after matters. A part of the plan that was not seen counts as if
     it had been missed by the plan's own spread. A vehicle that lags behind its setpoints by a constant time is moved
-    by that too: no log by itself can tell the two apart.
+    by that too: a log alone cannot distinguish the two.
 
     Raises InputError where the subject was hardly seen.
     """

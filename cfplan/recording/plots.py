@@ -74,26 +74,15 @@ def plots(record: Record) -> tuple[Plot, ...]:
             (Line("motors", status.time, motors, ("motor 1", "motor 2", "motor 3", "motor 4"), FOUR),),
             (planned.motor_thrust_min, planned.motor_thrust_max),
         ),
-        Plot(
-            "speed",
-            (
-                _flown("flown", estimates.time, _norm(estimates.velocity)),
-                _wanted(setpoints.due, _norm(setpoints.velocity)),
-            ),
-            (bounds.speed,),
-        ),
-        Plot(
-            "body_rate",
-            (_flown("flown", status.time, _norm(status.body_rate)), _wanted(setpoints.due, _norm(setpoints.body_rate))),
-            (bounds.body_rate,),
-        ),
-        Plot(
+        _norms("speed", estimates.time, estimates.velocity, setpoints.due, setpoints.velocity, bounds.speed),
+        _norms("body_rate", status.time, status.body_rate, setpoints.due, setpoints.body_rate, bounds.body_rate),
+        _norms(
             "acceleration",
-            (
-                _flown("flown", estimates.time, _norm(estimates.acceleration)),
-                _wanted(setpoints.due, _norm(setpoints.acceleration)),
-            ),
-            (bounds.acceleration,),
+            estimates.time,
+            estimates.acceleration,
+            setpoints.due,
+            setpoints.acceleration,
+            bounds.acceleration,
         ),
         Plot(
             "battery",
@@ -135,9 +124,7 @@ def _flown(name: str, time: NDArray, values: NDArray, label: str = "flown") -> L
     return Line(name, time, values, (label,), (FLOWN,))
 
 
-def _wanted(time: NDArray, values: NDArray) -> Line:
-    return Line("wanted", time, values, ("reference",), (WANTED,))
-
-
-def _norm(vectors: NDArray) -> NDArray:
-    return np.linalg.norm(vectors, axis=1)
+def _norms(name: str, time: NDArray, flown: NDArray, due: NDArray, wanted: NDArray, limit: float) -> Plot:
+    """Return the plot of a vector's norm, as flown and as planned."""
+    reference = Line("wanted", due, np.linalg.norm(wanted, axis=1), ("reference",), (WANTED,))
+    return Plot(name, (_flown("flown", time, np.linalg.norm(flown, axis=1)), reference), (limit,))

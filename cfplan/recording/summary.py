@@ -204,7 +204,7 @@ def summary_rows(summary: FlightSummary, shares: Mapping[str, float] | None = No
 
 
 def summary_text(record: Record) -> str:
-    """Return a heading, a table of the numbers, and what flew, in Markdown; a dash where the record cannot tell."""
+    """Return a heading, a table of the numbers, and what flew, in Markdown; a dash for what is not known."""
     header = record.header
     begun = datetime.fromtimestamp(header.wall_time_at_zero + record.start, UTC)
     cut = ["**The record ends early: what follows its last whole chunk is lost.**", ""] if record.truncated else []

@@ -54,7 +54,7 @@ COLUMNS = (
 )  # fmt: skip
 _DOWN = 0.05  # m
 _SETTLING = 0.1  # s in which the supervisor notices that it was disarmed
-_AFTERWARDS = 6.0  # s in which what the pilot left behind comes to rest
+_AFTERWARDS = 6.0  # s after the pilot ended, in which the vehicle comes to rest
 _ARMED = (State.ARMING, State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
 _RUNGS = {f"{rung.name.lower()}:": rung for rung in Rung}
 

@@ -57,7 +57,7 @@ class Sleeper:
 
 def _sleep(connection: Connection, rate: float, first: bool) -> None:
     """Run the sleeper's process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for whoever started this
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
     if not (first and use_fifo_scheduling()):
         shorten_time_slice()
     noted: dict[str, list[tuple[float, float]]] = {_LATE: [], _QUEUED: []}

@@ -9,7 +9,7 @@ from cfplan.recording.importers import crazyswarm_csv, ros_bag, tlog, usd_log, v
 from cfplan.recording.importers.mocap_log import MocapLog
 from cfplan.recording.importers.vicon_csv import Rotations
 
-_HEAD = 4096  # bytes by which a file is told
+_HEAD = 4096  # bytes by which a format is recognised
 
 
 @dataclass(frozen=True, slots=True)

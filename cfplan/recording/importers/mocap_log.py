@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InputError
 
-_LISTED = 12  # names that an error tells at most
+_LISTED = 12  # names that an error lists at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)

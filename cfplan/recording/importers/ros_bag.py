@@ -61,7 +61,7 @@ def read(file: Path) -> MocapLog:
                     rows.setdefault(name, []).append(row)
     except InputError:
         raise
-    # its readers let through whatever their parts raise on damaged bytes: struct, sqlite, lz4, zstd, yaml, keys
+    # on damaged bytes the readers raise what their parts raise: struct, sqlite, lz4, zstd, yaml, keys
     except Exception as error:
         raise InputError(
             f"the bag cannot be read ({type(error).__name__}: {_one_line(error)})",

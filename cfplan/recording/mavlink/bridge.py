@@ -139,7 +139,7 @@ class GroundStation:
     def write(self, packet: bytes) -> None:
         """Send a packet; the dialect's encoder calls this."""
         self._keep(packet)
-        with contextlib.suppress(OSError):  # nobody listens there now
+        with contextlib.suppress(OSError):  # no one listens there now
             self._socket.sendto(packet, self._to)
 
     def _run(self) -> None:
@@ -210,8 +210,8 @@ class GroundStation:
         self._reply(acknowledgement, sender)
         if found.message is not None:
             self._reply(messages.autopilot_version(self._mav, self._latest), sender)
-        if found.says:
-            self._texts.append((_WARNING, found.says))
+        if found.text:
+            self._texts.append((_WARNING, found.text))
 
     def _is_for_us(self, message: Any) -> bool:
         return message.target_system in (BROADCAST, SYSTEM) and message.target_component in (BROADCAST, COMPONENT)

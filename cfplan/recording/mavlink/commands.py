@@ -1,7 +1,6 @@
 """Answer a ground station's commands: it may stop a flight; everything else is refused.
 
-MAVLink is not authenticated, so nothing is obeyed that arms or moves the vehicle; a stop only makes things safer,
-whoever sends it.
+MAVLink is not authenticated, so nothing is obeyed that arms or moves the vehicle; a stop only makes things safer.
 """
 
 from dataclasses import dataclass
@@ -34,7 +33,7 @@ class Answer:
 
     result: Result
     order: Order | None = None  # for the pilot
-    says: str = ""  # what is told to all ground stations
+    text: str = ""  # sent to all ground stations as a status text
     message: int | None = None  # that was asked for
 
 
@@ -48,7 +47,7 @@ def answer(command: int, parameters: tuple[float, ...]) -> Answer:
     if command == _ARM and first == 0 and second == FORCE:
         return Answer(Result.ACCEPTED, Order.CUT, "motors off: forced disarm")
     if command in (_TERMINATE, _ARM, *_REFUSED):
-        return Answer(Result.DENIED, says=f"refused: command {command}; ground stations may only stop a flight")
+        return Answer(Result.DENIED, text=f"refused: command {command}; ground stations may only stop a flight")
     if command == _REQUEST_VERSION or (command == _REQUEST_MESSAGE and first == AUTOPILOT_VERSION):
         return Answer(Result.ACCEPTED, message=AUTOPILOT_VERSION)
     return Answer(Result.UNSUPPORTED)

@@ -18,7 +18,7 @@ WIDTH, HEIGHT = 560, 250  # of a chart, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 46, 34  # around what is drawn
 LIGHTEST = 0.55  # of a colour's luminance on white paper; lighter ones are darkened to it
 NARROWEST = 1.0  # m across a chart of places, or millimetres of noise would fill it
-COLUMNS = 400  # pixels, across which points are told apart
+COLUMNS = 400  # pixels across a chart, within which points cannot be distinguished
 _LETTER = 6.2  # width of one, about
 _GRID, _TEXT, _BAND = "#e3e3e3", "#444", "#f3f6fb"
 

@@ -26,7 +26,7 @@ from cfplan.recording.rerun.viewer import open_viewer, save
 COLOURS: tuple[Colour, ...] = (FOUR[0], WANTED, *FOUR[1:], (213, 94, 0), (0, 114, 178))
 ARM = 0.0375  # m, of the vehicle as drawn: a log does not know its size
 DASH = 0.05  # m, of the reference as drawn, and as much between two
-DRAWN_RATE = 100.0  # Hz: more poses than that are not drawn in 3-D, where nobody could tell
+DRAWN_RATE = 100.0  # Hz: more poses than that are not drawn in 3-D, as they could not be distinguished
 _REFERENCE, _TRIAL = f"{WORLD}/reference", f"{WORLD}/trial"
 _AXES = "xyz"
 

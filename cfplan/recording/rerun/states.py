@@ -25,7 +25,7 @@ PHASE_COLOURS = {
     Phase.CLOSED: _GROUND,
 }
 
-# The bits of supervisor.info that tell a reader most, the gravest first (crazyflie-firmware, supervisor.c).
+# The bits of supervisor.info that are shown, the gravest first (crazyflie-firmware, supervisor.c).
 _SUPERVISOR_BITS = (("crashed", 7), ("locked", 6), ("tumbled", 5), ("flying", 4), ("armed", 1), ("can be armed", 0))
 SUPERVISOR_COLOURS = {
     "crashed": (200, 50, 50),

@@ -70,7 +70,7 @@ def test_what_turns_left_from_the_east_heads_north():
 def test_what_stops_a_flight_is_accepted(command, parameters, order):
     found = answer(command, parameters)
     assert (found.result, found.order) == (Result.ACCEPTED, order)
-    assert found.says
+    assert found.text
 
 
 @pytest.mark.parametrize(
