@@ -10,6 +10,8 @@ each process compiles for itself.
 import ctypes
 import gc
 import hashlib
+import importlib
+import inspect
 import os
 import pickle
 import platform
@@ -17,11 +19,11 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import llvmlite
 import llvmlite.binding as llvm
@@ -31,6 +33,8 @@ from numba.core import event
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
+from numba.core.types import Omitted
+from numba.core.typing.typeof import Purpose, typeof
 
 PACKAGE = Path(__file__).parent
 _IMPORT = re.compile(r"^\s*from (cfplan[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
@@ -73,10 +77,14 @@ def _machine() -> bytes:
 @lru_cache(maxsize=512)
 def _source(module: str) -> tuple[str, tuple[str, ...]]:
     """Return a module's hash, and the cfplan modules that it imports; none where the name is no module."""
-    *folders, last = module.split(".")[1:] or ["__init__"]
-    file = getattr(sys.modules.get(module), "__file__", None) or PACKAGE.joinpath(*folders, f"{last}.py")
+    first, *parts = module.split(".")
+    if first == PACKAGE.name:
+        path = PACKAGE.joinpath(*parts)
+        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    else:
+        path = Path(getattr(sys.modules.get(module), "__file__", None) or "none")
     try:
-        text = Path(file).read_bytes()
+        text = path.read_bytes()
     except OSError:
         return "", ()
     imported: list[str] = []
@@ -244,30 +252,41 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Compile a function at its first call for each set of argument types, as numba.njit does, and keep the result."""
     if function is None:
         return lambda each: njit(each, **options)
+    if _calls is not None:
+        return _Noting(function, options)
+    return _compiling(function, options)
+
+
+def _compiling(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     made = numba.njit(no_cfunc_wrapper=True, **options)(function)
     if hasattr(made, "_cache"):  # else numba is switched off
         made._cache = _Kept(function)
     return made
 
 
-def llvm_functions(title: str, module: str, source: Callable[[], str], names: tuple[str, ...]) -> dict[str, Any]:
-    """Return functions of LLVM source, to be called through ctypes; compiled now if they were never.
+def kept_or_made(title: str, module: str, make: Callable[[], bytes]) -> bytes:
+    """Return what was made earlier, or make it now and keep it, unless another process does: then wait for that.
 
-    `source` is asked only then, and depends on nothing but the module and what that imports.
+    What is made depends on nothing but the module and what that imports.
     """
-    name = _name(title, key(module)) + ".o"
-    target = _target_machine()
-    data = _read(name) if kept() else None
+    if not kept():
+        return make()
+    name = _name(title, key(module)) + ".kept"
+    data = _read(name)
     if data is None:
-        if kept():
-            _locks.take(name)
-            data = _read(name)
+        _locks.take(name)
+        data = _read(name)
         if data is None:
-            data = target.emit_object(_optimised(source(), target))
-            if kept():
-                _write(name, data)
-        if kept():
-            _locks.give_back(name)
+            data = make()
+            _write(name, data)
+        _locks.give_back(name)
+    return data
+
+
+def llvm_functions(title: str, module: str, source: Callable[[], str], names: tuple[str, ...]) -> dict[str, Any]:
+    """Return functions of LLVM source, to be called through ctypes; see kept_or_made for the arguments."""
+    target = _target_machine()
+    data = kept_or_made(title, module, lambda: target.emit_object(_optimised(source(), target)))
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target)
     engine.add_object_file(llvm.ObjectFileRef.from_data(data))
     engine.finalize_object()
@@ -292,6 +311,76 @@ def _optimised(source: str, target: Any) -> Any:
     passes = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=2))
     passes.getModulePassManager().run(module, passes)
     return module
+
+
+class Call(NamedTuple):
+    """A compiled function, and types of arguments with which Python calls it."""
+
+    module: str
+    function: str
+    types: tuple[Any, ...]
+
+
+_calls: dict[Call, None] | None = None  # so far, in order, where calls are noted
+
+
+class _Noting:
+    """Stands for a compiled function where calls are noted, runs as Python, and notes calls from plain Python alone."""
+
+    depth = 0
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]):
+        self.function, self.options = function, options
+
+    def __call__(self, *arguments: Any) -> Any:
+        if _Noting.depth == 0 and _calls is not None:
+            parameters = list(inspect.signature(self.function).parameters.values())
+            types = [typeof(each, Purpose.argument) for each in arguments]
+            types += [Omitted(each.default) for each in parameters[len(arguments) :]]
+            _calls[Call(self.function.__module__, self.function.__qualname__, tuple(types))] = None
+        _Noting.depth += 1
+        try:
+            return self.function(*arguments)
+        finally:
+            _Noting.depth -= 1
+
+
+@contextmanager
+def noted_calls() -> Iterator[dict[Call, None]]:
+    """Run the functions of modules that are first imported in the block as Python, and yield the calls of them."""
+    global _calls
+    _calls = {}
+    try:
+        yield _calls
+    finally:
+        _calls = None
+        for module in [each for name, each in sys.modules.items() if name.startswith("cfplan.")]:
+            for name, value in list(vars(module).items()):
+                if isinstance(value, _Noting):
+                    made = getattr(sys.modules[value.function.__module__], value.function.__qualname__)
+                    if made is value:
+                        made = _compiling(value.function, value.options)
+                    setattr(module, name, made)
+
+
+def is_compiled(call: Call) -> bool:
+    """Return whether a call needs no compiling."""
+    return (cache_folder() / _file_of(call)).exists()
+
+
+def compile_call(call: Call) -> bool:
+    """Compile what a call needs, unless another process is compiling it: then return False."""
+    name = _file_of(call)
+    if not _locks.take(name, wait=False):
+        return False
+    getattr(sys.modules[call.module], call.function).compile(call.types)
+    _locks.give_back(name)
+    return True
+
+
+def _file_of(call: Call) -> str:
+    function = getattr(importlib.import_module(call.module), call.function)
+    return function._cache.file_name(call.types)
 
 
 def delete_unused() -> None:

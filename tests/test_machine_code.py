@@ -61,14 +61,15 @@ def test_a_damaged_file_is_compiled_anew(cache):
 
 
 def test_a_change_in_an_imported_module_changes_the_key(monkeypatch, tmp_path):
+    (tmp_path / "cfplan").mkdir()
     for name, text in {
         "upper": "from cfplan.lower import (\n    G,\n    H,\n)\n",
         "lower": "from cfplan.lowest import G\n",
         "lowest": "G = 9.81\n",
         "other": "G = 9.81\n",
     }.items():
-        (tmp_path / f"{name}.py").write_text(text)
-    monkeypatch.setattr(machine_code, "PACKAGE", tmp_path)
+        (tmp_path / "cfplan" / f"{name}.py").write_text(text)
+    monkeypatch.setattr(machine_code, "PACKAGE", tmp_path / "cfplan")
 
     def keys():
         machine_code.key.cache_clear()
@@ -78,7 +79,7 @@ def test_a_change_in_an_imported_module_changes_the_key(monkeypatch, tmp_path):
     try:
         before = keys()
         assert keys() == before
-        (tmp_path / "lowest.py").write_text("G = 9.80665\n")
+        (tmp_path / "cfplan" / "lowest.py").write_text("G = 9.80665\n")
         changed = [old != new for old, new in zip(before, keys(), strict=True)]
         assert changed == [True, True, True, False]
     finally:

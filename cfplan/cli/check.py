@@ -8,6 +8,7 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json
 from cfplan.errors import ExitCode
+from cfplan.preparation.compiled_calls import Stage
 
 
 @click.command(short_help="The certificate of a path or of a plan.", epilog="Example: cfplan check flights/circle.yaml")
@@ -20,7 +21,7 @@ def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **plannin
     Exit code 4 where a limit is exceeded.
     """
     steps = Steps(as_json=as_json)
-    limits = options.read_limits(safety_file, path_or_plan, steps)
+    limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
 
     from cfplan.cli.certificate_table import print_certificate
     from cfplan.preparation.plan_flight import FlightOptions, plan_flight

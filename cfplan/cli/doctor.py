@@ -1,8 +1,10 @@
 """`cfplan doctor`: is everything there that a flight needs?"""
 
+import os
 import platform
 import sys
 from importlib import metadata
+from pathlib import Path
 
 import click
 
@@ -21,9 +23,15 @@ OPTIONAL = {
 
 
 @click.command(short_help="Versions, packages, machine code, radio.", epilog="Example: cfplan doctor --json")
+@click.option("--warm-up", "warm", is_flag=True, help="Compile everything that flights need, on all processors, first.")
+@click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="safety.yaml; else the nearest above.")
 @options.as_json
-def doctor(as_json: bool) -> int:
+def doctor(warm: bool, safety_file: Path | None, as_json: bool) -> int:
     """Show versions, packages, compiled functions and the radio, and what is missing."""
+    if warm:
+        from cfplan.cli.warm_up import warm_up
+
+        warm_up(options.find_safety_file(safety_file, Path.cwd()), os.cpu_count() or 1)
     checks = [
         _python(),
         *map(_package, NEEDED),

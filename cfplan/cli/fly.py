@@ -9,6 +9,7 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.errors import ExitCode
+from cfplan.preparation.compiled_calls import Stage
 
 if TYPE_CHECKING:
     from cfplan.flight.pilot.outcome import FlightOutcome
@@ -67,7 +68,7 @@ def fly(
     steps = Steps(as_json=as_json)
     check_uris(uri, mocap_uri)
     check_watchers(live=live, mavlink=mavlink)
-    limits = options.read_limits(safety_file, path_or_plan, steps)
+    limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.FLIGHT)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
 
     from cfplan.cli.confirm import confirmed

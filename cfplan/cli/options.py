@@ -10,6 +10,7 @@ from cfplan.errors import InputError
 
 if TYPE_CHECKING:
     from cfplan.cli.output import Steps
+    from cfplan.preparation.compiled_calls import Stage
     from cfplan.safety.limits import Limits
 
 SAFETY_FILE = "safety.yaml"
@@ -66,12 +67,17 @@ def find_safety_file(given: Path | None, path_file: Path) -> Path:
     )
 
 
-def read_limits(given: Path | None, path_file: Path, steps: "Steps") -> "Limits":
-    """Find and read safety.yaml, once a command, as its first step."""
+def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compile_to: "Stage | None" = None) -> "Limits":
+    """Find and read safety.yaml, once a command, as its first step; begin to compile what the command will need."""
     with steps.step("limits") as results:
+        safety_file = find_safety_file(given, path_file)
+        if compile_to is not None:
+            from cfplan.cli.warm_up import compile_ahead
+
+            compile_ahead(compile_to, safety_file, silent=steps.as_json)
+
         from cfplan.safety.limits_file import load_limits
 
-        safety_file = find_safety_file(given, path_file)
         limits = load_limits(safety_file)
         plan = limits.plan
         results.append(f"{limits.vehicle}, {plan.speed:g} m/s, {plan.acceleration:g} m/s² ({safety_file})")

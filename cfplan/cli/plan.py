@@ -8,6 +8,7 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json
 from cfplan.errors import InputError
+from cfplan.preparation.compiled_calls import Stage
 
 
 @click.command(
@@ -23,7 +24,7 @@ def plan(
 ) -> None:
     """Plan the fastest flight along PATH within every limit, and print its certificate."""
     steps = Steps(as_json=as_json)
-    limits = options.read_limits(safety_file, path_file, steps)
+    limits = options.read_limits(safety_file, path_file, steps, compile_to=Stage.PLAN)
 
     from cfplan.cli.certificate_table import print_certificate
     from cfplan.preparation.plan_flight import FlightOptions, plan_flight

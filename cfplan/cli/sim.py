@@ -7,6 +7,7 @@ import click
 
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table
+from cfplan.preparation.compiled_calls import Stage
 
 
 @click.command(short_help="The dry run alone.", epilog="Example: cfplan sim flights/slalom.yaml")
@@ -16,7 +17,7 @@ from cfplan.cli.output import Steps, print_json, print_table
 def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> None:
     """Rehearse a path or a plan file: its very setpoints, the firmware's controller, a body with drag and motor lag."""
     steps = Steps(as_json=as_json)
-    limits = options.read_limits(safety_file, path_or_plan, steps)
+    limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
 
     from cfplan.preparation.plan_flight import FlightOptions, plan_flight
 

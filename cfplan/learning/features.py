@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path, horner_step
@@ -77,7 +78,7 @@ def coefficient_logs(h: float, slope: float, bend: float, step: float) -> tuple[
     )
 
 
-@njit
+@register_jitable
 def start_features(before: float, first: float, after: float) -> tuple[float, float, float]:
     """Return the features of a window's start: a log rate, and its first and second difference."""
     return first, after - before, after + before - 2.0 * first

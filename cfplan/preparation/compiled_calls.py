@@ -1,0 +1,67 @@
+"""Finds out which compiled functions a flight calls, and with which types of arguments, by a small flight in Python."""
+
+import pickle
+from enum import IntEnum
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cfplan.machine_code import Call
+
+NODES = 10  # grid intervals; so few that plain Python is quick
+
+
+class Stage(IntEnum):
+    """How far a command goes on the way from a path file to a flight."""
+
+    PLAN = 1
+    REHEARSAL = 2
+    FLIGHT = 3
+
+
+def find_calls(safety_file: Path, last: Stage) -> "list[Call]":
+    """Return the calls of a small flight under these limits, up to a stage, in order; noted once a machine.
+
+    For a process that has not yet imported what plans and flies.
+    """
+    from cfplan.machine_code import kept_or_made
+
+    title = f"calls-{last.name.lower()}"
+    return pickle.loads(kept_or_made(title, __name__, lambda: pickle.dumps(_fly(safety_file, last))))
+
+
+def _fly(safety_file: Path, last: Stage) -> "list[Call]":
+    from cfplan.machine_code import noted_calls
+
+    with noted_calls() as calls:
+        import numpy as np
+
+        from cfplan.errors import CfplanError
+        from cfplan.geometry.min_snap import min_snap
+        from cfplan.planning.plan import plan
+        from cfplan.safety.limits_file import load_limits
+
+        limits = load_limits(safety_file)
+        middle = (np.array(limits.space.low) + limits.space.high) / 2
+        path = min_snap(middle + 0.2 * np.array([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]]))
+        try:
+            planned = plan(path, limits.airframe, limits, planner="learned", nodes=NODES)
+        except CfplanError:  # no model for this vehicle
+            planned = plan(path, limits.airframe, limits, planner="expert", nodes=2 * NODES)
+        if last >= Stage.REHEARSAL:
+            from cfplan.preparation.plan_flight import PlannedFlight
+            from cfplan.preparation.prepare_flight import encode_flight, make_mission, rehearse
+            from cfplan.simulation.link_loss import swept_after_link_loss
+
+            flight = PlannedFlight("small flight", planned, limits)
+            encoded = encode_flight(flight)
+            rehearse(flight, encoded)
+            swept_after_link_loss(encoded.payloads, limits, np.zeros(1))
+            make_mission(encoded, limits)
+        if last >= Stage.FLIGHT:
+            from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
+
+            vehicle = VirtualCrazyflie(limits.airframe)
+            for _ in range(3):
+                vehicle.advance(10)
+    return list(calls)
