@@ -120,3 +120,12 @@ def test_no_module_imports_itself_by_way_of_others():
 
     for module in graph:
         visit(module, [])
+
+
+def test_a_public_class_name_occurs_once():
+    places: dict[str, list[str]] = {}
+    for file in FILES:
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(f"{file.relative_to(PACKAGE)}:{node.lineno}")
+    assert {name: found for name, found in places.items() if len(found) > 1} == {}

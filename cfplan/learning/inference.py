@@ -55,7 +55,7 @@ class Layer:
         return out, h, c
 
 
-class BiLstm:
+class CompiledBiLstm:
     """See networks.BiLstm."""
 
     def __init__(self, weights: Mapping[str, NDArray]) -> None:
@@ -71,7 +71,7 @@ class BiLstm:
         return values @ self.head + self.bias
 
 
-class EncoderDecoder:
+class CompiledEncoderDecoder:
     """See networks.EncoderDecoder."""
 
     def __init__(self, weights: Mapping[str, NDArray]) -> None:
@@ -105,7 +105,10 @@ class EncoderDecoder:
         return out
 
 
-NETWORKS: Mapping[str, type[BiLstm] | type[EncoderDecoder]] = {"bilstm": BiLstm, "attention": EncoderDecoder}
+NETWORKS: Mapping[str, type[CompiledBiLstm] | type[CompiledEncoderDecoder]] = {
+    "bilstm": CompiledBiLstm,
+    "attention": CompiledEncoderDecoder,
+}
 
 
 def _layers(weights: Mapping[str, NDArray], prefix: str) -> int:
