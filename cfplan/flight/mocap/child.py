@@ -15,7 +15,7 @@ from contextlib import suppress
 
 from cfplan.errors import CfplanError, InputError, LinkError
 from cfplan.flight.mocap.datastream_client import DataStreamClient
-from cfplan.flight.mocap.frames import Driver, Frame, Scene, Stage, TrackedBody
+from cfplan.flight.mocap.frames import Driver, DriverStage, Frame, Scene, TrackedBody
 from cfplan.flight.mocap.sdk import SdkDriver
 from cfplan.flight.mocap.uri import MocapUri, parse_uri
 from cfplan.flight.real_time import lock_memory
@@ -26,7 +26,7 @@ FRAME_ALARM = 1.5  # s between frames
 _TRY_AGAIN = 0.1  # s
 _PRIORITY = 10  # of SCHED_FIFO; the setpoint stream's is higher
 
-Message = Frame | Scene | Stage | CfplanError
+Message = Frame | Scene | DriverStage | CfplanError
 
 
 def encoded(message: Message) -> bytes:
@@ -99,7 +99,7 @@ def run(uri: MocapUri, outlet: Outlet, *, again: bool) -> None:
             if not again:
                 outlet.send(lost)
                 return
-            outlet.send(Stage(f"trying again: {lost.what}"))
+            outlet.send(DriverStage(f"trying again: {lost.what}"))
         except CfplanError as error:
             outlet.send(error)
             return
@@ -111,10 +111,10 @@ def run(uri: MocapUri, outlet: Outlet, *, again: bool) -> None:
 def _stream(driver: Driver, uri: MocapUri, outlet: Outlet) -> bool:
     """Send frames until the stream is lost; return whether there was one. Raises LinkError if there was none."""
     _alarm(CONNECT_ALARM)
-    outlet.send(Stage(f"connecting to {uri.address}"))
+    outlet.send(DriverStage(f"connecting to {uri.address}"))
     driver.connect()
     _alarm(FRAME_ALARM)
-    outlet.send(Stage("connected, waiting for a frame"))
+    outlet.send(DriverStage("connected, waiting for a frame"))
     sent: Scene | None = None
     frames = 0
     while True:
@@ -123,7 +123,7 @@ def _stream(driver: Driver, uri: MocapUri, outlet: Outlet) -> bool:
         except LinkError as lost:
             if not frames:
                 raise
-            outlet.send(Stage(lost.what))
+            outlet.send(DriverStage(lost.what))
             return True
         _alarm(FRAME_ALARM)
         frames += 1

@@ -11,7 +11,7 @@ from typing import Self
 
 from cfplan.errors import CfplanError, LinkError
 from cfplan.flight.mocap.child import CONNECT_ALARM, FRAME_ALARM, Message, decoded
-from cfplan.flight.mocap.frames import Stage
+from cfplan.flight.mocap.frames import DriverStage
 from cfplan.flight.mocap.uri import MocapUri
 from cfplan.flight.real_time import use_ordinary_scheduling
 
@@ -58,7 +58,7 @@ class Feed:
                 pass
             found = decoded(self._buffer)
         for message in found:
-            if isinstance(message, Stage):
+            if isinstance(message, DriverStage):
                 self.stage = message.text
             elif not isinstance(message, CfplanError):
                 self.stage = "streaming"

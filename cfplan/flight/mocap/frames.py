@@ -45,7 +45,7 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class DriverStage:
     """What the driver is about to do; if it hangs, this is its last message."""
 
     text: str
