@@ -64,7 +64,7 @@ def read_table(file: pathlib.Path, columns: int, what: str) -> tuple[NDArray, li
         cells = _SEPARATOR.split(text)
         if cells[-1] == "" and len(cells) == columns + 1:  # a comma at the end of the line
             cells.pop()
-        if header_allowed and not any(_is_number(cell) for cell in cells):
+        if header_allowed and not any(is_number(cell) for cell in cells):
             header_allowed = False
             continue
         header_allowed = False
@@ -79,7 +79,7 @@ def _numbers(cells: list[str], columns: int, what: str, where: str) -> list[floa
     if len(cells) != columns:
         raise InputError(f"the row has {len(cells)} numbers, not {columns}", where=where, hint=f"each row is {what}")
     for column, cell in enumerate(cells, start=1):
-        if not _is_number(cell):
+        if not is_number(cell):
             raise InputError(
                 f"column {column} is not a number: {cell[:40]!r}", where=where, hint="write a plain decimal number"
             )
@@ -96,7 +96,8 @@ def _numbers(cells: list[str], columns: int, what: str, where: str) -> list[floa
     return [float(cell) for cell in cells]
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Return whether Python reads the text as a number."""
     try:
         float(text)
     except ValueError:

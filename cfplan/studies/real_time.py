@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cfplan import __version__
 from cfplan.errors import CfplanError, ExitCode, InputError
 from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.mocap.source import pose_source
@@ -16,7 +15,7 @@ from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent, Telemetry
-from cfplan.recording.header import FlightBounds, RecordHeader
+from cfplan.recording.header import RecordHeader, header_under
 from cfplan.recording.rerun.live import LiveView
 from cfplan.recording.writer import RecordWriter, wall_time_at_zero
 from cfplan.simulation.lab.lab import Lab, Truth, start_lab
@@ -164,18 +163,11 @@ def _poses(lab: Lab, mission: Mission, conditions: Conditions) -> PoseSource:
 
 
 def _header(mission: Mission, name: str) -> RecordHeader:
-    limits = mission.limits
-    return RecordHeader(
+    return header_under(
+        mission.limits,
         name=name,
-        version=__version__,
         uri="sim://0",
-        planner="",
-        vehicle=limits.airframe,
-        thrust_at_full_command=limits.airframe.motor_thrust_max,
-        plan_limits=limits.plan,
-        bounds=FlightBounds(),
-        travel_time=mission.motion_ends,
         path=decode(mission.payloads).position[::5],
-        fence=(limits.space.low, limits.space.high),
+        travel_time=mission.motion_ends,
         wall_time_at_zero=wall_time_at_zero(),
     )

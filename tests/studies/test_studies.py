@@ -156,7 +156,7 @@ def test_the_machine_knows_its_packages():
     assert {"numpy", "casadi"} <= set(this_machine().packages)
 
 
-def test_a_refined_planner_is_another_entrant_than_the_same_one_slowed():
+def test_a_refined_planner_is_another_candidate_than_the_same_one_slowed():
     names = ["convex", "convex, refined", "expert, refined"]
     result = bench(paths=2, nodes=60, boxes=["4.5x8x2"], limit_sets=["hardware"], planners=names)
     slowed, refined, expert = rows(result)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from cfplan.errors import InputError
+from cfplan.files.text import is_number
 
 BLOCK = 1 << 24  # bytes turned into numbers at a time
 _AT_ONCE = 1 << 20  # bytes of them that one core takes: they fit into its cache
@@ -104,7 +105,7 @@ def _mistake(data: mmap.mmap, begin: int, end: int, lines: Lines, file: Path) ->
             )
         for index in lines.wanted if line else ():
             text = cells[index].strip().strip('"')
-            if not _is_number(text.replace(lines.point, ".")):
+            if text not in _NO_NUMBER and not is_number(text.replace(lines.point, ".")):
                 return InputError(
                     f"{text[:30]!r} in column {index + 1} is not a number",
                     where=place(data, begin, file),
@@ -112,11 +113,3 @@ def _mistake(data: mmap.mmap, begin: int, end: int, lines: Lines, file: Path) ->
                 )
         begin = after
     return None
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return text in _NO_NUMBER
-    return True

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from cfplan.errors import InputError
+from cfplan.files.text import is_number
 
 
 class Rotations(StrEnum):
@@ -158,7 +159,7 @@ def _unit(units: list[str], columns: tuple[int, ...], known: dict[str, float], n
     found = sorted({units[column].lower().strip("()[] ") if column < len(units) else "" for column in columns})
     if len(found) == 1 and found[0] in known:
         return known[found[0]]
-    if any(text == "" or _is_number(text) for text in found):
+    if any(text == "" or is_number(text) for text in found):
         raise InputError(
             f"no unit over the columns of {name!r}",
             where=where,
@@ -169,11 +170,3 @@ def _unit(units: list[str], columns: tuple[int, ...], known: dict[str, float], n
         where=where,
         hint="export it again in one of these",
     )
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
