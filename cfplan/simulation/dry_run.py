@@ -89,14 +89,14 @@ def dry_run(
     airframe: Airframe,
     limits: FlightLimits,
     *,
-    told: Airframe | None = None,
+    believed: Airframe | None = None,
     delay: float = 0.0,
     estimate: EstimateErrors = PERFECT,
 ) -> DryRun:
     """Fly the payloads on `airframe`; compare with `trajectory`.
 
-    `told` is the airframe that the controller believes in, the same where not given; `delay`, s, makes every setpoint
-    late. The real-time factor counts everything but the compilation at the first call ever.
+    `believed` is the airframe for which the controller is tuned, the same where not given; `delay`, s, makes every
+    setpoint late. The real-time factor counts everything but the compilation at the first call ever.
     """
     start = trajectory.at(0.0)
     fly = partial(
@@ -105,7 +105,7 @@ def dry_run(
         encoded.times,
         airframe,
         hovering(airframe, start.position, float(start.yaw)),
-        gains=gains_for(told or airframe),
+        gains=gains_for(believed or airframe),
         floor=_NO_FLOOR,
         delay=delay,
         estimate=estimate,
@@ -125,8 +125,8 @@ def stress(
     heavy, light = replace(airframe, mass=1.05 * airframe.mass), replace(airframe, mass=0.95 * airframe.mass)
     noisy = EstimateErrors(latency=0.010, position_noise=0.002, velocity_noise=0.03)
     return {
-        "5 % heavier": dry_run(encoded, trajectory, heavy, limits, told=airframe),
-        "5 % lighter": dry_run(encoded, trajectory, light, limits, told=airframe),
+        "5 % heavier": dry_run(encoded, trajectory, heavy, limits, believed=airframe),
+        "5 % lighter": dry_run(encoded, trajectory, light, limits, believed=airframe),
         "motors lag by a quarter more": dry_run(encoded, trajectory, slow, limits),
         "setpoints 20 ms late": dry_run(encoded, trajectory, airframe, limits, delay=0.020),
         "estimate 10 ms late and noisy": dry_run(encoded, trajectory, airframe, limits, estimate=noisy),

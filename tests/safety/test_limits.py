@@ -106,7 +106,7 @@ def test_unknown_keys_are_errors(tmp_path, place):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"vehicle": "crazyfly"}, "unknown vehicle 'crazyfly'"),
         ({"vehicle": "nowhere.yaml"}, "no such file"),
@@ -133,8 +133,8 @@ def test_unknown_keys_are_errors(tmp_path, place):
         ({"firmware.controller": 9}, "controller"),
     ],
 )
-def test_limits_that_contradict_each_other_or_the_vehicle_are_refused(tmp_path, changes, said):
-    with pytest.raises(InputError, match=said) as error:
+def test_limits_that_contradict_each_other_or_the_vehicle_are_refused(tmp_path, changes, message):
+    with pytest.raises(InputError, match=message) as error:
         load_limits(changed(tmp_path, changes))
     assert "\n" not in str(error.value)
     assert error.value.where

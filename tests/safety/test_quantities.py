@@ -146,7 +146,7 @@ def test_stops_are_judged_by_the_table(quantity, trajectory):
             replace(found, worst=found.worst | {quantity.name: beyond}).require(safety)
 
 
-def test_what_stops_may_reach_is_said_of_all_but_two():
+def test_stops_are_bound_in_all_quantities_but_two():
     assert {q.name for q in QUANTITIES} - {q.name for q in stop_certificate.BOUND} == {
         "angular acceleration", "motor thrust, least",
     }  # fmt: skip

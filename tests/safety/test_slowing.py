@@ -54,7 +54,7 @@ def test_flying_upside_down_is_slowed_too(make_profile):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"motor_thrust_max": 0.07}, "hovering takes"),
         ({"motor_thrust_min": 0.08}, "hovering takes"),
@@ -63,9 +63,9 @@ def test_flying_upside_down_is_slowed_too(make_profile):
         ({"tilt": float("nan")}, "tilt exceeds its limit however slow"),
     ],
 )
-def test_limits_that_no_flight_keeps_are_named(make_profile, changes, said):
+def test_limits_that_no_flight_keeps_are_named(make_profile, changes, message):
     trajectory = Trajectory(PATH, make_profile(PATH.end, np.full(20, 4.0)), AIRFRAME)
-    with pytest.raises(InfeasibleError, match=said):
+    with pytest.raises(InfeasibleError, match=message):
         slow_until_certified(trajectory, replace(LIMITS, **changes))
 
 

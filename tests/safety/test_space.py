@@ -18,7 +18,7 @@ def test_a_path_inside_is_fine():
 
 
 @pytest.mark.parametrize(
-    ("point", "said"),
+    ("point", "message"),
     [
         ((2.3, 0, 1), r"waypoint 2, .* is 0\.300 m outside the space x = 2 m, 0\.500 m too far"),
         ((1.9, 0, 1), r"waypoint 2, .* is 0\.100 m from the wall x = 2 m, 0\.100 m too far"),
@@ -27,9 +27,9 @@ def test_a_path_inside_is_fine():
         ((0, 1, float("nan")), r"waypoint 2, \(0\.000, 1\.000, nan\)"),
     ],
 )
-def test_a_waypoint_outside_or_within_the_margin_is_named_with_its_distance(point, said):
+def test_a_waypoint_outside_or_within_the_margin_is_named_with_its_distance(point, message):
     path = min_snap([[0, 0, 1], [1, 0, 1]])
-    with pytest.raises(InfeasibleError, match=said) as error:
+    with pytest.raises(InfeasibleError, match=message) as error:
         check_space(path, SPACE, waypoints=[(0, 0, 1), point], where="flight.yaml")
     assert str(error.value).startswith("flight.yaml: waypoint 2")
 

@@ -148,7 +148,7 @@ def test_a_vehicle_that_cannot_carry_itself_fails():
 
 
 def test_numbers_that_are_none_fail_it(encoded, trajectory):
-    run = dry_run(encoded, trajectory, replace(AIRFRAME, drag=(np.nan, np.nan)), LIMITS, told=AIRFRAME)
+    run = dry_run(encoded, trajectory, replace(AIRFRAME, drag=(np.nan, np.nan)), LIMITS, believed=AIRFRAME)
     assert not run.passed
     assert run.deviation == np.inf
     assert run.path_distance == np.inf

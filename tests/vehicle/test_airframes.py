@@ -73,7 +73,7 @@ def test_an_airframe_of_ones_own_is_read_from_a_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"mass": -0.03}, "mass"),
         ({"mass": 31.8}, "mass"),
@@ -85,8 +85,8 @@ def test_an_airframe_of_ones_own_is_read_from_a_file(tmp_path):
         ({"arm": None}, "'arm' is missing"),
     ],
 )
-def test_a_wrong_airframe_file_is_refused_with_the_line(tmp_path, changes, said):
-    with pytest.raises(InputError, match=r"own\.yaml:\d+:\d+: .*" + said):
+def test_a_wrong_airframe_file_is_refused_with_the_line(tmp_path, changes, message):
+    with pytest.raises(InputError, match=r"own\.yaml:\d+:\d+: .*" + message):
         load_airframe(written(tmp_path, **changes))
 
 

@@ -5,7 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cfplan.vehicle.profile_spline import profile_through
+from cfplan.vehicle.profile import h_within
+from cfplan.vehicle.profile_spline import (
+    AT_NODE,
+    h_coefficients,
+    node_coefficients,
+    node_values,
+    profile_through,
+    spline_profile,
+    weights_at,
+)
+from cfplan.vehicle.yaw_spline import YawSpline
 
 pytestmark = pytest.mark.unit
 
@@ -48,3 +58,22 @@ def test_stiffness_trades_nearness_for_smoothness():
     stiff, loose = (profile_through(grid, grid, kinked, grid, h_stiffness=value) for value in (10.0, 1e-4))
     assert np.abs(np.diff(stiff.dddh)).max() < 0.5 * np.abs(np.diff(loose.dddh)).max()
     assert np.abs(loose.h - kinked).max() < np.abs(stiff.h - kinked).max()
+
+
+def test_coefficients_lead_to_a_profile_and_back(make_profile):
+    coefficients = np.random.default_rng(2).uniform(0.5, 2.0, 43)
+    profile = spline_profile(coefficients, 6.0, YawSpline(np.zeros(41), np.zeros(41), np.zeros(40)))
+    np.testing.assert_allclose(h_coefficients(profile), coefficients, rtol=1e-12)
+    expected = make_profile(6.0, coefficients)
+    for name in ("s", "h", "dh", "ddh", "dddh"):
+        np.testing.assert_allclose(getattr(profile, name), getattr(expected, name), rtol=1e-9, atol=1e-8)
+
+
+def test_values_at_a_node_and_its_coefficients_are_of_each_other():
+    coefficients = np.random.default_rng(3).uniform(0.5, 2.0, 4)
+    h, slope, bend = node_values(*coefficients[:3])
+    assert node_coefficients(h, slope, bend) == pytest.approx(tuple(coefficients[:3]))
+    third = coefficients @ [-1, 3, -3, 1]
+    np.testing.assert_allclose(AT_NODE @ coefficients, [h, slope, bend, third])
+    for place in (0.0, 0.3, 1.0):
+        assert np.array(weights_at(place)) @ coefficients == pytest.approx(h_within(place, h, slope, bend, third)[0])
