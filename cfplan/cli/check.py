@@ -22,9 +22,9 @@ def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **plannin
     """
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
-
-    from cfplan.cli.certificate_table import print_certificate
-    from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+    with steps.waiting("loading planners"):
+        from cfplan.cli.certificate_table import print_certificate
+        from cfplan.preparation.plan_flight import FlightOptions, plan_flight
 
     planned = plan_flight(path_or_plan, limits, FlightOptions(**planning), steps)
     if as_json:

@@ -62,26 +62,25 @@ def fly(
     **planning: Any,
 ) -> int:
     """Fly along PATH: plan, certify, rehearse, then take off, stream the flight, land, and keep a record."""
-    from cfplan.cli.vehicle import check_uris, look_at_hardware
-    from cfplan.cli.watchers import check_watchers
+    from cfplan.cli.vehicle import StartingVehicle, check_uris, look_at_hardware
+    from cfplan.cli.watchers import Watched, check_watchers
 
-    steps = Steps(as_json=as_json)
+    steps, watched = Steps(as_json=as_json), Watched(live, mavlink)
     check_uris(uri, mocap_uri)
-    check_watchers(live=live, mavlink=mavlink)
+    check_watchers(watched)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.FLIGHT)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
-
-    from cfplan.cli.confirm import confirmed
-    from cfplan.cli.recorded_flight import FlownAs, fly_and_record
-    from cfplan.preparation.plan_flight import FlightOptions
-    from cfplan.preparation.prepare_flight import prepare_flight
-
-    prepared = prepare_flight(path_or_plan, limits, FlightOptions(**planning), steps)
-    if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
-        click.echo("not flown", err=True)
-        return int(ExitCode.ENDED_BY_PILOT)
-    flown_as = FlownAs(uri, mocap_uri, live, mavlink)
-    folder, outcome, summary = fly_and_record(prepared, path_or_plan, records, flown_as, steps)
+    with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # starts while the flight is prepared
+        with steps.waiting("loading planners and simulator"):
+            from cfplan.cli.confirm import confirmed
+            from cfplan.cli.recorded_flight import fly_and_record
+            from cfplan.preparation.plan_flight import FlightOptions
+            from cfplan.preparation.prepare_flight import prepare_flight
+        prepared = prepare_flight(path_or_plan, limits, FlightOptions(**planning), steps)
+        if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
+            click.echo("not flown", err=True)
+            return int(ExitCode.ENDED_BY_PILOT)
+        folder, outcome, summary = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
     _print_result(prepared, folder, outcome, summary, as_json)
     return int(outcome.exit_code)
 

@@ -1,9 +1,11 @@
 """How the commands speak: a line a step for people, one JSON document for scripts."""
 
 import json
+import sys
+import threading
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import click
@@ -12,24 +14,52 @@ from cfplan.errors import CfplanError
 from cfplan.files.json_values import json_value
 from cfplan.preparation.steps import StepState, step
 
+_FIRST_NOTE, _TERMINAL_NOTES, _OTHER_NOTES = 1.0, 0.5, 4.0  # s until a wait is shown, and between later notes
 _FILE_WIDTH = 170  # characters, of tables that go to a file or a pipe
 
 
 class Steps:
-    """Prints one line a step as it ends, with the time that it took; silent where JSON is asked for."""
+    """Prints one line a step as it ends, with the time that it took; silent where JSON is asked for.
+
+    A step that takes longer than a second says meanwhile what is waited for and for how long: on a terminal in a line
+    that is overwritten, elsewhere in a line of its own every few seconds.
+    """
 
     def __init__(self, *, as_json: bool):
         self.as_json = as_json
         self._begun = 0.0
+        self._ended = threading.Event()
+        self._waiting: threading.Thread | None = None
 
     def __call__(self, name: str, state: StepState, result: str) -> None:
         """Show how far a step is; an OnStep."""
+        if self.as_json:
+            return
         if state is StepState.BEGUN:
             self._begun = time.perf_counter()
-        elif not self.as_json:
-            mark = click.style("✓", fg="green") if state is StepState.FINISHED else click.style("✗", fg="red")
-            took = f"{(time.perf_counter() - self._begun) * 1e3:.0f} ms"
-            click.echo(f"{mark} {name:<12} {took:>8}  {result}".rstrip())
+            self._ended = threading.Event()
+            self._waiting = threading.Thread(target=_show_waiting, args=(name, self._ended), daemon=True)
+            self._waiting.start()
+            return
+        self._end_waiting()
+        mark = click.style("✓", fg="green") if state is StepState.FINISHED else click.style("✗", fg="red")
+        took = f"{(time.perf_counter() - self._begun) * 1e3:.0f} ms"
+        click.echo(f"{mark} {name:<12} {took:>8}  {result}".rstrip())
+
+    def _end_waiting(self) -> None:
+        self._ended.set()
+        if self._waiting is not None:
+            self._waiting.join()
+            self._waiting = None
+
+    @contextmanager
+    def waiting(self, name: str) -> Iterator[None]:
+        """Say what is waited for if the block takes longer than a second; nothing is printed at its end."""
+        self(name, StepState.BEGUN, "")
+        try:
+            yield
+        finally:
+            self._end_waiting()
 
     def step(self, name: str) -> AbstractContextManager[list[str]]:
         """Time a step of a command. What the block appends to the list is printed behind the step's name."""
@@ -44,6 +74,20 @@ class Steps:
         """Print a line that is no step."""
         if not self.as_json:
             click.echo(text)
+
+
+def _show_waiting(name: str, ended: threading.Event) -> None:
+    begun, on_terminal = time.perf_counter(), sys.stdout.isatty()
+    pause = _FIRST_NOTE
+    while not ended.wait(pause):
+        text = f"… {name}, {time.perf_counter() - begun:.0f} s"
+        if on_terminal:
+            click.echo(f"\r\033[K{text}", nl=False)
+        else:
+            click.echo(text)
+        pause = _TERMINAL_NOTES if on_terminal else _OTHER_NOTES
+    if on_terminal and pause != _FIRST_NOTE:
+        click.echo("\r\033[K", nl=False)
 
 
 def print_json(document: Any) -> None:

@@ -25,9 +25,9 @@ def plan(
     """Plan the fastest flight along PATH within every limit, and print its certificate."""
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_file, steps, compile_to=Stage.PLAN)
-
-    from cfplan.cli.certificate_table import print_certificate
-    from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+    with steps.waiting("loading planners"):
+        from cfplan.cli.certificate_table import print_certificate
+        from cfplan.preparation.plan_flight import FlightOptions, plan_flight
 
     planned = plan_flight(path_file, limits, FlightOptions(**planning), steps)
     if output is not None:

@@ -2,14 +2,13 @@
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cfplan.cli.flight_progress import FlightProgress
 from cfplan.cli.output import Steps
-from cfplan.cli.vehicle import vehicle
-from cfplan.cli.watchers import watchers
+from cfplan.cli.vehicle import StartingVehicle
+from cfplan.cli.watchers import Watched, watchers
 from cfplan.errors import CfplanError
 from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.pilot.outcome import FlightOutcome
@@ -23,37 +22,27 @@ from cfplan.recording.summary import summarise
 from cfplan.recording.writer import RecordWriter, new_record_folder, wall_time_at_zero, write_summary
 
 
-@dataclass(frozen=True, slots=True)
-class FlownAs:
-    """Which vehicle flies, where its poses come from, and who watches."""
-
-    uri: str
-    mocap_uri: str | None
-    live: bool
-    mavlink: str | None
-
-
 def fly_and_record(
-    prepared: PreparedFlight, source: Path, records: Path, flown_as: FlownAs, steps: Steps
+    prepared: PreparedFlight, source: Path, records: Path, vehicle: StartingVehicle, watched: Watched, steps: Steps
 ) -> tuple[Path, FlightOutcome, dict[str, Any]]:
     """Fly, and return the record's folder, the outcome and the summary. Without a flight no folder is left.
 
     Raises a CfplanError where the vehicle or its poses cannot be had.
     """
-    with vehicle(flown_as.uri, flown_as.mocap_uri, prepared.mission.limits) as reached:
-        folder = new_record_folder(records, prepared.planned.name)
-        progress = FlightProgress(duration=prepared.mission.duration, steps=steps)
-        try:
-            outcome, failures = _fly_into(folder, prepared, source, flown_as, reached, progress)
-        except CfplanError:
-            if progress.heard_vehicle:
-                steps.say(f"what was recorded: {folder}")
-            else:
-                shutil.rmtree(folder)  # there was no flight
-            raise
+    pose_source = vehicle.poses(steps)
+    folder = new_record_folder(records, prepared.planned.name)
+    progress = FlightProgress(duration=prepared.mission.duration, steps=steps)
+    try:
+        outcome, failures = _fly_into(folder, prepared, source, vehicle, pose_source, watched, progress)
+    except CfplanError:
+        if progress.heard_vehicle:
+            steps.say(f"what was recorded: {folder}")
+        else:
+            shutil.rmtree(folder)  # there was no flight
+        raise
     for what, failure in failures:
         steps.failed(what, failure)
-    summary = {"uri": flown_as.uri, "outcome": outcome.to_dict(), **summarise(read_record(folder)).to_json()}
+    summary = {"uri": vehicle.uri, "outcome": outcome.to_dict(), **summarise(read_record(folder)).to_json()}
     write_summary(folder, summary)
     return folder, outcome, summary
 
@@ -62,24 +51,25 @@ def _fly_into(
     folder: Path,
     prepared: PreparedFlight,
     source: Path,
-    flown_as: FlownAs,
-    reached: tuple[list[type], PoseSource],
+    vehicle: StartingVehicle,
+    pose_source: PoseSource,
+    watched: Watched,
     progress: FlightProgress,
 ) -> tuple[FlightOutcome, list[tuple[str, str]]]:
     """Fly, and return the outcome and what failed beside the flight: (record or watching, why)."""
-    name, uri, (drivers, pose_source) = prepared.planned.name, flown_as.uri, reached
+    name, uri = prepared.planned.name, vehicle.uri
     save_plan(prepared.plan, folder / "plan.parquet", {"name": name, "path file": str(source)})
     header = header_of_plan(prepared.plan, name=name, uri=uri, source=source, wall_time_at_zero=wall_time_at_zero())
     with (
         RecordWriter(folder, header) as writer,
-        watchers(header, folder, live=flown_as.live, mavlink=flown_as.mavlink) as watching,
+        watchers(header, folder, watched) as watching,
         progress,
     ):
         outcome = fly(
             prepared.mission,
             uri=uri,
-            drivers=drivers,
             pose_source=pose_source,
+            pilot=vehicle.pilot,
             on_telemetry=_for_all(writer.write, progress.show, *watching.listeners),
             more_orders=watching.orders,
         )

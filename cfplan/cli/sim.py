@@ -18,13 +18,11 @@ def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning:
     """Rehearse a path or a plan file: its very setpoints, the firmware's controller, a body with drag and motor lag."""
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
-
-    from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+    with steps.waiting("loading planners and simulator"):
+        from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+        from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, rehearse
 
     planned = plan_flight(path_or_plan, limits, FlightOptions(**planning), steps)
-
-    from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, rehearse
-
     encoded = encode_flight(planned, steps)
     rehearsed = rehearse(planned, encoded, steps)
     find_link_loss(encoded, limits, steps)

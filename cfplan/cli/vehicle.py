@@ -1,8 +1,8 @@
 """Which vehicle to fly, and where its poses come from."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
+from types import TracebackType
 from typing import TYPE_CHECKING
 
 from cfplan.errors import InputError
@@ -10,7 +10,9 @@ from cfplan.errors import InputError
 if TYPE_CHECKING:
     from cfplan.cli.output import Steps
     from cfplan.flight.mocap.poses import PoseSource
+    from cfplan.flight.pilot.process import PilotProcess
     from cfplan.safety.limits import Limits, PoseLimits
+    from cfplan.simulation.lab.lab import StartingLab
 
 SIMULATED = "sim://"
 VIRTUAL_VICON = "lab"  # as the computer in a URI of motion capture
@@ -63,30 +65,57 @@ def _is_virtual(uri: str, mocap_uri: str) -> bool:
     return uri.startswith(SIMULATED) and parse_uri(mocap_uri, subject_needed=True).host == VIRTUAL_VICON
 
 
-@contextmanager
-def vehicle(uri: str, mocap_uri: str | None, limits: "Limits") -> "Iterator[tuple[list[type], PoseSource]]":
-    """The link drivers and the poses for a URI; for the virtual Crazyflie, its lab too."""
-    from cfplan.flight.mocap.source import pose_source
-    from cfplan.flight.mocap.uri import parse_uri
+class StartingVehicle:
+    """The pilot's process and, for a virtual vehicle, its lab: both start while the flight is being prepared."""
 
-    mocap = parse_uri(mocap_uri, subject_needed=True) if mocap_uri is not None else None
-    if not uri.startswith(SIMULATED):
-        yield [], pose_source(str(mocap), limits.pose)
-        return
-    from cfplan.simulation.lab.lab import start_lab
-    from cfplan.simulation.lab.room import RoomPoseSource, RoomSettings
-    from cfplan.simulation.lab.sim_driver import SimDriver, lab_number
-    from cfplan.simulation.virtual_vicon.cameras import ViconSettings
+    def __init__(self, uri: str, mocap_uri: str | None, limits: "Limits"):
+        self.uri, self._mocap_uri, self._limits = uri, mocap_uri, limits
+        self._open = ExitStack()
+        self._lab: StartingLab | None = None
+        self.drivers: list[type] = []  # cflib link drivers tried before cflib's own
+        if uri.startswith(SIMULATED):
+            self._lab = self._open.enter_context(self._launch_lab())
+            from cfplan.simulation.lab.sim_driver import SimDriver
 
-    number = lab_number(uri)
-    if mocap is None:
-        with start_lab(limits.airframe, number=number) as lab:
-            yield [SimDriver], RoomPoseSource(lab.number)
-    elif mocap.host == VIRTUAL_VICON:
-        room = RoomSettings(vicon=ViconSettings(subject=mocap.subject))
-        with start_lab(limits.airframe, room=room, number=number) as lab:
-            there = lab.mocap_uri.replace("vicon:", f"{mocap.system}:", 1)
-            yield [SimDriver], pose_source(there, limits.pose)
-    else:
-        with start_lab(limits.airframe, number=number):
-            yield [SimDriver], pose_source(str(mocap), limits.pose)
+            self.drivers = [SimDriver]
+        from cfplan.flight.pilot.process import start_pilot
+
+        self.pilot: PilotProcess = self._open.enter_context(start_pilot(self.drivers))
+
+    def _launch_lab(self) -> "StartingLab":
+        from cfplan.flight.mocap.uri import parse_uri
+        from cfplan.simulation.lab.lab import launch_lab
+        from cfplan.simulation.lab.room import RoomSettings
+        from cfplan.simulation.virtual_vicon.cameras import ViconSettings
+
+        room, number = RoomSettings(), int(self.uri.removeprefix(SIMULATED))
+        if self._mocap_uri is not None and _is_virtual(self.uri, self._mocap_uri):
+            subject = parse_uri(self._mocap_uri, subject_needed=True).subject
+            room = RoomSettings(vicon=ViconSettings(subject=subject))
+        return launch_lab(self._limits.airframe, room=room, number=number)
+
+    def poses(self, steps: "Steps") -> "PoseSource":
+        """Wait for the lab where there is one; return the source of the vehicle's poses."""
+        from cfplan.flight.mocap.source import pose_source
+        from cfplan.flight.mocap.uri import parse_uri
+
+        mocap = parse_uri(self._mocap_uri, subject_needed=True) if self._mocap_uri is not None else None
+        if self._lab is not None:
+            from cfplan.simulation.lab.room import RoomPoseSource
+
+            with steps.step("lab") as results:
+                lab = self._lab.wait()
+                results.append(f"the virtual Crazyflie is at {lab.uri}")
+            if mocap is None:
+                return RoomPoseSource(lab.number)
+            if mocap.host == VIRTUAL_VICON:
+                return pose_source(lab.mocap_uri.replace("vicon:", f"{mocap.system}:", 1), self._limits.pose)
+        return pose_source(str(mocap), self._limits.pose)
+
+    def __enter__(self) -> "StartingVehicle":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.close()

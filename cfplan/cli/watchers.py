@@ -18,48 +18,56 @@ TLOG_FILE = "telemetry.tlog"
 
 @dataclass(frozen=True, slots=True)
 class Watching:
-    """Those that watch."""
+    """Those that watch, as long as they do."""
 
     view: "LiveView | None"
     station: "GroundStation | None"
 
     @property
     def listeners(self) -> "list[Callable[[Telemetry], None]]":
-        """To be told of everything."""
+        """Return what wants every message."""
         return [watcher.show for watcher in (self.view, self.station) if watcher is not None]
 
     def orders(self) -> "Sequence[Order]":
-        """What the ground station commanded since the last call."""
+        """Return what the ground station commanded since the last call."""
         return self.station.orders() if self.station is not None else ()
 
     def failures(self) -> list[str]:
-        """What went wrong with watching; none of it touched the flight."""
+        """Return what went wrong with watching; none of it touched the flight."""
         return [watcher.failure for watcher in (self.view, self.station) if watcher is not None and watcher.failure]
 
 
-def check_watchers(*, live: bool, mavlink: str | None) -> None:
-    """Raises InputError, before anything is planned, where a watcher cannot be had."""
-    if live:
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """Who is asked to watch."""
+
+    live: bool  # a live view in rerun
+    mavlink: str | None  # where a ground station listens, as udp:127.0.0.1:14550
+
+
+def check_watchers(watched: Watched) -> None:
+    """Raise InputError, before anything is planned, where a watcher is not available."""
+    if watched.live:
         from cfplan.recording.rerun.viewer import require_screen
 
         require_screen("leave out --live; `cfplan replay` shows the record afterwards")
-    if mavlink is not None:
+    if watched.mavlink is not None:
         from cfplan.recording.mavlink.bridge import check_place
 
-        check_place(mavlink)
+        check_place(watched.mavlink)
 
 
 @contextlib.contextmanager
-def watchers(header: "RecordHeader", folder: Path, *, live: bool, mavlink: str | None) -> Iterator[Watching]:
-    """The watchers that were asked for, for as long as the block lasts; the .tlog lies in the record's folder."""
+def watchers(header: "RecordHeader", folder: Path, watched: Watched) -> Iterator[Watching]:
+    """Open the watchers that were asked for while the block lasts; the .tlog lies in the record's folder."""
     with contextlib.ExitStack() as stack:
         view = station = None
-        if live:
+        if watched.live:
             from cfplan.recording.rerun.live import open_live
 
             view = stack.enter_context(open_live(header, folder))
-        if mavlink is not None:
+        if watched.mavlink is not None:
             from cfplan.recording.mavlink.bridge import GroundStation, parse_place
 
-            station = stack.enter_context(GroundStation(parse_place(mavlink), folder / TLOG_FILE))
+            station = stack.enter_context(GroundStation(parse_place(watched.mavlink), folder / TLOG_FILE))
         yield Watching(view, station)

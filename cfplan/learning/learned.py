@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from cfplan.errors import InputError
 from cfplan.geometry.path import Path
@@ -151,6 +150,8 @@ def predict(
 
 def _lower(logs: NDArray, known: NDArray, asked: NDArray, rest_start: bool, rest_end: bool) -> None:
     """Lower the profile by as much as the reference is lower, less what the profile lies under its own already."""
+    from scipy.ndimage import gaussian_filter1d  # slow to import
+
     gap = np.maximum(known - asked - np.maximum(known - logs[1:-1], 0.0), 0.0)
     gap = gaussian_filter1d(np.pad(gap, 1, mode="edge"), LOWERING_WIDTH, mode="nearest")
     if rest_start:

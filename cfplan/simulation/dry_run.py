@@ -4,18 +4,18 @@ It starts in hover at the start, receives each payload when it is due and hovers
 the true state. What it does is held against the limits from which on the pilot would interfere.
 """
 
+import math
 import time
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter1d
-from scipy.spatial import cKDTree
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.flight.setpoints.packets import decode
+from cfplan.machine_code import njit
 from cfplan.safety.limits import FlightLimits
 from cfplan.safety.quantities import ON_LADDER
 from cfplan.simulation.dynamics.body import TIME_STEP, hovering
@@ -110,7 +110,8 @@ def dry_run(
         delay=delay,
         estimate=estimate,
     )
-    fly(duration=0.0)  # compiles where need be
+    fly(duration=0.0)  # compiles if need be, as does the next line
+    _distances_to_path(np.zeros((1, 3)), np.zeros((1, 3)))
     begun = time.perf_counter()
     loop = fly(duration=encoded.duration + SETTLING)
     run = _judge(loop, trajectory, limits)
@@ -139,7 +140,7 @@ def _judge(loop: ClosedLoop, trajectory: Trajectory, limits: FlightLimits) -> Dr
     error = np.linalg.norm(positions - wanted, axis=1)
     error = np.where(np.isfinite(error), error, np.inf)
     known = np.isfinite(positions).all(axis=1)
-    nearest = np.where(known, cKDTree(wanted).query(np.where(known[:, None], positions, 0.0))[0], np.inf)
+    nearest = np.where(known, _distances_to_path(np.where(known[:, None], positions, 0.0), wanted), np.inf)
     moving = times <= trajectory.duration
     late = np.flatnonzero(~moving & (error > SETTLED))
     settled = times[late[-1]] - trajectory.duration if len(late) else 0.0
@@ -183,7 +184,38 @@ def _fault(run: DryRun, limits: FlightLimits) -> str:
 
 
 def _lasting(values: NDArray, patience: float) -> float:
-    """The highest value that is not fallen short of for `patience`, s."""
-    window = max(1, round(patience / TIME_STEP))
+    """Return the highest value below which the values do not fall for `patience`, s; less at the ends."""
+    window = min(max(1, round(patience / TIME_STEP)), len(values))
     values = np.where(np.isfinite(values), values, np.inf)
-    return float(minimum_filter1d(values, min(window, len(values)), mode="nearest").max())
+    # Repeated ends stand for what is not simulated any more.
+    padded = np.pad(values, (window // 2, window - 1 - window // 2), mode="edge")
+    return float(np.lib.stride_tricks.sliding_window_view(padded, window).min(axis=1).max())
+
+
+@njit
+def _distances_to_path(positions: NDArray, wanted: NDArray) -> NDArray:
+    """Return the distance of each position, (N, 3), to the nearest of the wanted ones, (N, 3) too, in order of time.
+
+    The search goes from the same moment both ways. Where the distance exceeds the nearest one by some steps, it skips
+    as many: consecutive points are at most the longest step apart.
+    """
+    longest = 0.0
+    for n in range(len(wanted) - 1):
+        longest = max(longest, _distance(wanted[n], wanted[n + 1]))
+    out = np.empty(len(positions))
+    for n in range(len(positions)):
+        nearest = _distance(positions[n], wanted[n])
+        for direction in (-1, 1):
+            place = n + direction
+            while 0 <= place < len(wanted):
+                distance = _distance(positions[n], wanted[place])
+                nearest = min(nearest, distance)
+                skipped = (distance - nearest) / longest if longest > 0.0 else float(len(wanted))
+                place += direction * max(1, int(min(skipped, float(len(wanted)))))
+        out[n] = nearest
+    return out
+
+
+@njit
+def _distance(first: NDArray, second: NDArray) -> float:
+    return math.sqrt((first[0] - second[0]) ** 2 + (first[1] - second[1]) ** 2 + (first[2] - second[2]) ** 2)

@@ -11,8 +11,6 @@ quadratic spline on the same grid, yaw_spline.py has the same.
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
 from cfplan.machine_code import njit
@@ -82,6 +80,11 @@ def weights_at(place: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     )
 
 
+def _quadratic_weights_at(place: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Return the same of the three coefficients of a quadratic spline."""
+    return (1 - place) ** 2 / 2, (1 + 2 * place - 2 * place**2) / 2, place**2 / 2
+
+
 def profile_through(
     grid: NDArray, s: NDArray, h: NDArray, yaw: NDArray, *, h_stiffness: float = 0.0, yaw_stiffness: float = 0.0
 ) -> SpeedProfile:
@@ -91,49 +94,40 @@ def profile_through(
     the intervals, in units of one interval, against the mean squared error. Where samples are sparse a little
     stiffness is what fills in.
     """
-    turn = _fit(grid, s, yaw, np.ones_like(yaw), 2, yaw_stiffness)
-    track = YawSpline(turn(grid), turn(grid, 1), turn(_middles(grid), 2))
+    turning = _fit(grid, s, yaw, np.ones_like(yaw), 2, yaw_stiffness)
+    track = YawSpline.from_coefficients(turning, grid[1] - grid[0])
     return speed_through(grid, s, h, track, stiffness=h_stiffness)
 
 
 def speed_through(grid: NDArray, s: NDArray, h: NDArray, yaw: YawSpline, *, stiffness: float = 0.0) -> SpeedProfile:
     """Return what profile_through() does, with yaw as given."""
     speed = _fit(grid, s, h, 1.0 / np.square(h), 3, stiffness)
-    return SpeedProfile(
-        grid, speed(grid), speed(grid, 1), speed(grid, 2), speed(_middles(grid), 3), yaw.yaw, yaw.dyaw, yaw.ddyaw
-    )
+    _, values, dh, ddh, dddh = _on_grid(speed, float(grid[-1] - grid[0]))
+    return SpeedProfile(grid, values, dh, ddh, dddh, yaw.yaw, yaw.dyaw, yaw.ddyaw)
 
 
-def _middles(grid: NDArray) -> NDArray:
-    return 0.5 * (grid[1:] + grid[:-1])
-
-
-def _fit(grid: NDArray, s: NDArray, values: NDArray, weights: NDArray, degree: int, stiffness: float) -> BSpline:
-    step = grid[1] - grid[0]
-    # Knots go on beyond the ends at the same spacing, so that differences of coefficients are derivatives everywhere.
-    knots = grid[0] + step * np.arange(-degree, len(grid) + degree)
+def _fit(grid: NDArray, s: NDArray, values: NDArray, weights: NDArray, degree: int, stiffness: float) -> NDArray:
+    """Return the coefficients, (N + degree,), of the spline of degree 2 or 3 that is nearest to the samples."""
     count = len(grid) - 1 + degree
-    inside = np.clip(s, knots[degree], knots[-degree - 1])  # the last knot may differ from the end by rounding
-    basis = BSpline.design_matrix(inside, knots, degree)
-    normal = basis.T @ sparse.diags_array(weights / len(s)) @ basis
-    target = basis.T @ (weights * values) / len(s)
+    place = np.clip((s - grid[0]) / (grid[1] - grid[0]), 0.0, len(grid) - 1.0)  # the end may differ by rounding
+    interval = np.minimum(place.astype(int), len(grid) - 2)
+    basis = (weights_at if degree == 3 else _quadratic_weights_at)(place - interval)
+    shares = weights / len(s)
     # The (degree + 1)-th difference of the coefficients is the jump of the highest derivative at an inner knot.
-    difference = _difference(count, degree + 1)
-    local = np.interp(np.arange(count - degree - 1) + (degree + 1) / 2, _coefficient(grid, s, count), weights)
-    # A floor keeps the problem regular where an interval has no sample.
-    normal += difference.T @ sparse.diags_array((stiffness + 1e-9) * local / count) @ difference
-    bands = np.zeros((degree + 2, count))
-    for offset in range(degree + 2):
-        bands[degree + 1 - offset, offset:] = normal.diagonal(offset)
-    return BSpline(knots, solveh_banded(bands, target), degree)
-
-
-def _difference(count: int, order: int) -> sparse.csr_array:
-    """Return (count - order, count): the difference of that order."""
-    matrix = sparse.eye_array(count, format="csr")
-    for _ in range(order):
-        matrix = matrix[1:] - matrix[:-1]
-    return matrix
+    difference = np.diff(np.eye(degree + 2), degree + 1, axis=0)[0]
+    knot = np.arange(count - degree - 1)
+    local = np.interp(knot + (degree + 1) / 2, _coefficient(grid, s, count), weights)
+    stiff = (stiffness + 1e-9) * local / count  # the floor keeps the problem regular if an interval has no sample
+    bands, target = np.zeros((degree + 2, count)), np.zeros(count)
+    for i in range(degree + 2):
+        if i <= degree:
+            target += np.bincount(interval + i, basis[i] * shares * values, count)
+        for j in range(i, degree + 2):
+            band = bands[degree + 1 - (j - i)]
+            band += np.bincount(knot + j, stiff * difference[i] * difference[j], count)
+            if j <= degree:
+                band += np.bincount(interval + j, shares * basis[i] * basis[j], count)
+    return solveh_banded(bands, target)
 
 
 def _coefficient(grid: NDArray, s: NDArray, count: int) -> NDArray:

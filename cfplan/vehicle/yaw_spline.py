@@ -13,8 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bmat, csr_matrix, diags
-from scipy.sparse.linalg import spsolve
 
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
@@ -150,6 +148,9 @@ def _fit(
     end: BoundaryState | None,
 ) -> YawSpline:
     """Fit to a target at nodes and midpoints, (2 nodes + 1,)."""
+    from scipy.sparse import bmat, csr_matrix, diags  # slow to import
+    from scipy.sparse.linalg import spsolve
+
     step = path.end / nodes
     size = nodes + 2
     ones = np.ones(size)

@@ -9,9 +9,11 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from types import TracebackType
 
 from cfplan.errors import CfplanError, LinkError
 from cfplan.flight.mocap.poses import PoseSource
@@ -30,41 +32,82 @@ _POLL_PERIOD = 0.05  # s
 _LANDING_TIME = 60.0  # s that a pilot without a main process has to land
 
 
+@dataclass(frozen=True, slots=True)
+class _Assignment:
+    """What the pilot's process is told once its flight is prepared."""
+
+    mission: Mission
+    uri: str
+    pose_source: PoseSource
+    environment: Mapping[str, str]  # of the main process by now: a lab that started meanwhile stands there
+
+
+class PilotProcess:
+    """The pilot's process, which imports what it needs until it is assigned a mission; a context manager."""
+
+    def __init__(self, process: BaseProcess, telemetry: Connection, orders: Connection):
+        self.process, self.telemetry, self.orders = process, telemetry, orders
+        self._assigned = False
+
+    def assign(self, mission: Mission, uri: str, pose_source: PoseSource) -> None:
+        """Let it fly. Raises LinkError if it has died."""
+        try:
+            self.orders.send(_Assignment(mission, uri, pose_source, dict(os.environ)))
+        except OSError as why:
+            raise _died(self.process) from why
+        self._assigned = True
+
+    def close(self) -> None:
+        """End it: at once on the ground, after its landing in flight. May be called twice."""
+        self.orders.close()  # if this end fails, the pilot notices and lands
+        self.telemetry.close()
+        self.process.join(_LANDING_TIME if self._assigned else 0.0)
+        if self.process.is_alive():
+            self.process.kill()
+
+    def __enter__(self) -> "PilotProcess":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def start_pilot(drivers: Sequence[type] = ()) -> PilotProcess:
+    """Start the pilot's process, ahead of its mission. `drivers` are cflib link drivers tried before cflib's own."""
+    context = multiprocessing.get_context("spawn")
+    telemetry, telemetry_end = context.Pipe(duplex=False)
+    orders_end, orders = context.Pipe(duplex=False)
+    process = context.Process(target=_run, args=(tuple(drivers), telemetry_end, orders_end), name="pilot")
+    with _signals_ignored():
+        process.start()
+    telemetry_end.close()
+    orders_end.close()
+    return PilotProcess(process, telemetry, orders)
+
+
 def fly(
     mission: Mission,
     *,
     uri: str,
     pose_source: PoseSource,
     drivers: Sequence[type] = (),
+    pilot: PilotProcess | None = None,
     on_telemetry: Callable[[Telemetry], None] = lambda _: None,
     more_orders: Callable[[], Sequence[Order]] = tuple,
 ) -> FlightOutcome:
     """Fly a mission and return when the vehicle is down. Call from the main thread, so that Ctrl-C lands.
 
-    `pose_source` and `drivers` (cflib link drivers tried before cflib's own) go to the pilot's process by pickle.
-    `on_telemetry` gets every message, in order; what it raises is raised here after the vehicle has landed.
-    `more_orders` returns the orders since its last call that came neither by key nor by signal; it must not wait.
-    Raises LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose source raises.
+    `pilot` is a process that was started before, with `drivers`; without one it is started now. `pose_source` and
+    `drivers` go there by pickle. `on_telemetry` gets every message, in order; what it raises is raised here after the
+    vehicle has landed. `more_orders` returns the orders since its last call that came neither by key nor by signal; it
+    must not wait. Raises LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose
+    source raises.
     """
-    context = multiprocessing.get_context("spawn")
-    telemetry, telemetry_end = context.Pipe(duplex=False)
-    orders_end, orders = context.Pipe(duplex=False)
-    process = context.Process(
-        target=_run, args=(mission, uri, tuple(drivers), pose_source, telemetry_end, orders_end), name="pilot"
-    )
-    with Keyboard() as keyboard, telemetry, orders:
-        with _signals_ignored():
-            process.start()
-        telemetry_end.close()
-        orders_end.close()
-        try:
-            return _attend(process, telemetry, orders, keyboard, on_telemetry, more_orders)
-        finally:
-            orders.close()  # if this end fails, the pilot notices and lands
-            telemetry.close()
-            process.join(_LANDING_TIME)
-            if process.is_alive():
-                process.kill()
+    with Keyboard() as keyboard, pilot or start_pilot(drivers) as started:
+        started.assign(mission, uri, pose_source)
+        return _attend(started.process, started.telemetry, started.orders, keyboard, on_telemetry, more_orders)
 
 
 def _attend(
@@ -89,11 +132,7 @@ def _attend(
         try:
             message = telemetry.recv()
         except (EOFError, OSError):
-            process.join(5.0)
-            raise LinkError(
-                f"the pilot's process died (exit code {process.exitcode})",
-                hint="the vehicle levels out after 0.5 s without setpoints and stops its motors after 2 s",
-            ) from failure
+            raise _died(process) from failure
         if isinstance(message, list):
             if failure is None:
                 try:
@@ -108,6 +147,14 @@ def _attend(
         if isinstance(message, CfplanError):
             raise message
         return message
+
+
+def _died(process: BaseProcess) -> LinkError:
+    process.join(5.0)
+    return LinkError(
+        f"the pilot's process died (exit code {process.exitcode})",
+        hint="the vehicle levels out after 0.5 s without setpoints and stops its motors after 2 s",
+    )
 
 
 def _send(orders: Connection, order: Order) -> None:
@@ -148,30 +195,31 @@ class OrderReceiver:
         self.worst = max(order, self.worst or order)
 
 
-def _run(
-    mission: Mission,
-    uri: str,
-    drivers: tuple[type, ...],
-    pose_source: PoseSource,
-    telemetry: Connection,
-    orders_connection: Connection,
-) -> None:
+def _run(drivers: tuple[type, ...], telemetry: Connection, orders_connection: Connection) -> None:
     """Run the pilot's process, from its first line to its last."""
     with contextlib.suppress(OSError):
         os.setsid()  # the terminal's signals are for the main process
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
         signal.signal(number, signal.SIG_IGN)
-    orders, report = OrderReceiver(orders_connection), Reporter(telemetry)
-    signal.signal(signal.SIGTERM, lambda *_: orders.give(Order.LAND))
     logging.getLogger("cflib").setLevel(logging.CRITICAL)  # its warnings are reported as telemetry
     warnings.filterwarnings("ignore", module="cflib")
+    import cflib.crazyflie  # noqa: F401  connecting needs it, and it takes long
+
+    try:
+        assignment: _Assignment = orders_connection.recv()
+    except (EOFError, OSError):
+        os._exit(0)  # nothing is to be flown
+    os.environ.update(assignment.environment)
+    uri = assignment.uri
+    orders, report = OrderReceiver(orders_connection), Reporter(telemetry)
+    signal.signal(signal.SIGTERM, lambda *_: orders.give(Order.LAND))
     sys.setswitchinterval(_SWITCH_INTERVAL)
     last: FlightOutcome | CfplanError
     try:
         pilot = Pilot(
-            mission,
+            assignment.mission,
             connect=lambda waiting: connect(uri, report, drivers, waiting=waiting),
-            source=pose_source,
+            source=assignment.pose_source,
             report=report,
             orders=orders,
             enter_real_time=_enter_real_time,

@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from cfplan.geometry.path import Path
 from cfplan.safety.limits import PlanLimits
@@ -33,5 +32,7 @@ def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int,
         (0.7 * SHARE * limits.angular_velocity * GRAVITY / third) ** (2 / 3),
         (0.7 * SHARE * turning * GRAVITY / fourth) ** 0.5,
     ])  # fmt: skip
+    from scipy.ndimage import gaussian_filter1d, minimum_filter1d  # slow to import
+
     logarithm = minimum_filter1d(np.log(h), int(2 * WIDTH) + 1, mode="nearest")
     return np.exp(gaussian_filter1d(logarithm, WIDTH, mode="nearest"))

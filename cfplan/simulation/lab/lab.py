@@ -8,6 +8,7 @@ its link drivers itself, from nothing but the URI, in the pilot's process and in
 """
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -148,6 +149,78 @@ class Lab:
         self.close()
 
 
+class StartingLab:
+    """A lab whose process is starting; a context manager that ends it. `launch_lab` makes it."""
+
+    def __init__(self, process: subprocess.Popen, connection: Connection, number: int, room: RoomSettings):
+        self._process, self._connection, self._number, self._room = process, connection, number, room
+        self._lab: Lab | None = None
+
+    def wait(self) -> Lab:
+        """Wait until it runs. Raises LinkError if it does not come up, InputError if its port is taken."""
+        try:
+            if not self._connection.poll(_START_TIMEOUT):
+                raise EOFError
+            answer = self._connection.recv()
+        except (OSError, EOFError) as why:
+            self._process.kill()
+            code = self._process.wait()
+            raise LinkError(
+                f"the virtual lab did not start (exit {code})",
+                where=f"sim://{self._number}",
+                hint="run `cfplan doctor`",
+            ) from why
+        if isinstance(answer, CfplanError):
+            raise answer
+        port, vicon_port = answer
+        cameras = self._room.vicon
+        mocap_uri = f"vicon://127.0.0.1:{vicon_port}/{cameras.subject}" if cameras is not None else ""
+        self._lab = Lab(self._process, self._connection, self._number, port, mocap_uri)
+        return self._lab
+
+    def close(self) -> None:
+        """End it, whether it runs or not; may be called twice."""
+        if self._lab is not None:
+            self._lab.close()
+        else:
+            self._process.kill()
+            self._process.wait()
+            self._connection.close()
+
+    def __enter__(self) -> "StartingLab":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def launch_lab(
+    airframe: Airframe,
+    *,
+    vehicle: VehicleSettings | None = None,
+    room: RoomSettings | None = None,
+    number: int = 0,
+    port: int = 0,
+) -> StartingLab:
+    """Launch the process of a lab, as for `start_lab`, and return at once."""
+    room = room or RoomSettings()
+    ours, theirs = socket.socketpair()
+    unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is the pilot's to handle
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "cfplan.simulation.lab.process", str(theirs.fileno())],
+            pass_fds=(theirs.fileno(),),
+            stdin=subprocess.DEVNULL,
+        )
+    signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
+    connection = Connection(ours.detach())
+    with suppress(OSError):  # it has died, which waiting for it notices
+        connection.send((airframe, vehicle or VehicleSettings(), room, port))
+    return StartingLab(process, connection, number, room)
+
+
 def start_lab(
     airframe: Airframe,
     *,
@@ -163,28 +236,4 @@ def start_lab(
     A lab that had that number is hidden until this one is closed. A plain child process rather than one of
     multiprocessing's, so that it can be started from a daemonic process and from a script without a main guard.
     """
-    ours, theirs = socket.socketpair()
-    with theirs:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "cfplan.simulation.lab.process", str(theirs.fileno())],
-            pass_fds=(theirs.fileno(),),
-            stdin=subprocess.DEVNULL,
-        )
-    connection = Connection(ours.detach())
-    try:
-        connection.send((airframe, vehicle or VehicleSettings(), room or RoomSettings(), port))
-        if not connection.poll(_START_TIMEOUT):
-            raise EOFError
-        answer = connection.recv()
-        if isinstance(answer, CfplanError):
-            raise answer
-        port, vicon_port = answer
-        subject = room.vicon.subject if room is not None and room.vicon is not None else ""
-        mocap_uri = f"vicon://127.0.0.1:{vicon_port}/{subject}" if subject else ""
-        return Lab(process, connection, number, port, mocap_uri)
-    except (OSError, EOFError) as why:
-        process.kill()
-        code = process.wait()
-        raise LinkError(
-            f"the virtual lab did not start (exit {code})", where=f"sim://{number}", hint="run `cfplan doctor`"
-        ) from why
+    return launch_lab(airframe, vehicle=vehicle, room=room, number=number, port=port).wait()

@@ -5,7 +5,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from cfplan.simulation.dynamics.body import MASS, THRUST_MAX
 from cfplan.simulation.virtual_crazyflie.battery import Battery
@@ -350,6 +349,8 @@ def _reproduce_residual_error(poses: NDArray, belief: NDArray) -> None:
     This was the filter's error before 2025.09.1 (crazyflie-firmware #1292): with yaw beyond 90° it corrected roll and
     pitch the wrong way.
     """
+    from scipy.spatial.transform import Rotation  # slow to import, and few vehicles need it
+
     believed = Rotation.from_quat(belief)
     for row in poses:
         if np.any(row[3:7]):

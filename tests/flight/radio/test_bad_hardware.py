@@ -24,7 +24,7 @@ def refused(tmp_path, monkeypatch, capsys):
     def never(*_, **__):
         pytest.fail("a vehicle was reached for")
 
-    monkeypatch.setattr("cfplan.simulation.lab.lab.start_lab", never)
+    monkeypatch.setattr("cfplan.simulation.lab.lab.launch_lab", never)
     monkeypatch.setattr("cfplan.flight.pilot.process.fly", never)
     (tmp_path / "path.yaml").write_text(PATH)
 
