@@ -122,3 +122,12 @@ def write_quaternion(out: NDArray, matrix: NDArray) -> None:
         out[j] = (matrix[j, i] + matrix[i, j]) / (2.0 * twice)
         out[k] = (matrix[k, i] + matrix[i, k]) / (2.0 * twice)
         out[3] = (matrix[k, j] - matrix[j, k]) / (2.0 * twice)
+
+
+@njit(error_model="numpy")
+def quaternions_of(matrices: NDArray) -> NDArray:
+    """Return the (N, 4) quaternions of rotation matrices, (N, 3, 3)."""
+    out = np.empty((len(matrices), 4))
+    for n in range(len(matrices)):
+        write_quaternion(out[n], matrices[n])
+    return out

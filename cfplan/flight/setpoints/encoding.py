@@ -120,11 +120,6 @@ def controller_attitude(thrust: NDArray, quaternion: NDArray) -> NDArray:
     return _attitudes(np.array(thrust, dtype=float), np.array(quaternion, dtype=float))
 
 
-def quaternion_of(frames: NDArray) -> NDArray:
-    """Return (N, 4) x y z w of attitudes given as rotation matrices, (N, 3, 3)."""
-    return _quaternions(np.ascontiguousarray(frames, dtype=float))
-
-
 def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimits) -> None:
     """Certify the bytes against the trajectory, which is evaluated afresh: nothing that encoding computed is used.
 
@@ -262,14 +257,6 @@ def _commands(quaternions: NDArray) -> NDArray:
         frame[0, 0], frame[1, 0], frame[2, 0] = p, q, r
         frame[0, 1], frame[1, 1], frame[2, 1] = b * r - c * q, c * p - a * r, a * q - b * p
         write_quaternion(out[n], frame)
-    return out
-
-
-@njit(error_model="numpy")
-def _quaternions(frames: NDArray) -> NDArray:
-    out = np.empty((len(frames), 4))
-    for n in range(len(frames)):
-        _write_quaternion(out[n], frames[n])
     return out
 
 

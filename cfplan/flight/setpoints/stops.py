@@ -11,10 +11,10 @@ r falls as a smoothstep, so the braking deceleration is at most 1.5 v₀ / durat
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude, quaternion_of
+from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import about_z, yaw_of
+from cfplan.vehicle.rotations import about_z, quaternions_of, yaw_of
 
 DURATION = 0.8  # s, from full speed to rest: 3.75 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
@@ -44,7 +44,7 @@ def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION, row
     acceleration = clock_rate[:, None] ** 2 * at(reference.acceleration) + slowing[:, None] * velocity
     turn = at(np.unwrap(yaw_of(reference.quaternion.T))[:, None])[..., 0].reshape(-1)
     made = controller_attitude(acceleration.reshape(-1, 3) + _GRAVITY, about_z(turn))
-    attitude = quaternion_of(made)
+    attitude = quaternions_of(made)
     shape = (len(begin), steps + 1)
     body_rate = _ahead(_turn_rates(attitude.reshape(*shape, 4), rate), RATE_LEAD * rate)
     body_rate[:, -1] = 0.0  # the vehicle may be left with the last setpoint
