@@ -14,7 +14,15 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
-from cfplan.simulation.dynamics.body import ALL_WELL, STILL_AIR, THRUST_MAX, TIME_STEP, hovering, pack_body, step_body
+from cfplan.simulation.dynamics.body import (
+    FULL_EFFICIENCY,
+    STILL_AIR,
+    THRUST_MAX,
+    TIME_STEP,
+    hovering,
+    pack_body,
+    step_body,
+)
 from cfplan.simulation.dynamics.mellinger import (
     CONTROL_PERIOD,
     FULL_COMMAND,
@@ -125,7 +133,7 @@ def _run(
     longest: int,
 ) -> None:
     state, memory, thrusts = start.copy(), np.zeros(MEMORY_SIZE), np.zeros(4)
-    flying, wind, efficiency = FULL_STATE.copy(), STILL_AIR.copy(), ALL_WELL.copy()
+    flying, wind, efficiency = FULL_STATE.copy(), STILL_AIR.copy(), FULL_EFFICIENCY.copy()
     newest, flown = 0, 0
     for number in range(len(moments)):
         for step in range(flown, moments[number]):

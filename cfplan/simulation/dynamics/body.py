@@ -29,7 +29,7 @@ STATE_SIZE = 17
 MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, THRUST_MAX, _LAG, _DRAG, _AXIAL_DRAG, FLOOR, _REACTION = range(12)
 
 STILL_AIR = np.zeros(3)
-ALL_WELL = np.ones(4)
+FULL_EFFICIENCY = np.ones(4)
 
 
 def pack_body(airframe: Airframe, *, floor: float = 0.0) -> NDArray:
@@ -67,10 +67,10 @@ def at_rest(position: NDArray, yaw: float = 0.0) -> NDArray:
 
 @njit
 def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, efficiency: NDArray) -> None:
-    """Carry `state` on by one TIME_STEP, in place.
+    """Advance `state` by one TIME_STEP, in place.
 
     `command` (4,) N is what each motor is asked for, clipped to what it can give; `wind` (3,) m/s in world axes;
-    `efficiency` (4,) is the share of its thrust that each motor really gives, 1 when well.
+    `efficiency` (4,) is the share of its thrust that each motor gives, 1 without a fault.
     """
     lag = min(1.0, TIME_STEP / max(body[_LAG], 1e-9))
     push, twist = np.empty(4), np.empty(4)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.machine_code import njit
 from cfplan.simulation.dynamics.body import (
-    ALL_WELL,
     BODY_RATE,
+    FULL_EFFICIENCY,
     MOTORS,
     POSITION,
     QUATERNION,
@@ -100,7 +100,7 @@ def fly_setpoints(
     delay: float = 0.0,
     estimate: EstimateErrors = PERFECT,
     wind: NDArray = STILL_AIR,
-    efficiency: NDArray = ALL_WELL,
+    efficiency: NDArray = FULL_EFFICIENCY,
 ) -> ClosedLoop:
     """Fly setpoints that arrive at `times` + `delay`, (N,) s, from the state `start`, (17,), for `duration` s.
 

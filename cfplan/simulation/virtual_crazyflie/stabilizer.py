@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 from cfplan.simulation.dynamics.body import (
-    ALL_WELL,
     FLOOR,
+    FULL_EFFICIENCY,
     STILL_AIR,
     TIME_STEP,
     at_rest,
@@ -81,7 +81,7 @@ class Stabilizer:
             counts=np.zeros(3, dtype=np.int64),
             noise=_sensor_noise(settings.sensors, settings.seed),
             wind=STILL_AIR.copy(),
-            efficiency=ALL_WELL.copy(),
+            efficiency=FULL_EFFICIENCY.copy(),
         )
         estimate(self.loop.kalman, self.loop.belief)
         self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N

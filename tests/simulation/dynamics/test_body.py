@@ -6,8 +6,8 @@ from rotorpy.vehicles.multirotor import Multirotor
 from scipy.spatial.transform import Rotation
 
 from cfplan.simulation.dynamics.body import (
-    ALL_WELL,
     BODY_RATE,
+    FULL_EFFICIENCY,
     MOTORS,
     POSITION,
     QUATERNION,
@@ -33,7 +33,7 @@ def airframe(**changes) -> Airframe:
     return Airframe(**(values | changes))
 
 
-def fly(state, command, body, seconds, *, wind=STILL_AIR, efficiency=ALL_WELL):
+def fly(state, command, body, seconds, *, wind=STILL_AIR, efficiency=FULL_EFFICIENCY):
     """The state `seconds` later."""
     state = state.copy()
     for _ in range(round(seconds / TIME_STEP)):
