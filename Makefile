@@ -1,7 +1,8 @@
-# Two commands: `make fly` flies the virtual Crazyflie, `make test` runs every test but the slow ones.
+# `make fly` installs what flies and flies the virtual Crazyflie; `make test` installs what tests and runs the tests.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --editable
 
 .PHONY: install fly test slow lint clean
 
@@ -9,19 +10,24 @@ install: $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --disable-pip-version-check --quiet --editable ".[dev]"
+	$(PIP) .
+	$(BIN)/cfplan doctor --warm-up
+	touch $@
+
+$(VENV)/installed-tests: $(VENV)/installed
+	$(PIP) ".[dev]"
 	touch $@
 
 fly: install
 	$(BIN)/cfplan fly flights/figure8.yaml
 
-test: install
+test: $(VENV)/installed-tests
 	$(BIN)/python -m pytest
 
-slow: install
+slow: $(VENV)/installed-tests
 	$(BIN)/python -m pytest -m slow
 
-lint: install
+lint: $(VENV)/installed-tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
