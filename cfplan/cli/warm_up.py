@@ -11,7 +11,7 @@ import click
 
 from cfplan.preparation.compiled_calls import Stage, find_calls
 
-SHOWN_EVERY = 4.0  # s
+SHOWN_AFTER, SHOWN_EVERY = 2.0, 4.0  # s
 
 
 class Worker:
@@ -49,7 +49,6 @@ def compile_ahead(stage: Stage, safety_file: Path, *, silent: bool) -> None:
     context.call_on_close(worker.stop)
     context.call_on_close(ended.set)
     if not silent:
-        click.echo("compiling for this machine; this happens once, and takes up to half a minute", err=True)
         threading.Thread(target=_show, args=([worker], ended.wait), daemon=True).start()
 
 
@@ -79,6 +78,9 @@ def _all_ended(workers: list[Worker], seconds: float) -> bool:
 
 def _show(workers: list[Worker], ended: Callable[[float], bool]) -> None:
     """Print how many functions are compiled, again and again, until `ended`, which waits for some seconds."""
+    if ended(SHOWN_AFTER):
+        return
+    click.echo("compiling for this machine; this happens once, and takes up to half a minute", err=True)
     while not ended(SHOWN_EVERY):
         total, done = (max(getattr(worker, name) for worker in workers) for name in ("total", "done"))
         if total == 0:
