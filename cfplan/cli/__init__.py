@@ -1,6 +1,11 @@
 """The command line: one small file a command, wiring only. Whatever is heavy is imported inside the commands."""
 
+import atexit
+import gc
+import os
 import sys
+import threading
+from contextlib import suppress
 
 import click
 
@@ -42,21 +47,39 @@ for command in (plan, check, sim, fly, virtual, replay, report, mocap, dataset, 
 
 
 def main() -> None:
-    """Run the command line; a user's mistake ends in one line and an exit code, never in a traceback."""
+    """Run the command line, and end the process.
+
+    What thousands of imported objects cost is half of a short command's time: the garbage collector looks less often,
+    and where nothing else runs in the process it ends without freeing them one by one.
+    """
+    gc.set_threshold(50_000, 20, 20)
+    code = _run()
+    children = sys.modules["multiprocessing"].active_children() if "multiprocessing" in sys.modules else []
+    if children or any(not thread.daemon for thread in threading.enumerate()[1:]):
+        sys.exit(code)
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):  # the reader went away, or it is closed already
+            stream.flush()
+    os._exit(code)
+
+
+def _run() -> int:
+    """Run a command and return the exit code; a user's mistake ends in one line, never in a traceback."""
     try:
         result = cfplan.main(standalone_mode=False)
     except click.exceptions.Exit as ending:
-        sys.exit(ending.exit_code)
+        return ending.exit_code
     except click.ClickException as error:
         error.show()
-        sys.exit(error.exit_code)
+        return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         print("stopped", file=sys.stderr)
-        sys.exit(130)
+        return 130
     except BrokenPipeError:  # the reader of our output went away, as `| head` does
         sys.stderr.close()
-        sys.exit(0)
+        return 0
     except CfplanError as error:
         print_error(error, as_json="--json" in sys.argv)
-        sys.exit(error.exit_code)
-    sys.exit(result if isinstance(result, int) else 0)
+        return int(error.exit_code)
+    return result if isinstance(result, int) else 0
