@@ -153,7 +153,6 @@ def _lower(logs: NDArray, known: NDArray, asked: NDArray, rest_start: bool, rest
     from scipy.ndimage import gaussian_filter1d  # slow to import
 
     gap = np.maximum(known - asked - np.maximum(known - logs[1:-1], 0.0), 0.0)
-    from scipy.ndimage import gaussian_filter1d
 
     gap = gaussian_filter1d(np.pad(gap, 1, mode="edge"), LOWERING_WIDTH, mode="nearest")
     if rest_start:
