@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from cfplan.planners.expert.intersample import violates_at_nodes
-from cfplan.planners.expert.refine import refine
+from cfplan.planners.expert.refine import refinements
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import Certificate, certify
-from cfplan.safety.slowing import Slowed, slow_until_certified
+from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import duration_of
@@ -63,24 +63,18 @@ def repair(task: PlanningTask, profile: SpeedProfile, space: Space | None = None
         certificate = certify(trajectory, limits, space)
         if certificate.passed:
             return Repaired(trajectory, certificate, 1.0, trajectory.duration)
-    certified: list[Slowed] = []
-
-    def passes(refined: SpeedProfile) -> bool:
+    for solution in refinements(task, profile):
+        if solution.profile is None:
+            return slow(task, profile, space, failed=solution.reason)
+        refined, joints = solution.profile, solution.joints
         trajectory = Trajectory(path, refined, airframe)
         certificate = certify(trajectory, limits, space)
         if certificate.passed:
-            certified.append(Slowed(trajectory, certificate, 1.0))
-        return certificate.passed
-
-    solution = refine(task, profile, passes=passes)
-    if solution.profile is None:
-        return slow(task, profile, space, failed=solution.reason)
-    if not certified:
-        certified.append(slow_until_certified(Trajectory(path, solution.profile, airframe), limits, space))
-    (slowed,) = certified
+            break
+    slowed = slow_until_certified(trajectory, limits, space, certificate)
     return Repaired(
-        slowed.trajectory, slowed.certificate, slowed.speed_factor, before, *_where_slower(profile, solution.profile),
-        joints=solution.joints,
+        slowed.trajectory, slowed.certificate, slowed.speed_factor, before, *_where_slower(profile, refined),
+        joints=joints,
     )  # fmt: skip
 
 

@@ -28,13 +28,17 @@ class Slowed:
     speed_factor: float  # everywhere; 1: not slowed
 
 
-def slow_until_certified(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Slowed:
+def slow_until_certified(
+    trajectory: Trajectory, limits: PlanLimits, space: Space | None = None, certificate: Certificate | None = None
+) -> Slowed:
     """Return the trajectory itself where it passes, else at the largest speed factor that does, within RESOLUTION.
+
+    `certificate` is the trajectory's, if it is known.
 
     Raises:
         InfeasibleError: no speed factor passes, because hovering or the path itself breaks a limit; says which.
     """
-    certificate = certify(trajectory, limits, space)
+    certificate = certificate or certify(trajectory, limits, space)
     if certificate.passed:
         return Slowed(trajectory, certificate, 1.0)
     _check_hover(trajectory.airframe, limits)

@@ -8,7 +8,7 @@ from hard_paths import hard_paths
 
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.expert.expert import plan_expert
-from cfplan.planners.expert.refine import refine
+from cfplan.planners.expert.refine import refinements
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.planning import repair as repairing
@@ -38,7 +38,7 @@ def test_what_exceeds_limits_between_points_after_refining_is_refined_on_not_slo
     for case in SHARP_TURNS:
         if case.limit_set == limit_set:
             profile = plan_learned(case.task).profile
-            first = refine(case.task, profile, passes=lambda _: True).profile
+            first = next(refinements(case.task, profile)).profile
             between += not certify(Trajectory(case.path, first, case.airframe), case.limits).passed
             repaired = repair(case.task, profile)
             assert repaired.speed_factor == 1.0
@@ -57,7 +57,7 @@ def test_the_certificate_is_that_of_the_trajectory():
 
 def test_what_cannot_be_refined_is_slowed_and_says_why(monkeypatch):
     monkeypatch.setattr(
-        repairing, "refine", lambda *_, **__: Solution(Status.NOT_CONVERGED, None, "refining: no step makes it better")
+        repairing, "refinements", lambda *_: [Solution(Status.NOT_CONVERGED, None, "refining: no step makes it better")]
     )
     path = random_path(1, "10x10x10")
     profile = plan_learned(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits)).profile
