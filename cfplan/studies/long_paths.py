@@ -16,6 +16,7 @@ from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.expert.windows import WindowSize
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.planners import default_nodes
 from cfplan.planning.repair import Repaired, repair
@@ -147,7 +148,7 @@ def _measure(path: Path, seed: int, chosen: LimitSet) -> LongPlan:
         values |= {"kept": _memory("VmRSS") - before, "peak": _memory("VmHWM") - before}
         values |= {"speed_factor": found.speed_factor, "flight": found.trajectory.duration}
         values["worst_share"] = found.certificate.worst.share
-        expert = plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes), windows=False)
+        expert = plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes), window=WindowSize(nodes, 0))
         if expert.profile is not None:
             values["expert_flight"] = Trajectory(path, expert.profile, chosen.airframe).duration
     except InputError:

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 from cfplan.errors import CfplanError, InfeasibleError, InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.expert import refine as refined
+from cfplan.planners.expert.refine import refinements
+from cfplan.planners.expert.windows import WindowSize
 from cfplan.planners.solution import Solution, Status
+from cfplan.planning import repair
 from cfplan.planning.plan import plan
 from cfplan.planning.planners import FEWEST_NODES, MOST_NODES, PLANNERS, default_nodes, find_planner
 from cfplan.safety.certificate import certify
@@ -166,7 +169,7 @@ def test_too_fast_a_profile_of_the_learned_planner_is_refined_and_the_plan_says_
 
 def test_a_plan_made_window_by_window_tells_where_they_meet(limits, make_profile, monkeypatch):
     zigzag = min_snap([[(-1) ** turn, 0.4 * turn - 1.6, 1.0] for turn in range(9)])
-    monkeypatch.setattr(refined, "WINDOW", (96, 32))
+    monkeypatch.setattr(repair, "refinements", partial(refinements, window=WindowSize(96, 32)))
     found = {n: plan(zigzag, limits.airframe, limits, planner="convex", nodes=n) for n in (100, 150)}
     assert all("refined" in made.notes[-1] for made in found.values())
     assert found[100].joints == ()

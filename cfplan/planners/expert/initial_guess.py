@@ -1,4 +1,4 @@
-"""Where the search for a speed profile starts: slow enough everywhere, and smooth."""
+"""Where the search for a speed profile starts: slow enough everywhere, smooth, and led into boundary states."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,15 +6,89 @@ from numpy.typing import NDArray
 from cfplan.geometry.path import Path
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.profile_spline import node_coefficients
+from cfplan.vehicle.yaw_spline import end_coefficients
 
-SHARE = 0.7
-# of each limit that the guess uses
-WIDTH = 2.0
-# intervals over which it is smoothed
+SHARE = 0.7  # of each limit that the guess uses
+WIDTH = 2.0  # intervals over which it is smoothed
+# Intervals over which h, and yaw, come away from a boundary state. In less they jerk; in more h is too fast to brake.
+H_BLEND, YAW_BLEND = 5.0, 4.0
+LOWERED_FROM, LOWERED_TO = 3, 10  # coefficients from an end that is held, where lowered() begins, and is complete
+
+
+def guess(
+    path: Path,
+    airframe: Airframe,
+    limits: PlanLimits,
+    nodes: int,
+    ceiling: float,
+    start: BoundaryState | None,
+    end: BoundaryState | None,
+    yaw: float | None,
+) -> NDArray:
+    """Return (N+3, 1 or 2) spline coefficients: of h in squares of the speed limit, h at most `ceiling`; and of yaw.
+
+    `yaw` is None where it is not to be guessed, else where it starts if no state says so.
+    """
+    step, unit = path.end / nodes, limits.speed**2
+    cubic = guess_spline(path, airframe, limits, nodes, ceiling) / unit
+    slow, held = cubic.copy(), []
+    for state, here, there in ((start, cubic, slow), (end, cubic[::-1], slow[::-1])):
+        if state:
+            turned = 1.0 if state is start else -1.0
+            first = node_coefficients(state.h / unit, turned * state.dh * step / unit, state.ddh * step**2 / unit)
+            if min(first) > 0:
+                here[1:] *= np.exp(_leave(np.log(first[1:]) - np.log(there[1:3]), len(cubic) - 1, bool(start and end)))
+            held.append((here, first))
+    for here, first in held:  # both have left their mark before either is put in place
+        here[:3] = first
+    if yaw is None:
+        return cubic[:, None]
+    return np.stack([cubic, np.append(_yaw(start, end, yaw, nodes, step), 0.0)], axis=1)
+
+
+def _leave(offsets: NDArray, count: int, held: bool) -> NDArray:
+    """Return (count,): from two offsets smoothly to zero, to the last bit at the other end if that is held too."""
+    x = np.arange(count) - 1.0
+    last, slope = offsets[1], offsets[1] - offsets[0]
+    left = np.clip(1.0 - x / (count - 2 - 2 * held), 0.0, 1.0)
+    return (last + x * (slope + last / H_BLEND)) * np.exp(-x / H_BLEND) * left**2 * (3.0 - 2.0 * left)
+
+
+def _yaw(start: BoundaryState | None, end: BoundaryState | None, yaw: float, nodes: int, step: float) -> NDArray:
+    """Return (N+2,) coefficients: turning ever less from a state, across to what leads into the other."""
+
+    def turned(state: BoundaryState, distance: NDArray, towards: float) -> NDArray:
+        faded = YAW_BLEND * np.sign(distance) * (1.0 - np.exp(-np.abs(distance) / YAW_BLEND))
+        return state.yaw + towards * state.dyaw * step * faded
+
+    x = np.arange(nodes + 2) - 0.5
+    spline = turned(start, x, 1.0) if start else np.full(nodes + 2, yaw)
+    if end:
+        share = np.clip(x / nodes, 0.0, 1.0)
+        spline += (turned(end, nodes - x, -1.0) - spline) * share**2 * (3.0 - 2.0 * share)
+        spline[-2:] = end_coefficients(end.yaw, end.dyaw * step)
+    if start:
+        spline[:2] = end_coefficients(start.yaw, start.dyaw * step)
+    return spline
+
+
+def lowered(coefficients: NDArray, share: float, held: tuple[bool, bool]) -> NDArray:
+    """Return the coefficients with h less by that share; less so next to an end that is held by a boundary state."""
+    less = np.full(len(coefficients), float(share))
+    ramp = np.clip((np.arange(LOWERED_TO) - LOWERED_FROM + 1) / (LOWERED_TO - LOWERED_FROM + 1), 0.0, 1.0)
+    for is_held, from_end in zip(held, (less, less[::-1]), strict=True):
+        if is_held:
+            count = min(len(less), LOWERED_TO)
+            from_end[:count] *= ramp[:count]
+    result = coefficients.copy()
+    result[:, 0] *= 1.0 - less
+    return result
 
 
 def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int, ceiling: float) -> NDArray:
-    """(N+3,) coefficients of a cubic B-spline on the grid: h where it is taken to change slowly.
+    """Return (N+3,) coefficients of a cubic B-spline on the grid: h where it is taken to change slowly.
 
     With h' = 0 each limit alone gives a bound on h: |v|² = h|γ'|², |a| = h|γ''|, and with the thrust axis about
     vertical |ω| = h^1.5 |γ'''|/g and |α| = h²|γ''''|/g.

@@ -1,4 +1,4 @@
-"""How far a profile exceeds its limits between the points where the optimiser holds them."""
+"""Limits exceeded between the points where the optimiser holds them: by how much, in which interval."""
 
 from dataclasses import dataclass
 
@@ -14,41 +14,34 @@ from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.measures import MEASURES
 from cfplan.vehicle.profile import SpeedProfile
 
-COUNT = 17
-# places an interval
+COUNT = 17  # places an interval
+# Places in brisk intervals: the END_INTERVALS at each end, where the thrust axis may swing to and fro within one, and
+# where the path turns by more than SHARP.
 FINE_COUNT = 65
-# in brisk intervals: the END_INTERVALS at each end, where the thrust axis may swing to and fro within one, and
-# where the path turns by more than SHARP
 END_INTERVALS = 4
-SHARP = 0.25
-# rad, an interval
-ALLOWANCE = 1.5e-3
-# of the rows, kept free: certificates allow for their own sampling
-THRUST_ALLOWANCE = 4e-3
-# likewise, of thrusts, which change fastest
-FINE_ALLOWANCE = 5e-3
-# likewise in brisk intervals
+SHARP = 0.25  # rad, an interval
+ALLOWANCE = 1.5e-3  # of the rows, kept free: certificates allow for their own sampling
+THRUST_ALLOWANCE = 4e-3  # likewise, of thrusts, which change fastest
+FINE_ALLOWANCE = 5e-3  # likewise in brisk intervals
 
-COLUMNS = MEASURES  # the rows of the optimiser, and the squared speed behind them
 # Chebyshev-Lobatto: both ends of an interval, and closer together near them
 _PLACES, _FINE = ((1.0 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2.0 for count in (COUNT, FINE_COUNT))
 CONTINUOUS = np.flatnonzero(~quantities.JUMPS).tolist()
 
 
 @dataclass(frozen=True, slots=True)
-class Excess:
+class Violation:
     """By how much each row leaves its limits less the allowance, in each interval, in the rows' own units.
 
     Negative where it does not.
     """
 
-    upper: NDArray
-    # (N, COLUMNS) above 1
-    lower: NDArray
-    # (N, COLUMNS) below quantities.LOWER
+    upper: NDArray  # (N, MEASURES) above quantities.UPPER
+    lower: NDArray  # (N, MEASURES) below quantities.LOWER
 
     @property
     def worst(self) -> float:
+        """The largest."""
         return float(max(self.upper.max(), self.lower.max()))
 
 
@@ -56,12 +49,12 @@ class DensePath:
     """A path's derivatives at many places of every interval, evaluated once."""
 
     def __init__(self, path: Path, nodes: int, held: NDArray) -> None:
-        """`held`, (N,): how far, 0 to 1, each interval is bound by a boundary state and had better be left alone."""
+        """Take `held`, (N,): how far, 0 to 1, a boundary state decides each interval; its violation counts less."""
         self.held = held[:, None]
         step = path.end / nodes
         brisk = turns(path, nodes) > SHARP
         brisk[:END_INTERVALS] = brisk[-END_INTERVALS:] = True
-        self.allowance = np.full((nodes, COLUMNS), ALLOWANCE)
+        self.allowance = np.full((nodes, MEASURES), ALLOWANCE)
         self.allowance[:, quantities.JUMPS] = THRUST_ALLOWANCE
         self.allowance[brisk] = FINE_ALLOWANCE
         self.groups = tuple(
@@ -75,14 +68,14 @@ class DensePath:
             [_by_place(path, step * (which[:, None] + places)) for which, places in self.groups], axis=2
         )
 
-    def excess(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Excess:
-        """Of a profile with as many intervals; h must be positive."""
+    def violation(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Violation:
+        """Return the violation by a profile with as many intervals; h must be positive."""
         highest, lowest = self._extremes(profile, airframe, limits)
         upper, lower = highest.T - quantities.UPPER + self.allowance, quantities.LOWER - lowest.T + self.allowance
-        return Excess(upper - self.held * np.maximum(upper, 0.0), lower - self.held * np.maximum(lower, 0.0))
+        return Violation(upper - self.held * np.maximum(upper, 0.0), lower - self.held * np.maximum(lower, 0.0))
 
     def _extremes(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> tuple[NDArray, NDArray]:
-        """(COLUMNS, N) twice: the most and the least that each row comes to in each interval."""
+        """Return the highest and the lowest value of each row in each interval, (MEASURES, N)."""
         at = dense.dense_rows(airframe, self.derivatives, profile, self.places, self.interval)
         highest, lowest = (np.empty((MEASURES, len(profile.dddh))) for _ in range(2))
         end = 0
@@ -94,7 +87,7 @@ class DensePath:
 
 
 def violates_at_nodes(path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> bool:
-    """Whether a limit is exceeded at a node; where not, the certificate has the word."""
+    """Return whether a limit is exceeded at a node; where none is, the certificate still decides."""
     first, nodes = profile.s[:-1], np.arange(len(profile.s) - 1)
     at = dense.dense_rows(airframe, path.derivatives(first)[1:], profile, np.zeros(len(first)), nodes)
     rows = scaled(at, limits).T
@@ -102,13 +95,13 @@ def violates_at_nodes(path: Path, profile: SpeedProfile, airframe: Airframe, lim
 
 
 def _by_place(path: Path, s: NDArray) -> NDArray:
-    """(4, 3, P · K) γ' to the fourth derivative at s, (K, P) ascending along rows: of all first places, then on."""
+    """Return (4, 3, P · K): γ' to the fourth derivative at s, (K, P): of all first places, then on."""
     found = path.derivatives(s.ravel())[1:].reshape(4, 3, *s.shape)
     return found.transpose(0, 1, 3, 2).reshape(4, 3, -1)
 
 
 def turns(path: Path, nodes: int) -> NDArray:
-    """(N,) rad, by how much the direction of the path differs from one end of each interval to the other."""
+    """Return (N,) rad: by how much the direction of the path differs from one end of each interval to the other."""
     s = np.arange(nodes + 1) * (path.end / nodes)
     s[0], s[-1] = s[1], s[-2]  # at rest there is no direction
     tangent = path(s, 1)
@@ -117,10 +110,10 @@ def turns(path: Path, nodes: int) -> NDArray:
     return np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0))
 
 
-def spread(excess: NDArray) -> NDArray:
-    """(N, COLUMNS): what is continuous counts for the neighbours too, whose points lie as near to its peak."""
-    wider = excess.copy()
+def spread(violation: NDArray) -> NDArray:
+    """Return (N, MEASURES): what is continuous counts for neighbours too, whose points lie as near to its peak."""
+    wider = violation.copy()
     for column in CONTINUOUS:
-        wider[1:, column] = np.maximum(wider[1:, column], excess[:-1, column])
-        wider[:-1, column] = np.maximum(wider[:-1, column], excess[1:, column])
+        wider[1:, column] = np.maximum(wider[1:, column], violation[:-1, column])
+        wider[:-1, column] = np.maximum(wider[:-1, column], violation[1:, column])
     return wider

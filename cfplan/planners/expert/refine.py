@@ -11,57 +11,62 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.planners.expert.point_constraints import Penalties
-from cfplan.planners.expert.problem import FLOOR, Ends, Problem, pose
-from cfplan.planners.expert.program import Shape, layout_of
-from cfplan.planners.expert.solvers import Attempt, interior_point, quickly, quickly_again
-from cfplan.planners.expert.tightening import Kept, Task, flaw, kept_between
-from cfplan.planners.expert.windows import Joined, by_windows, far_enough, windows_of
+from cfplan.planners.expert.initial_guess import lowered
+from cfplan.planners.expert.layout import Shape, layout_of
+from cfplan.planners.expert.problem import FLOOR, Ends, Problem, Segment, build_problem
+from cfplan.planners.expert.search import (
+    COLD_START,
+    Attempt,
+    Start,
+    refining_restarts,
+    refining_starts,
+    rejection_reason,
+    solve,
+)
+from cfplan.planners.expert.tightening import Tightened, tighten_until_feasible
+from cfplan.planners.expert.windows import Joined, WindowSize, by_windows, far_enough, windows_of
 from cfplan.planners.solution import Solution, Status
-from cfplan.planners.solver.interior_point import Search
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.profile import SpeedProfile
-from cfplan.vehicle.profile_spline import h_coefficients, spline_profile
+from cfplan.vehicle.profile_spline import h_coefficients
 from cfplan.vehicle.yaw_spline import YawSpline
 
-WINDOW = (224, 32)
-# intervals that a window keeps, and how much further it looks
-SLOWER, OVER = 0.1, 10
-# share of h by which the search begins below what it is given, fully so from so many intervals behind a joint on:
-# where limits are used to the full, nearly all constraints then begin inside their bounds, and steps are long
+WINDOW = WindowSize(kept=224, ahead=32)
+# Share of h by which the search begins below the given profile: where that uses limits to the full, nearly all
+# constraints then begin inside their bounds, and steps are long.
+SLOWER = 0.1
 
 
-def refine(task: PlanningTask, profile: SpeedProfile) -> Solution:
+def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WINDOW) -> Solution:
     """Plan a profile within about 0.3 % of the fastest, with the grid and the yaw of the given one, not of the task."""
-    *_, last = refinements(task, profile)
+    *_, last = refinements(task, profile, window=window)
     return last
 
 
-def refinements(task: PlanningTask, profile: SpeedProfile) -> Iterator[Solution]:
+def refinements(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WINDOW) -> Iterator[Solution]:
     """Yield the refined profile: first with limits held at points, then, if it is asked for, between them too.
 
-    The first often passes the certificate, and costs half. A path longer than WINDOW is planned window by window; its
+    The first often passes the certificate, and costs half. A path longer than `window` is planned window by window; its
     profile comes once, with limits held between points. A failure comes alone.
     """
     began = time.perf_counter()
-    path, limits = task.path, task.limits
-    nodes, unit, track = len(profile.s) - 1, limits.speed**2, YawSpline.of(profile)
-    near = np.maximum(h_coefficients(profile) / unit, FLOOR)[:, None]
+    path, limits, nodes = task.path, task.limits, len(profile.s) - 1
     layout = layout_of(Shape(nodes, False, turning_limited=limits.angular_acceleration < math.inf))
-    whole = Task(path, task.airframe, limits, Ends(task.start, task.end), track, layout)
-    if len(windows_of(nodes, *far_enough(WINDOW, path.end / nodes, limits))) > 1:
-        yield _solution(whole, by_windows(whole, WINDOW, _refine_window, near), began)
+    whole = Segment(path, task.airframe, limits, Ends(task.start, task.end), YawSpline.of(profile), layout)
+    near = np.maximum(h_coefficients(profile) / whole.unit, FLOOR)[:, None]
+    if len(windows_of(nodes, *far_enough(window, path.end / nodes, limits))) > 1:
+        yield _solution(whole, by_windows(whole, window, _refine_window, near), began)
         return
     found = _hold_at_points(whole, near)
     if isinstance(found, str):
         yield _solution(whole, found, began)
         return
-    yield _solution(whole, Joined(found.attempt.table, (), found.attempt.iterations, 0), began)
-    between = kept_between(found.attempt, found.problem, whole, found.restarts)
-    yield _solution(whole, Joined(between.table, (), between.iterations, between.rounds), began)
+    yield _solution(whole, Joined(found.attempt.coefficients, (), found.attempt.iterations, 0), began)
+    between = tighten_until_feasible(found.attempt, found.problem, whole, found.restarts)
+    yield _solution(whole, Joined(between.coefficients, (), between.iterations, between.rounds), began)
 
 
-def _solution(whole: Task, joined: Joined | str, began: float) -> Solution:
+def _solution(whole: Segment, joined: Joined | str, began: float) -> Solution:
     if isinstance(joined, str):
         return Solution(Status.NOT_CONVERGED, None, f"refining: {joined}")
     stats: dict[str, float | int | str] = {
@@ -71,8 +76,7 @@ def _solution(whole: Task, joined: Joined | str, began: float) -> Solution:
         "windows": 1 + len(joined.joints),
         "solver": "interior point",
     }
-    refined = spline_profile(joined.table[:, 0] * whole.limits.speed**2, whole.path.end, whole.track)
-    return Solution(Status.SOLVED, refined, "", stats, joined.joints)
+    return Solution(Status.SOLVED, whole.profile(joined.coefficients), "", stats, joined.joints)
 
 
 class _HeldAtPoints(NamedTuple):
@@ -80,33 +84,24 @@ class _HeldAtPoints(NamedTuple):
 
     attempt: Attempt
     problem: Problem
-    restarts: Sequence[Search]
+    restarts: Sequence[Start]
 
 
-def _hold_at_points(task: Task, near: NDArray) -> _HeldAtPoints | str:
+def _hold_at_points(segment: Segment, near: NDArray) -> _HeldAtPoints | str:
     """Solve the problem from the coefficients `near`, or return why not."""
-    nodes, unit = task.layout.shape.nodes, task.limits.speed**2
-    interval = task.path.end / nodes * float(np.mean(1.0 / np.sqrt(unit * near[:, 0])))
-    given = task.layout, task.path, task.airframe, task.limits, task.track, 0.0, task.ends, Penalties()
-    agrees = not task.ends.end and (task.ends.continues or not task.ends.start)
-    problem = pose(*given, _lowered(near, task.ends) if agrees else None)
-    attempt = interior_point(problem, None, quickly(interval))
-    if flaw(attempt, problem, task):  # not near enough
-        problem = pose(*given)
-        attempt = interior_point(problem, None)
-    return flaw(attempt, problem, task) or _HeldAtPoints(attempt, problem, quickly_again(interval))
+    ends = segment.ends
+    interval = segment.path.end / segment.layout.shape.nodes * float(np.mean(1.0 / np.sqrt(segment.unit * near[:, 0])))
+    agrees = not ends.end and (ends.continues or not ends.start)  # with the boundary states
+    problem = build_problem(segment, coefficients=lowered(near, SLOWER, ends.held) if agrees else None)
+    attempt = solve(problem, problem.coefficients, refining_starts(interval))
+    if rejection_reason(attempt, segment):  # not near enough
+        problem = build_problem(segment)
+        attempt = solve(problem, problem.coefficients, COLD_START)
+    return rejection_reason(attempt, segment) or _HeldAtPoints(attempt, problem, refining_restarts(interval))
 
 
-def _refine_window(task: Task, near: NDArray) -> Kept | str:
-    found = _hold_at_points(task, near)
+def _refine_window(segment: Segment, near: NDArray) -> Tightened | str:
+    found = _hold_at_points(segment, near)
     if isinstance(found, str):
         return found
-    return kept_between(found.attempt, found.problem, task, found.restarts)
-
-
-def _lowered(near: NDArray, ends: Ends) -> NDArray:
-    """Where to begin; what a joint decides stays."""
-    share = np.full((len(near), 1), SLOWER)
-    if ends.continues:
-        share[:OVER, 0] *= np.maximum(np.arange(OVER) - 2, 0) / (OVER - 2)
-    return (1.0 - share) * near
+    return tighten_until_feasible(found.attempt, found.problem, segment, found.restarts)

@@ -1,3 +1,3 @@
-"""A primal-dual interior point method for banded nonlinear programs."""
+"""The interior point method: a primal-dual solver for banded nonlinear programs."""
 
 __all__ = ["barrier", "interior_point"]

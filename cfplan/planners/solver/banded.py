@@ -5,19 +5,21 @@ A matrix is a (size, width) array whose entry [r, d] is the matrix's (r, r - d).
 
 import math
 
+import numpy as np
+
 from cfplan.machine_code import njit
 
-REGULARISED, REGULARISED_MOST = 1e-4, 1e14
-# added to a diagonal where it must, at first and at most
+REGULARISED, REGULARISED_MOST = 1e-4, 1e14  # added to a diagonal where it must, at first and at most
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def factorise(matrix, added, factor):
-    """The Cholesky factor of the matrix plus `added` on its diagonal, into `factor`; False where there is none.
+def factorise(matrix, added):
+    """Return the Cholesky factor of the matrix plus `added` on its diagonal, and whether there is one.
 
-    Its diagonal is kept inverted. A row that nothing touches counts as that of the unit matrix.
+    The diagonal of the factor is inverted. A row of zeros counts as that of the unit matrix.
     """
     size, width = matrix.shape
+    factor = np.empty((size, width))
     for r in range(size):
         reach = min(width - 1, r)
         for d in range(reach, 0, -1):
@@ -32,15 +34,16 @@ def factorise(matrix, added, factor):
             value -= factor[r, e] * factor[r, e]
         value += added
         if not value > 1e-12:
-            return False
+            return factor, False
         factor[r, 0] = 1.0 / math.sqrt(value)
-    return True
+    return factor, True
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def solve(factor, x):
-    """Solve for the right side x, in place."""
+def solve(factor, right):
+    """Return the solution for a right side, (size,)."""
     size, width = factor.shape
+    x = right.copy()
     for r in range(size):
         value = x[r]
         for d in range(1, min(width - 1, r) + 1):
@@ -51,19 +54,20 @@ def solve(factor, x):
         x[r] = value
         for d in range(1, min(width - 1, r) + 1):
             x[r - d] -= factor[r, d] * value
+    return x
 
 
 @njit(error_model="numpy")
-def solve_regularised(matrix, regularised, factor, x):
-    """Solve for the right side x, in place, with as much added to the diagonal as makes the matrix positive definite.
+def solve_regularised(matrix, right, regularised):
+    """Solve with as much added to the diagonal as makes the matrix positive definite; return (solution, added).
 
-    Gives what was added; `regularised` is what that was the last time. Where nothing helps x becomes NaN.
+    `regularised` is what was added the last time. Where nothing helps the solution is NaN.
     """
     added = 0.0
-    while not factorise(matrix, added, factor):
+    factor, definite = factorise(matrix, added)
+    while not definite:
         added = 8.0 * added if added > 0.0 else max(REGULARISED, regularised / 3.0)
         if added > REGULARISED_MOST:
-            x[:] = math.nan
-            return added
-    solve(factor, x)
-    return added
+            return np.full(len(right), math.nan), added
+        factor, definite = factorise(matrix, added)
+    return solve(factor, right), added

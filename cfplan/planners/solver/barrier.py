@@ -1,11 +1,19 @@
-"""Slacks of constraints between bounds, the multipliers of those bounds, and the barrier that keeps slacks inside.
+"""The barrier method's slacks, multipliers and steps, for constraints between bounds.
 
-Arrays of (m,) lie together as rows: bounds, a state that a search changes, a step of it, and what constraints then pull
-with (PULLS). A bound that is not there lies far away and has no barrier, so that all constraints go through the same
-arithmetic, several at a time.
+Each constraint g has a slack s, with lower ≤ s ≤ upper, and a multiplier of each bound. Arrays of (m,) constraints lie
+together as rows:
+
+    bounds  (5, m)   lower bound, upper bound, whether there is a lower one, an upper one, either
+    slacks  (3, m)   slack, multiplier of its lower bound, of its upper bound
+    step    (3, m)   a change of these
+    terms   (4, m)   TERMS: what the Newton step needs of each constraint
+
+A missing bound lies far away and has no barrier, so that all constraints go through the same arithmetic, several at a
+time. No function changes its arguments.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
@@ -13,19 +21,36 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 
-PULLS = ("stiffness", "multiplier", "wall", "missing")
-# of each constraint, by row: Σ of its slack; y; the slope of a barrier of 1 there; Σ times what it is off its slack
+TERMS = ("sigma", "multiplier", "barrier", "residual")
+# Of each constraint, by row: Σ, the curvature that its slack's barrier adds; the multiplier y of g; the slope of a
+# barrier of weight 1 at the slack; and Σ (g - s).
 FAR = 1e20
-COMPLEMENTARY = 1e10
-# how far a multiplier may be from what the barrier makes of its slack, as a factor
+COMPLEMENTARY = 1e10  # how far a multiplier may be from what the barrier makes of its slack, as a factor
 
-_SUMS = {"contract", "reassoc", "nsz", "arcp"}  # freedom that what is not a number survives
-_LANES = 16  # numbers that the compiler may want to compare at once
+# Freedom in the order of sums that lets NaN survive.
+_SUMS = {"contract", "reassoc", "nsz", "arcp"}
+_LANES = 16  # numbers that the processor may compare at once
+
+
+class Errors(NamedTuple):
+    """How far slacks and multipliers are from the solution of the barrier's problem."""
+
+    infeasibility: float  # the largest |g - s|
+    complementarity: float  # the largest difference of a slack's product with its multiplier from the barrier
+
+
+class SearchDirection(NamedTuple):
+    """A step of slacks and multipliers, and how much of it keeps them inside."""
+
+    step: NDArray  # (3, m)
+    slope: float  # of the barrier along it
+    share: float  # of the step of the slacks, at most 1
+    share_dual: float  # of the step of the multipliers, at most 1
 
 
 @njit
 def bounds_of(lower: NDArray, upper: NDArray) -> NDArray:
-    """(5, m) lower and upper bound, whether each is there, and whether either is."""
+    """Return the bounds, (5, m), of (m,) lower and upper ones, infinite where there is none."""
     bounds = np.empty((5, len(lower)))
     for j in range(len(lower)):
         has_low, has_high = lower[j] > -np.inf, upper[j] < np.inf
@@ -35,27 +60,31 @@ def bounds_of(lower: NDArray, upper: NDArray) -> NDArray:
 
 
 @njit(error_model="numpy")
-def first(g, bounds, barrier, push, state, pulls):
-    """Slacks where the constraints are, but inside by `push` of the span between bounds at least; multipliers that the
-    barrier makes of them. Fills in the pulls too.
+def initialise(g, bounds, barrier, push):
+    """Return (slacks, terms): slacks where g is, but inside by `push` of the span between bounds at least.
 
     Slacks that start next to a bound would hold back every step: better to start a little off the constraints.
     """
+    slacks, terms = np.empty((3, len(g))), np.empty((4, len(g)))
     for j in range(len(g)):
-        lower, upper, active = bounds[0, j], bounds[1, j], bounds[4, j]
+        lower, upper, bounded = bounds[0, j], bounds[1, j], bounds[4, j]
         room = push * min(upper - lower, 2.0)
         s = min(max(g[j], lower + room), upper - room)
         by_below, by_above = bounds[2, j] / (s - lower), bounds[3, j] / (upper - s)
         low, high = barrier * by_below, barrier * by_above
-        stiffness = low * by_below + high * by_above
-        state[0, j], state[1, j], state[2, j] = s, low, high
-        pulls[0, j], pulls[1, j] = stiffness, high - low
-        pulls[2, j], pulls[3, j] = by_above - by_below, active * stiffness * (g[j] - s)
+        sigma = low * by_below + high * by_above
+        slacks[0, j], slacks[1, j], slacks[2, j] = s, low, high
+        terms[0, j], terms[1, j] = sigma, high - low
+        terms[2, j], terms[3, j] = by_above - by_below, bounded * sigma * (g[j] - s)
+    return slacks, terms
 
 
 @register_jitable
 def _largest(values):
-    """The largest of non-negative numbers. The compiler would compare one by one, as it may not change the order."""
+    """Return the largest of non-negative numbers.
+
+    Sixteen running maxima let the processor compare as many at once: a single one fixes the order of the comparisons.
+    """
     most, whole = np.zeros(_LANES), len(values) - len(values) % _LANES
     for begin in range(0, whole, _LANES):
         for lane in range(_LANES):
@@ -70,35 +99,35 @@ def _largest(values):
 
 
 @njit(error_model="numpy", fastmath=_SUMS)
-def errors(g, bounds, state, barrier):
-    """The largest |g - s|, and the largest difference of a slack's product from the barrier. For finite numbers."""
-    lower, upper, has_low, has_high, active = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
-    s, low, high = state[0], state[1], state[2]
+def errors(g, bounds, slacks, barrier):
+    """Return the Errors, of finite numbers."""
+    lower, upper, has_low, has_high, bounded = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
+    s, low, high = slacks[0], slacks[1], slacks[2]
     infeasible, off = np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
-        infeasible[j] = active[j] * abs(g[j] - s[j])
+        infeasible[j] = bounded[j] * abs(g[j] - s[j])
         below = abs(low[j] * (s[j] - lower[j]) - has_low[j] * barrier)
         above = abs(high[j] * (upper[j] - s[j]) - has_high[j] * barrier)
         off[j] = below if below > above else above
-    return _largest(infeasible), _largest(off)
+    return Errors(_largest(infeasible), _largest(off))
 
 
 @njit(error_model="numpy", fastmath=_SUMS)
-def steps(g, along, bounds, state, barrier, most, step):
-    """Fill in the step, where g changes by `along`.
+def search_direction(g, dg, bounds, slacks, barrier, most):
+    """Return the SearchDirection where g changes by `dg`; no step takes more than `most` of the room to a bound.
 
-    Gives (slope of the barrier along it, longest share of it that leaves (1 - most) of the room, the same for
-    multipliers). For finite numbers.
+    For finite numbers.
     """
-    lower, upper, has_low, has_high, active = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
-    s, low, high = state[0], state[1], state[2]
+    lower, upper, has_low, has_high, bounded = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
+    s, low, high = slacks[0], slacks[1], slacks[2]
+    step = np.empty((3, len(s)))
     ds, dlow, dhigh = step[0], step[1], step[2]
     slope, fastest, fastest_dual = 0.0, np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
         below, above = s[j] - lower[j], upper[j] - s[j]
         inverse = 1.0 / (below * above)  # divisions take longest
         by_below, by_above = above * inverse, below * inverse
-        d = active[j] * (g[j] - s[j] + along[j])
+        d = bounded[j] * (g[j] - s[j] + dg[j])
         ds[j] = d
         slope += (has_high[j] * by_above - has_low[j] * by_below) * d
         fastest[j] = d * by_above if d > 0.0 else -d * by_below
@@ -110,18 +139,18 @@ def steps(g, along, bounds, state, barrier, most, step):
         of_low, of_high = -dl * its_high * inverse, -dh * its_low * inverse
         fastest_dual[j] = of_low if of_low > of_high else of_high
     share, share_dual = most / max(_largest(fastest), 1e-30), most / max(_largest(fastest_dual), 1e-30)
-    return barrier * slope, min(1.0, share), min(1.0, share_dual)
+    return SearchDirection(step, barrier * slope, min(1.0, share), min(1.0, share_dual))
 
 
 @njit(error_model="numpy", fastmath=_SUMS)
-def standing(g, bounds, state, step, share, barrier, rows):
-    """How infeasible the slacks are after a share of the step, as a sum, and what the barrier adds to the cost.
+def merit_terms(g, bounds, slacks, step, share, barrier, rows):
+    """Return (Σ |g - s|, the barrier's cost) after a share of the step.
 
-    g is taken as `rows` rows of as many constraints each, and a rest: a logarithm of a column takes less time than one
-    of each of its entries.
+    g is taken as `rows` rows of as many constraints each, and a rest: a logarithm of a column's product takes less time
+    than one of each of its entries.
     """
-    lower, upper, has_low, has_high, active = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
-    s, ds = state[0], step[0]
+    lower, upper, has_low, has_high, bounded = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
+    s, ds = slacks[0], step[0]
     columns = len(g) // rows
     products = np.ones(columns)
     infeasible, total = 0.0, 0.0
@@ -129,29 +158,30 @@ def standing(g, bounds, state, step, share, barrier, rows):
         for c in range(columns):
             j = r * columns + c
             slack = s[j] + share * ds[j]
-            infeasible += active[j] * abs(g[j] - slack)
+            infeasible += bounded[j] * abs(g[j] - slack)
             products[c] *= has_low[j] * (slack - lower[j]) + (1.0 - has_low[j])
             products[c] *= has_high[j] * (upper[j] - slack) + (1.0 - has_high[j])
     for c in range(columns):
         total += math.log(products[c])
     for j in range(rows * columns, len(g)):
         slack = s[j] + share * ds[j]
-        infeasible += active[j] * abs(g[j] - slack)
+        infeasible += bounded[j] * abs(g[j] - slack)
         total += math.log(has_low[j] * (slack - lower[j]) + (1.0 - has_low[j]))
         total += math.log(has_high[j] * (upper[j] - slack) + (1.0 - has_high[j]))
     return infeasible, -barrier * total
 
 
 @njit(error_model="numpy", fastmath=_SUMS)
-def advance(g, bounds, state, step, share, share_dual, barrier, pulls):
-    """Take the step, in place, and fill in the pulls where g is now; gives the errors there.
+def accept_step(g, bounds, slacks, step, share, share_dual, barrier):
+    """Return (slacks, terms, Errors) after these shares of the step, which led to g.
 
     Multipliers stay within a factor of what the barrier makes of their slacks.
     """
-    lower, upper, has_low, has_high, active = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
-    s, low, high = state[0], state[1], state[2]
+    lower, upper, has_low, has_high, bounded = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
     ds, dlow, dhigh = step[0], step[1], step[2]
-    stiffness, multiplier, wall, missing = pulls[0], pulls[1], pulls[2], pulls[3]
+    after, terms = slacks.copy(), np.empty((4, len(g)))  # a copy changed in place has one array less to tell apart
+    s, low, high = after[0], after[1], after[2]
+    sigma, multiplier, slope, residual = terms[0], terms[1], terms[2], terms[3]
     infeasible, off = np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
         there = s[j] + share * ds[j]
@@ -163,12 +193,12 @@ def advance(g, bounds, state, step, share, share_dual, barrier, pulls):
         middle = barrier * by_above
         of_high = min(max(high[j] + share_dual * dhigh[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
         s[j], low[j], high[j] = there, of_low, of_high
-        by_slack = of_low * by_below + of_high * by_above
-        missed = active[j] * (g[j] - there)
-        stiffness[j], multiplier[j] = by_slack, of_high - of_low
-        wall[j], missing[j] = by_above - by_below, by_slack * missed
+        curvature = of_low * by_below + of_high * by_above
+        missed = bounded[j] * (g[j] - there)
+        sigma[j], multiplier[j] = curvature, of_high - of_low
+        slope[j], residual[j] = by_above - by_below, curvature * missed
         infeasible[j] = abs(missed)
         below = abs(of_low * (there - lower[j]) - has_low[j] * barrier)
         above = abs(of_high * (upper[j] - there) - has_high[j] * barrier)
         off[j] = below if below > above else above
-    return _largest(infeasible), _largest(off)
+    return after, terms, Errors(_largest(infeasible), _largest(off))

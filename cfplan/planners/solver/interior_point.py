@@ -1,6 +1,6 @@
-"""A primal-dual interior point method for problems along a path.
+"""A primal-dual interior point method for nonlinear programs with a banded Newton matrix.
 
-Variables are spline coefficients, so there are no equations to keep, and a coefficient meets only its neighbours: the
+Where variables are spline coefficients there are no equations to keep, and a coefficient meets only its neighbours: the
 Newton matrix is banded, and factoring it costs less than evaluating the functions. With slacks s for the constraints,
 
     minimise f(v)   subject to   g(v) = s,   lower ≤ s ≤ upper,
@@ -12,165 +12,194 @@ not positive definite is made so by adding to its diagonal.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.planners.solver import banded
-from cfplan.planners.solver import barrier as slacks
+from cfplan.planners.solver.barrier import (
+    Errors,
+    SearchDirection,
+    accept_step,
+    errors,
+    initialise,
+    merit_terms,
+    search_direction,
+)
 
-BOUNDARY = 0.99
-# of the way to a bound that a step may go, at least
-BARRIER_FACTOR, BARRIER_POWER = 0.2, 1.5
-# how fast the barrier parameter falls
-BARRIER_SOLVED = 10.0
-# times the barrier parameter: the error at which it falls
-FILTER = 1e-5
-# share of the infeasibility by which a step must better it, or the cost
+BOUNDARY = 0.99  # of the way to a bound that a step may go, at least
+BARRIER_FACTOR, BARRIER_POWER = 0.2, 1.5  # how fast the barrier parameter falls
+BARRIER_SOLVED = 10.0  # times the barrier parameter: the error at which it falls
+FILTER = 1e-5  # share of the infeasibility by which a step must reduce it, or the cost
 SWITCH_COST, SWITCH_FEASIBILITY = 2.3, 1.1
 ARMIJO = 1e-4
 HALVINGS = 14
 
 
-class Functions(Protocol):
-    """f and g of a problem, with the arrays in which numbers go to and fro."""
+class Values(NamedTuple):
+    """f and g at a point."""
 
-    bounds: NDArray
-    # (5, m) of the constraints, see slacks
-    rows: int
-    # g begins with so many rows of as many constraints each
-    g: NDArray
-    # (m,) by values()
-    pulls: NDArray
-    # (4, m) barrier.PULLS, for expand()
-    gradients: NDArray
-    # (4, size) of f, and J' times each of the pulls but the first; by expand()
-    matrix: NDArray
-    # (size, band + 1) the Hessian of f + y·g, plus J'ΣJ, see banded; by expand()
+    cost: float
+    constraints: NDArray  # (m,)
 
-    def values(self, v: NDArray) -> float:
-        """f; and g."""
 
-    def expand(self) -> None:
-        """Gradients and matrix, around the last v."""
+class Linearisation(NamedTuple):
+    """First and second derivatives at a point."""
 
-    def along(self, dv: NDArray) -> NDArray:
-        """(m,) J dv, J of the last expand(). Overwritten by the next call."""
+    gradients: NDArray  # (4, size) of f; and J' times each of barrier.TERMS but the first
+    matrix: NDArray  # (size, band + 1) the Hessian of f + y·g, plus J'ΣJ; see banded
+    jvp: Callable[[NDArray], NDArray]  # J dv, (m,), of dv, (size,)
+
+
+class NonlinearProgram(Protocol):
+    """f, g and the bounds of g."""
+
+    @property
+    def bounds(self) -> NDArray:
+        """(5, m), see barrier."""
+
+    @property
+    def rows(self) -> int:
+        """g begins with this many rows of as many constraints each."""
+
+    def evaluate(self, v: NDArray) -> Values:
+        """Return f and g at v."""
+
+    def linearise(self, v: NDArray, terms: NDArray) -> Linearisation:
+        """Return the derivatives at v, where the constraints have these (4, m) barrier.TERMS."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Search:
     """How to search; the numbers are in the problem's own units."""
 
-    barrier: float = 1.0
-    # at first
+    barrier: float = 1.0  # at first
     last_barrier: float = 3e-3
-    gradient: float = 1e-2
-    # of the Lagrangian, at the end
-    feasibility: float = 1e-5
-    # of the constraints, at the end
-    left_by_step: float | None = None
-    # share of that gradient which a whole step is taken to leave; else it is computed anew before the search ends
-    push: float = 1e-2
-    # how far slacks start inside their bounds at least, of the span between them
+    gradient: float = 1e-2  # of the Lagrangian, at the end
+    feasibility: float = 1e-5  # of the constraints, at the end
+    left_by_step: float | None = None  # share of the gradient that a whole step leaves; None: it is always computed
+    push: float = 1e-2  # how far slacks start inside their bounds at least, of the span between them
     iterations: int = 100
 
 
-class Ended(NamedTuple):
-    """Where the search ended."""
+class SearchResult(NamedTuple):
+    """Where a search ended."""
 
     v: NDArray
+    values: Values  # there
     solved: bool
     iterations: int
-    words: str
+    message: str
 
 
-def minimise(functions: Functions, v: NDArray, search: Search) -> Ended:
-    """Search from v, where the functions must be defined. They are left at the end of the search."""
-    barrier, bounds, rows = search.barrier, functions.bounds, functions.rows
-    g, pulls = functions.g, functions.pulls
-    gradient, by_multipliers, by_walls, by_missing = functions.gradients
-    state, step = np.empty((3, len(g))), np.zeros((3, len(g)))
-    factor = np.empty_like(functions.matrix)
-    cost = functions.values(v)
-    slacks.first(g, bounds, barrier, search.push, state, pulls)
-    errors = slacks.errors(g, bounds, state, barrier)
-    infeasible, walls = slacks.standing(g, bounds, state, step, 0.0, barrier, rows)
-    most_infeasible, regularised = 1e4 * max(1.0, infeasible), 0.0
-    filtered: list[tuple[float, float]] = []
+@dataclass(frozen=True, slots=True)
+class _Filter:
+    """Which pairs of infeasibility and merit no step may fall behind."""
+
+    most: float  # infeasibility
+    pairs: list[tuple[float, float]] = field(default_factory=list)
+
+    def judge(self, before: tuple[float, float], after: tuple[float, float], slope: float) -> str:
+        """Return whether a step "descends" by the merit, "widens" the filter, or is refused: "".
+
+        `before` and `after` are pairs of infeasibility and merit.
+        """
+        (infeasible, merit), (infeasible_after, merit_after) = before, after
+        if not (math.isfinite(merit_after) and infeasible_after < self.most):
+            return ""
+        if any(infeasible_after >= i and merit_after >= m for i, m in self.pairs):
+            return ""
+        rounding = 1e-12 * abs(merit)
+        if slope < 0 and (-slope) ** SWITCH_COST > infeasible**SWITCH_FEASIBILITY and infeasible <= 1e-4 * self.most:
+            return "descends" if merit_after <= merit + ARMIJO * slope + rounding else ""
+        better = infeasible_after <= (1 - FILTER) * infeasible or merit_after <= merit - FILTER * infeasible + rounding
+        return "widens" if better else ""
+
+
+class _Step(NamedTuple):
+    v: NDArray
+    values: Values
+    share: float
+    infeasible: float
+    walls: float  # the barrier's cost
+    widens: bool  # the filter
+
+
+def minimise(program: NonlinearProgram, v: NDArray, search: Search) -> SearchResult:
+    """Search from v, where the functions must be defined."""
+    barrier, bounds, rows = search.barrier, program.bounds, program.rows
+    values = program.evaluate(v)
+    slacks, terms = initialise(values.constraints, bounds, barrier, search.push)
+    off = errors(values.constraints, bounds, slacks, barrier)
+    infeasible, walls = merit_terms(values.constraints, bounds, slacks, slacks, 0.0, barrier, rows)
+    filtered, regularised = _Filter(1e4 * max(1.0, infeasible)), 0.0
     for iteration in range(search.iterations):
-        functions.expand()
-        off_gradient = float(np.abs(gradient + by_multipliers).max())
-        if not math.isfinite(infeasible + off_gradient + cost):
-            return Ended(v, False, iteration, "met what is not a number")
+        near = program.linearise(v, terms)
+        gradient, by_multiplier, by_barrier, by_residual = near.gradients
+        off_gradient = float(np.abs(gradient + by_multiplier).max())
+        if not math.isfinite(infeasible + off_gradient + values.cost):
+            return SearchResult(v, values, False, iteration, "a value is not a number")
         lowered = False
-        while _error(errors, off_gradient, search) <= BARRIER_SOLVED * barrier:
+        while _error(off, off_gradient, search) <= BARRIER_SOLVED * barrier:
             if barrier <= search.last_barrier:
-                return Ended(v, True, iteration, f"solved in {iteration} iterations")
+                return SearchResult(v, values, True, iteration, f"solved in {iteration} iterations")
             barrier = max(search.last_barrier, min(BARRIER_FACTOR * barrier, barrier**BARRIER_POWER))
-            errors = slacks.errors(g, bounds, state, barrier)
+            off = errors(values.constraints, bounds, slacks, barrier)
             lowered = True
         if lowered:
-            filtered.clear()
-            infeasible, walls = slacks.standing(g, bounds, state, step, 0.0, barrier, rows)
+            filtered.pairs.clear()
+            infeasible, walls = merit_terms(values.constraints, bounds, slacks, slacks, 0.0, barrier, rows)
 
-        dv = -(gradient + barrier * by_walls + by_missing)
-        added = banded.solve_regularised(functions.matrix, regularised, factor, dv)
+        dv, added = banded.solve_regularised(near.matrix, -(gradient + barrier * by_barrier + by_residual), regularised)
         regularised = added if added > 0.0 else regularised / 3.0
         slope = float(gradient @ dv)
         if not math.isfinite(slope):
-            return Ended(v, False, iteration, "no direction to go")
-        of_walls, share, share_dual = slacks.steps(
-            g, functions.along(dv), bounds, state, barrier, max(BOUNDARY, 1 - barrier), step
+            return SearchResult(v, values, False, iteration, "no direction of descent")
+        dg = near.jvp(dv)
+        direction = search_direction(values.constraints, dg, bounds, slacks, barrier, max(BOUNDARY, 1 - barrier))
+        before = infeasible, values.cost + walls
+        step = _line_search(program, v, dv, slacks, direction, barrier, before, slope + direction.slope, filtered)
+        if step is None:
+            return SearchResult(v, values, False, iteration, "no step improves the solution")
+        if step.widens:
+            filtered.pairs.append(((1 - FILTER) * infeasible, before[1] - FILTER * infeasible))
+        v, values, infeasible, walls = step.v, step.values, step.infeasible, step.walls
+        slacks, terms, off = accept_step(
+            values.constraints, bounds, slacks, direction.step, step.share, direction.share_dual, barrier
         )
-        slope += of_walls
-        merit = cost + walls
-        for _ in range(HALVINGS):
-            there = v + share * dv
-            cost_there = functions.values(there)
-            infeasible_there, walls = slacks.standing(g, bounds, state, step, share, barrier, rows)
-            merit_there = cost_there + walls
-            verdict = _judge(infeasible, merit, infeasible_there, merit_there, share * slope, most_infeasible, filtered)
-            if verdict:
-                break
-            share /= 2
-        else:
-            functions.values(v)
-            return Ended(v, False, iteration, "no step makes it better")
-        if verdict == "widens":
-            filtered.append(((1 - FILTER) * infeasible, merit - FILTER * infeasible))
-        v, cost, infeasible = there, cost_there, infeasible_there
-        errors = slacks.advance(g, bounds, state, step, share, share_dual, barrier, pulls)
-        if search.left_by_step is not None and share == share_dual == 1.0 and barrier <= search.last_barrier:
+        whole = step.share == direction.share_dual == 1.0
+        if search.left_by_step is not None and whole and barrier <= search.last_barrier:
             left = search.left_by_step * off_gradient
-            if _error(errors, left, search) <= BARRIER_SOLVED * barrier:
-                return Ended(v, True, iteration + 1, f"solved in {iteration + 1} iterations")
-    return Ended(v, False, search.iterations, f"not solved in {search.iterations} iterations")
+            if _error(off, left, search) <= BARRIER_SOLVED * barrier:
+                return SearchResult(v, values, True, iteration + 1, f"solved in {iteration + 1} iterations")
+    return SearchResult(v, values, False, search.iterations, f"not solved in {search.iterations} iterations")
 
 
-def _error(errors: tuple[float, float], off_gradient: float, search: Search) -> float:
-    """How far this is from the barrier's solution, in units of the barrier."""
-    off_constraints, off_complementary = errors
+def _line_search(
+    program: NonlinearProgram, v: NDArray, dv: NDArray, slacks: NDArray, direction: SearchDirection, barrier: float,
+    before: tuple[float, float], slope: float, filtered: _Filter,
+) -> _Step | None:  # fmt: skip
+    """Halve the step until the filter takes it; None where it never does."""
+    share = direction.share
+    for _ in range(HALVINGS):
+        there = v + share * dv
+        values = program.evaluate(there)
+        infeasible, walls = merit_terms(
+            values.constraints, program.bounds, slacks, direction.step, share, barrier, program.rows
+        )
+        if verdict := filtered.judge(before, (infeasible, values.cost + walls), share * slope):
+            return _Step(there, values, share, infeasible, walls, verdict == "widens")
+        share /= 2
+    return None
+
+
+def _error(off: Errors, off_gradient: float, search: Search) -> float:
+    """Return how far this is from the barrier's solution, in units of the barrier."""
     return max(
-        off_constraints / search.feasibility * search.last_barrier,
+        off.infeasibility / search.feasibility * search.last_barrier,
         off_gradient / search.gradient * search.last_barrier,
-        off_complementary,
+        off.complementarity,
     )
-
-
-def _judge(
-    infeasible: float, merit: float, infeasible_there: float, merit_there: float, slope: float,
-    most_infeasible: float, filtered: list[tuple[float, float]],
-) -> str:  # fmt: skip
-    """Whether a step is taken: "descends" by the merit, "widens" the filter, or "" where it is refused."""
-    if not (math.isfinite(merit_there) and infeasible_there < most_infeasible):
-        return ""
-    if any(infeasible_there >= i and merit_there >= m for i, m in filtered):
-        return ""
-    slack = 1e-12 * abs(merit)  # of rounding
-    if slope < 0 and (-slope) ** SWITCH_COST > infeasible**SWITCH_FEASIBILITY and infeasible <= 1e-4 * most_infeasible:
-        return "descends" if merit_there <= merit + ARMIJO * slope + slack else ""
-    better = infeasible_there <= (1 - FILTER) * infeasible or merit_there <= merit - FILTER * infeasible + slack
-    return "widens" if better else ""

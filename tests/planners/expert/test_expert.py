@@ -1,4 +1,4 @@
-"""The reduced expert: feasible between the nodes, near the optimum, and honest where it cannot plan."""
+"""The expert: feasible between the nodes, near the optimum, and honest where it cannot plan."""
 
 import math
 from dataclasses import replace
@@ -10,8 +10,8 @@ from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.expert import expert as reduced
 from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.expert.windows import WindowSize
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
@@ -36,15 +36,13 @@ def duration(path: Path, profile: SpeedProfile, airframe: Airframe) -> float:
 
 
 @pytest.mark.parametrize("yaw", YawMode)
-def test_a_long_path_by_windows_is_as_fast_as_at_once_and_certified_across_joints(yaw, monkeypatch):
-    monkeypatch.setattr(reduced, "WINDOW", (60, 30))
+def test_a_long_path_by_windows_is_as_fast_as_at_once_and_certified_across_joints(yaw):
     path = min_snap(np.concatenate([CORNERED, CORNERED[:2] + 0.4, CORNERED[1:] - 0.3]))
     times = []
-    for windows in (True, False):
-        solution = plan_expert(
-            PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, nodes=200, yaw=yaw), windows=windows
-        )
-        assert solution.joints == (pytest.approx((0.3 * path.end, 0.6 * path.end)) if windows else ())
+    for window, joints in ((WindowSize(60, 30), (0.3, 0.6)), (WindowSize(200, 0), ())):
+        task = PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, nodes=200, yaw=yaw)
+        solution = plan_expert(task, window=window)
+        assert solution.joints == pytest.approx(tuple(joint * path.end for joint in joints))
         trajectory = Trajectory(path, solved(solution), HARDWARE.airframe)  # refuses jumps of h, h', h'' and yaw
         assert certify(trajectory, HARDWARE.limits).passed
         times.append(trajectory.duration)

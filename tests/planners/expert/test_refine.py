@@ -7,10 +7,9 @@ import pytest
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.random_paths import random_waypoints
-from cfplan.planners.expert import refine as refined
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.expert.refine import WINDOW, refine
-from cfplan.planners.expert.windows import windows_of
+from cfplan.planners.expert.windows import WindowSize, windows_of
 from cfplan.planners.solution import Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
@@ -26,11 +25,8 @@ def planned(limit_set: str, seed: int, nodes: int = 100, waypoints: tuple[int, i
     """(path, limit set, the expert's profile)."""
     chosen = LIMIT_SETS[limit_set]
     path = min_snap(random_waypoints(seed, BOX, waypoints))
-    return (
-        path,
-        chosen,
-        plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes=nodes), windows=False).profile,
-    )
+    task = PlanningTask(path, chosen.airframe, chosen.limits, nodes=nodes)
+    return path, chosen, plan_expert(task, window=WindowSize(nodes, 0)).profile
 
 
 def disturbed(profile, end, size, seed=0):
@@ -66,10 +62,10 @@ def test_windows_cover_a_path_and_each_looks_ahead():
             assert ends - begins == ahead
 
 
-def test_a_long_path_by_windows_is_as_fast_as_by_the_whole_and_continuous_at_joints(monkeypatch):
-    monkeypatch.setattr(refined, "WINDOW", (96, 32))
+def test_a_long_path_by_windows_is_as_fast_as_by_the_whole_and_continuous_at_joints():
     path, chosen, expert = planned("hardware", 5, nodes=320, waypoints=(9, 9))
-    solution = refine(PlanningTask(path, chosen.airframe, chosen.limits), disturbed(expert, path.end, 0.02))
+    task = PlanningTask(path, chosen.airframe, chosen.limits)
+    solution = refine(task, disturbed(expert, path.end, 0.02), window=WindowSize(96, 32))
     assert solution.stats["windows"] == 3
     flown = Trajectory(path, solution.profile, chosen.airframe)  # refuses jumps of h, h', h'' and yaw
     assert certify(flown, chosen.limits).passed

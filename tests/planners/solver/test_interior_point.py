@@ -9,7 +9,7 @@ from scipy.linalg import solveh_banded
 
 from cfplan.planners.solver import banded, barrier
 from cfplan.planners.solver.barrier import bounds_of
-from cfplan.planners.solver.interior_point import Search, minimise
+from cfplan.planners.solver.interior_point import Linearisation, Search, Values, minimise
 
 
 class Valley:
@@ -21,43 +21,37 @@ class Valley:
         self.size = size
         m = 2 * size
         low, high = np.full(m, -np.inf), np.full(m, np.inf)
-        low[: size - 1], high[: size - 1] = lower, upper  # the last product is of nobody
+        low[: size - 1], high[: size - 1] = lower, upper  # there is no last product
         low[size:] = least
         self.bounds = bounds_of(low, high)
-        self.g, self.pulls = np.zeros(m), np.zeros((4, m))
-        self.gradients, self.matrix = np.zeros((4, size)), np.zeros((size, 2))
 
     def cost(self, x):
         return sum(100 * (x[k + 1] - x[k] ** 2) ** 2 + (1 - x[k]) ** 2 for k in range(self.size - 1))
 
-    def values(self, v):
-        self.v = v.copy()
-        self.g[:] = np.concatenate([v[:-1] * v[1:], [0.0], v])
-        return self.cost(v)
+    def evaluate(self, v):
+        return Values(self.cost(v), np.concatenate([v[:-1] * v[1:], [0.0], v]))
 
-    def jacobian(self):
-        x, rows = self.v, np.zeros((2 * self.size, self.size))
+    def jacobian(self, x):
+        rows = np.zeros((2 * self.size, self.size))
         k = np.arange(self.size - 1)
         rows[k, k], rows[k, k + 1] = x[1:], x[:-1]
         rows[self.size :] = np.eye(self.size)
         return rows
 
-    def expand(self):
-        x, (stiffness, multipliers, *_) = self.v, self.pulls
-        self.gradients[0] = 0.0
-        self.gradients[0, :-1] = -400 * x[:-1] * (x[1:] - x[:-1] ** 2) - 2 * (1 - x[:-1])
-        self.gradients[0, 1:] += 200 * (x[1:] - x[:-1] ** 2)
-        self.gradients[1:] = self.pulls[1:] @ self.jacobian()
+    def linearise(self, x, terms):
+        sigma, multipliers = terms[:2]
+        jacobian = self.jacobian(x)
+        gradient = np.zeros(self.size)
+        gradient[:-1] = -400 * x[:-1] * (x[1:] - x[:-1] ** 2) - 2 * (1 - x[:-1])
+        gradient[1:] += 200 * (x[1:] - x[:-1] ** 2)
         whole = np.zeros((self.size, self.size))
         k = np.arange(self.size - 1)
         whole[k, k] = -400 * x[1:] + 1200 * x[:-1] ** 2 + 2
         whole[k + 1, k + 1] += 200
         whole[k + 1, k] = whole[k, k + 1] = -400 * x[:-1] + multipliers[: self.size - 1]
-        whole += self.jacobian().T @ (stiffness[:, None] * self.jacobian())
-        self.matrix[:, 0], self.matrix[1:, 1] = np.diag(whole), np.diag(whole, -1)
-
-    def along(self, dv):
-        return self.jacobian() @ dv
+        whole += jacobian.T @ (sigma[:, None] * jacobian)
+        matrix = np.stack([np.diag(whole), np.append(0.0, np.diag(whole, -1))], axis=1)
+        return Linearisation(np.vstack([gradient, terms[1:] @ jacobian]), matrix, lambda dv: jacobian @ dv)
 
 
 EXACTLY = Search(last_barrier=1e-9, gradient=1e-7, feasibility=1e-9, iterations=300)
@@ -69,7 +63,7 @@ EXACTLY = Search(last_barrier=1e-9, gradient=1e-7, feasibility=1e-9, iterations=
 def test_it_ends_where_another_solver_does(lower, upper, least):
     start = np.linspace(0.5, 1.5, 8)
     ended = minimise(Valley(8, lower, upper, least), start, EXACTLY)
-    assert ended.solved, ended.words
+    assert ended.solved, ended.message
     x = casadi.SX.sym("x", 8)
     problem = {"x": x, "f": Valley(8, lower, upper).cost(x), "g": x[:-1] * x[1:]}
     options = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10}}
@@ -81,9 +75,9 @@ def test_a_search_that_takes_whole_steps_at_their_word_saves_looking_and_ends_as
     class Looks(Valley):
         count = 0
 
-        def expand(self):
-            super().expand()
+        def linearise(self, x, terms):
             self.count += 1
+            return super().linearise(x, terms)
 
     start = np.linspace(0.5, 1.5, 8)
     near = Search(barrier=1e-3, last_barrier=1e-3, gradient=1e-3, feasibility=1e-3, iterations=300)
@@ -103,7 +97,7 @@ def test_the_worst_of_all_slacks_counts_wherever_it_is(size):
     bounds = bounds_of(lower, upper)
     for worst in range(size):
         g, along = rng.uniform(-0.9, 0.9, (2, size))
-        state, step = np.stack([rng.uniform(-0.9, 0.9, size), *rng.uniform(0.1, 1.0, (2, size))]), np.empty((3, size))
+        state = np.stack([rng.uniform(-0.9, 0.9, size), *rng.uniform(0.1, 1.0, (2, size))])
         along[worst] *= 50.0
         s, low, high = state[0], state[1] * bounds[2], state[2] * bounds[3]
         state[1], state[2] = low, high
@@ -115,7 +109,7 @@ def test_the_worst_of_all_slacks_counts_wherever_it_is(size):
         dlow, dhigh = bounds[2] * ((0.01 - low * d) / below - low), bounds[3] * ((0.01 + high * d) / above - high)
         most = max((-bounds[2] * d / below).max(), (bounds[3] * d / above).max())
         dual = max((-dlow / (low + 1e-300)).max(), (-dhigh / (high + 1e-300)).max())
-        _, share, share_dual = barrier.steps(g, along, bounds, state, 0.01, 0.99, step)
+        step, _, share, share_dual = barrier.search_direction(g, along, bounds, state, 0.01, 0.99)
         assert share == pytest.approx(min(1.0, 0.99 / max(most, 1e-30)))
         assert share_dual == pytest.approx(min(1.0, 0.99 / max(dual, 1e-30)))
         np.testing.assert_allclose(step, [d, dlow, dhigh], rtol=1e-9, atol=1e-9)
@@ -131,7 +125,7 @@ def test_bounds_that_contradict_each_other_are_not_called_solved():
 def test_what_is_not_a_number_is_told():
     ended = minimise(Valley(8, 0.0, 1.0), np.full(8, np.nan), Search())
     assert not ended.solved
-    assert "not a number" in ended.words
+    assert "not a number" in ended.message
 
 
 @pytest.mark.parametrize("width", [1, 2, 5, 9])
@@ -146,8 +140,7 @@ def test_banded_matrices_are_factored_as_lapack_does(width):
         bands[d, : size - d] = matrix[d:, d]
     bands[0] += 0.5
     expected = solveh_banded(bands, x, lower=True)
-    factor = np.empty_like(matrix)
-    assert banded.factorise(matrix, 0.5, factor)
-    banded.solve(factor, x)
-    np.testing.assert_allclose(x, expected, rtol=1e-10)
-    assert not banded.factorise(matrix, -4.0 * width, factor)
+    factor, definite = banded.factorise(matrix, 0.5)
+    assert definite
+    np.testing.assert_allclose(banded.solve(factor, x), expected, rtol=1e-10)
+    assert not banded.factorise(matrix, -4.0 * width)[1]

@@ -1,0 +1,96 @@
+"""How the interior point method searches a speed-profile problem: where each search starts, and when it stops."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.planners.expert.initial_guess import lowered
+from cfplan.planners.expert.problem import Problem, Segment
+from cfplan.planners.expert.transcription import SplineProgram
+from cfplan.planners.solver.interior_point import Search, minimise
+
+
+class Start(NamedTuple):
+    """One search, and where it starts."""
+
+    search: Search
+    lowered: float = 0.0  # share of h by which it starts below the coefficients that it is given
+
+
+class Attempt(NamedTuple):
+    """A solution of a problem as the solver left it."""
+
+    coefficients: NDArray  # (N+3, 1 or 2)
+    rows: NDArray  # (ROWS, P) at points
+    solved: bool
+    iterations: int  # of all searches
+    message: str
+
+
+# From a guess; what the first does not solve starts far inside the bounds, and at last slower.
+COLD_START = (
+    Start(Search(iterations=60)),
+    Start(Search(barrier=0.1, push=0.3, iterations=100)),
+    Start(Search(barrier=0.1, push=0.3, iterations=100), lowered=0.5),
+)
+# From the solution of a problem almost the same: near the bounds, and further off where that fails.
+WARM_START = (
+    Start(Search(barrier=3e-3, push=1e-4, iterations=20)),
+    Start(Search(barrier=0.05, push=1e-3, iterations=40)),
+    *COLD_START,
+)
+# Refining stops early, within about 0.3 % of the optimum: at a barrier of EARLY_STOP for each second that an interval
+# takes. What then remains of the constraints is a fraction of the margin that they are tightened by; whole steps leave
+# less than a tenth of the gradient.
+EARLY_STOP, EARLY_FEASIBILITY, EARLY_GRADIENT, EARLY_LEFT_BY_STEP = 1.25, 2e-4, 0.05, 0.2
+
+
+def refining_starts(interval: float) -> Sequence[Start]:
+    """Return the searches that refine a near-feasible profile whose intervals take this long, s."""
+    return _early(EARLY_STOP * interval, push=1e-2, iterations=40), *COLD_START
+
+
+def refining_restarts(interval: float) -> Sequence[Start]:
+    """Return the same from the solution of a problem almost the same."""
+    return _early(EARLY_STOP * interval, push=3e-3, iterations=20), *WARM_START
+
+
+def _early(barrier: float, push: float, iterations: int) -> Start:
+    return Start(Search(
+        barrier=barrier, last_barrier=barrier, push=push, iterations=iterations, feasibility=EARLY_FEASIBILITY,
+        gradient=EARLY_GRADIENT, left_by_step=EARLY_LEFT_BY_STEP,
+    ))  # fmt: skip
+
+
+def solve(problem: Problem, coefficients: NDArray, starts: Sequence[Start]) -> Attempt:
+    """Search from these coefficients, (N+3, 1 or 2), as the first of `starts` that succeeds."""
+    program, iterations = SplineProgram(problem), 0
+    for start in starts:
+        from_here = lowered(coefficients, start.lowered, problem.ends.held) if start.lowered else coefficients
+        result = minimise(program, program.v_of(from_here), start.search)
+        iterations += result.iterations
+        if result.solved:
+            break
+    return Attempt(
+        program.coefficients_of(result.v), program.rows_of(result.values.constraints), result.solved, iterations,
+        result.message,
+    )  # fmt: skip
+
+
+def rejection_reason(attempt: Attempt, segment: Segment) -> str:
+    """Return why a solution must be rejected even if the solver reports success; empty where it need not be."""
+    if not attempt.solved:
+        return attempt.message
+    if not np.isfinite(attempt.coefficients).all():
+        return "the solution is not finite"
+    if (attempt.coefficients[:, 0] > 0).all():  # then so is h, which lies between its coefficients
+        return ""
+    profile = segment.profile(attempt.coefficients)
+    places = np.linspace(0.0, 1.0, 9)
+    nodes = np.arange(segment.layout.shape.nodes)
+    s = profile.s[:-1, None] + np.diff(profile.s)[:, None] * places
+    if (profile.at(s, np.repeat(nodes[:, None], len(places), axis=1)).h <= 0).any():
+        return "h falls to zero between nodes"
+    return ""
