@@ -12,6 +12,7 @@ from cfplan.flight.setpoints import stop_certificate
 from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.geometry.min_snap import min_snap
+from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.intersample import DensePath, violates_at_nodes
 from cfplan.safety import quantities
 from cfplan.safety.certificate import certify, shares
@@ -96,11 +97,22 @@ def test_the_expert_judges_it_between_nodes(quantity, trajectory):
     nodes = len(trajectory.profile.s) - 1
     dense = DensePath(trajectory.path, nodes, np.zeros(nodes))
     wide, tight = tightened(quantity, trajectory)
-    assert dense.excess(trajectory.profile, AIRFRAME, wide).worst < 0.0
-    excess = dense.excess(trajectory.profile, AIRFRAME, tight)
-    side = excess.upper if quantity.side == AT_MOST else excess.lower
-    assert side[:, quantity.which].max() == excess.worst > 0.0
+    assert dense.violation(trajectory.profile, AIRFRAME, wide).worst < 0.0
+    violation = dense.violation(trajectory.profile, AIRFRAME, tight)
+    side = violation.upper if quantity.side == AT_MOST else violation.lower
+    assert side[:, quantity.which].max() == violation.worst > 0.0
     assert violates_at_nodes(trajectory.path, trajectory.profile, AIRFRAME, tight)
+
+
+@each_quantity
+def test_the_expert_binds_it_at_points_or_by_h_alone(quantity):
+    rows = range(measures.MEASURES)[quantity.which]
+    if quantity.name == "speed":
+        assert list(rows) == [point_constraints.ROWS]
+        return
+    bound = point_constraints.UPPER if quantity.side == AT_MOST else point_constraints.LOWER
+    assert np.isfinite(bound[list(rows)]).all()
+    assert (point_constraints.JUMPS[list(rows)] == quantity.jumps).all()
 
 
 @each_quantity

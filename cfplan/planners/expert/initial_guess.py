@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
+from cfplan.safety.feasibility import spare_thrust, spare_turning
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile import BoundaryState
@@ -95,10 +96,9 @@ def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int,
     """
     s = np.clip(np.arange(-1, nodes + 2) * (path.end / nodes), 0.0, path.end)
     first, second, third, fourth = np.maximum(np.linalg.norm(path.derivatives(s)[1:], axis=1), 1e-9)
-    up = limits.motor_thrust_max - airframe.hover_thrust
-    down = airframe.hover_thrust - limits.motor_thrust_min
+    up, _ = spare_thrust(airframe, limits)
     acceleration = min(limits.acceleration, GRAVITY * np.tan(min(limits.tilt, 1.0)), 4 * up / airframe.mass)
-    turning = 2 * min(up, down) * airframe.arm / max(airframe.inertia[:2])
+    turning = 0.5 * spare_turning(airframe, limits)
     h = np.minimum.reduce([
         np.full(len(s), 0.3 * ceiling),
         SHARE * limits.speed**2 / first**2,
