@@ -3,6 +3,7 @@
 import atexit
 import gc
 import os
+import signal
 import sys
 import threading
 from contextlib import suppress
@@ -54,6 +55,7 @@ def main() -> None:
     """
     gc.set_threshold(50_000, 20, 20)
     code = _run()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C, or a late one, must not print a traceback
     children = sys.modules["multiprocessing"].active_children() if "multiprocessing" in sys.modules else []
     if children or any(not thread.daemon for thread in threading.enumerate()[1:]):
         sys.exit(code)

@@ -1,5 +1,6 @@
 """What a person sees while the vehicle flies: a line a phase, and a bar along the path."""
 
+import contextlib
 import time
 from types import TracebackType
 
@@ -53,10 +54,15 @@ class FlightProgress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._bar.stop()
+        with contextlib.suppress(OSError):
+            self._bar.stop()
 
     def show(self, message: Telemetry) -> None:
-        """Take a message; draws at most ten times a second."""
+        """Take a message; draws at most ten times a second. A terminal that has closed is no reason to land."""
+        with contextlib.suppress(OSError):
+            self._show(message)
+
+    def _show(self, message: Telemetry) -> None:
         if isinstance(message, PhaseEntered):
             self._enter(message)
         elif isinstance(message, Event) and message.level is not Level.INFO:

@@ -11,6 +11,7 @@ from cfplan.cli.vehicle import StartingVehicle
 from cfplan.cli.watchers import Watched, watchers
 from cfplan.errors import CfplanError
 from cfplan.flight.mocap.poses import PoseSource
+from cfplan.flight.pilot.keys import Keyboard
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import Telemetry
@@ -32,18 +33,19 @@ def fly_and_record(
     pose_source = vehicle.poses(steps)
     folder = new_record_folder(records, prepared.planned.name)
     progress = FlightProgress(duration=prepared.mission.duration, steps=steps)
-    try:
-        outcome, failures = _fly_into(folder, prepared, source, vehicle, pose_source, watched, progress)
-    except CfplanError:
-        if progress.heard_vehicle:
-            steps.say(f"what was recorded: {folder}")
-        else:
-            shutil.rmtree(folder)  # there was no flight
-        raise
-    for what, failure in failures:
-        steps.failed(what, failure)
-    summary = {"uri": vehicle.uri, "outcome": outcome.to_dict(), **summarise(read_record(folder)).to_json()}
-    write_summary(folder, summary)
+    with Keyboard() as keyboard:  # until the summary is written: Ctrl-C during landing must not end the program
+        try:
+            outcome, failures = _fly_into(folder, prepared, source, vehicle, pose_source, watched, progress, keyboard)
+        except CfplanError:
+            if progress.heard_vehicle:
+                steps.say(f"what was recorded: {folder}")
+            else:
+                shutil.rmtree(folder)  # there was no flight
+            raise
+        for what, failure in failures:
+            steps.failed(what, failure)
+        summary = {"uri": vehicle.uri, "outcome": outcome.to_dict(), **summarise(read_record(folder)).to_json()}
+        write_summary(folder, summary)
     return folder, outcome, summary
 
 
@@ -55,6 +57,7 @@ def _fly_into(
     pose_source: PoseSource,
     watched: Watched,
     progress: FlightProgress,
+    keyboard: Keyboard,
 ) -> tuple[FlightOutcome, list[tuple[str, str]]]:
     """Fly, and return the outcome and what failed beside the flight: (record or watching, why)."""
     name, uri = prepared.planned.name, vehicle.uri
@@ -72,6 +75,7 @@ def _fly_into(
             pilot=vehicle.pilot,
             on_telemetry=_for_all(writer.write, progress.show, *watching.listeners),
             more_orders=watching.orders,
+            keyboard=keyboard,
         )
     failures = [("record", writer.failure)] if writer.failure else []
     return outcome, failures + [("watching", failure) for failure in watching.failures()]

@@ -3,18 +3,22 @@
 import contextlib
 import os
 import re
+import select
 import signal
+import stat
 import sys
 import termios
 import threading
-import time
 from collections import deque
 from enum import IntEnum
 from types import FrameType, TracebackType
 from typing import Any
 
 _ESCAPE_WAIT = 0.03  # s in which the rest of an arrow key follows its Esc
-_SEQUENCES = re.compile(rb"\x1b[\[O][0-9;]*[A-Za-z~]")
+_LONGEST_BURST = 1 << 16  # bytes that are read in one go
+_SEQUENCE = re.compile(rb"\x1b?\x1b(\[[0-?]*[!-/]*[@-~]?|O[0-9;]*[A-Za-z]?)")  # an arrow or function key, or its start
+_KEYS = re.compile(rb"(?P<escapes>\x1b+)(?P<next>[^\x1b])?|(?P<space> )", re.DOTALL)
+_ALT = b"\x00"  # stands for a sequence: Esc before it is Alt
 
 
 class Order(IntEnum):
@@ -25,16 +29,26 @@ class Order(IntEnum):
 
 
 def orders_of(keys: bytes) -> list[Order]:
-    """Return the orders of typed keys: space lands, Esc cuts; arrow keys and the like begin with Esc but do not cut."""
-    found = {ord(" "): Order.LAND, 0x1B: Order.CUT}
-    return [found[key] for key in _SEQUENCES.sub(b"", keys) if key in found]
+    """Return the orders of a burst of typed keys that silence follows: space lands, Esc cuts.
+
+    Only an Esc that stands alone or is typed twice cuts: before another key it is Alt, or begins an arrow key.
+    """
+    orders = []
+    for key in _KEYS.finditer(_SEQUENCE.sub(_ALT, keys)):
+        escapes = len(key["escapes"] or b"")
+        if escapes > 1 or (escapes == 1 and key["next"] is None):
+            orders += [Order.CUT] * escapes
+        if key["space"] or key["next"] == b" ":
+            orders.append(Order.LAND)
+    return orders
 
 
 class Keyboard:
     """Collects orders while it is entered. Without a terminal only signals give any.
 
     Space lands, Esc cuts; Ctrl-C lands the first time and cuts the second; SIGTERM and SIGHUP land.
-    Ctrl-Z is off: it would stop the program in the air.
+    Ctrl-Z and Ctrl-S are off: they would stop the program in the air, Ctrl-S at its next line of output. If the
+    terminal closes, that lands too, and what is still printed to it is dropped.
     """
 
     def __init__(self) -> None:
@@ -58,16 +72,18 @@ class Keyboard:
     @staticmethod
     def _read_keys_at_once(descriptor: int) -> None:
         mode = termios.tcgetattr(descriptor)
+        mode[0] &= ~(termios.IXON | termios.IXOFF)
         mode[3] &= ~(termios.ICANON | termios.ECHO)
         mode[6][termios.VMIN], mode[6][termios.VTIME] = 0, 0
         mode[6][termios.VSUSP] = b"\x00"
-        termios.tcsetattr(descriptor, termios.TCSADRAIN, mode)
+        termios.tcsetattr(descriptor, termios.TCSANOW, mode)  # which lets output go on that Ctrl-S has stopped
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._terminal is not None:
-            termios.tcsetattr(self._terminal[0], termios.TCSAFLUSH, self._terminal[1])
+            with contextlib.suppress(termios.error):  # it has closed
+                termios.tcsetattr(self._terminal[0], termios.TCSAFLUSH, self._terminal[1])
             self._terminal = None
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
@@ -80,17 +96,41 @@ class Keyboard:
 
     @property
     def descriptor(self) -> int | None:
-        """A file descriptor to wait on for keys; None without a terminal."""
+        """A file descriptor to wait on for keys; None without a terminal, or once it has closed."""
         return self._terminal[0] if self._terminal is not None else None
 
     def orders(self) -> list[Order]:
         """Return the orders since the last call. Takes 30 ms after an Esc, else does not wait."""
         if self._terminal is not None:
-            keys = os.read(self._terminal[0], 64)
-            if keys.endswith(b"\x1b"):
-                time.sleep(_ESCAPE_WAIT)
-                keys += os.read(self._terminal[0], 64)
-            self._orders.extend(orders_of(keys))
+            self._orders.extend(orders_of(_burst(self._terminal[0])))
+            if not os.isatty(self._terminal[0]):
+                self._terminal = None
+                self._orders.append(Order.LAND)
+                _drop_output()
         given = list(self._orders)
         self._orders.clear()
         return given
+
+
+def _burst(terminal: int) -> bytes:
+    """Return what was typed, and after an Esc what follows it at once."""
+    keys = b""
+    with contextlib.suppress(OSError):  # it has closed
+        while len(keys) < _LONGEST_BURST:
+            if keys.endswith(b"\x1b"):
+                select.select([terminal], [], [], _ESCAPE_WAIT)
+            more = os.read(terminal, 4096)
+            if not more:
+                break
+            keys += more
+    return keys
+
+
+def _drop_output() -> None:
+    """Let output to a closed terminal go nowhere: an error of it would end what is still to be done."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        with contextlib.suppress(OSError):
+            if stat.S_ISCHR(os.fstat(stream).st_mode) and not os.isatty(stream):
+                os.dup2(nowhere, stream)
+    os.close(nowhere)

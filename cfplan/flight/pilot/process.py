@@ -96,18 +96,19 @@ def fly(
     pilot: PilotProcess | None = None,
     on_telemetry: Callable[[Telemetry], None] = lambda _: None,
     more_orders: Callable[[], Sequence[Order]] = tuple,
+    keyboard: Keyboard | None = None,
 ) -> FlightOutcome:
     """Fly a mission and return when the vehicle is down. Call from the main thread, so that Ctrl-C lands.
 
     `pilot` is a process that was started before, with `drivers`; without one it is started now. `pose_source` and
     `drivers` go there by pickle. `on_telemetry` gets every message, in order; what it raises is raised here after the
     vehicle has landed. `more_orders` returns the orders since its last call that came neither by key nor by signal; it
-    must not wait. Raises LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose
-    source raises.
+    must not wait. `keyboard` is one that was entered before; without one it is entered for the flight. Raises
+    LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose source raises.
     """
-    with Keyboard() as keyboard, pilot or start_pilot(drivers) as started:
+    with Keyboard() if keyboard is None else contextlib.nullcontext(keyboard) as entered, pilot or start_pilot(drivers) as started:
         started.assign(mission, uri, pose_source)
-        return _attend(started.process, started.telemetry, started.orders, keyboard, on_telemetry, more_orders)
+        return _attend(started.process, started.telemetry, started.orders, entered, on_telemetry, more_orders)
 
 
 def _attend(
@@ -120,10 +121,8 @@ def _attend(
 ) -> FlightOutcome:
     """Pass telemetry one way and orders the other; return the pilot's last message."""
     failure: BaseException | None = None
-    watched: list[Connection | int] = [telemetry]
-    if keyboard.descriptor is not None:
-        watched.append(keyboard.descriptor)
     while True:
+        watched = [telemetry] if keyboard.descriptor is None else [telemetry, keyboard.descriptor]
         ready = wait(watched, _POLL_PERIOD)
         for order in (*keyboard.orders(), *more_orders()):
             _send(orders, order)
@@ -188,7 +187,7 @@ class OrderReceiver:
         try:
             while True:
                 self.give(self._connection.recv())
-        except (EOFError, OSError):
+        except (EOFError, OSError, TypeError):  # TypeError: it was closed here while it was read
             self.gone = True
 
     def give(self, order: Order) -> None:

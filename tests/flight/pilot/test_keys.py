@@ -26,6 +26,18 @@ from cfplan.flight.pilot.keys import Keyboard, Order, orders_of
         (b" \x1b", [Order.LAND, Order.CUT]),
         (b"\x1b[A\x1b", [Order.CUT]),
         (b"\x1b\x1b", [Order.CUT, Order.CUT]),
+        (b"\x1b\x1bx", [Order.CUT, Order.CUT]),
+        (b"\x1bx", []),
+        (b"\x1b\xc3\xa9", []),
+        (b"\x1bO", []),
+        (b"\x1b[", []),
+        (b"\x1b[1;", []),
+        (b"\x1b ", [Order.LAND]),
+        (b"\x1bO ", [Order.LAND]),
+        (b"\x1b\x1b[A", []),
+        (b"\x1b[[A", []),
+        (b"\x1b[A" * 1000, []),
+        (b"\x1b[A" * 1000 + b"\x1b", [Order.CUT]),
     ],
 )
 def test_space_lands_and_esc_cuts_and_arrows_do_neither(keys, orders):
@@ -79,6 +91,60 @@ except ZeroDivisionError:
     pass
 print("restored" if termios.tcgetattr(0) == before else "changed", flush=True)
 """
+
+
+def test_a_burst_of_arrow_keys_is_not_torn(monkeypatch):
+    ours, theirs = pty.openpty()
+    with os.fdopen(theirs) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        monkeypatch.setattr("os.tcgetpgrp", lambda _: os.getpgrp())
+        with Keyboard() as keyboard:
+            for burst in (b"\x1b[A" * 100, b"x" + b"\x1b[A" * 100, b"xy" + b"\x1b[A" * 100, b"x" * 63 + b"\x1bx"):
+                os.write(ours, burst)
+                assert keyboard.orders() == []
+                assert keyboard.orders() == []
+            os.write(ours, b"\x1b[A" * 100 + b"\x1b")
+            assert keyboard.orders() == [Order.CUT]
+        os.close(ours)
+
+
+def test_ctrl_s_does_not_stop_the_output(monkeypatch):
+    ours, theirs = pty.openpty()
+    with os.fdopen(theirs) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        monkeypatch.setattr("os.tcgetpgrp", lambda _: os.getpgrp())
+        with Keyboard() as keyboard:
+            assert not termios.tcgetattr(terminal)[0] & termios.IXON
+            os.write(ours, b"\x13")
+            assert keyboard.orders() == []
+        assert termios.tcgetattr(terminal)[0] & termios.IXON
+        os.close(ours)
+
+
+_LEFT_ALONE = """
+import sys, time
+from cfplan.flight.pilot.keys import Keyboard
+with Keyboard() as keyboard:
+    print("ready", flush=True)
+    seen = []
+    while not seen or keyboard.descriptor is not None:
+        seen += keyboard.orders()
+        time.sleep(0.01)
+    print("nobody reads this", flush=True)
+with open(sys.argv[1], "w") as file:
+    print(*sorted({order.name for order in seen}), file=file)
+"""
+
+
+def test_a_terminal_that_closes_lands_and_output_to_it_ends_nothing(tmp_path):
+    said = tmp_path / "said"
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, [sys.executable, "-c", textwrap.dedent(_LEFT_ALONE), str(said)])
+    _read_until(terminal, "ready")
+    os.close(terminal)
+    assert os.waitpid(child, 0)[1] == 0
+    assert said.read_text() == "LAND\n"
 
 
 def _read_until(descriptor: int, text: str, patience: float = 20.0) -> str:
