@@ -12,9 +12,10 @@ import click
 
 from cfplan.errors import CfplanError
 from cfplan.files.json_values import json_value
-from cfplan.preparation.steps import StepState, step
+from cfplan.preparation.steps import StepResults, StepState, step
 
 _FIRST_NOTE, _TERMINAL_NOTES, _OTHER_NOTES = 1.0, 0.5, 4.0  # s until a wait is shown, and between later notes
+_MARKS = {StepState.FINISHED: ("✓", "green"), StepState.WARNED: ("!", "yellow"), StepState.FAILED: ("✗", "red")}
 _FILE_WIDTH = 170  # characters, of tables that go to a file or a pipe
 
 
@@ -42,7 +43,8 @@ class Steps:
             self._waiting.start()
             return
         self._end_waiting()
-        mark = click.style("✓", fg="green") if state is StepState.FINISHED else click.style("✗", fg="red")
+        sign, colour = _MARKS[state]
+        mark = click.style(sign, fg=colour)
         took = f"{(time.perf_counter() - self._begun) * 1e3:.0f} ms"
         click.echo(f"{mark} {name:<12} {took:>8}  {result}".rstrip())
 
@@ -61,7 +63,7 @@ class Steps:
         finally:
             self._end_waiting()
 
-    def step(self, name: str) -> AbstractContextManager[list[str]]:
+    def step(self, name: str) -> AbstractContextManager[StepResults]:
         """Time a step of a command. What the block appends to the list is printed behind the step's name."""
         return step(self, name)
 

@@ -102,7 +102,7 @@ def find_link_loss(encoded: EncodedFlight, limits: Limits, on_step: OnStep = ign
     """Simulate that the pilot or the radio dies at moments all along the flight, and return the worst."""
     with step(on_step, "link loss") as results:
         lost = simulate_link_loss(encoded.payloads, limits)
-        results.append(str(lost))
+        (results.warn if lost.beyond > 0 else results.append)(str(lost))
     return lost
 
 

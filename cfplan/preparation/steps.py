@@ -12,6 +12,7 @@ class StepState(Enum):
 
     BEGUN = "begun"
     FINISHED = "finished"
+    WARNED = "warned"  # finished, and a person should read the result
     FAILED = "failed"
 
 
@@ -22,14 +23,25 @@ def ignore_steps(name: str, state: StepState, result: str) -> None:
     """Show nothing."""
 
 
+class StepResults(list[str]):
+    """What a step says at its end, and whether that is a warning."""
+
+    warning = False
+
+    def warn(self, result: str) -> None:
+        """Append a result that a person should read."""
+        self.append(result)
+        self.warning = True
+
+
 @contextmanager
-def step(on_step: OnStep, name: str) -> Iterator[list[str]]:
+def step(on_step: OnStep, name: str) -> Iterator[StepResults]:
     """Report the block as a step. What the block appends to the list is the step's result, joined by commas."""
     on_step(name, StepState.BEGUN, "")
-    results: list[str] = []
+    results = StepResults()
     try:
         yield results
     except CfplanError:
         on_step(name, StepState.FAILED, "")
         raise
-    on_step(name, StepState.FINISHED, ", ".join(results))
+    on_step(name, StepState.WARNED if results.warning else StepState.FINISHED, ", ".join(results))

@@ -31,6 +31,14 @@ def test_a_step_that_fails_is_marked(capsys):
     assert capsys.readouterr().out.startswith("✗ path")
 
 
+def test_a_step_with_a_warning_has_no_tick(capsys):
+    with Steps(as_json=False).step("link loss") as results:
+        results.warn("3.2 m beyond the walls")
+    printed = capsys.readouterr().out
+    assert printed.startswith("! link loss")
+    assert "✓" not in printed
+
+
 def test_a_long_step_says_meanwhile_what_is_waited_for(capsys, impatient):
     with Steps(as_json=False).step("plan"):
         time.sleep(0.5)

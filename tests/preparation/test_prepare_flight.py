@@ -12,12 +12,15 @@ from cfplan.planning.plan_file import save_plan
 from cfplan.preparation import plan_flight as planning
 from cfplan.preparation import prepare_flight as preparation
 from cfplan.preparation.plan_flight import FlightOptions, plan_flight
-from cfplan.preparation.prepare_flight import encode_flight, prepare_flight
+from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, prepare_flight
 from cfplan.preparation.steps import StepState
+from cfplan.simulation.link_loss import LinkLoss
 
 REPOSITORY = Path(__file__).parents[2]
 LINE = REPOSITORY / "flights" / "line.yaml"
 AFTER_PLANNING = ["certificate", "bytes", "dry run", "link loss", "stops"]
+
+ENDED_WELL = (StepState.FINISHED, StepState.WARNED)
 
 
 @pytest.fixture
@@ -29,20 +32,27 @@ def steps():
         noted.append((name, state, result))
 
     note.noted = noted
-    note.names = lambda wanted: [name for name, state, _ in noted if state is wanted]
+    note.names = lambda *wanted: [name for name, state, _ in noted if state in wanted]
     return note
 
 
 def test_every_step_is_reported_once_in_the_order_of_the_data(limits, steps):
     prepared = prepare_flight(LINE, limits, on_step=steps)
     order = ["path", "plan", "bound", *AFTER_PLANNING]
-    assert steps.names(StepState.BEGUN) == steps.names(StepState.FINISHED) == order
-    assert all(result for _, state, result in steps.noted if state is StepState.FINISHED)
+    assert steps.names(StepState.BEGUN) == steps.names(*ENDED_WELL) == order
+    assert all(result for _, state, result in steps.noted if state in ENDED_WELL)
     assert prepared.plan.certificate.passed
     assert prepared.dry_run.passed
     assert prepared.mission.payloads is prepared.encoded.payloads
     assert prepared.stops.count == len(prepared.mission.stops) == len(prepared.mission.payloads)
     assert prepared.planned.lower_bound <= prepared.plan.trajectory.duration
+
+
+@pytest.mark.parametrize(("beyond", "state"), [(-0.1, StepState.FINISHED), (3.2, StepState.WARNED)])
+def test_a_link_loss_that_ends_beyond_the_walls_is_a_warning(limits, monkeypatch, steps, beyond, state):
+    monkeypatch.setattr(preparation, "simulate_link_loss", lambda *_: LinkLoss(1.0, 4.0, beyond))
+    find_link_loss(encode_flight(plan_flight(LINE, limits)), limits, steps)
+    assert steps.names(state) == ["link loss"]
 
 
 def test_nothing_is_simulated_twice(limits, monkeypatch):
@@ -58,7 +68,7 @@ def test_a_plan_file_gives_the_same_bytes_as_its_path_file(limits, tmp_path, ste
     prepared = prepare_flight(LINE, limits)
     save_plan(prepared.plan, tmp_path / "plan.parquet")
     again = prepare_flight(tmp_path / "plan.parquet", limits, on_step=steps)
-    assert steps.names(StepState.FINISHED) == ["plan", *AFTER_PLANNING]
+    assert steps.names(*ENDED_WELL) == ["plan", *AFTER_PLANNING]
     np.testing.assert_array_equal(again.mission.payloads, prepared.mission.payloads)
     np.testing.assert_array_equal(again.mission.stops, prepared.mission.stops)
     assert again.planned.lower_bound is None
