@@ -106,7 +106,8 @@ def fly(
     must not wait. `keyboard` is one that was entered before; without one it is entered for the flight. Raises
     LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose source raises.
     """
-    with Keyboard() if keyboard is None else contextlib.nullcontext(keyboard) as entered, pilot or start_pilot(drivers) as started:
+    held = Keyboard() if keyboard is None else contextlib.nullcontext(keyboard)
+    with held as entered, pilot or start_pilot(drivers) as started:
         started.assign(mission, uri, pose_source)
         return _attend(started.process, started.telemetry, started.orders, entered, on_telemetry, more_orders)
 
