@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cfplan.cli import main
+from cfplan.cli import run_command
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -32,7 +32,7 @@ def cfplan(monkeypatch, capsys):
     def run(*words: object) -> Ended:
         monkeypatch.setattr("sys.argv", ["cfplan", *map(str, words)])
         with pytest.raises(SystemExit) as ending:
-            main()
+            run_command()
         printed = capsys.readouterr()
         return Ended(int(ending.value.code or 0), printed.out, printed.err)
 

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from cfplan.cli import main
+from cfplan.cli import run_command
 from cfplan.learning.model_files import load_model
 
 
@@ -16,7 +16,7 @@ def run(monkeypatch, capfd):
     def typed(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["cfplan", "train", *map(str, arguments)])
         with pytest.raises(SystemExit) as ending:
-            main()
+            run_command()
         said = capfd.readouterr()
         return ending.value.code, said.out, said.err
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cfplan.cli import main
+from cfplan.cli import run_command
 from cfplan.errors import ExitCode, InputError, LinkError
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.outcome import Check, Deviation, FlightOutcome, Rung
@@ -179,7 +179,7 @@ def test_conditions_that_cannot_be_are_refused_before_anything_is_planned(wrong,
     monkeypatch.setattr(flights, "plan_flight", None)
     monkeypatch.setattr("sys.argv", ["cfplan", "study", "flights", str(LINE), *wrong])
     with pytest.raises(SystemExit) as ended:
-        main()
+        run_command()
     assert ended.value.code == 2
     assert wrong[0] in capsys.readouterr().err
 

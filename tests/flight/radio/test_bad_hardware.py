@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from cfplan.cli import main
+from cfplan.cli import run_command
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.simulation.virtual_vicon.vicon import serve
 
@@ -35,7 +35,7 @@ def refused(tmp_path, monkeypatch, capsys):
         )
         began = time.monotonic()
         with pytest.raises(SystemExit) as ending:
-            main()
+            run_command()
         assert time.monotonic() - began < 5.0
         said = capsys.readouterr().err
         assert said.startswith("error: ")
