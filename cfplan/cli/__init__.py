@@ -1,7 +1,6 @@
 """The command line: one small file a command, wiring only. Whatever is heavy is imported inside the commands."""
 
 import gc
-import os
 import signal
 import sys
 
