@@ -1,4 +1,4 @@
-"""The command line: one small file a command, wiring only. Whatever is heavy is imported inside the commands."""
+"""The command line: one small file a command, wiring only. Heavy packages are imported inside the commands."""
 
 import gc
 import signal

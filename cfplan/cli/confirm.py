@@ -1,4 +1,4 @@
-"""The question before hardware flies."""
+"""The confirmation that is asked for before hardware flies."""
 
 import json
 import re

@@ -74,7 +74,7 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
 def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **what: Any) -> None:
     """Make the dataset DIR, or what is still missing of it.
 
-    The same options give the same rows, whatever the number of workers; solves that fail are rows with a reason.
+    The same options give the same rows with any number of workers; solves that fail are rows with a reason.
     """
     from cfplan.geometry.yaw import YawMode
     from cfplan.learning.dataset import make_dataset

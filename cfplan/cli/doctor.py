@@ -1,4 +1,4 @@
-"""`cfplan doctor`: is everything there that a flight needs?"""
+"""`cfplan doctor`: checks that everything that a flight needs is installed."""
 
 import os
 import platform
@@ -77,7 +77,7 @@ def _optional(name: str) -> dict[str, str]:
 
 
 def _machine_code() -> dict[str, str]:
-    """Whether compiled functions are kept for the next start."""
+    """Check whether compiled functions are kept for the next start."""
     from cfplan.machine_code import cache_folder, kept
 
     if not kept():
@@ -88,7 +88,7 @@ def _machine_code() -> dict[str, str]:
 
 
 def _priority() -> dict[str, str]:
-    """Whether setpoints are on time although other programs run."""
+    """Check whether setpoints can be sent ahead of other programs."""
     from cfplan.flight.real_time import STREAM_PRIORITY, may_use_fifo_scheduling
 
     if may_use_fifo_scheduling():
@@ -98,7 +98,7 @@ def _priority() -> dict[str, str]:
 
 
 def _radio() -> dict[str, str]:
-    """Whether a Crazyradio is plugged in and may be used."""
+    """Check whether a Crazyradio is plugged in and may be used."""
     from cfplan.flight.radio.crazyradio import check_radio, find_radios
 
     try:

@@ -1,4 +1,4 @@
-"""What a person sees while the vehicle flies: a line a phase, and a bar along the path."""
+"""The flight on the terminal while it goes on: a line a phase, and a bar along the path."""
 
 import contextlib
 import time
@@ -20,7 +20,7 @@ _REFRESH = 0.1  # s
 
 
 class FlightProgress:
-    """Follows the telemetry. On a terminal the bar moves; elsewhere only lines are printed."""
+    """Shows telemetry. On a terminal the bar moves; elsewhere only lines are printed."""
 
     def __init__(self, *, duration: float, steps: Steps):
         from rich.console import Console
@@ -58,7 +58,7 @@ class FlightProgress:
             self._bar.stop()
 
     def show(self, message: Telemetry) -> None:
-        """Take a message; draws at most ten times a second. A terminal that has closed is no reason to land."""
+        """Take a message; draw at most ten times a second. A terminal that has closed is no reason to land."""
         with contextlib.suppress(OSError):
             self._show(message)
 

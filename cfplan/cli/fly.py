@@ -32,7 +32,7 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
 @click.option(
     "--mocap",
     "mocap_uri",
-    help="The vehicle in motion capture, as vicon://192.168.1.2/cf1. sim:// has poses of its own; "
+    help="The vehicle in motion capture, as vicon://192.168.1.2/cf1. sim:// has poses already; "
     "vicon://lab/cf1 takes them through a virtual Vicon.",
 )
 @click.option(
@@ -40,12 +40,12 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("records"),
     show_default=True,
-    help="Folder in which the flight's record gets a folder of its own.",
+    help="Folder in which the flight's record is written, as a new folder.",
 )
 @click.option("--live", is_flag=True, help="Show the flight in rerun while it goes on.")
 @click.option(
     "--mavlink",
-    help="Tell a ground station of the flight and obey its orders to stop, as udp:127.0.0.1:14550, where it listens.",
+    help="Ground station that watches the flight and may stop it, where it listens, as udp:127.0.0.1:14550.",
 )
 @click.option("--yes", is_flag=True, help="Do not ask before hardware flies.")
 @options.as_json
@@ -113,5 +113,9 @@ def _rows(prepared: "PreparedFlight", outcome: "FlightOutcome", summary: dict[st
         ["deviation, dry run", f"{100 * prepared.dry_run.deviation:.1f} cm max"],
         ["deviation, flown", f"{100 * deviation.max:.1f} cm max, {100 * deviation.rms:.1f} cm rms"],
         ["lateness of setpoints", f"{1e3 * lateness.p99:.2f} ms p99, {1e3 * lateness.max:.2f} ms max"],
-        ["battery", f"{summary['battery_start']} → {summary['battery_end']} V"],
+        ["battery", f"{_volts(summary['battery_start'])} → {_volts(summary['battery_end'])} V"],
     ]
+
+
+def _volts(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"

@@ -1,11 +1,11 @@
-"""How the commands speak: a line a step for people, one JSON document for scripts."""
+"""Output of the commands: a line a step for people, one JSON document for scripts."""
 
 import json
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any
 
 import click
@@ -23,7 +23,7 @@ class Steps:
     """Prints one line a step as it ends, with the time that it took; silent where JSON is asked for.
 
     A step that takes longer than a second says meanwhile what is waited for and for how long: on a terminal in a line
-    that is overwritten, elsewhere in a line of its own every few seconds.
+    that is overwritten, elsewhere in another line every few seconds.
     """
 
     def __init__(self, *, as_json: bool):
@@ -79,26 +79,25 @@ class Steps:
 
 
 def _show_waiting(name: str, ended: threading.Event) -> None:
+    """Say again and again what is waited for, until it has ended."""
     begun, on_terminal = time.perf_counter(), sys.stdout.isatty()
     pause = _FIRST_NOTE
-    while not ended.wait(pause):
-        text = f"… {name}, {time.perf_counter() - begun:.0f} s"
-        if on_terminal:
-            click.echo(f"\r\033[K{text}", nl=False)
-        else:
-            click.echo(text)
-        pause = _TERMINAL_NOTES if on_terminal else _OTHER_NOTES
-    if on_terminal and pause != _FIRST_NOTE:
-        click.echo("\r\033[K", nl=False)
+    with suppress(BrokenPipeError):  # the reader of our output went away, as `| head` does
+        while not ended.wait(pause):
+            text = f"… {name}, {time.perf_counter() - begun:.0f} s"
+            click.echo(f"\r\033[K{text}" if on_terminal else text, nl=not on_terminal)
+            pause = _TERMINAL_NOTES if on_terminal else _OTHER_NOTES
+        if on_terminal and pause != _FIRST_NOTE:
+            click.echo("\r\033[K", nl=False)
 
 
 def print_json(document: Any) -> None:
-    """One document on standard output; what is not finite becomes null, as JSON has no word for it."""
+    """Print one document on standard output; numbers that are not finite become null, as JSON has no word for them."""
     click.echo(json.dumps(json_value(document), indent=2, ensure_ascii=False))
 
 
 def print_error(error: CfplanError, *, as_json: bool) -> None:
-    """One line on standard error, and the same as JSON on standard output where that was asked for."""
+    """Print one line on standard error, and the same as JSON on standard output where that was asked for."""
     click.echo(f"{click.style('error:', fg='red')} {error}", err=True)
     if as_json:
         code = int(error.exit_code)
@@ -106,7 +105,7 @@ def print_error(error: CfplanError, *, as_json: bool) -> None:
 
 
 def print_table(title: str, columns: list[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table; the first column to the left, numbers to the right."""
+    """Print a table: the first column to the left, numbers to the right."""
     from rich import box
     from rich.console import Console
     from rich.table import Table

@@ -71,7 +71,7 @@ def replay(
 
 @dataclass(frozen=True, slots=True)
 class Files:
-    """What to write; where it is nothing, the viewer opens."""
+    """The files to write; without any, the viewer opens."""
 
     save: Path | None
     png: Path | None
@@ -82,7 +82,7 @@ class Files:
     def make(
         self, steps: Steps, write: "Callable[..., None]", picture: "Callable[..., tuple[str, ...]]", show: Callable
     ) -> None:
-        """Write or show."""
+        """Write the files, or show the flight in the viewer."""
         if self.save is not None:
             with steps.step("rerun file") as said:
                 write(self.save, overwrite=self.force)
@@ -140,7 +140,7 @@ def _reference(plan_file: Path, steps: Steps) -> "Reference":
     from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, plan_flight
     from cfplan.recording.overlay import reference_of
 
-    if plan_file.suffix == PLAN_SUFFIX:  # as it was planned, whatever today's limits say
+    if plan_file.suffix == PLAN_SUFFIX:  # as it was planned, under the limits of that day
         from cfplan.planning.plan_file import load_plan
 
         with steps.step("plan") as results:
@@ -155,7 +155,7 @@ def _reference(plan_file: Path, steps: Steps) -> "Reference":
 def _trials(
     place: Path, reference: "Reference | None", names: tuple[str, ...], angles: str | None, steps: Steps
 ) -> "list[tuple[Trial, dict[str, Any]]]":
-    """The trials of one file, and what is to be told of each; laid over the reference where there is one."""
+    """Return the trials of one file with a description each; laid over the reference where there is one."""
     from cfplan.recording.overlay import subject_of_record, trial_of_record, trial_of_subject
     from cfplan.recording.reader import is_record, read_record
 
@@ -205,5 +205,5 @@ def _laid(
         found = align(subject, reference)
         said.append(f"{subject.name}: {found}")
         if not found.alike:
-            said.append(f"it hardly looks like a flight of {reference.name}")
+            said.append(f"it does not look like a flight of {reference.name}")
     return trial_of_subject(subject, reference, found.offset), {**about, "alignment": asdict(found)}

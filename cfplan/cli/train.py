@@ -97,5 +97,5 @@ def _line(epoch: Any) -> str:
 
 
 def _command() -> str:
-    """What was typed; of absolute paths the last part, as the rest means nothing elsewhere."""
+    """Return the command as typed; of absolute paths the last part, as the rest means nothing elsewhere."""
     return " ".join(["cfplan", *(Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:])])

@@ -1,4 +1,4 @@
-"""Which vehicle to fly, and where its poses come from."""
+"""The vehicle to fly and the source of its poses, checked first, and started while the flight is prepared."""
 
 import math
 from contextlib import ExitStack
@@ -19,7 +19,7 @@ VIRTUAL_VICON = "lab"  # as the computer in a URI of motion capture
 
 
 def check_uris(uri: str, mocap_uri: str | None) -> None:
-    """Raises InputError where one is wrong, or a vehicle has no source of poses; looks for nothing yet."""
+    """Raise InputError where a URI is wrong, or a vehicle has no source of poses. Nothing is connected yet."""
     from cfplan.flight.mocap.uri import EXAMPLE, parse_uri
     from cfplan.flight.radio.uri import check_vehicle_uri
 
@@ -29,13 +29,13 @@ def check_uris(uri: str, mocap_uri: str | None) -> None:
         if mocap.host == VIRTUAL_VICON and not mocap.system.startswith("vicon") and uri.startswith(SIMULATED):
             raise InputError("the lab has a virtual Vicon only", where=mocap_uri, hint="use vicon:// or vicon-sdk://")
     elif not uri.startswith(SIMULATED):
-        raise InputError("where do its poses come from?", where=uri, hint=f"name it with --mocap, as {EXAMPLE}")
+        raise InputError("this vehicle needs a source of poses", where=uri, hint=f"name it with --mocap, as {EXAMPLE}")
 
 
 def look_at_hardware(uri: str, mocap_uri: str | None, limits: "PoseLimits", steps: "Steps") -> None:
-    """Before anything is planned: is the radio to be had, and is the body seen, upright and in metres?
+    """Check, before anything is planned, that the radio is available, and the body seen, upright and in metres.
 
-    Raises a CfplanError, within 5 s. Says where the body is, which a person can check with a glance.
+    Prints where the body is, which a person can check with a glance. Raises a CfplanError, within 5 s.
     """
     from cfplan.flight.mocap.source import pose_source
     from cfplan.flight.radio.crazyradio import check_radio
@@ -44,7 +44,7 @@ def look_at_hardware(uri: str, mocap_uri: str | None, limits: "PoseLimits", step
     if uri.startswith("radio://"):
         with steps.step("radio") as said:
             check_radio(uri)
-            said.append("there, and free")
+            said.append("found, and free")
     if mocap_uri is None or _is_virtual(uri, mocap_uri):
         return
     with steps.step("body") as said:
@@ -59,7 +59,7 @@ def look_at_hardware(uri: str, mocap_uri: str | None, limits: "PoseLimits", step
 
 
 def _is_virtual(uri: str, mocap_uri: str) -> bool:
-    """Whether it is the lab's own, which is not there before the lab is."""
+    """Return whether motion capture is the lab's own, which starts with the lab."""
     from cfplan.flight.mocap.uri import parse_uri
 
     return uri.startswith(SIMULATED) and parse_uri(mocap_uri, subject_needed=True).host == VIRTUAL_VICON

@@ -30,9 +30,9 @@ Examples:
     "--port", type=click.IntRange(1024, 65534), default=19850, show_default=True,
     help="UDP; cfclient scans 19850 to 19859. The next port gives poses.",
 )  # fmt: skip
-@click.option("--seconds", type=click.FloatRange(0.1), help="End after so long; else with Ctrl-C.")
+@click.option("--seconds", type=click.FloatRange(0.1), help="End after this time; else with Ctrl-C.")
 @click.option("--live", is_flag=True, help="Show it in rerun.")
-@click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="Its vehicle is served.")
+@click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="File that names the vehicle to serve.")
 def virtual(port: int, seconds: float | None, live: bool, safety_file: Path | None) -> None:
     """Serve the virtual Crazyflie over UDP, with poses on board as from a positioning deck."""
     from cfplan.safety.limits_file import load_limits
@@ -60,7 +60,7 @@ def virtual(port: int, seconds: float | None, live: bool, safety_file: Path | No
 
 
 def _show(truth: "Truth", view: "LiveView | None") -> None:
-    """Where it is: on the terminal's last line, and in the view."""
+    """Show where the vehicle is: on the terminal's last line, and in the view."""
     from cfplan.flight.telemetry import PoseReceived
     from cfplan.simulation.virtual_crazyflie.supervisor import State
 

@@ -1,4 +1,4 @@
-"""Who watches a flight besides its record: a live view in rerun, a ground station."""
+"""The watchers of a flight besides its record: a live view in rerun, a ground station."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence

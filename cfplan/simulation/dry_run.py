@@ -1,7 +1,7 @@
-"""The flight before the flight: the very bytes that will be sent, flown by the simulated vehicle.
+"""Dry run: the very bytes that will be sent, flown by the simulated vehicle before the flight.
 
 It starts in hover at the start, receives each payload when it is due and hovers on the last one; the controller sees
-the true state. What it does is held against the limits from which on the pilot would interfere.
+the true state. Its motion is compared with the limits at which the pilot would brake.
 """
 
 import math
@@ -34,7 +34,7 @@ _HINT = "plan with lower limits, or check mass, thrust and motor lag of the airf
 
 @dataclass(frozen=True, slots=True)
 class DryRun:
-    """What came of it."""
+    """The result of a dry run."""
 
     reason: str  # why it failed; empty when it passed
     deviation: float  # m, worst distance from where the trajectory is at that time
@@ -52,18 +52,18 @@ class DryRun:
 
     @property
     def passed(self) -> bool:
-        """Whether the bytes may fly."""
+        """Return whether the bytes may fly."""
         return not self.reason
 
     def summary(self) -> dict[str, bool | float | str | None]:
-        """Everything but the flight itself, for a file; what has no finite value is None, as JSON knows no infinity."""
+        """Return everything but the flight itself, for a file; a value that is not finite is None, as in JSON."""
         figures = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "loop"}
         return {"passed": self.passed} | {
             name: value if isinstance(value, str) or np.isfinite(value) else None for name, value in figures.items()
         }
 
     def rows(self) -> list[tuple[str, str]]:
-        """Everything but the flight itself, for people."""
+        """Return everything but the flight itself, for people."""
         return [
             ("verdict", self.reason or "passed"),
             ("deviation in time", f"{100 * self.deviation:.1f} cm at {self.deviation_time:.2f} s"),
@@ -121,7 +121,7 @@ def dry_run(
 def stress(
     encoded: EncodedFlight, trajectory: Trajectory, airframe: Airframe, limits: FlightLimits
 ) -> dict[str, DryRun]:
-    """The same bytes on vehicles, and over a link, that are not quite what the plan takes them for."""
+    """Fly the same bytes on vehicles, and over a link, that differ a little from what the plan assumes."""
     slow = replace(airframe, motor_time_constant=1.25 * airframe.motor_time_constant)
     heavy, light = replace(airframe, mass=1.05 * airframe.mass), replace(airframe, mass=0.95 * airframe.mass)
     noisy = EstimateErrors(latency=0.010, position_noise=0.002, velocity_noise=0.03)
@@ -168,7 +168,7 @@ def _judge(loop: ClosedLoop, trajectory: Trajectory, limits: FlightLimits) -> Dr
 
 
 def _fault(run: DryRun, limits: FlightLimits) -> str:
-    """The first reason not to fly, or nothing. Where NaN came out, the deviation is infinite."""
+    """Return the first reason not to fly, or nothing. A position that is not a number counts as infinitely far."""
     if not run.deviation < limits.deviation.brake:
         return (
             f"the vehicle strays {run.deviation:.2f} m from the trajectory at {run.deviation_time:.2f} s; "

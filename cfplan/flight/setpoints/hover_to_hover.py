@@ -1,7 +1,7 @@
-"""From one hover to another by setpoints: to the start of a plan, and down where the on-board commander does not land.
+"""Hover to hover by setpoints: to the start of a plan, and down if the on-board commander does not land.
 
 While setpoints come, the vehicle's own time-outs watch over it: it levels out when they stop, and stops its motors
-2 s later. In the hands of its on-board commander it would hover on, without poses, wherever that leads.
+2 s later. In the hands of its on-board commander it would hover on without poses, and drift.
 """
 
 import math
@@ -17,7 +17,7 @@ from cfplan.vehicle.rotations import about_z
 def encode_hover_to_hover(
     begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float, rate: float
 ) -> NDArray:
-    """(N, 29) uint8 at `rate`, Hz: straight from `begin` to `end`, m, in `duration`, s, turning the shorter way."""
+    """Return (N, 29) uint8 at `rate`, Hz: straight from `begin` to `end`, m, in `duration`, s; yaw the shorter way."""
     share = np.linspace(0.0, 1.0, max(round(duration * rate), 1) + 1)
     along = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     speed = 30.0 * share**2 * (1.0 - share) ** 2 / duration

@@ -1,7 +1,7 @@
 """Full-state setpoints as the 29 bytes that go over the radio, and back.
 
 CRTP port 7 channel 0; `<B 3h 3h 3h I 3h`: type 6, position mm, velocity mm/s, acceleration mm/s² (without gravity),
-quaternion compressed to its three smallest components, body rates in millirad/s (whatever cflib's docstring says).
+quaternion compressed to its three smallest components, body rates in millirad/s (cflib's docstring is wrong).
 cflib's own call truncates towards zero; here values are rounded, which halves the error and removes the bias.
 """
 

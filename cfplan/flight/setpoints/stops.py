@@ -21,7 +21,7 @@ _GRAVITY = np.array([0.0, 0.0, GRAVITY])
 
 
 def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION, rows: NDArray | None = None) -> NDArray:
-    """(N, M, 29) uint8: stop i begins with setpoint i's place and ends in hover; M setpoints at `rate`.
+    """Return (N, M, 29) uint8: stop i begins with setpoint i's place and ends in hover; M setpoints at `rate`.
 
     Where `rows` are given, those of these setpoints alone.
     """
@@ -60,7 +60,7 @@ def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION, row
 
 
 def _ahead(values: NDArray, by: float) -> NDArray:
-    """(..., M, 3) rows from `by` rows later on; the last holds."""
+    """Return (..., M, 3): the rows `by` rows later on; the last holds."""
     place = np.minimum(np.arange(values.shape[-2]) + by, values.shape[-2] - 1.0)
     row = place.astype(int)
     after = np.minimum(row + 1, values.shape[-2] - 1)
@@ -68,7 +68,7 @@ def _ahead(values: NDArray, by: float) -> NDArray:
 
 
 def _turn_rates(quaternion: NDArray, rate: float) -> NDArray:
-    """(..., M, 3) rad/s in body axes: the turn from the attitude before to the one after, over the time between."""
+    """Return (..., M, 3) rad/s in body axes: the turn from the attitude before to the one after."""
     before = np.concatenate([quaternion[..., :1, :], quaternion[..., :-1, :]], axis=-2)
     after = np.concatenate([quaternion[..., 1:, :], quaternion[..., -1:, :]], axis=-2)
     periods = np.full(quaternion.shape[-2], 2.0)

@@ -72,7 +72,7 @@ def test_nobody_there_is_an_error():
 
 
 def test_hardware_needs_motion_capture_before_anything_else():
-    with pytest.raises(InputError, match="where do its poses come from") as caught:
+    with pytest.raises(InputError, match="needs a source of poses") as caught:
         check_uris("radio://0/80/2M/E7E7E7E7E7", None)
     assert "--mocap" in caught.value.hint
     with pytest.raises(InputError, match="which body"):
