@@ -57,14 +57,16 @@ def test_the_certificate_is_that_of_the_trajectory():
 
 def test_what_cannot_be_refined_is_slowed_and_says_why(monkeypatch):
     monkeypatch.setattr(
-        repairing, "refinements", lambda *_: [Solution(Status.NOT_CONVERGED, None, "refining: no step makes it better")]
+        repairing,
+        "refinements",
+        lambda *_: [Solution(Status.NOT_CONVERGED, None, "refining: no step improves the solution")],
     )
     path = random_path(1, "10x10x10")
     profile = plan_learned(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits)).profile
     repaired = repair(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits), profile)
     assert repaired.speed_factor < 1.0
     assert repaired.certificate.passed
-    assert "no step makes it better" in repaired.describe()
+    assert "no step improves the solution" in repaired.describe()
 
 
 def test_limits_that_the_profile_never_knew_are_kept_too():

@@ -139,16 +139,28 @@ def _point_data(segment: Segment, step: float) -> NDArray:
 
 def _limits_at_points(layout: Layout, ends: Ends, margin: NDArray) -> tuple[NDArray, NDArray]:
     """Return the lower and upper bounds of the rows at points, tightened by the margin of each interval, (N,)."""
-    first = (layout.interval == 0) & (layout.place == 0.0)
-    last = (layout.interval == layout.shape.nodes - 1) & (layout.place == 1.0)
-    decided = (first & ends.held[0]) | (last & ends.held[1])
-    tighter = np.where(
-        decided & ~point_constraints.JUMPS[:, None], -BOUNDARY_TOLERANCE, 2.0 * margin[layout.interval]
-    )  # of squares
-    return (
-        np.where(layout.bounded, point_constraints.LOWER[:, None] + tighter, -np.inf),
-        np.where(layout.bounded, point_constraints.UPPER[:, None] - tighter, np.inf),
-    )
+    last = layout.interval[-1] + 1.0 if ends.end else np.inf
+    return _tightened_by_margin(
+        layout.bounded, layout.interval, layout.place, margin, 0.0 if ends.start else -1.0, last,
+        point_constraints.LOWER, point_constraints.UPPER, point_constraints.JUMPS,
+    )  # fmt: skip
+
+
+@njit
+def _tightened_by_margin(
+    bounded: NDArray, interval: NDArray, place: NDArray, margin: NDArray, first: float, last: float, lower: NDArray,
+    upper: NDArray, jumps: NDArray,
+) -> tuple[NDArray, NDArray]:  # fmt: skip
+    """Return _limits_at_points; boundary states decide the points at `first` and `last`, in intervals."""
+    low, high = np.full(bounded.shape, -np.inf), np.full(bounded.shape, np.inf)
+    for row in range(len(bounded)):
+        for p in range(len(interval)):
+            if bounded[row, p]:
+                s = interval[p] + place[p]
+                decided = (s == first or s == last) and not jumps[row]
+                tighter = -BOUNDARY_TOLERANCE if decided else 2.0 * margin[interval[p]]  # as most rows are squares
+                low[row, p], high[row, p] = lower[row] + tighter, upper[row] - tighter
+    return low, high
 
 
 def tightened(problem: Problem, violation: Violation, rows: NDArray) -> Problem:
