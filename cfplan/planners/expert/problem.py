@@ -157,7 +157,7 @@ def _tightened_by_margin(
         for p in range(len(interval)):
             if bounded[row, p]:
                 s = interval[p] + place[p]
-                decided = (s == first or s == last) and not jumps[row]
+                decided = s in (first, last) and not jumps[row]
                 tighter = -BOUNDARY_TOLERANCE if decided else 2.0 * margin[interval[p]]  # as most rows are squares
                 low[row, p], high[row, p] = lower[row] + tighter, upper[row] - tighter
     return low, high

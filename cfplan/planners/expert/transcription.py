@@ -41,7 +41,9 @@ class SplineProgram:
             problem.layout.shape.free_yaw, problem.point_data, problem.common, OBJECTIVE_SCALE * problem.penalties,
             self._linear,
         )  # fmt: skip
-        self._work = np.empty((derivative_rows(it.local.shape[1]), problem.point_data.shape[1]))  # within linearise()
+        # Within one call of evaluate() or linearise():
+        self._at_points = np.empty((it.local.shape[1], problem.point_data.shape[1]))
+        self._work = np.empty((derivative_rows(it.local.shape[1]), problem.point_data.shape[1]))
         self._scale = OBJECTIVE_SCALE * math.sqrt(problem.step**2 / problem.unit)  # of time in node units
         self.rows = point_constraints.ROWS
         self.bounds = self._bounds(problem)
@@ -72,16 +74,18 @@ class SplineProgram:
 
     def evaluate(self, v: NDArray) -> Values:
         """Return f and g at v."""
-        local, at_points = _gather(v, self._variables.sparsity, self._fixed_local)
-        constraints, penalty = self._kernels.evaluate(at_points)
-        return Values(_complete(constraints, penalty, local, self._variables.sparsity, self._scale), constraints)
+        it = self._variables.sparsity
+        _gather(v, it, self._fixed_local, self._at_points)
+        constraints, penalty = self._kernels.evaluate(self._at_points)
+        return Values(_complete(constraints, penalty, v, it, self._fixed_local, self._scale), constraints)
 
     def linearise(self, v: NDArray, terms: NDArray) -> Linearisation:
         """Return the derivatives at v, where the constraints have these barrier.TERMS."""
         it = self._variables
-        local, at_points = _gather(v, it.sparsity, self._fixed_local)
-        jacobian = self._kernels.differentiate(at_points, terms, self._work)
-        gradients, matrix = _assemble(self._work, it.sparsity, terms, local, self._scale, it.size, it.band)
+        _gather(v, it.sparsity, self._fixed_local, self._at_points)
+        jacobian = self._kernels.differentiate(self._at_points, terms, self._work)
+        gradients, matrix = np.zeros((len(terms), it.size)), np.zeros((it.size, it.band + 1))
+        _assemble(self._work, it.sparsity, terms, v, self._fixed_local, self._scale, gradients, matrix)
         return Linearisation(gradients, matrix, partial(_jvp, jacobian, it.sparsity))
 
 
@@ -121,22 +125,21 @@ def _weigh(sparsity, local, result):
 
 
 @njit(error_model="numpy")
-def _gather(v, sparsity, fixed):
-    """Return each interval's coefficients, (N, k), and those of each point, (k, P)."""
+def _gather(v, sparsity, fixed, at_points):
+    """Fill in the coefficients of each point, (k, P)."""
     local, interval = _spread(v, sparsity.slots, fixed), sparsity.interval
-    at_points = np.empty((local.shape[1], len(interval)))
     for a in range(local.shape[1]):
         for p in range(len(interval)):
             at_points[a, p] = local[interval[p], a]
-    return local, at_points
 
 
 @njit(error_model="numpy", fastmath=_FREELY)
-def _complete(constraints, penalty, local, sparsity, scale):
+def _complete(constraints, penalty, v, sparsity, fixed, scale):
     """Fill in the linear constraints, which the kernels left open, and return the cost: penalties and time.
 
     The time in node units is Σ ∫ds/√x over all intervals.
     """
+    local = _spread(v, sparsity.slots, fixed)
     _weigh(sparsity, local, constraints[len(constraints) - len(sparsity.linear_interval) :])
     time, total = 0.0, 0.0
     for i in range(local.shape[0]):
@@ -206,15 +209,15 @@ def _add_time(local, scale, gradients, hessian):
 
 
 @njit(error_model="numpy", fastmath=_FREELY)
-def _assemble(at_points, sparsity, terms, local, scale, size, band):
-    """Return gradients and matrix from the kernel's at points, the linear constraints, and the time spent."""
-    (count, k), slots, entries = local.shape, sparsity.slots, sparsity.entries
-    kinds = len(terms)
+def _assemble(at_points, sparsity, terms, v, fixed, scale, gradients, matrix):
+    """Add up gradients and matrix, zero at first, from the kernel's at points, the linear constraints and the time."""
+    slots, entries, kinds = sparsity.slots, sparsity.entries, len(terms)
+    local = _spread(v, slots, fixed)
+    count, k = local.shape
     of_gradients = _sum_by_interval(at_points[: kinds * k], sparsity.interval, count)
     of_hessian = _sum_by_interval(at_points[kinds * k :], sparsity.interval, count)
     _add_linear(sparsity, terms, k, of_gradients, of_hessian)
     _add_time(local, scale, of_gradients, of_hessian)
-    gradients, matrix = np.zeros((kinds, size)), np.zeros((size, band + 1))
     flat = matrix.ravel()
     for i in range(count):
         for a in range(k):
@@ -224,7 +227,6 @@ def _assemble(at_points, sparsity, terms, local, scale, size, band):
         for e in range(entries.shape[1]):
             if entries[i, e, 0] >= 0:
                 flat[entries[i, e, 0]] += entries[i, e, 1] * of_hessian[e, i]
-    return gradients, matrix
 
 
 @njit(error_model="numpy", fastmath=_FREELY)

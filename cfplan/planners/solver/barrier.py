@@ -9,7 +9,7 @@ together as rows:
     terms   (4, m)   TERMS: what the Newton step needs of each constraint
 
 A missing bound lies far away and has no barrier, so that all constraints go through the same arithmetic, several at a
-time. No function changes its arguments.
+time. No public function changes its arguments.
 """
 
 import math
@@ -112,15 +112,22 @@ def errors(g, bounds, slacks, barrier):
     return Errors(_largest(infeasible), _largest(off))
 
 
-@njit(error_model="numpy", fastmath=_SUMS)
-def search_direction(g, dg, bounds, slacks, barrier, most):
+def search_direction(
+    g: NDArray, dg: NDArray, bounds: NDArray, slacks: NDArray, barrier: float, most: float
+) -> SearchDirection:
     """Return the SearchDirection where g changes by `dg`; no step takes more than `most` of the room to a bound.
 
     For finite numbers.
     """
+    step = np.empty_like(slacks)  # made here, as compiled code takes longer to hand one out
+    return SearchDirection(step, *_search_direction(g, dg, bounds, slacks, barrier, most, step))
+
+
+@njit(error_model="numpy", fastmath=_SUMS)
+def _search_direction(g, dg, bounds, slacks, barrier, most, step):
+    """Fill in the step; return the rest of the SearchDirection."""
     lower, upper, has_low, has_high, bounded = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
     s, low, high = slacks[0], slacks[1], slacks[2]
-    step = np.empty((3, len(s)))
     ds, dlow, dhigh = step[0], step[1], step[2]
     slope, fastest, fastest_dual = 0.0, np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
@@ -139,7 +146,7 @@ def search_direction(g, dg, bounds, slacks, barrier, most):
         of_low, of_high = -dl * its_high * inverse, -dh * its_low * inverse
         fastest_dual[j] = of_low if of_low > of_high else of_high
     share, share_dual = most / max(_largest(fastest), 1e-30), most / max(_largest(fastest_dual), 1e-30)
-    return SearchDirection(step, barrier * slope, min(1.0, share), min(1.0, share_dual))
+    return barrier * slope, min(1.0, share), min(1.0, share_dual)
 
 
 @njit(error_model="numpy", fastmath=_SUMS)
@@ -171,16 +178,23 @@ def merit_terms(g, bounds, slacks, step, share, barrier, rows):
     return infeasible, -barrier * total
 
 
-@njit(error_model="numpy", fastmath=_SUMS)
-def accept_step(g, bounds, slacks, step, share, share_dual, barrier):
+def accept_step(
+    g: NDArray, bounds: NDArray, slacks: NDArray, step: NDArray, share: float, share_dual: float, barrier: float
+) -> tuple[NDArray, NDArray, Errors]:
     """Return (slacks, terms, Errors) after these shares of the step, which led to g.
 
     Multipliers stay within a factor of what the barrier makes of their slacks.
     """
+    after, terms = slacks.copy(), np.empty((4, len(g)))
+    return after, terms, Errors(*_accept_step(g, bounds, after, step, share, share_dual, barrier, terms))
+
+
+@njit(error_model="numpy", fastmath=_SUMS)
+def _accept_step(g, bounds, slacks, step, share, share_dual, barrier, terms):
+    """Take the step, fill in the terms, and return the Errors."""
     lower, upper, has_low, has_high, bounded = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
     ds, dlow, dhigh = step[0], step[1], step[2]
-    after, terms = slacks.copy(), np.empty((4, len(g)))  # a copy changed in place has one array less to tell apart
-    s, low, high = after[0], after[1], after[2]
+    s, low, high = slacks[0], slacks[1], slacks[2]
     sigma, multiplier, slope, residual = terms[0], terms[1], terms[2], terms[3]
     infeasible, off = np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
@@ -201,4 +215,4 @@ def accept_step(g, bounds, slacks, step, share, share_dual, barrier):
         below = abs(of_low * (there - lower[j]) - has_low[j] * barrier)
         above = abs(of_high * (upper[j] - there) - has_high[j] * barrier)
         off[j] = below if below > above else above
-    return after, terms, Errors(_largest(infeasible), _largest(off))
+    return _largest(infeasible), _largest(off)
