@@ -74,7 +74,7 @@ def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compile_
         if compile_to is not None:
             from cfplan.cli.warm_up import compile_ahead
 
-            compile_ahead(compile_to, safety_file, silent=steps.as_json)
+            compile_ahead(compile_to, safety_file, steps)
 
         from cfplan.safety.limits_file import load_limits
 

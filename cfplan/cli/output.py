@@ -4,7 +4,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any
 
@@ -28,6 +28,7 @@ class Steps:
 
     def __init__(self, *, as_json: bool):
         self.as_json = as_json
+        self.meanwhile: Callable[[], str] = str  # what else goes on, shown beside what is waited for
         self._begun = 0.0
         self._ended = threading.Event()
         self._waiting: threading.Thread | None = None
@@ -39,7 +40,7 @@ class Steps:
         if state is StepState.BEGUN:
             self._begun = time.perf_counter()
             self._ended = threading.Event()
-            self._waiting = threading.Thread(target=_show_waiting, args=(name, self._ended), daemon=True)
+            self._waiting = threading.Thread(target=_show_waiting, args=(name, self._ended, self), daemon=True)
             self._waiting.start()
             return
         self._end_waiting()
@@ -78,13 +79,15 @@ class Steps:
             click.echo(text)
 
 
-def _show_waiting(name: str, ended: threading.Event) -> None:
+def _show_waiting(name: str, ended: threading.Event, steps: Steps) -> None:
     """Say again and again what is waited for, until it has ended."""
     begun, on_terminal = time.perf_counter(), sys.stdout.isatty()
     pause = _FIRST_NOTE
     with suppress(BrokenPipeError):  # the reader of our output went away, as `| head` does
         while not ended.wait(pause):
             text = f"… {name}, {time.perf_counter() - begun:.0f} s"
+            if meanwhile := steps.meanwhile():
+                text += f" ({meanwhile})"
             click.echo(f"\r\033[K{text}" if on_terminal else text, nl=not on_terminal)
             pause = _TERMINAL_NOTES if on_terminal else _OTHER_NOTES
         if on_terminal and pause != _FIRST_NOTE:

@@ -4,14 +4,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import click
 
+from cfplan.cli.output import Steps
 from cfplan.preparation.compiled_calls import Stage, find_calls
 
-SHOWN_AFTER, SHOWN_EVERY = 2.0, 4.0  # s
+SHOWN_EVERY = 4.0  # s
 
 
 class Worker:
@@ -30,13 +30,19 @@ class Worker:
         for line in self.process.stdout:
             self.done, self.total = map(int, line.split())
 
+    def progress(self) -> str:
+        """Return how far compiling is, in words; nothing once it is done."""
+        if self.process.poll() is not None:
+            return ""
+        return "compiling, once for this machine" + (f": {self.done} of {self.total} functions" if self.total else "")
+
     def stop(self) -> None:
         """End the process; what it was compiling is lost."""
         self.process.kill()
         self.process.wait()
 
 
-def compile_ahead(stage: Stage, safety_file: Path, *, silent: bool) -> None:
+def compile_ahead(stage: Stage, safety_file: Path, steps: Steps) -> None:
     """Compile what a command is going to need, from the end of its way, while it starts from the beginning.
 
     Does nothing where all is compiled. Stops as the command ends.
@@ -45,11 +51,9 @@ def compile_ahead(stage: Stage, safety_file: Path, *, silent: bool) -> None:
 
     if not kept() or _ready_file(stage).exists():
         return
-    worker, ended, context = Worker(stage, safety_file, "last"), threading.Event(), click.get_current_context()
-    context.call_on_close(worker.stop)
-    context.call_on_close(ended.set)
-    if not silent:
-        threading.Thread(target=_show, args=([worker], ended.wait), daemon=True).start()
+    worker = Worker(stage, safety_file, "last")
+    click.get_current_context().call_on_close(worker.stop)
+    steps.meanwhile = worker.progress
 
 
 def warm_up(safety_file: Path, processes: int) -> None:
@@ -57,7 +61,8 @@ def warm_up(safety_file: Path, processes: int) -> None:
     begun = time.perf_counter()
     workers = [Worker(Stage.FLIGHT, safety_file, f"{number / processes:.3f}") for number in range(processes)]
     try:
-        _show(workers, lambda seconds: _all_ended(workers, seconds))
+        while not _all_ended(workers, SHOWN_EVERY):
+            click.echo(max(workers, key=lambda worker: worker.done).progress() or "compiling", err=True)
     finally:
         for worker in workers:
             worker.stop()
@@ -74,19 +79,6 @@ def _all_ended(workers: list[Worker], seconds: float) -> bool:
         except subprocess.TimeoutExpired:
             return False
     return True
-
-
-def _show(workers: list[Worker], ended: Callable[[float], bool]) -> None:
-    """Print how many functions are compiled, again and again, until `ended`, which waits for some seconds."""
-    if ended(SHOWN_AFTER):
-        return
-    click.echo("compiling for this machine; this happens once, and takes up to half a minute", err=True)
-    while not ended(SHOWN_EVERY):
-        total, done = (max(getattr(worker, name) for worker in workers) for name in ("total", "done"))
-        if total == 0:
-            click.echo("compiling: finding out what is needed", err=True)
-        elif done < total:
-            click.echo(f"compiled {done} of {total} functions", err=True)
 
 
 def _ready_file(stage: Stage) -> Path:
