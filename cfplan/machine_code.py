@@ -232,7 +232,7 @@ class _Kept(_Cache):
         written_for, payload = pickle.loads(data)
         return CompileResult._rebuild(target_context, *payload) if written_for == str(signature) else None
 
-    def save_overload(self, sig: Any, data: CompileResult) -> None:
+    def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a compiled function for other processes."""
         if not kept():
             return
@@ -258,7 +258,8 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 
 def _compiling(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    made = numba.njit(no_cfunc_wrapper=True, **options)(function)
+    options = {"no_cfunc_wrapper": True, **options}
+    made: Any = numba.njit(**options)(function)
     if hasattr(made, "_cache"):  # else numba is switched off
         made._cache = _Kept(function)
     return made
