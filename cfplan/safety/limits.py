@@ -6,6 +6,10 @@ from dataclasses import dataclass
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import Airframe
 
+STOP_TILT = math.radians(
+    35.0
+)  # of plans made before safety.yaml had it; the Mellinger controller was seen to fail beyond some 40°
+
 
 @dataclass(frozen=True, slots=True)
 class PlanLimits:
@@ -49,6 +53,7 @@ class FlightLimits:
     acceleration: Ladder  # m/s², gravity not counted
     angular_velocity: Ladder  # rad/s
     patience: float  # s, for which speed, acceleration and angular velocity must last before they count
+    stop_tilt: float = STOP_TILT  # rad, that braking may reach where a turn is flown at the plan's limit
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """safety.yaml, read strictly: every mistake is named with its line and column."""
 
 import math
+from dataclasses import fields
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -28,6 +29,15 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.airframes import load_airframe
 
 LARGEST_IN_PACKET = 32.767  # m, m/s, m/s², rad/s: what a setpoint's 16 bits of thousandths hold
+
+_LEAST_PLANNED = {
+    "speed": 0.02,
+    "acceleration": 0.05,
+    "angular_velocity": 0.05,
+    "angular_acceleration": 0.05,
+    "tilt_deg": 0.5,
+}
+"""What a limit of planned motion must allow at least: noise of the gyroscope and of poses would hide slower motion."""
 
 Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
 Encodable = Annotated[float, Field(gt=0.0, le=LARGEST_IN_PACKET)]
@@ -64,6 +74,7 @@ class _Flight(_Section):
     acceleration: _Ladder
     angular_velocity: _Ladder
     patience: Annotated[float, Field(gt=0.0, le=1.0)]
+    stop_tilt_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
 
     @classmethod
     def ladders(cls) -> list[str]:
@@ -127,7 +138,8 @@ Kind = TypeVar("Kind")
 
 def _made(kind: type[Kind], section: _Section, **others: Any) -> Kind:
     """A dataclass from the section with the same keys; `others` replace what the file says differently."""
-    values = {name: getattr(section, name) for name in type(section).model_fields if name not in others}
+    names = {field.name for field in fields(kind)} - others.keys()  # type: ignore[arg-type]
+    values = {name: getattr(section, name) for name in names}
     ladders = {name: Ladder(v.brake, v.land, v.cut) for name, v in values.items() if isinstance(v, _Ladder)}
     return kind(**{**values, **ladders, **others})
 
@@ -148,7 +160,7 @@ def load_limits(file: Path | str) -> Limits:
         vehicle=content.vehicle,
         airframe=airframe,
         plan=_plan_limits(content.plan, airframe),
-        flight=_made(FlightLimits, content.flight),
+        flight=_made(FlightLimits, content.flight, stop_tilt=math.radians(content.flight.stop_tilt_deg)),
         space=_made(Space, content.space),
         battery=_made(BatteryLimits, content.battery),
         pose=PoseLimits(**pose, yaw_agreement=yaw_agreement),
@@ -183,6 +195,13 @@ def _plan_limits(plan: _Plan, airframe: Airframe) -> PlanLimits:
 
 def _check_order(content: _SafetyFile, places: Places) -> None:
     """Check the order of values within the file alone."""
+    for key, least in _LEAST_PLANNED.items():
+        if getattr(content.plan, key) < least:
+            raise InputError(
+                f"plan.{key} is {getattr(content.plan, key):g}, less than {least:g}: noise would hide motion that slow",
+                where=places.where("plan", key),
+                hint=f"allow at least {least:g}; to fly slower, use --speed",
+            )
     for name in _Flight.ladders():
         ladder = getattr(content.flight, name)
         if not ladder.brake < ladder.land < ladder.cut:
@@ -241,6 +260,13 @@ def _check_vehicle_can(limits: Limits, places: Places) -> None:
             f"{airframe.name} cannot hold its height beyond a tilt of {math.degrees(steepest):.1f}°",
             where=places.where("plan", "tilt_deg"),
             hint="allow no more than the vehicle can do",
+        )
+    if plan.tilt > limits.flight.stop_tilt:
+        planned, stops = math.degrees(plan.tilt), math.degrees(limits.flight.stop_tilt)
+        raise InputError(
+            f"plan.tilt_deg ({planned:g}°) is above flight.stop_tilt_deg ({stops:g}°), which stops must keep",
+            where=places.where("plan", "tilt_deg"),
+            hint=f"plan at most {stops:g}°; the firmware's Mellinger controller fails beyond some 40°",
         )
     level = math.sqrt(strongest**2 - GRAVITY**2)
     if plan.acceleration > level:

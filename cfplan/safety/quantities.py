@@ -22,7 +22,6 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import Scalar
 
 AT_MOST, AT_LEAST = 1, -1  # sides of a limit
-STOP_TILT = np.radians(35.0)  # beyond some 40° the firmware's Mellinger controller was seen to fail
 PACKET_ROUNDING = 1e-3  # m/s² and less, by which packets may round what they hold
 
 
@@ -117,7 +116,7 @@ QUANTITIES = (
     ),
     Quantity(
         "tilt", "rad", "tilt", "tilt_deg", AT_MOST, measures.TILT, value=_tilt,
-        measured=_squared_tangent_of_half, row=_versine, in_stop=lambda _: STOP_TILT,
+        measured=_squared_tangent_of_half, row=_versine, in_stop=lambda limits: limits.flight.stop_tilt,
     ),
     Quantity(
         "motor thrust, most", "N", "motor_thrust_max", "motor_reserve", AT_MOST, measures.MOTOR_THRUST, 4, jumps=True,

@@ -116,6 +116,13 @@ def test_unknown_keys_are_errors(tmp_path, place):
         ({"plan.motor_reserve": 0.1, "plan.acceleration": 9.8}, "cannot accelerate at more than 9.6"),
         ({"plan.speed": 20.0, "flight.speed": {"brake": 25, "land": 28, "cut": 32}}, "cannot fly faster than 17.8"),
         ({"plan.angular_acceleration": 900.0}, r"cannot turn faster by more than \d+ rad"),
+        ({"plan.tilt_deg": 36}, r"plan.tilt_deg \(36°\) is above flight.stop_tilt_deg \(35°\)"),
+        ({"plan.tilt_deg": 34, "flight.stop_tilt_deg": 33}, r"is above flight.stop_tilt_deg \(33°\)"),
+        ({"plan.speed": 0.001}, "noise would hide"),
+        ({"plan.acceleration": 0.001}, "noise would hide"),
+        ({"plan.angular_velocity": 0.01}, "noise would hide"),
+        ({"plan.angular_acceleration": 0.001}, "noise would hide"),
+        ({"plan.tilt_deg": 0.01}, "noise would hide"),
         ({"plan.speed": 3.5}, "not below flight.speed.brake"),
         ({"plan.acceleration": 10.0}, "not below flight.acceleration.brake"),
         ({"plan.angular_velocity": 12.0}, "not below flight.angular_velocity.brake"),
@@ -138,6 +145,12 @@ def test_limits_that_contradict_each_other_or_the_vehicle_are_refused(tmp_path, 
         load_limits(changed(tmp_path, changes))
     assert "\n" not in str(error.value)
     assert error.value.where
+
+
+def test_the_tilt_of_stops_is_read(tmp_path):
+    assert load_limits(SAFETY).flight.stop_tilt == pytest.approx(math.radians(35))
+    looser = load_limits(changed(tmp_path, {"flight.stop_tilt_deg": 38}))
+    assert looser.flight.stop_tilt == pytest.approx(math.radians(38))
 
 
 def test_the_place_of_a_wrong_value_is_its_line_and_column(tmp_path):

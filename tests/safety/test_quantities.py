@@ -165,5 +165,5 @@ def test_stops_are_bound_in_all_quantities_but_two():
 
 
 def test_ladders_are_those_of_the_flight_limits():
-    ladders = {field.name for field in fields(FlightLimits)} - {"deviation", "fence", "patience"}
+    ladders = {field.name for field in fields(FlightLimits)} - {"deviation", "fence", "patience", "stop_tilt"}
     assert {quantity.ladder for quantity in quantities.ON_LADDER} == ladders

@@ -5,6 +5,7 @@ little (5.7 m/s² instead of 5.8 for twice the way), so all are short, and must 
 that a stop may reach: the limits of the flight, a tilt at which the controller is stable, the thrust of the motors.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,8 +39,11 @@ class StopCertificate:
             value, limit = self.worst[quantity.name], quantity.in_stop(limits)
             if not quantity.excess(value, limit) <= 0.0:
                 side = "at most" if quantity.side == AT_MOST else "at least"
+                unit = quantity.unit
+                if unit == "rad":
+                    value, limit, unit = math.degrees(value), math.degrees(limit), "°"
                 raise NotCertifiedError(
-                    f"a stop reaches a {quantity.noun} of {value:.3g} {quantity.unit}; it may be {side} {limit:.3g}",
+                    f"a stop reaches a {quantity.noun} of {value:.3g} {unit}; it may be {side} {limit:.3g}",
                     where="stops",
                     hint="plan with a lower speed or acceleration",
                 )

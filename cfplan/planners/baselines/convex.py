@@ -81,7 +81,7 @@ def plan_convex(task: PlanningTask) -> Solution:
     along = YawSpline.along(task.path, task.nodes, task.yaw, task.yaw_angle)
     width = smoothing_half_width(airframe, limits)
     profiles = (smooth_profile(task.path, at, speeds, share * width, task.nodes, along) for share in WINDOW_SHARES)
-    profile = select_fastest(task, profiles)
+    profile = select_fastest(task, (profile for profile in profiles if profile is not None))
     stats: dict[str, float | int | str] = {
         "solver": "copp-py",
         "solve_seconds": time.perf_counter() - begun,

@@ -20,6 +20,7 @@ from cfplan.vehicle.yaw_spline import YawSpline
 SAMPLES_PER_INTERVAL = 8
 TIME_STEPS_PER_WINDOW = 200
 H_STIFFNESS = 1e-4
+WINDOW_RANGE = (1e-4, 50.0)  # of half the window's width, in flights: narrower costs gigabytes, wider leaves no speed
 
 
 def smoothing_half_width(airframe: Airframe, limits: PlanLimits) -> float:
@@ -34,8 +35,13 @@ def smoothing_half_width(airframe: Airframe, limits: PlanLimits) -> float:
     return max(2 * most / rate, (4 * most / acceleration) ** 0.5)
 
 
-def smooth_profile(path: Path, at: Stations, b: NDArray, half_width: float, nodes: int, yaw: YawSpline) -> SpeedProfile:
-    """Return the profile over `nodes` intervals of the speeds √b at the stations, averaged over ± half_width s."""
+def smooth_profile(
+    path: Path, at: Stations, b: NDArray, half_width: float, nodes: int, yaw: YawSpline
+) -> SpeedProfile | None:
+    """Return the profile over `nodes` intervals of the speeds √b at the stations, averaged over ± half_width s.
+
+    None where that leaves no speed at a sample.
+    """
     length, speed = _averaged(at.length, b, half_width)
     grid = np.linspace(0.0, path.end, nodes + 1)
     samples = grid[-1] * (np.arange(SAMPLES_PER_INTERVAL * nodes) + 0.5) / (SAMPLES_PER_INTERVAL * nodes)
@@ -43,6 +49,8 @@ def smooth_profile(path: Path, at: Stations, b: NDArray, half_width: float, node
     here = np.interp(samples, at.s, _graded(at.length, total))
     rate = np.interp(here, _graded(length, total), np.cbrt(speed)) ** 3
     h = np.square(rate / np.linalg.norm(path(samples, 1), axis=1))
+    if not np.all((h > 0.0) & np.isfinite(h)):
+        return None
     return speed_through(grid, samples, h, yaw, stiffness=H_STIFFNESS)
 
 
@@ -50,6 +58,7 @@ def _averaged(length: NDArray, b: NDArray, half_width: float) -> tuple[NDArray, 
     """Return distance, m, and speed, m/s, at close times after averaging speed over the triangular window."""
     speed = np.sqrt(np.maximum(b, 0.0))
     duration = np.concatenate([[0.0], np.cumsum(2 * np.diff(length) / (speed[1:] + speed[:-1]))])
+    half_width = float(np.clip(half_width, *(share * duration[-1] for share in WINDOW_RANGE)))
     step = half_width / TIME_STEPS_PER_WINDOW
     time = np.arange(-TIME_STEPS_PER_WINDOW, int(np.ceil(duration[-1] / step)) + TIME_STEPS_PER_WINDOW + 1) * step
     law = np.interp(time, duration, speed)  # acceleration is constant between stations: speed is linear in time

@@ -141,7 +141,7 @@ def test_a_terminal_that_closes_lands_and_output_to_it_ends_nothing(tmp_path):
     child, terminal = pty.fork()
     if child == 0:
         os.execv(sys.executable, [sys.executable, "-c", textwrap.dedent(_LEFT_ALONE), str(said)])
-    _read_until(terminal, "ready")
+    _read_until(terminal, "ready\r\n")
     os.close(terminal)
     assert os.waitpid(child, 0)[1] == 0
     assert said.read_text() == "LAND\n"

@@ -1,5 +1,6 @@
 """The lower bound is below everything that can be flown, and meets what can be computed by hand."""
 
+import contextlib
 import math
 from dataclasses import replace
 
@@ -167,3 +168,12 @@ def test_min_snap_comes_certified_and_touches_a_limit(yaw, wiggly):
     assert certificate.passed
     assert certificate.worst.share > 0.98
     assert np.ptp(solution.profile.h) == 0.0
+
+
+@pytest.mark.parametrize("limit", ["angular_velocity", "angular_acceleration", "acceleration"])
+@pytest.mark.parametrize("value", [1e-3, 1e-6, 1e-9])
+def test_absurd_limits_end_in_a_solution_or_in_none(wiggly, limit, value):
+    limits = replace(HARDWARE.limits, **{limit: value})
+    task = PlanningTask(wiggly, HARDWARE.airframe, limits, nodes=30)
+    with contextlib.suppress(InfeasibleError):
+        assert plan_convex(task).status in (Status.SOLVED, Status.NOT_CONVERGED, Status.INFEASIBLE)
