@@ -1,6 +1,7 @@
 """Finds out which compiled functions a flight calls, and with which types of arguments, by a small flight in Python."""
 
 import pickle
+from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from cfplan.machine_code import Call
 
-NODES = 10  # grid intervals; so few that plain Python is quick
+NODES = 12  # grid intervals; so few that plain Python is quick
 
 
 class Stage(IntEnum):
@@ -44,10 +45,9 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         limits = load_limits(safety_file)
         middle = (np.array(limits.space.low) + limits.space.high) / 2
         path = min_snap(middle + 0.2 * np.array([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]]))
-        try:
-            planned = plan(path, limits.airframe, limits, planner="learned", nodes=NODES)
-        except CfplanError:  # no model for this vehicle
-            planned = plan(path, limits.airframe, limits, planner="expert", nodes=2 * NODES)
+        with suppress(CfplanError):  # there may be no model for this vehicle
+            plan(path, limits.airframe, limits, planner="learned", nodes=NODES)
+        planned = plan(path, limits.airframe, limits, planner="expert", nodes=NODES)  # exceeds limits between nodes
         if last >= Stage.REHEARSAL:
             from cfplan.preparation.plan_flight import PlannedFlight
             from cfplan.preparation.prepare_flight import encode_flight, make_mission, rehearse
