@@ -1,8 +1,12 @@
 """Read text and tables of numbers from files that people write."""
 
+import io
 import math
+import os
 import pathlib
 import re
+import select
+import stat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +15,7 @@ from cfplan.errors import InputError
 
 MAX_FILE_SIZE = 4_000_000  # bytes; a path or a set of limits is a few kilobytes
 MAX_NUMBER = 1e6  # metres, seconds or coefficients: a larger number is a slip and would cost digits
+PIPE_PATIENCE = 5.0  # s without a byte
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 
 
@@ -23,8 +28,7 @@ def read_text(file: pathlib.Path) -> str:
     try:
         if file.is_dir():
             raise InputError("a folder, not a file", where=str(file), hint="name the file in it")
-        with file.open("rb") as stream:
-            content = stream.read(MAX_FILE_SIZE + 1)
+        content = _content(file)
     except FileNotFoundError:
         raise InputError(
             "no such file",
@@ -44,6 +48,26 @@ def read_text(file: pathlib.Path) -> str:
     if not text.strip():
         raise InputError("the file is empty", where=str(file), hint="check that it is the right file")
     return text
+
+
+def _content(file: pathlib.Path) -> bytes:
+    """Return at most MAX_FILE_SIZE + 1 bytes of a file, or of a pipe."""
+    with open(os.open(file, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as stream:
+        if stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+            return io.BufferedReader(stream).read(MAX_FILE_SIZE + 1)
+        content = b""
+        while len(content) <= MAX_FILE_SIZE:
+            if not select.select([stream], [], [], PIPE_PATIENCE)[0]:
+                raise InputError(
+                    f"a pipe or device that gave nothing for {PIPE_PATIENCE:g} s",
+                    where=str(file),
+                    hint="name a file, or write to the pipe first",
+                )
+            more = stream.read(1 << 16)
+            if not more:
+                break
+            content += more
+    return content
 
 
 def read_table(file: pathlib.Path, columns: int, what: str) -> tuple[NDArray, list[int]]:

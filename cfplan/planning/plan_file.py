@@ -89,6 +89,8 @@ def load_plan(file: FilePath | str) -> Plan:
 
     where = str(file)
     try:
+        if FilePath(file).is_fifo():
+            raise InputError("a pipe, not a file", where=where, hint="name a plan that cfplan has written")
         table = pyarrow.parquet.read_table(file)
     except FileNotFoundError:
         raise InputError("no such file", where=where, hint="make it with `cfplan plan PATH -o FILE`") from None

@@ -79,6 +79,8 @@ def read_record(place: Path) -> Record:
 
 def is_record(place: Path) -> bool:
     """Return whether a folder or a file is a record of cfplan, damaged or not; other MCAP files and logs are not."""
+    if place.is_fifo():
+        return False
     if place.name == FLIGHT_FILE or (place / FLIGHT_FILE).exists():
         return True
     try:
@@ -97,6 +99,8 @@ def _find(place: Path) -> Path:
                 f"the folder holds no {FLIGHT_FILE}", where=str(place), hint="name the folder of one flight"
             )
         return file
+    if place.is_fifo():
+        raise InputError("a pipe, not a record", where=str(place), hint="name the folder of one flight")
     if not place.exists():
         raise InputError("no such record", where=str(place), hint="`cfplan fly` prints the folder of each record")
     return place

@@ -123,7 +123,9 @@ def _attend(
     """Pass telemetry one way and orders the other; return the pilot's last message."""
     failure: BaseException | None = None
     while True:
-        watched = [telemetry] if keyboard.descriptor is None else [telemetry, keyboard.descriptor]
+        watched: list[Connection | int] = [telemetry]
+        if keyboard.descriptor is not None:
+            watched.append(keyboard.descriptor)
         ready = wait(watched, _POLL_PERIOD)
         for order in (*keyboard.orders(), *more_orders()):
             _send(orders, order)

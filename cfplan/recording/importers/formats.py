@@ -66,6 +66,8 @@ def _is_rerun(file: Path) -> bool:
 def find_importer(file: Path) -> Importer | None:
     """Return the importer that recognises the file, or None. Raises InputError where it is absent or empty."""
     head = b""
+    if file.is_fifo():
+        raise InputError("a pipe, not a file", where=str(file), hint="write what comes from it to a file first")
     if not file.is_dir():
         try:
             with file.open("rb") as stream:

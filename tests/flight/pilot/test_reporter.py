@@ -86,6 +86,15 @@ def test_the_gravest_order_stays(pipe):
     assert not orders.gone
 
 
+def test_a_connection_that_closes_here_while_it_is_read_is_no_traceback():
+    class ClosedWhileRead:
+        def recv(self):
+            raise TypeError("'NoneType' object cannot be interpreted as an integer")
+
+    orders = OrderReceiver(ClosedWhileRead())
+    wait_for(lambda: orders.gone)
+
+
 def test_a_main_process_that_ends_is_noticed(pipe):
     reader, writer = pipe
     orders = OrderReceiver(reader)
