@@ -1,6 +1,14 @@
 """Errors that a user can cause, and the exit codes that they end in."""
 
 from enum import IntEnum
+from unicodedata import category
+
+
+def printable(text: str) -> str:
+    """Return one line without control characters, which names from files and networks may hold: they are escaped."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or category(c) == "Zs" else c.encode("unicode_escape").decode() for c in text)
 
 
 class ExitCode(IntEnum):
@@ -32,7 +40,7 @@ class CfplanError(Exception):
     def __str__(self) -> str:
         place = f"{self.where}: " if self.where else ""
         remedy = f" (hint: {self.hint})" if self.hint else ""
-        return f"{place}{self.what}{remedy}"
+        return printable(f"{place}{self.what}{remedy}")
 
     def __reduce__(self):  # keyword-only arguments must survive the way between processes
         return _rebuild, (type(self), self.what, self.where, self.hint)

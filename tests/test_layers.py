@@ -16,7 +16,7 @@ ROOMS = {
     "planners": [MODULES, "solver", "expert", "baselines"],
     "flight": [MODULES, "setpoints", "radio", "mocap", "pilot"],
     "simulation": ["timed_fault", "dynamics", "virtual_crazyflie", "virtual_vicon", "lab", MODULES],
-    "recording": ["importers", MODULES, "rerun", "report", "mavlink"],
+    "recording": ["plausible", "importers", MODULES, "rerun", "report", "mavlink"],
 }
 PACKAGE = Path(__file__).parent.parent / "cfplan"
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -5,6 +5,7 @@ import time
 from types import TracebackType
 
 from cfplan.cli.output import Steps
+from cfplan.errors import printable
 from cfplan.flight.telemetry import (
     Event,
     Level,
@@ -67,7 +68,7 @@ class FlightProgress:
             self._enter(message)
         elif isinstance(message, Event) and message.level is not Level.INFO:
             style = "red" if message.level is Level.ERROR else "yellow"
-            self._bar.console.print(f"  {message.text}", style=style, highlight=False, markup=False)
+            self._bar.console.print(f"  {printable(message.text)}", style=style, highlight=False, markup=False)
         elif isinstance(message, SetpointSent):
             self._setpoint = message
         elif isinstance(message, PoseReceived):

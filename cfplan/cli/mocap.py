@@ -9,6 +9,7 @@ import click
 
 from cfplan.cli import options
 from cfplan.cli.output import print_json, print_table
+from cfplan.errors import printable
 
 if TYPE_CHECKING:
     from cfplan.flight.mocap.survey import Survey
@@ -44,7 +45,7 @@ def mocap(uri: str, seconds: float, as_json: bool) -> int:
 
 
 def _show_live(found: "Survey") -> None:
-    bodies = "  ".join(f"{body.name} {_place(body.position)}" for body in found.bodies)
+    bodies = "  ".join(f"{printable(body.name)} {_place(body.position)}" for body in found.bodies)
     click.echo(f"\r\033[K{found.rate:.0f} Hz  {bodies}"[:200], nl=False)
 
 
@@ -66,7 +67,7 @@ def _print(uri: str, found: "Survey") -> None:
         lines.append([body.name, f"{100 * body.seen:.1f} %", *counts, _place(body.position), *angles])
     print_table(f"{len(lines)} bodies", columns, lines)
     for remark in _remarks(found):
-        click.echo(remark)
+        click.echo(printable(remark))
 
 
 def _remarks(found: "Survey") -> list[str]:

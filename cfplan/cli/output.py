@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from cfplan.errors import CfplanError
+from cfplan.errors import CfplanError, printable
 from cfplan.files.json_values import json_value
 from cfplan.preparation.steps import StepResults, StepState, step
 
@@ -47,7 +47,7 @@ class Steps:
         sign, colour = _MARKS[state]
         mark = click.style(sign, fg=colour)
         took = f"{(time.perf_counter() - self._begun) * 1e3:.0f} ms"
-        click.echo(f"{mark} {name:<12} {took:>8}  {result}".rstrip())
+        click.echo(f"{mark} {name:<12} {took:>8}  {printable(result)}".rstrip())
 
     def _end_waiting(self) -> None:
         self._ended.set()
@@ -71,7 +71,7 @@ class Steps:
     def failed(self, name: str, text: str) -> None:
         """Show a step that ran to its end with the verdict no."""
         if not self.as_json:
-            click.echo(f"{click.style('✗', fg='red')} {name:<12} {text}")
+            click.echo(f"{click.style('✗', fg='red')} {name:<12} {printable(text)}")
 
     def say(self, text: str = "") -> None:
         """Print a line that is no step."""
@@ -96,7 +96,8 @@ def _show_waiting(name: str, ended: threading.Event, steps: Steps) -> None:
 
 def print_json(document: Any) -> None:
     """Print one document on standard output; numbers that are not finite become null, as JSON has no word for them."""
-    click.echo(json.dumps(json_value(document), indent=2, ensure_ascii=False))
+    text = json.dumps(json_value(document), indent=2, ensure_ascii=False)
+    click.echo(text.encode("utf-8", "backslashreplace").decode("utf-8"))  # half a surrogate pair, as JSON escapes it
 
 
 def print_error(error: CfplanError, *, as_json: bool) -> None:
@@ -118,7 +119,7 @@ def print_table(title: str, columns: list[str], rows: Sequence[Sequence[str]]) -
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index == 0 else "right")
     for row in rows:
-        table.add_row(*map(Text, row))
+        table.add_row(*(Text(printable(cell)) for cell in row))
     console = Console()
     if not console.is_terminal:
         console.width = _FILE_WIDTH

@@ -1,6 +1,5 @@
 """`cfplan replay`: look at flights in rerun."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -57,7 +56,7 @@ def replay(
     """
     from cfplan.recording.reader import is_record
 
-    if moment is not None and (png is None or not math.isfinite(moment)):
+    if moment is not None and (png is None or not abs(moment) < 1e6):
         raise InputError("--at says when a picture is taken, in s", hint="add --png flight.png")
     steps = Steps(as_json=as_json)
     files = Files(save, png, moment, force)

@@ -19,3 +19,14 @@ def json_value(value: Any) -> Any:
     if hasattr(value, "tolist"):  # of NumPy, which need not be loaded for this
         return json_value(value.tolist())
     return value
+
+
+def whole_characters(value: Any) -> Any:
+    """Return a document read from JSON with `?` for each half of a surrogate pair, which no file or terminal takes."""
+    if isinstance(value, str):
+        return value.encode("utf-8", "replace").decode("utf-8")
+    if isinstance(value, dict):
+        return {whole_characters(key): whole_characters(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [whole_characters(item) for item in value]
+    return value

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cfplan import __version__
 from cfplan.errors import InputError
-from cfplan.files.json_values import json_value
+from cfplan.files.json_values import json_value, whole_characters
 from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.vehicle.airframe import Airframe
 
@@ -126,7 +126,7 @@ def header_from_json(text: str, *, where: str = "") -> RecordHeader:
     Records outlive versions: keys of later ones are ignored, limits that earlier ones lacked are NaN.
     """
     try:
-        values = json.loads(text)
+        values = whole_characters(json.loads(text))
         return RecordHeader(
             name=str(values["name"]),
             version=str(values["version"]),

@@ -19,6 +19,7 @@ STEP = 0.01  # s, of the grid on which time is first looked for
 NEARBY = 0.2  # s, around what the grid says, where time is looked for closely
 SPEED_SPAN = 0.025  # s, before and after
 _LONGEST_GAP = 0.1  # s between poses, over which a straight line still approximates where the vehicle was
+_SHORTEST_STEP = 1e-5  # s between poses, that anything measures
 _ALIKE = 0.5  # of the plan's own variance: where more is left, log and plan hardly are the same flight
 
 
@@ -58,7 +59,8 @@ class Trial:
         """Return (N,) m/s over SPEED_SPAN before and after, so that noise of a millimetre hardly shows; NaN at gaps."""
         speed = np.full(len(self.time), np.nan)
         if len(self.time) > 2:
-            reach = max(1, round(SPEED_SPAN / float(np.median(np.diff(self.time)))))
+            step = max(float(np.median(np.diff(self.time))), _SHORTEST_STEP)
+            reach = max(1, round(SPEED_SPAN / step))
             moved = self.position[2 * reach :] - self.position[: -2 * reach]
             took = self.time[2 * reach :] - self.time[: -2 * reach]
             speed[reach:-reach] = np.linalg.norm(moved, axis=1) / took

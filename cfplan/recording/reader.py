@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -16,7 +17,9 @@ from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata
 from mcap.stream_reader import get_chunk_data_stream
 
 from cfplan.errors import InputError
+from cfplan.files.json_values import whole_characters
 from cfplan.recording.header import RecordHeader, header_from_json
+from cfplan.recording.plausible import check_places, check_times
 from cfplan.recording.record import FLIGHT_FILE, SUMMARY_FILE, Record
 from cfplan.recording.topics import FORMAT, METADATA, PROFILE, TOPICS, columns_from_json
 
@@ -74,7 +77,23 @@ def read_record(place: Path) -> Record:
     for topic in TOPICS:
         own = [payload for number, name in topics.items() if name == topic.name for payload in payloads[number]]
         streams[topic.stream] = _columns(topic, own, file)
-    return Record(folder=file.parent, header=header, summary=_summary(file.parent), truncated=not whole, **streams)
+    record = Record(folder=file.parent, header=header, summary=_summary(file.parent), truncated=not whole, **streams)
+    _check_plausible(record, file)
+    return record
+
+
+def _check_plausible(record: Record, file: Path) -> None:
+    """Raise InputError where a message has a time or a place that no flight has."""
+    for topic in TOPICS:
+        stream = getattr(record, topic.stream)
+        check_times(stream.time, topic.name, where=str(file))
+        if hasattr(stream, "position"):
+            check_places(stream.position, topic.name, where=str(file))
+    check_times(record.setpoints.due, "the setpoints' deadlines", where=str(file), missing=True)
+    check_times(np.array([record.start, record.start + record.duration]), "the record", where=str(file))
+    if not np.isfinite(record.header.fence).all():
+        raise InputError("the header's fence is not finite", where=str(file), hint="the record was changed since")
+    check_places(np.vstack([record.header.path, record.header.fence]), "the header", where=str(file))
 
 
 def is_record(place: Path) -> bool:
@@ -181,7 +200,7 @@ def _columns(topic: Any, payloads: list[bytes], file: Path) -> Any:
 
 def _summary(folder: Path) -> Mapping[str, Any]:
     try:
-        summary = json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
+        summary = whole_characters(json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")))
     except (OSError, ValueError, RecursionError):
         return {}
     return summary if isinstance(summary, dict) else {}

@@ -206,19 +206,26 @@ def summary_rows(summary: FlightSummary, shares: Mapping[str, float] | None = No
 def summary_text(record: Record) -> str:
     """Return a heading, a table of the numbers, and what flew, in Markdown; a dash for what is not known."""
     header = record.header
-    begun = datetime.fromtimestamp(header.wall_time_at_zero + record.start, UTC)
     cut = ["**The record ends early: what follows its last whole chunk is lost.**", ""] if record.truncated else []
     lines = [
         f"## {header.name}",
         "",
         *cut,
-        f"{begun:%Y-%m-%d %H:%M:%S} UTC · {header.vehicle.name} · {header.uri} · {header.planner}",
+        f"{begun(record)} · {header.vehicle.name} · {header.uri} · {header.planner}",
         "",
         "| | |",
         "|---|---|",
         *(f"| {name} | {value} |" for name, value in summary_rows(summarise(record))),
     ]
     return "\n".join(lines)
+
+
+def begun(record: Record) -> str:
+    """Return the date and time of the record's start; a dash where it is not known."""
+    try:
+        return f"{datetime.fromtimestamp(record.header.wall_time_at_zero + record.start, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    except (ValueError, OverflowError, OSError):
+        return UNKNOWN
 
 
 def _text(value: float, unit: str, digits: int) -> str:

@@ -31,6 +31,15 @@ def test_a_step_that_fails_is_marked(capsys):
     assert capsys.readouterr().out.startswith("✗ path")
 
 
+def test_names_with_escape_codes_do_not_reach_the_terminal(capsys):
+    with Steps(as_json=False).step("read") as results:
+        results.append("\x1b[2Jclear\nline \ud800 °")
+    output.print_table("bodies", ["body"], [["\x1b[2Jclear"]])
+    printed = capsys.readouterr().out
+    assert "\x1b[2J" not in printed
+    assert "\\x1b[2Jclear\\nline \\ud800 °" in printed
+
+
 def test_a_step_with_a_warning_has_no_tick(capsys):
     with Steps(as_json=False).step("link loss") as results:
         results.warn("3.2 m beyond the walls")

@@ -79,6 +79,7 @@ class Fields:
         return bytes(self._data[self._at - size : self._at]).decode("utf-8", "replace")
 
 
+_LONGEST_LATENCY = 60.0  # s; a server that says more does not know it
 _U32, _I8, _F64 = struct.Struct("<I"), struct.Struct("<b"), struct.Struct("<d")
 _IDS_AND_BOUNDS = struct.Struct("<II6f")
 _QUALITY = struct.Struct("<Id")
@@ -156,7 +157,8 @@ class Decoder:
                 subjects[number] = known
             elif kind == Block.LATENCY_INFO:
                 samples = {fields.string(): fields.take(_F64)[0] for _ in range(fields.count(12))}
-                self._latency = math.fsum(samples.values()) if samples else math.nan
+                latency = sum(samples.values()) if samples else math.nan
+                self._latency = latency if abs(latency) < _LONGEST_LATENCY else math.nan
             elif kind == Block.FRAME_RATE_INFO:
                 rates = [(fields.string(), fields.take(_F64)[0]) for _ in range(fields.count(12))]
                 # The cameras' rate where there are several: the system's own name for it is "Hardware".

@@ -17,6 +17,7 @@ SYSTEMS: dict[str, int | None] = {
     "vrpn": 3883,
 }
 EXAMPLE = "vicon://192.168.1.2/cf1"
+_LISTED, _LONGEST_NAME = 12, 40  # names that an error lists at most, and characters of each
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,5 +94,10 @@ def no_such_body(uri: MocapUri, there: Collection[str]) -> InputError:
     return InputError(
         f"there is no body named {uri.subject!r}",
         where=str(uri),
-        hint=f"{meant}there are: {', '.join(sorted(there))}" if there else "no body is defined or enabled there",
+        hint=f"{meant}there are: {_listed(there)}" if there else "no body is defined or enabled there",
     )
+
+
+def _listed(names: Collection[str]) -> str:
+    shown = [name[:_LONGEST_NAME] for name in sorted(names)[:_LISTED]]
+    return ", ".join(shown) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")

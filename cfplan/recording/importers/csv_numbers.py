@@ -45,9 +45,12 @@ def numbers(data: mmap.mmap, lines: Lines, file: Path, *, block: int = BLOCK) ->
             cut = is_cut_off(data, last, end)
             mistake = _mistake(data, begin, last if cut else end, lines, file)
             if mistake is not None or not cut:
-                raise mistake or InputError("the numbers cannot be read", where=place(data, begin, file)) from error
+                raise mistake or _unreadable(data, begin, file) from error
             if last > begin:
-                blocks.append(_block(data[begin:last], lines))
+                try:
+                    blocks.append(_block(data[begin:last], lines))
+                except pa.ArrowInvalid:
+                    raise _unreadable(data, begin, file) from error
     if not blocks:
         return np.empty((0, len(lines.wanted))), cut
     return np.concatenate(blocks, axis=1).T, cut
@@ -89,6 +92,14 @@ def _block(text: bytes, lines: Lines) -> NDArray:
         ),
     )
     return np.stack([column.to_numpy() for column in table.columns])
+
+
+def _unreadable(data: mmap.mmap, begin: int, file: Path) -> InputError:
+    return InputError(
+        "the numbers behind this line cannot be read",
+        where=place(data, begin, file),
+        hint="export the log again, with plain decimal numbers and without quotes",
+    )
 
 
 def _mistake(data: mmap.mmap, begin: int, end: int, lines: Lines, file: Path) -> InputError | None:

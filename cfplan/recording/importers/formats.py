@@ -8,6 +8,7 @@ from cfplan.errors import InputError
 from cfplan.recording.importers import crazyswarm_csv, ros_bag, tlog, usd_log, vicon_csv
 from cfplan.recording.importers.mocap_log import MocapLog
 from cfplan.recording.importers.vicon_csv import Rotations
+from cfplan.recording.plausible import check_places, check_times
 
 _HEAD = 4096  # bytes by which a format is recognised
 
@@ -51,6 +52,9 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
         log = vicon_csv.read(file, rotations) if importer.read is vicon_csv.read else importer.read(file)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", where=str(file)) from error
+    for subject in log.subjects:
+        check_times(subject.time, repr(subject.name), where=str(file))
+        check_places(subject.position, repr(subject.name), where=str(file))
     if not any(subject.seen.any() for subject in log.subjects):
         raise InputError("the log holds no pose", where=str(file), hint="; ".join(log.notes))
     return log

@@ -81,6 +81,10 @@ def read(file: Path, *, block: int = BLOCK) -> MocapLog:
             for number, offsets in places.items()
         }
     starts = [float(rows["time"][0]) for rows in tables.values() if len(rows)]
+    if not starts:
+        raise InputError(
+            "the log ends before its first record", where=str(file), hint="nothing was logged, or copy it again"
+        )
     scale = _TIMES[version][1]
     subjects, notes = [], []
     for event, rows in tables.items():

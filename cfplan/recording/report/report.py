@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from cfplan.errors import CfplanError
 from cfplan.planning.plan_file import load_plan
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE, Record
-from cfplan.recording.summary import UNKNOWN, FlightSummary, summarise, summary_rows
+from cfplan.recording.summary import UNKNOWN, FlightSummary, begun, summarise, summary_rows
 from cfplan.safety.certificate import Certificate
 
 
@@ -69,9 +68,8 @@ def read_flight(place: Path) -> ReportedFlight:
 
 def _provenance(record: Record) -> list[tuple[str, str]]:
     header = record.header
-    begun = datetime.fromtimestamp(header.wall_time_at_zero + record.start, UTC)
     return [
-        ("begun", f"{begun:%Y-%m-%d %H:%M:%S} UTC"),
+        ("begun", begun(record)),
         ("path", header.name),
         ("vehicle", header.vehicle.name),
         ("reached by", header.uri),

@@ -26,6 +26,7 @@ from cfplan.recording.rerun.viewer import open_viewer, save
 COLOURS: tuple[Colour, ...] = (FOUR[0], WANTED, *FOUR[1:], (213, 94, 0), (0, 114, 178))
 ARM = 0.0375  # m, of the vehicle as drawn: a log does not know its size
 DASH = 0.05  # m, of the reference as drawn, and as much between two
+MOST_DASHES = 20_000
 DRAWN_RATE = 100.0  # Hz: more poses than that are not drawn in 3-D, as they could not be distinguished
 _REFERENCE, _TRIAL = f"{WORLD}/reference", f"{WORLD}/trial"
 _AXES = "xyz"
@@ -133,8 +134,9 @@ def dashes(points: NDArray) -> list[NDArray]:
     if len(points) < 2:
         return []
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    places = np.arange(0.0, along[-1], 2 * DASH)
-    ends = np.stack([places, np.minimum(places + DASH, along[-1])], axis=1)
+    dash = max(DASH, along[-1] / (2 * MOST_DASHES))
+    places = np.arange(0.0, along[-1], 2 * dash)
+    ends = np.stack([places, np.minimum(places + dash, along[-1])], axis=1)
     moving = np.r_[True, np.diff(along) > 0]
     return list(np.stack([np.interp(ends, along[moving], axis[moving]) for axis in points.T], axis=-1))
 
@@ -172,8 +174,8 @@ def _drawn(trial: Trial) -> NDArray:
     seen = np.flatnonzero(np.isfinite(trial.position).all(axis=1))
     if len(seen) < 2:
         return seen
-    rate = 1 / float(np.median(np.diff(trial.time[seen])))
-    return seen[:: max(1, round(rate / DRAWN_RATE))]
+    step = float(np.median(np.diff(trial.time[seen])))
+    return seen[:: max(1, round(1 / max(DRAWN_RATE * step, 1e-3)))]
 
 
 def _log_curve(

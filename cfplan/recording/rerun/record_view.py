@@ -28,6 +28,7 @@ from cfplan.recording.summary import dropouts, pose_gaps, reference_span, summar
 from cfplan.vehicle.airframe import GRAVITY
 
 AXIS_LENGTH = 0.25  # m, of the body axes as drawn
+LARGEST_FLOOR = 100.0  # m, from the origin, that is drawn
 STRIPS_AT_ONCE = 500  # `rerun rrd verify` takes a time that grows with the square of the strips in one chunk
 BODY_SCALE = 4.0  # the vehicle is drawn larger than it is, or it could not be seen in its room
 TRACK_RADIUS, TAIL_RADIUS, WANTED_RADIUS, PATH_RADIUS = 0.004, 0.02, 0.01, 0.006  # m, of the lines
@@ -97,7 +98,7 @@ def log_room(stream: rr.RecordingStream, header: RecordHeader) -> None:
 
 def floor_lines(low: NDArray, high: NDArray) -> list[NDArray]:
     """Return lines on the floor, 1 m apart, beneath the box from low to high, both (3,) m."""
-    low, high = np.floor(low), np.ceil(high)
+    low, high = np.clip([np.floor(low), np.ceil(high)], -LARGEST_FLOOR, LARGEST_FLOOR)
     xs, ys = np.arange(low[0], high[0] + 0.5), np.arange(low[1], high[1] + 0.5)
     across = [np.array([[x, low[1], 0.0], [x, high[1], 0.0]]) for x in xs]
     return across + [np.array([[low[0], y, 0.0], [high[0], y, 0.0]]) for y in ys]

@@ -52,6 +52,13 @@ def decode(decoder, *blocks):
 TURN = Rotation.from_rotvec([0.3, -0.8, 2.0])
 
 
+@pytest.mark.parametrize("parts", [(math.inf, -math.inf), (1e308, 1e308), (math.inf,), (math.nan,), (-1e9,), (1e9,)])
+def test_an_absurd_latency_is_not_known(parts):
+    told = struct.pack("<I", len(parts)) + b"".join(text(str(i)) + struct.pack("<d", v) for i, v in enumerate(parts))
+    frame = decode(Decoder(), contents(), subject(4, "cf1", (1, 0, "cf1")), frame_info(77), block(26, told))
+    assert math.isnan(frame.latency)
+
+
 def test_a_frame_is_read_field_by_field():
     frame = decode(
         Decoder(),

@@ -61,6 +61,15 @@ def test_any_text_is_a_uri_or_an_input_error(text):
     assert uri.host
 
 
+def test_an_error_lists_a_dozen_of_many_names_on_one_line_without_control_characters():
+    names = ["\x1b[2Jclear", "new\nline", *(f"body{number:05}" * 30 for number in range(5000))]
+    text = str(no_such_body(parse_uri("vicon://a/cf1", subject_needed=True), names))
+    assert len(text) < 1000
+    assert "and 4990 more" in text
+    assert text.isprintable()
+    assert "\\x1b[2Jclear" in text
+
+
 def test_a_body_that_is_not_there_is_told_with_those_that_are():
     error = no_such_body(parse_uri("vicon://a/cf1", subject_needed=True), ["cf2", "gate"])
     assert "did you mean 'cf2'" in error.hint

@@ -1,0 +1,45 @@
+"""Refuse times and places that no flight has, where a record or a log is read."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import InputError
+
+LONGEST = 12 * 3600.0  # s, from the first time to the last; more cost memory and minutes wherever times are compared
+_LATEST = 1e11  # s; microseconds taken for seconds are later
+_FARTHEST = 1e4  # m, from the origin
+
+
+def check_times(time: NDArray, name: str, *, where: str, missing: bool = False) -> None:
+    """Raise InputError where a time, (N,) s, is no number, or is absurd, or where all of them span too long.
+
+    `missing`: whether a time may be NaN.
+    """
+    if np.isnan(time).all() and (missing or len(time) == 0):
+        return
+    wrong = np.flatnonzero(~(np.abs(time) <= _LATEST) & ~(missing & np.isnan(time)))
+    if len(wrong):
+        raise InputError(
+            f"time {int(wrong[0]) + 1} of {name} is {float(time[wrong[0]]):g} s",
+            where=where,
+            hint="the file is damaged, or its times are not in the unit that its format has",
+        )
+    span = float(np.nanmax(time) - np.nanmin(time))
+    if span > LONGEST:
+        raise InputError(
+            f"the times of {name} span {span:g} s, more than {LONGEST / 3600:g} h",
+            where=where,
+            hint="a time is damaged, or the log must be cut into flights",
+        )
+
+
+def check_places(position: NDArray, name: str, *, where: str) -> None:
+    """Raise InputError where a position, (N, 3) m, is farther away than any flight; NaN is not seen."""
+    wrong = np.flatnonzero((np.abs(position) > _FARTHEST).any(axis=1))
+    if len(wrong):
+        x, y, z = position[wrong[0]]
+        raise InputError(
+            f"position {int(wrong[0]) + 1} of {name} is ({x:g}, {y:g}, {z:g}) m",
+            where=where,
+            hint="the file is damaged, or its lengths are not in the unit that its format has",
+        )
