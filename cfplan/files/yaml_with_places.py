@@ -30,6 +30,23 @@ _TAGS = {
 _INTEGER = re.compile(r"[-+]?[0-9]{1,18}")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _NOT_FINITE = re.compile(r"[-+]?\.?(inf|nan|infinity)", re.IGNORECASE)
+_REMEDIES = {  # by the beginning of pydantic's name of a mistake
+    "float": "write a plain number, as 0.5, without quotes and without a unit",
+    "int": "write a whole number, as 2, without quotes",
+    "bool": "write true or false",
+    "string_type": "write text, in quotes where it looks like a number",
+    "string": "write text of that form",
+    "list": "write a list, as [0, 0, 1]",
+    "tuple": "write a list, as [0, 0, 1]",
+    "too_": "write a list of that length",
+    "model": "write keys with values, each on a line of its own",
+    "dict": "write keys with values, each on a line of its own",
+    "enum": "write one of those words",
+    "literal": "write one of those words",
+    "greater": "choose a larger value",
+    "less": "choose a smaller value",
+    "missing": "write a list of that length",
+}
 _WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
 
 
@@ -202,14 +219,28 @@ def _named(details: Any, model: type[BaseModel], places: Places) -> tuple[int, t
         return 0, places.keys.get(location, (1, 1)), f"unknown key {name!r}", hint
     if details["type"] == "missing":
         missing = str(details["loc"][-1])
-        return 2, place, f"the key {missing!r} is missing" + (f" in {name}" if name else ""), ""
+        owner = _model_at(model, location)
+        return (
+            2,
+            place,
+            f"the key {missing!r} is missing" + (f" in {name}" if name else ""),
+            f"add `{missing}: …`" + (f"; {_known(owner)}" if owner else ""),
+        )
     message = _one_line(details["msg"].removeprefix("Value error, "))
     if not message.startswith("Input "):
-        return 1, place, f"{name}: {message}" if name else message, ""
+        return 1, place, f"{name}: {message}" if name else message, _remedy(details["type"])
     value = details["input"]
     shown = json.dumps(value, ensure_ascii=False) if isinstance(value, int | float | str | None) else ""
     unlike = f", not {shown}" if 0 < len(shown) <= 40 else ""
-    return 1, place, f"{name or 'the file'} {message.removeprefix('Input ')}{unlike}", ""
+    return 1, place, f"{name or 'the file'} {message.removeprefix('Input ')}{unlike}", _remedy(details["type"])
+
+
+def _remedy(mistake: str) -> str:
+    """Return what to write instead, by pydantic's name of a mistake."""
+    for beginning, remedy in _REMEDIES.items():
+        if mistake.startswith(beginning):
+            return remedy
+    return "write another value there"
 
 
 def _location(parts: tuple[str | int, ...], places: Places) -> Location:

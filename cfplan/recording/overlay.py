@@ -128,13 +128,21 @@ def align(subject: LoggedSubject, reference: Reference) -> Alignment:
     """
     time, position = subject.time[subject.seen], subject.position[subject.seen]
     if len(time) < 2 or time[-1] - time[0] < 2 * STEP:
-        raise InputError("seen for too short a time to be aligned with a plan", where=subject.name)
+        raise InputError(
+            "seen for too short a time to be aligned with a plan",
+            where=subject.name,
+            hint="choose another subject with --subject, or leave out the plan",
+        )
     guess, left_over = _on_grid(time, position, reference)
     offset = _closely(guess, time, position, reference)
     difference = position - reference.at(time - offset)
     difference = difference[np.isfinite(difference[:, 0])]
     if len(difference) == 0:
-        raise InputError("not seen while the plan was flown", where=subject.name)
+        raise InputError(
+            "not seen while the plan was flown",
+            where=subject.name,
+            hint="choose another subject with --subject, or another plan",
+        )
     distance = np.linalg.norm(difference, axis=1)
     x, y, z = (float(value) for value in difference.mean(axis=0))
     return Alignment(

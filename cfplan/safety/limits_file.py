@@ -206,7 +206,9 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
         ladder = getattr(content.flight, name)
         if not ladder.brake < ladder.land < ladder.cut:
             raise InputError(
-                f"flight.{name} must rise from brake over land to cut", where=places.where("flight", name, "brake")
+                f"flight.{name} must rise from brake over land to cut",
+                where=places.where("flight", name, "brake"),
+                hint="the pilot brakes first, then lands, then cuts the motors: write each larger than the one before",
             )
     for quantity in ON_LADDER:
         planned, abort = getattr(content.plan, quantity.key), getattr(content.flight, quantity.ladder).brake
@@ -221,26 +223,40 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
             raise InputError(
                 f"the space from {low:g} to {high:g} m leaves no room within a margin of {content.space.margin:g} m",
                 where=places.where("space", "high", axis),
+                hint="lower the margin, or name a larger space, from its low corner to its high one",
             )
     if not content.battery.under_load < content.battery.at_rest:
         raise InputError(
-            "battery.under_load must be below battery.at_rest", where=places.where("battery", "under_load")
+            "battery.under_load must be below battery.at_rest",
+            where=places.where("battery", "under_load"),
+            hint="a battery's voltage falls under load; 3.2 V is usual",
         )
     pose = content.pose
     if not pose.age_warning < pose.age_brake < pose.age_land:
-        raise InputError("pose ages must rise from warning over brake to land", where=places.where("pose", "age_brake"))
+        raise InputError(
+            "pose ages must rise from warning over brake to land",
+            where=places.where("pose", "age_brake"),
+            hint="write age_warning below age_brake, and age_brake below age_land",
+        )
     if not pose.rate_min <= pose.rate:
-        raise InputError("pose.rate_min is above pose.rate", where=places.where("pose", "rate_min"))
+        raise InputError(
+            "pose.rate_min is above pose.rate",
+            where=places.where("pose", "rate_min"),
+            hint="rate is what motion capture should deliver, rate_min the least that it may",
+        )
     if not 1.0 / pose.rate < pose.age_warning:
         raise InputError(
             f"at {pose.rate:g} Hz every pose grows older than pose.age_warning",
             where=places.where("pose", "age_warning"),
+            hint=f"write an age_warning above {1.0 / pose.rate:.3g} s, or a higher rate",
         )
     height = content.ground.take_off_height
     if not content.space.low[2] + content.space.margin <= height <= content.space.high[2] - content.space.margin:
         raise InputError(
             f"a take-off to {height:g} m ends outside the space or within its margin",
             where=places.where("ground", "take_off_height"),
+            hint=f"write a height from {content.space.low[2] + content.space.margin:g} to "
+            f"{content.space.high[2] - content.space.margin:g} m",
         )
 
 

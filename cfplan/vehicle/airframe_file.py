@@ -49,5 +49,6 @@ def read_airframe(file: Path | str) -> Airframe:
         raise InputError(
             "no rigid body has these moments of inertia: one exceeds the sum of the others",
             where=places.where("inertia"),
+            hint="write the moments about x, y and z in kg m²",
         )
     return airframe

@@ -145,6 +145,7 @@ def test_limits_that_contradict_each_other_or_the_vehicle_are_refused(tmp_path, 
         load_limits(changed(tmp_path, changes))
     assert "\n" not in str(error.value)
     assert error.value.where
+    assert error.value.hint
 
 
 def test_the_tilt_of_stops_is_read(tmp_path):
@@ -194,3 +195,13 @@ def test_a_file_with_a_slip_anywhere_is_read_or_refused_in_one_line(tmp_path, pl
     file.write_text(text[:place] + slip + text[place + len(slip) :], encoding="utf-8", errors="surrogatepass")
     limits = read_or_refused(file)
     assert not isinstance(limits, str) or "\n" not in limits
+
+
+@pytest.mark.parametrize("value", [None, True, "word", "", -1, 1e9, [], [1, 2], {"a": 1}, {}])
+@pytest.mark.parametrize("place", [".".join(place) for place in keys()] + ["plan", "flight.speed", "space"])
+def test_every_value_of_a_wrong_kind_is_refused_with_a_hint(tmp_path, place, value):
+    try:
+        load_limits(changed(tmp_path, {place: value}))
+    except InputError as error:
+        assert error.where  # noqa: PT017  some of them are right
+        assert error.hint  # noqa: PT017

@@ -160,7 +160,13 @@ def main() -> None:
     except BrokenPipeError:
         return
     except Exception as error:  # the parent must learn of anything that a driver raises
-        outlet.send(InputError(f"fault in the driver: {error!r}", where=text))
+        outlet.send(
+            InputError(
+                f"fault in the driver: {error!r}",
+                where=text,
+                hint="try another system in the URI, as vicon-sdk:// for vicon://; please report this",
+            )
+        )
 
 
 if __name__ == "__main__":

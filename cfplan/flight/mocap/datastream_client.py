@@ -86,7 +86,7 @@ class DataStreamClient:
 
     def _read(self, size: int) -> bytes:
         if self._socket is None:
-            raise LinkError("the stream is closed", where=self._where)
+            raise LinkError("the stream is closed", where=self._where, hint="connect again")
         while len(self._buffer) < size:
             try:
                 data = self._socket.recv(1 << 16)

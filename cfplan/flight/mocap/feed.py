@@ -78,7 +78,11 @@ class Feed:
                 hint = "is the system live and streaming?"
             limit = CONNECT_ALARM if self.stage.startswith("connecting") else FRAME_ALARM
             return LinkError(f"no answer within {limit:g} s ({self.stage})", where=str(self._uri), hint=hint)
-        return LinkError(f"the driver's process died (exit code {code}, {self.stage})", where=str(self._uri))
+        return LinkError(
+            f"the driver's process died (exit code {code}, {self.stage})",
+            where=str(self._uri),
+            hint="connect again; try another system in the URI, as vicon:// for vicon-sdk://",
+        )
 
     def close(self) -> None:
         """End the child; may be called twice."""

@@ -26,7 +26,11 @@ def read(file: Path) -> MocapLog:
         names = _names(data[:begin])
         missing = [name for name in COLUMNS if name not in names]
         if missing:
-            raise InputError(f"there is no column {', '.join(missing)}", where=f"{file}:1")
+            raise InputError(
+                f"there is no column {', '.join(missing)}",
+                where=f"{file}:1",
+                hint="the first line names the columns timestamp, x, y, z, qx, qy, qz and qw",
+            )
         wanted = [names.index(name) for name in COLUMNS]
         values, cut = numbers(data, Lines(begin, len(data), ",", len(names), wanted), file)
     keep = ascending(values[:, 0])
@@ -38,7 +42,11 @@ def read(file: Path) -> MocapLog:
         quaternion = unit_quaternions(values[:, 4:])
     except ValueError as error:
         row, length = error.args
-        raise InputError(f"the quaternion has length {length:.3g} at {values[row, 0]:.3f} s", where=str(file)) from None
+        raise InputError(
+            f"the quaternion has length {length:.3g} at {values[row, 0]:.3f} s",
+            where=str(file),
+            hint="the file is damaged, or its columns are in another order",
+        ) from None
     subject = LoggedSubject(file.stem, values[:, 0], values[:, 1:4], quaternion)
     return MocapLog(FORMAT, (subject,), tuple(notes), truncated=cut)
 

@@ -51,7 +51,11 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
     try:
         log = vicon_csv.read(file, rotations) if importer.read is vicon_csv.read else importer.read(file)
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror or error})", where=str(file)) from error
+        raise InputError(
+            f"cannot be read ({error.strerror or error})",
+            where=str(file),
+            hint="check its permissions, or copy it again",
+        ) from error
     for subject in log.subjects:
         check_times(subject.time, repr(subject.name), where=str(file))
         check_places(subject.position, repr(subject.name), where=str(file))
@@ -77,11 +81,15 @@ def find_importer(file: Path) -> Importer | None:
             with file.open("rb") as stream:
                 head = stream.read(_HEAD)
         except FileNotFoundError:
-            raise InputError("no such file", where=str(file)) from None
+            raise InputError(
+                "no such file", where=str(file), hint="check the name; it is relative to the working folder"
+            ) from None
         except (OSError, ValueError) as error:
             raise InputError(
-                f"cannot be read ({getattr(error, 'strerror', None) or error})", where=str(file)
+                f"cannot be read ({getattr(error, 'strerror', None) or error})",
+                where=str(file),
+                hint="check its permissions",
             ) from error
         if not head:
-            raise InputError("the file is empty", where=str(file))
+            raise InputError("the file is empty", where=str(file), hint="copy it again, or record it again")
     return next((importer for importer in IMPORTERS if importer.recognises(file, head)), None)

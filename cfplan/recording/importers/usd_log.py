@@ -106,7 +106,11 @@ def _head(data: mmap.mmap, file: Path) -> tuple[int, dict[int, _EventType], int]
     try:
         version, count = struct.unpack_from("<HH", data, 1)
         if version not in _TIMES:
-            raise InputError(f"version {version} of the log; versions 1 and 2 are known", where=str(file))
+            raise InputError(
+                f"version {version} of the log; versions 1 and 2 are known",
+                where=str(file),
+                hint="it was written by newer firmware, or is no log of the microSD card",
+            )
         offset, types = 5, {}
         if count > _MOST:
             raise ValueError(f"{count} kinds of records")

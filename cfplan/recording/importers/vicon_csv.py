@@ -106,6 +106,7 @@ class _Reading:
             raise InputError(
                 f"{width} cells where the columns are {rows.section.headings}",
                 where=place(self.data, begin, self.file),
+                hint="export the section again, with all its columns",
             )
         values, cut = numbers(
             self.data, Lines(begin, end, delimiter, width, wanted, point), self.file, block=self.block
@@ -180,7 +181,9 @@ def _subject(group: Group, time: NDArray, values: NDArray, file: Path) -> Logged
     except ValueError as error:
         row, length = error.args
         raise InputError(
-            f"the quaternion of {group.name!r} has length {length:.3g} at {time[row]:.3f} s", where=str(file)
+            f"the quaternion of {group.name!r} has length {length:.3g} at {time[row]:.3f} s",
+            where=str(file),
+            hint="export the rotation again, as a quaternion or as a vector",
         ) from None
     return LoggedSubject(group.name, time, position, quaternion)
 

@@ -68,7 +68,11 @@ def read_head(lines: list[str], *, where: str, rotations: Rotations | None) -> S
     name = _first_cell(lines[0])
     rate = _rate(lines[1] if len(lines) > 1 else "", name, where)
     if len(lines) < 4:
-        raise InputError(f"section {name!r} ends before its columns", where=where)
+        raise InputError(
+            f"section {name!r} ends before its columns",
+            where=where,
+            hint="a section begins with its name, its rate, the subjects and the columns",
+        )
     delimiter = max(",;\t", key=lines[3].count)
     names, headings, units = (_cells(line, delimiter) for line in (lines[2], lines[3], (*lines, "")[4]))
     headings = [heading.upper() for heading in headings]
@@ -82,7 +86,11 @@ def read_head(lines: list[str], *, where: str, rotations: Rotations | None) -> S
     if name.lower() in READ:
         starts = [index for index, cell in enumerate(names) if cell]
         if not starts:
-            raise InputError(f"section {name!r} names no subject above its columns", where=where)
+            raise InputError(
+                f"section {name!r} names no subject above its columns",
+                where=where,
+                hint="the line above the columns names each subject over its first column",
+            )
         for first, after in zip(starts, [*starts[1:], len(headings)], strict=True):
             group = _group(names[first], headings, units, range(first, min(after, len(headings))), where, rotations)
             if group is None:
@@ -113,7 +121,11 @@ def _rate(line: str, section: str, where: str) -> float:
     except ValueError:
         rate = math.nan
     if not 0 < rate < 1e6:
-        raise InputError(f"the rate of section {section!r} is {text[:30]!r}, not a number of Hz", where=where)
+        raise InputError(
+            f"the rate of section {section!r} is {text[:30]!r}, not a number of Hz",
+            where=where,
+            hint="the line below the name of a section holds its rate alone, as 100",
+        )
     return rate
 
 

@@ -87,7 +87,11 @@ class HeadlessViewer:
         end = time.monotonic() + _LOADS_WITHIN
         while self._client.get_state().loading:
             if time.monotonic() > end:
-                raise InputError("the viewer does not finish loading it", where=str(recording))
+                raise InputError(
+                    "the viewer does not finish loading it",
+                    where=str(recording),
+                    hint="draw a shorter flight, or wait until the computer is idle",
+                )
             time.sleep(0.1)
 
     def go_to(self, moment: float) -> None:
