@@ -10,21 +10,18 @@ _LATEST = 1e11  # s; microseconds taken for seconds are later
 _FARTHEST = 1e4  # m, from the origin
 
 
-def check_times(time: NDArray, name: str, *, where: str, missing: bool = False) -> None:
-    """Raise InputError where a time, (N,) s, is no number, or is absurd, or where all of them span too long.
-
-    `missing`: whether a time may be NaN.
-    """
-    if np.isnan(time).all() and (missing or len(time) == 0):
+def check_times(time: NDArray, name: str, *, where: str) -> None:
+    """Raise InputError where a time, (N,) s, is no number, or is absurd, or where all of them span too long."""
+    if len(time) == 0:
         return
-    wrong = np.flatnonzero(~(np.abs(time) <= _LATEST) & ~(missing & np.isnan(time)))
+    wrong = np.flatnonzero(~(np.abs(time) <= _LATEST))
     if len(wrong):
         raise InputError(
             f"time {int(wrong[0]) + 1} of {name} is {float(time[wrong[0]]):g} s",
             where=where,
             hint="the file is damaged, or its times are not in the unit that its format has",
         )
-    span = float(np.nanmax(time) - np.nanmin(time))
+    span = float(np.max(time) - np.min(time))
     if span > LONGEST:
         raise InputError(
             f"the times of {name} span {span:g} s, more than {LONGEST / 3600:g} h",

@@ -89,7 +89,7 @@ def _check_plausible(record: Record, file: Path) -> None:
         check_times(stream.time, topic.name, where=str(file))
         if hasattr(stream, "position"):
             check_places(stream.position, topic.name, where=str(file))
-    check_times(record.setpoints.due, "the setpoints' deadlines", where=str(file), missing=True)
+    check_times(record.setpoints.due, "the setpoints' deadlines", where=str(file))
     check_times(np.array([record.start, record.start + record.duration]), "the record", where=str(file))
     if not np.isfinite(record.header.fence).all():
         raise InputError("the header's fence is not finite", where=str(file), hint="the record was changed since")

@@ -10,7 +10,7 @@ import pytest
 from cfplan.cli.output import print_json
 from cfplan.errors import InputError
 from cfplan.flight.telemetry import Event as Message
-from cfplan.flight.telemetry import Level, PoseReceived
+from cfplan.flight.telemetry import Level, PoseReceived, SetpointSent
 from cfplan.recording.importers import usd_log
 from cfplan.recording.importers.formats import read_log
 from cfplan.recording.overlay import Trial, trial_of_record
@@ -49,6 +49,12 @@ def test_a_record_with_absurd_times_is_refused(tmp_path, times):
 def test_times_that_are_no_times_are_named(times):
     with pytest.raises(InputError, match="of 'swift' is"):
         check_times(np.array(times), "'swift'", where="log.csv")
+
+
+def test_a_setpoint_without_a_deadline_is_refused(tmp_path):
+    late = SetpointSent(1.0, np.nan, 0, (0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, LEVEL, (0.0,) * 3)
+    with pytest.raises(InputError, match="deadlines is nan"):
+        read_record(record_of(tmp_path, late))
 
 
 @pytest.mark.parametrize("place", [(1e30, 0.0, 0.0), (0.0, -2e4, 0.0)])
