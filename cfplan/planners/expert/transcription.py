@@ -42,6 +42,7 @@ class SplineProgram:
             self._linear,
         )  # fmt: skip
         # Within one call of evaluate() or linearise():
+        self._local = np.empty(it.local.shape)
         self._at_points = np.empty((it.local.shape[1], problem.point_data.shape[1]))
         self._work = np.empty((derivative_rows(it.local.shape[1]), problem.point_data.shape[1]))
         self._scale = OBJECTIVE_SCALE * math.sqrt(problem.step**2 / problem.unit)  # of time in node units
@@ -75,17 +76,18 @@ class SplineProgram:
     def evaluate(self, v: NDArray) -> Values:
         """Return f and g at v."""
         it = self._variables.sparsity
-        _gather(v, it, self._fixed_local, self._at_points)
+        _gather(v, it.slots, it.interval, self._fixed_local, self._local, self._at_points)
         constraints, penalty = self._kernels.evaluate(self._at_points)
-        return Values(_complete(constraints, penalty, v, it, self._fixed_local, self._scale), constraints)
+        return Values(_complete(constraints, penalty, self._local, it, self._scale), constraints)
 
     def linearise(self, v: NDArray, terms: NDArray) -> Linearisation:
         """Return the derivatives at v, where the constraints have these barrier.TERMS."""
         it = self._variables
-        _gather(v, it.sparsity, self._fixed_local, self._at_points)
+        slots, interval = it.sparsity.slots, it.sparsity.interval
+        _gather(v, slots, interval, self._fixed_local, self._local, self._at_points)
         jacobian = self._kernels.differentiate(self._at_points, terms, self._work)
         gradients, matrix = np.zeros((len(terms), it.size)), np.zeros((it.size, it.band + 1))
-        _assemble(self._work, it.sparsity, terms, v, self._fixed_local, self._scale, gradients, matrix)
+        _assemble(self._work, it.sparsity, terms, self._local, self._scale, gradients, matrix)
         return Linearisation(gradients, matrix, partial(_jvp, jacobian, it.sparsity))
 
 
@@ -104,13 +106,11 @@ def _smallest(table, slots, size):
 
 
 @register_jitable
-def _spread(v, slots, fixed):
-    """Return each interval's coefficients, (N, k)."""
-    local = np.empty(slots.shape)
+def _spread(v, slots, fixed, local):
+    """Fill in each interval's coefficients, (N, k)."""
     for i in range(slots.shape[0]):
         for a in range(slots.shape[1]):
             local[i, a] = v[slots[i, a]] if slots[i, a] >= 0 else fixed[i, a]
-    return local
 
 
 @register_jitable(fastmath=_FREELY)
@@ -125,21 +125,20 @@ def _weigh(sparsity, local, result):
 
 
 @njit(error_model="numpy")
-def _gather(v, sparsity, fixed, at_points):
-    """Fill in the coefficients of each point, (k, P)."""
-    local, interval = _spread(v, sparsity.slots, fixed), sparsity.interval
+def _gather(v, slots, interval, fixed, local, at_points):
+    """Fill in the coefficients of each interval, (N, k), and of each point, (k, P)."""
+    _spread(v, slots, fixed, local)
     for a in range(local.shape[1]):
         for p in range(len(interval)):
             at_points[a, p] = local[interval[p], a]
 
 
 @njit(error_model="numpy", fastmath=_FREELY)
-def _complete(constraints, penalty, v, sparsity, fixed, scale):
+def _complete(constraints, penalty, local, sparsity, scale):
     """Fill in the linear constraints, which the kernels left open, and return the cost: penalties and time.
 
     The time in node units is Σ ∫ds/√x over all intervals.
     """
-    local = _spread(v, sparsity.slots, fixed)
     _weigh(sparsity, local, constraints[len(constraints) - len(sparsity.linear_interval) :])
     time, total = 0.0, 0.0
     for i in range(local.shape[0]):
@@ -209,10 +208,9 @@ def _add_time(local, scale, gradients, hessian):
 
 
 @njit(error_model="numpy", fastmath=_FREELY)
-def _assemble(at_points, sparsity, terms, v, fixed, scale, gradients, matrix):
+def _assemble(at_points, sparsity, terms, local, scale, gradients, matrix):
     """Add up gradients and matrix, zero at first, from the kernel's at points, the linear constraints and the time."""
     slots, entries, kinds = sparsity.slots, sparsity.entries, len(terms)
-    local = _spread(v, slots, fixed)
     count, k = local.shape
     of_gradients = _sum_by_interval(at_points[: kinds * k], sparsity.interval, count)
     of_hessian = _sum_by_interval(at_points[kinds * k :], sparsity.interval, count)
@@ -235,7 +233,8 @@ def _jvp(jacobian, sparsity, dv):
     count, k = sparsity.slots.shape
     interval, points = sparsity.interval, jacobian.shape[1]
     rows = jacobian.shape[0] // k
-    local, of_point = _spread(dv, sparsity.slots, np.zeros((count, k))), np.empty(points)
+    local, of_point = np.zeros((count, k)), np.empty(points)
+    _spread(dv, sparsity.slots, local, local)
     result = np.zeros(rows * points + len(sparsity.linear_interval))
     for a in range(k):
         for p in range(points):

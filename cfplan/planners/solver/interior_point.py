@@ -160,6 +160,7 @@ def minimise(program: NonlinearProgram, v: NDArray, search: Search) -> SearchRes
             return SearchResult(v, values, False, iteration, "no direction of descent")
         dg = near.jvp(dv)
         direction = search_direction(values.constraints, dg, bounds, slacks, barrier, max(BOUNDARY, 1 - barrier))
+        del near, dg  # so that the next ones get their memory, which the processor's cache still holds
         before = infeasible, values.cost + walls
         step = _line_search(program, v, dv, slacks, direction, barrier, before, slope + direction.slope, filtered)
         if step is None:
@@ -171,6 +172,7 @@ def minimise(program: NonlinearProgram, v: NDArray, search: Search) -> SearchRes
             values.constraints, bounds, slacks, direction.step, step.share, direction.share_dual, barrier
         )
         whole = step.share == direction.share_dual == 1.0
+        del direction
         if search.left_by_step is not None and whole and barrier <= search.last_barrier:
             left = search.left_by_step * off_gradient
             if _error(off, left, search) <= BARRIER_SOLVED * barrier:
