@@ -90,7 +90,9 @@ def _check_plausible(record: Record, file: Path) -> None:
         if hasattr(stream, "position"):
             check_places(stream.position, topic.name, where=str(file))
     check_times(record.setpoints.due, "the setpoints' deadlines", where=str(file))
-    check_times(np.array([record.start, record.start + record.duration]), "the record", where=str(file))
+    check_times(record.poses.received, "the poses' arrivals", where=str(file))
+    ends = [record.start, record.start + record.duration]
+    check_times(np.r_[ends, record.setpoints.due, record.poses.received], "the record", where=str(file))
     if not np.isfinite(record.header.fence).all():
         raise InputError("the header's fence is not finite", where=str(file), hint="the record was changed since")
     check_places(np.vstack([record.header.path, record.header.fence]), "the header", where=str(file))

@@ -57,6 +57,11 @@ def test_a_setpoint_without_a_deadline_is_refused(tmp_path):
         read_record(record_of(tmp_path, late))
 
 
+def test_a_pose_without_a_plausible_arrival_is_refused(tmp_path):
+    with pytest.raises(InputError, match="of the record span"):
+        read_record(record_of(tmp_path, PoseReceived(1.0, 1e10, (0.0, 0.0, 1.0), LEVEL)))
+
+
 @pytest.mark.parametrize("place", [(1e30, 0.0, 0.0), (0.0, -2e4, 0.0)])
 def test_a_record_with_absurd_places_is_refused(tmp_path, place):
     with pytest.raises(InputError, match="position 2 of"):
