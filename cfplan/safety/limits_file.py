@@ -13,6 +13,7 @@ from cfplan.errors import CfplanError, InputError
 from cfplan.files.yaml_with_places import Places, read_yaml_with_places
 from cfplan.safety.feasibility import describe_hover, hover_violation
 from cfplan.safety.limits import (
+    STOP_TILT,
     BatteryLimits,
     FirmwareSettings,
     FlightLimits,
@@ -74,7 +75,7 @@ class _Flight(_Section):
     acceleration: _Ladder
     angular_velocity: _Ladder
     patience: Annotated[float, Field(gt=0.0, le=1.0)]
-    stop_tilt_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
+    stop_tilt_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = math.degrees(STOP_TILT)
 
     @classmethod
     def ladders(cls) -> list[str]:

@@ -150,6 +150,9 @@ def test_limits_that_contradict_each_other_or_the_vehicle_are_refused(tmp_path, 
 
 def test_the_tilt_of_stops_is_read(tmp_path):
     assert load_limits(SAFETY).flight.stop_tilt == pytest.approx(math.radians(35))
+    older = tmp_path / "older.yaml"  # from before this limit
+    older.write_text("".join(line for line in SAFETY.read_text().splitlines(True) if "stop_tilt_deg" not in line))
+    assert load_limits(older).flight.stop_tilt == pytest.approx(math.radians(35))
     looser = load_limits(changed(tmp_path, {"flight.stop_tilt_deg": 38}))
     assert looser.flight.stop_tilt == pytest.approx(math.radians(38))
 
