@@ -287,7 +287,7 @@ def kept_or_made(title: str, module: str, make: Callable[[], bytes]) -> bytes:
 def llvm_functions(title: str, module: str, source: Callable[[], str], names: tuple[str, ...]) -> dict[str, Any]:
     """Return functions of LLVM source, to be called through ctypes; see kept_or_made for the arguments."""
     target = _target_machine()
-    data = kept_or_made(title, module, lambda: target.emit_object(_optimised(source(), target)))
+    data = kept_or_made(title, module, lambda: target.emit_object(_parsed(source(), target)))
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target)
     engine.add_object_file(llvm.ObjectFileRef.from_data(data))
     engine.finalize_object()
@@ -306,10 +306,14 @@ def _target_machine() -> Any:
     )
 
 
-def _optimised(source: str, target: Any) -> Any:
+def _parsed(source: str, target: Any) -> Any:
+    """Return the module of LLVM source, inlined where it says so.
+
+    Nothing else is rearranged: what LLVM moves out of a long loop goes to the stack, as registers are few.
+    """
     module = llvm.parse_assembly(source)
     module.verify()
-    passes = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=2))
+    passes = llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options(speed_level=0))
     passes.getModulePassManager().run(module, passes)
     return module
 

@@ -1,8 +1,8 @@
 """Constraints and penalty of points by the spline coefficients of their intervals, with derivatives, as machine code.
 
 In an interval h is made of four coefficients of a cubic B-spline and yaw of three of a quadratic one, so everything
-physical at a point follows from at most seven numbers (point_constraints.py). CasADi differentiates those expressions,
-llvm_emitter.py writes them out, and LLVM compiles them once a machine.
+physical at a point follows from at most seven numbers. CasADi differentiates those expressions (derivatives.py),
+llvm_emitter.py writes them out, and LLVM compiles them once a machine; both are imported only then.
 
 Arrays hold a quantity a row and a point a column; columns are a multiple of LANES.
 """
@@ -11,73 +11,22 @@ import ctypes
 from functools import lru_cache
 from typing import Any, Protocol
 
-import casadi
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.machine_code import llvm_functions
-from cfplan.planners.expert import llvm_emitter
-from cfplan.planners.expert.point_constraints import PLACE, ROWS, family, point_expressions, variables
+from cfplan.planners.expert.point_constraints import ROWS, family, variables
 from cfplan.planners.solver.barrier import TERMS
-from cfplan.vehicle import profile_spline, yaw_spline
-from cfplan.vehicle.profile import h_within, yaw_within
 
-LANES = llvm_emitter.LANES
 UNIFORM = (2, 3)  # arguments that are the same at all points
 _TITLES = ("values", "derivatives")
 
 
-@lru_cache(maxsize=2)
-def point_kernels(free_yaw: bool) -> tuple[casadi.Function, casadi.Function]:
-    """Return values and derivatives at one point, as CasADi functions.
-
-    Both take the coefficients, (k,), point data, common data and weights of the penalties, derivatives also Σ and the
-    rest of barrier.TERMS, (ROWS,) each. They give what Kernels do.
-    """
-    inputs, rows, penalty = point_expressions(free_yaw)
-    here, place = inputs[0], inputs[1][PLACE]
-    terms = [casadi.SX.sym(name, ROWS) for name in TERMS]
-    sigma, multipliers = terms[:2]
-    # Differentiated by what holds at the point itself, which is sparser, and led to the coefficients from there.
-    jacobian = casadi.jacobian(rows, here)
-    gradients = casadi.horzcat(casadi.gradient(penalty, here), casadi.mtimes(jacobian.T, casadi.horzcat(*terms[1:])))
-    hessian = casadi.jacobian(casadi.gradient(penalty + casadi.dot(multipliers, rows), here), here)
-    hessian += casadi.mtimes(jacobian.T, casadi.repmat(sigma, 1, here.numel()) * jacobian)
-    hessian = casadi.tril2symm(casadi.tril(hessian))  # what lies above is not computed
-    by_here = casadi.Function("by_here", [*inputs, *terms], [rows, penalty, jacobian, gradients, hessian])
-
-    coefficients = casadi.SX.sym("coefficients", here.numel())
-    led = _here_by_coefficients(place, free_yaw)
-    rows, penalty, jacobian, gradients, hessian = by_here(casadi.mtimes(led, coefficients), *inputs[1:], *terms)
-    inputs[0] = coefficients
-    jacobian, gradients = casadi.mtimes(jacobian, led), casadi.mtimes(led.T, gradients)
-    hessian = casadi.mtimes(led.T, casadi.mtimes(hessian, led))
-    size = range(here.numel())
-    lower = casadi.vertcat(*(hessian[i, j] for j in size for i in size if i >= j))
-
-    def function(title: str, arguments: list[casadi.SX], results: list[casadi.SX]) -> casadi.Function:
-        dense = [casadi.densify(result) for result in results]
-        return casadi.Function(f"{family(free_yaw)}_{title}", arguments, casadi.cse(dense))
-
-    return (
-        function("values", inputs, [rows, penalty]),
-        function("derivatives", [*inputs, *terms], [casadi.vec(jacobian), casadi.vec(gradients), lower]),
-    )
-
-
-def _here_by_coefficients(place: casadi.SX, free_yaw: bool) -> casadi.SX:
-    """Return the matrix that leads from the coefficients to h, and yaw, with derivatives at a place in the interval."""
-    z = casadi.SX.sym("z", variables(free_yaw))
-    h, at_node = h_within(place, *casadi.vertsplit(z)[:4]), casadi.DM(profile_spline.AT_NODE)
-    if not free_yaw:
-        return casadi.mtimes(casadi.jacobian(casadi.vertcat(*h), z), at_node)
-    here = casadi.vertcat(*h, *yaw_within(place, *casadi.vertsplit(z)[4:]))
-    return casadi.mtimes(casadi.jacobian(here, z), casadi.diagcat(at_node, casadi.DM(yaw_spline.AT_NODE)))
-
-
 def source() -> str:
     """Return the LLVM source of all kernels."""
-    return llvm_emitter.source([f for free_yaw in (False, True) for f in point_kernels(free_yaw)], UNIFORM)
+    from cfplan.planners.expert import derivatives, llvm_emitter
+
+    return llvm_emitter.source([f for free_yaw in (False, True) for f in derivatives.point_kernels(free_yaw)], UNIFORM)
 
 
 @lru_cache(maxsize=1)
@@ -145,13 +94,15 @@ class CompiledKernels:
 
 def _address(array: NDArray) -> int:
     """Return where a contiguous array begins in memory."""
-    return ctypes.addressof(ctypes.c_char.from_buffer(array.data))
+    return ctypes.addressof(ctypes.c_char.from_buffer(array))
 
 
 class InterpretedKernels:
     """The kernels by CasADi's virtual machine, point by point, to check the machine code by; see Kernels."""
 
     def __init__(self, free_yaw: bool, data: NDArray, common: NDArray, weights: NDArray, spare: int) -> None:
+        from cfplan.planners.expert.derivatives import point_kernels
+
         points, self._spare = data.shape[1], spare
         self._values, self._derivatives = (kernel.map(points) for kernel in point_kernels(free_yaw))
         self._given = data, *(np.tile(each[:, None], points) for each in (common, weights))

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.planners.expert import point_constraints
-from cfplan.planners.expert.kernel import LANES
 from cfplan.vehicle import measures, yaw_spline
 from cfplan.vehicle.profile_spline import weights_at
 
@@ -73,7 +72,7 @@ def layout_of(shape: Shape) -> Layout:
         right = all_rows if k == shape.nodes - 1 else jumping  # the rest holds at the next interval's left end
         points += [(j, k, place, right if place == 1.0 else all_rows) for j, place in enumerate(places)]
     points.sort(key=lambda point: point[:2])
-    padding = -len(points) % LANES
+    padding = -len(points) % point_constraints.LANES
     interval, place = (np.array([point[i] for point in points + points[-1:] * padding]) for i in (1, 2))
     bounded = np.stack([point[3] for point in points] + [np.zeros_like(all_rows)] * padding, axis=1)
     weight = np.where(place == 0.0, 1.0, 0.0)  # penalties count once an interval

@@ -9,20 +9,21 @@ from collections.abc import Collection, Sequence
 
 import casadi
 
+from cfplan.planners.expert.point_constraints import LANES
 from cfplan.vehicle import trigonometry
 
-LANES = 8
 _WIDE = f"<{LANES} x double>"
 _FREELY = "nsz contract"  # products and sums may be fused; nothing else may be rearranged
 _OPERATIONS = {casadi.OP_ADD: "fadd", casadi.OP_SUB: "fsub", casadi.OP_MUL: "fmul"}
 _READ, _WRITTEN = "!alias.scope !1, !noalias !2", "!alias.scope !2, !noalias !1"  # results overlap no argument
+# Vectors that do not fit the registers go to the stack, and must not lie across two lines of the cache there.
 _ENDING = """
 !0 = !{!0}
 !3 = !{!3, !0}
 !4 = !{!4, !0}
 !1 = !{!3}
 !2 = !{!4}
-attributes #0 = { "min-legal-vector-width"="512" "prefer-vector-width"="512" }
+attributes #0 = { alignstack=64 "min-legal-vector-width"="512" "prefer-vector-width"="512" }
 """
 
 

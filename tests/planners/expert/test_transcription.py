@@ -6,7 +6,7 @@ import pytest
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.random_paths import random_waypoints
-from cfplan.planners.expert import expert, kernel
+from cfplan.planners.expert import derivatives, expert, kernel
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.expert.initial_guess import guess
 from cfplan.planners.expert.intersample import Violation
@@ -180,7 +180,7 @@ def test_kernels_are_compiled_once_and_left_alone(other_cache):
 def test_an_instruction_that_cannot_be_written_out_is_named(monkeypatch):
     x = casadi.SX.sym("x")
     unknown = casadi.Function("unknown", [x], [casadi.atan(x)])
-    monkeypatch.setattr(kernel, "point_kernels", lambda free_yaw: (unknown, unknown))
+    monkeypatch.setattr(derivatives, "point_kernels", lambda free_yaw: (unknown, unknown))
     with pytest.raises(NotImplementedError, match="unknown: instruction"):
         kernel.source()
 
