@@ -94,7 +94,7 @@ class CompiledKernels:
 
 def _address(array: NDArray) -> int:
     """Return where a contiguous array begins in memory."""
-    return ctypes.addressof(ctypes.c_char.from_buffer(array))
+    return ctypes.addressof(ctypes.c_char.from_buffer(array.data))
 
 
 class InterpretedKernels:
