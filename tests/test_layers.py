@@ -97,7 +97,7 @@ def test_every_face_names_what_there_is():
 
 
 def test_every_package_is_in_the_list():
-    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} <= set(LAYERS)
+    assert {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"} == set(LAYERS)
 
 
 def test_shared_modules_import_no_layer():

@@ -24,7 +24,7 @@ from cfplan.planners.expert.point_constraints import Penalties
 from cfplan.planners.expert.problem import Ends, Segment, build_problem
 from cfplan.planners.expert.search import COLD_START, rejection_reason, solve
 from cfplan.planners.expert.tightening import Tightened, tighten_until_feasible
-from cfplan.planners.expert.windows import WindowSize, by_windows
+from cfplan.planners.expert.windows import WindowSize, by_windows, solution_of
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.yaw_spline import YawSpline
@@ -60,11 +60,4 @@ def plan_expert(task: PlanningTask, *, penalties: Penalties | None = None, windo
     joined = by_windows(whole, window, search)
     if isinstance(joined, str):
         return Solution(Status.NOT_CONVERGED, None, joined)
-    stats: dict[str, float | int | str] = {
-        "solve_seconds": time.perf_counter() - began,
-        "iterations": joined.iterations,
-        "rounds": joined.rounds,
-        "windows": 1 + len(joined.joints),
-        "solver": "interior point",
-    }
-    return Solution(Status.SOLVED, whole.profile(joined.coefficients), "", stats, joined.joints)
+    return solution_of(whole, joined, began)

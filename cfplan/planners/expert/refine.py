@@ -24,7 +24,7 @@ from cfplan.planners.expert.search import (
     solve,
 )
 from cfplan.planners.expert.tightening import Tightened, tighten_until_feasible
-from cfplan.planners.expert.windows import Joined, WindowSize, by_windows, far_enough, windows_of
+from cfplan.planners.expert.windows import Joined, WindowSize, by_windows, far_enough, solution_of, windows_of
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.profile import SpeedProfile
@@ -69,14 +69,7 @@ def refinements(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize
 def _solution(whole: Segment, joined: Joined | str, began: float) -> Solution:
     if isinstance(joined, str):
         return Solution(Status.NOT_CONVERGED, None, f"refining: {joined}")
-    stats: dict[str, float | int | str] = {
-        "solve_seconds": time.perf_counter() - began,
-        "iterations": joined.iterations,
-        "rounds": joined.rounds,
-        "windows": 1 + len(joined.joints),
-        "solver": "interior point",
-    }
-    return Solution(Status.SOLVED, whole.profile(joined.coefficients), "", stats, joined.joints)
+    return solution_of(whole, joined, began)
 
 
 class _HeldAtPoints(NamedTuple):

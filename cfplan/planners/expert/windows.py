@@ -5,6 +5,7 @@ than it takes to brake. Joints are crossed a little below the limits.
 """
 
 import math
+import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from cfplan.planners.expert.layout import Shape, layout_of
 from cfplan.planners.expert.problem import Ends, Segment
 from cfplan.planners.expert.tightening import Tightened
+from cfplan.planners.solution import Solution, Status
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import node_values
@@ -93,3 +95,15 @@ def _state(rows: NDArray, yaw_given: YawSpline, unit: float, step: float) -> Bou
     if rows.shape[1] == 2:
         yaw, dyaw = (rows[0, 1] + rows[1, 1]) / 2, (rows[1, 1] - rows[0, 1]) / step
     return BoundaryState(float(h), float(slope / step), float(bend / step**2), float(yaw), float(dyaw))
+
+
+def solution_of(whole: Segment, joined: Joined, began: float) -> Solution:
+    """Return the solution that windows were joined to; the search began at this time.perf_counter()."""
+    stats: dict[str, float | int | str] = {
+        "solve_seconds": time.perf_counter() - began,
+        "iterations": joined.iterations,
+        "rounds": joined.rounds,
+        "windows": 1 + len(joined.joints),
+        "solver": "interior point",
+    }
+    return Solution(Status.SOLVED, whole.profile(joined.coefficients), "", stats, joined.joints)
