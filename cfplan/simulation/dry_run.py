@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
+from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.flight.setpoints.packets import decode
 from cfplan.machine_code import njit
@@ -20,7 +21,7 @@ from cfplan.safety.limits import FlightLimits
 from cfplan.safety.quantities import ON_LADDER
 from cfplan.simulation.dynamics.body import TIME_STEP, hovering
 from cfplan.simulation.dynamics.closed_loop import PERFECT, ClosedLoop, EstimateErrors, fly_setpoints
-from cfplan.simulation.dynamics.mellinger import FULL_COMMAND, gains_for
+from cfplan.simulation.dynamics.mellinger import FULL_COMMAND
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 

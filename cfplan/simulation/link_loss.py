@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.flight.firmware import Timeouts, gains_for
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.machine_code import njit
@@ -30,14 +31,14 @@ from cfplan.simulation.dynamics.mellinger import (
     MEMORY_SIZE,
     SETPOINT_SIZE,
     distribute_power,
-    gains_for,
     level_out,
     step_mellinger,
 )
 from cfplan.vehicle.rotations import yaw_of
 
-LEVEL_AFTER, OFF_AFTER = 0.54, 2.04  # s after the last setpoint; the supervisor checks every 40 ms
-OFF_BY_WATCHDOG = 1.0  # s after the last setpoint, if the emergency-stop watchdog is enabled
+# s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
+LEVEL_AFTER, OFF_AFTER = Timeouts().level_out_at_latest, Timeouts().motors_off_at_latest
+OFF_BY_WATCHDOG = Timeouts().keep_alive  # if the emergency-stop watchdog is enabled
 _LONGEST = 4.0  # s that are simulated after the last setpoint, unless the vehicle lies on the floor before
 _MOMENTS = 48  # at which the link is lost
 _STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)

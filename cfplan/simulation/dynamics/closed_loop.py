@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.flight.firmware import MellingerGains, gains_for
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.machine_code import njit
 from cfplan.simulation.dynamics.body import (
@@ -31,9 +32,7 @@ from cfplan.simulation.dynamics.mellinger import (
     FULL_STATE,
     MEMORY_SIZE,
     SETPOINT_SIZE,
-    MellingerGains,
     distribute_power,
-    gains_for,
     step_mellinger,
 )
 from cfplan.vehicle.airframe import Airframe

@@ -13,14 +13,12 @@ integrators and its term on the change of body rates. Runs at 500 Hz inside numb
     control (4,)    thrust, roll, pitch, yaw in 16-bit units
 """
 
-from dataclasses import astuple, dataclass
-
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
-from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import matrix_of, yaw_of
 
 CONTROL_PERIOD = 0.002  # s
@@ -41,44 +39,10 @@ FULL_COMMAND = 65535  # of one motor
 _MOMENT_LIMIT = 32000.0
 
 
-@dataclass(frozen=True, slots=True)
-class MellingerGains:
-    """The parameters of the group ctrlMel, with the firmware's defaults."""
-
-    mass: float = 0.029  # kg; set this to the true mass before a flight
-    mass_thrust: float = 132000.0  # 16-bit units per N
-    kp_xy: float = 0.4
-    kd_xy: float = 0.2
-    ki_xy: float = 0.05
-    i_range_xy: float = 2.0
-    kp_z: float = 1.25
-    kd_z: float = 0.4
-    ki_z: float = 0.05
-    i_range_z: float = 0.4
-    kR_xy: float = 70000.0
-    kw_xy: float = 20000.0
-    ki_m_xy: float = 0.0
-    i_range_m_xy: float = 1.0
-    kR_z: float = 60000.0
-    kw_z: float = 12000.0
-    ki_m_z: float = 500.0
-    i_range_m_z: float = 1500.0
-    kd_omega_rp: float = 200.0
-
-    def pack(self) -> NDArray:
-        """Return the gains (19,) for `step_mellinger`."""
-        return np.array(astuple(self))
-
-
 (
     _MASS, _MASS_THRUST, _KP_XY, _KD_XY, _KI_XY, _I_RANGE_XY, _KP_Z, _KD_Z, _KI_Z, _I_RANGE_Z, _KR_XY, _KW_XY,
     _KI_M_XY, _I_RANGE_M_XY, _KR_Z, _KW_Z, _KI_M_Z, _I_RANGE_M_Z, _KD_OMEGA,
-) = range(19)  # fmt: skip
-
-
-def gains_for(airframe: Airframe) -> MellingerGains:
-    """Return the default gains with the vehicle's own mass and thrust scale, as the pilot sets them."""
-    return MellingerGains(mass=airframe.mass, mass_thrust=airframe.command_per_thrust)
+) = range(19)  # as flight/firmware.py packs the gains  # fmt: skip
 
 
 @njit

@@ -1,18 +1,13 @@
 """The values that parameters have after power-up, and those of them that reach the inner loop."""
 
-from dataclasses import fields
-
+from cfplan.flight.firmware import GAIN_PARAMETERS, MellingerGains
 from cfplan.simulation.dynamics.kalman import Prior
-from cfplan.simulation.dynamics.mellinger import MellingerGains
 from cfplan.simulation.virtual_crazyflie.pid import default_gains, default_limits
 
 PID, MELLINGER = 1, 2
 COMPLEMENTARY, KALMAN = 1, 2
 
 # Parameters in the order in which the compiled loop has them.
-GAIN_PARAMETERS = tuple(
-    "ctrlMel." + {"mass_thrust": "massThrust"}.get(each.name, each.name) for each in fields(MellingerGains)
-)
 PRIOR_PARAMETERS = tuple(
     "kalman." + name
     for name in (

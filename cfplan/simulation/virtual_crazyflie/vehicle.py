@@ -6,13 +6,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.flight.firmware import GAIN_PARAMETERS
 from cfplan.simulation.dynamics.body import MASS, THRUST_MAX
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.commander import Commander, Priority
 from cfplan.simulation.virtual_crazyflie.defaults import (
     COMPLEMENTARY,
     DEFAULTS,
-    GAIN_PARAMETERS,
     KALMAN,
     MELLINGER,
     PID,

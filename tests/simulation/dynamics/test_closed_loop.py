@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cfplan.flight.firmware import MellingerGains
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
 from cfplan.simulation.dynamics.body import hovering
 from cfplan.simulation.dynamics.closed_loop import EstimateErrors, fly_setpoints
-from cfplan.simulation.dynamics.mellinger import MellingerGains
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.airframes import AIRFRAMES
 

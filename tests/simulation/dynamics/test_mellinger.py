@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cfplan.flight.firmware import MellingerGains
 from cfplan.simulation.dynamics.body import BODY_RATE, POSITION, QUATERNION, VELOCITY, at_rest
 from cfplan.simulation.dynamics.mellinger import (
     ABSOLUTE,
@@ -17,7 +18,6 @@ from cfplan.simulation.dynamics.mellinger import (
     ON_BOARD,
     SETPOINT_SIZE,
     VELOCITY_MODE,
-    MellingerGains,
     distribute_power,
     level_out,
     step_mellinger,

@@ -1,0 +1,96 @@
+"""What cfplan knows of crazyflie-firmware: the gains of its Mellinger controller, and its time-outs by version.
+
+Setpoints, dry run and link loss rest on these figures, so preflight reads back what of them a vehicle can tell.
+"""
+
+import re
+from dataclasses import astuple, dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.vehicle.airframe import Airframe
+
+NEWEST_KNOWN = (2026, 8)  # the newest firmware that these figures were read from
+
+
+@dataclass(frozen=True, slots=True)
+class MellingerGains:
+    """The parameters of the group ctrlMel, with the defaults that they have from firmware 2023.11 to 2026.08."""
+
+    mass: float = 0.029  # kg; set this to the true mass before a flight
+    mass_thrust: float = 132000.0  # 16-bit units per N
+    kp_xy: float = 0.4
+    kd_xy: float = 0.2
+    ki_xy: float = 0.05
+    i_range_xy: float = 2.0
+    kp_z: float = 1.25
+    kd_z: float = 0.4
+    ki_z: float = 0.05
+    i_range_z: float = 0.4
+    kR_xy: float = 70000.0
+    kw_xy: float = 20000.0
+    ki_m_xy: float = 0.0
+    i_range_m_xy: float = 1.0
+    kR_z: float = 60000.0
+    kw_z: float = 12000.0
+    ki_m_z: float = 500.0
+    i_range_m_z: float = 1500.0
+    kd_omega_rp: float = 200.0
+
+    def pack(self) -> NDArray:
+        """Return the gains (19,), as the compiled controller takes them."""
+        return np.array(astuple(self))
+
+
+# The parameter of each gain, in the order of `MellingerGains.pack`.
+GAIN_PARAMETERS = tuple(
+    "ctrlMel." + {"mass_thrust": "massThrust"}.get(each.name, each.name) for each in fields(MellingerGains)
+)
+
+
+def gains_for(airframe: Airframe) -> MellingerGains:
+    """Return the default gains with the vehicle's own mass and thrust scale, as the pilot sets them."""
+    return MellingerGains(mass=airframe.mass, mass_thrust=airframe.command_per_thrust)
+
+
+@dataclass(frozen=True, slots=True)
+class Timeouts:
+    """What the supervisor does by itself, and after which time, s."""
+
+    level_out: float = 0.5  # after the last setpoint: x and y are given up, and the vehicle levels out
+    motors_off: float = 2.0  # after the last setpoint: motors off, then locked until restarted
+    keep_alive: float = 1.0  # after the last keep-alive packet, once there was one: motors off
+    still_flying: float = 2.0  # after the last thrust, for which the vehicle counts as flying
+    period: float = 0.04  # between two looks at all that: each comes up to this much later
+
+    @property
+    def level_out_at_latest(self) -> float:
+        """Return when, s after the last setpoint, the vehicle levels out at the latest."""
+        return self.level_out + self.period
+
+    @property
+    def motors_off_at_latest(self) -> float:
+        """Return when, s after the last setpoint, the motors stop at the latest."""
+        return self.motors_off + self.period
+
+
+# Each from this version on; read in supervisor.c of every release from 2023.06 to 2026.08, which agree.
+TIMEOUTS: tuple[tuple[tuple[int, ...], Timeouts], ...] = (((2023, 6), Timeouts()),)
+
+
+def version_of(text: str) -> tuple[int, ...]:
+    """Return the version in what a vehicle says of its firmware: "2025.09.1 (abc)" is (2025, 9, 1), "" is ()."""
+    found = re.match(r"\s*(\d+(?:\.\d+)*)", text)
+    return tuple(int(part) for part in found[1].split(".")) if found else ()
+
+
+def timeouts_of(version: tuple[int, ...]) -> Timeouts:
+    """Return the time-outs of a firmware; one newer than NEWEST_KNOWN is taken to have the newest known ones.
+
+    Raises ValueError for a firmware older than all of `TIMEOUTS`.
+    """
+    for since, timeouts in reversed(TIMEOUTS):
+        if version >= since:
+            return timeouts
+    raise ValueError(f"the time-outs of firmware {'.'.join(map(str, version)) or 'unknown'} are not known")
