@@ -158,7 +158,7 @@ def fly_stepped(
         flown.struck = lab.now
         for fault in scenario.faults if not scenario.from_start else ():
             lab.disturb(fault)
-        lab.stall(scenario.stall)
+        lab.clock.stall(scenario.stall)
         orders.worst, orders.gone = scenario.order, scenario.main_killed
         if scenario.pilot_killed:
             raise PilotKilled
@@ -173,7 +173,7 @@ def fly_stepped(
             if message.phase is Phase.LAND:
                 flown.landing = message.time
             if message.phase is scenario.phase and math.isnan(flown.struck):
-                lab.at(message.time + scenario.moment, strike)
+                lab.clock.at(message.time + scenario.moment, strike)
 
     if scenario.from_start:
         for fault in scenario.faults:
@@ -185,7 +185,6 @@ def fly_stepped(
         report=hear,
         orders=orders,
         clock=lab.clock,
-        sleep=lab.sleep,
     )
     try:
         flown.outcome = pilot.fly()
@@ -194,10 +193,10 @@ def fly_stepped(
         flown.reason = "the pilot was killed"
     except CfplanError as error:
         flown.reason = str(error)
-    lab.sleep(_SETTLING)
+    lab.clock.sleep(_SETTLING)
     flown.truth = lab.truth()
     if flown.truth.position[-1, 2] > _DOWN or flown.truth.motor[-1].any():
-        lab.sleep(_AFTERWARDS)
+        lab.clock.sleep(_AFTERWARDS)
         flown.truth = lab.truth()
     return flown
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from septic_flight import septic_payloads
 
+from cfplan.flight.clock import SteppedClock
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
@@ -73,7 +74,6 @@ class FakeOrders:
 class World:
     """The clock, the vehicle as its link shows it, and motion capture, in one."""
 
-    now: float = 100.0
     position: tuple[float, float, float] = (0.0, 0.5, 0.02)
     yaw: float = 0.0
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -102,7 +102,6 @@ class World:
     forwarded: list[tuple[float, ...]] = field(default_factory=list)
     calls: list[str] = field(default_factory=list)
     signs_of_life: list[float] = field(default_factory=list)
-    events: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
     orders: FakeOrders = field(default_factory=FakeOrders)
     motors_off_in_the_air: float = 0.0
     armed: bool = False
@@ -110,6 +109,7 @@ class World:
     stopped: bool = False
 
     def __post_init__(self) -> None:
+        self.clock = SteppedClock(100.0, self.pass_time)
         self._on_board, self._curve, self._stopping = True, None, -math.inf
         self._poses: list[Pose] = []
         self._count = 0
@@ -121,14 +121,14 @@ class World:
 
     # The clock.
 
-    def clock(self) -> float:
-        return self.now
+    @property
+    def now(self) -> float:
+        return self.clock.now()
 
-    def sleep(self, duration: float) -> None:
-        end = self.now + duration
+    def pass_time(self, end: float) -> None:
         while self.now < end - 1e-12:
             step = min(0.005, end - self.now)
-            self.now += step
+            self.clock.reach(self.now + step)
             self._move(step)
 
     def when(self, phase: Phase, after: float, action: Callable[[], None]) -> None:
@@ -140,7 +140,7 @@ class World:
         if isinstance(message, PhaseEntered):
             for phase, after, action in getattr(self, "_triggers", []):
                 if phase is message.phase:
-                    self.events.append((self.now + after, action))
+                    self.clock.at(self.now + after, action)
 
     @property
     def phases(self) -> list[Phase]:
@@ -151,9 +151,6 @@ class World:
         return "\n".join(message.text for message in self.messages if isinstance(message, Event))
 
     def _move(self, step: float) -> None:
-        for moment, action in [event for event in self.events if event[0] <= self.now]:
-            self.events.remove((moment, action))
-            action()
         before = self.position
         if self._on_board and self._curve is not None:
             start, end, began, duration, landing = self._curve
@@ -312,7 +309,6 @@ def fly(world, mission):
             report=world.report,
             orders=world.orders,
             clock=world.clock,
-            sleep=world.sleep,
         )
         return pilot.fly()
 

@@ -1,11 +1,12 @@
 """Absolute deadlines at a fixed rate, and how late they were met."""
 
 import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from cfplan.flight.clock import REAL_CLOCK, Clock
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,27 +29,22 @@ class Lateness:
 class Deadlines:
     """Deadlines that do not drift: one that is met late does not move the next."""
 
-    def __init__(
-        self,
-        rate: float,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ):
-        self._period, self._clock, self._sleep = 1.0 / rate, clock, sleep
-        self._first, self._count = clock(), 0
+    def __init__(self, rate: float, clock: Clock = REAL_CLOCK):
+        self._period, self._now, self._sleep = 1.0 / rate, clock.now, clock.sleep
+        self._first, self._count = clock.now(), 0
         self.skipped = 0
 
     @property
     def upcoming(self) -> float:
         """The next deadline that is still to come, s."""
-        passed = math.floor((self._clock() - self._first) / self._period)
+        passed = math.floor((self._now() - self._first) / self._period)
         return self._first + (max(self._count, passed) + 1) * self._period
 
     def wait(self) -> float:
         """Sleep until the next deadline that is still to come; return its time, s."""
         self._count += 1
         due = self._first + self._count * self._period
-        now = self._clock()
+        now = self._now()
         if now - due > self._period:
             missed = int((now - due) / self._period)
             self.skipped += missed

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 
 from cfplan.errors import ExitCode
+from cfplan.flight.clock import Clock
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.mission import Mission
@@ -16,8 +17,8 @@ SETTLED_WITHIN = 0.03  # m, from where the motion ended
 class FlightHistory:
     """Collects what happens and reports it as telemetry."""
 
-    def __init__(self, report: Callable[[Telemetry], None], clock: Callable[[], float]):
-        self.report, self._clock = report, clock
+    def __init__(self, report: Callable[[Telemetry], None], clock: Clock):
+        self.report, self._now = report, clock.now
         self.phases: list[tuple[Phase, float]] = []  # each with the time, s, at which it was entered
         self.checks: tuple[Check, ...] = ()  # the preflight table
         self.late: list[float] = []  # s by which the plan's setpoints were late
@@ -30,13 +31,13 @@ class FlightHistory:
 
     def enter(self, phase: Phase) -> None:
         """Note and report that a phase begins now."""
-        now = self._clock()
+        now = self._now()
         self.phases.append((phase, now))
         self.report(PhaseEntered(now, phase))
 
     def say(self, level: Level, text: str) -> None:
         """Report an event."""
-        self.report(Event(self._clock(), level, text))
+        self.report(Event(self._now(), level, text))
 
     def outcome(self, mission: Mission, exit_code: ExitCode, reason: str, last_pose: Pose | None) -> FlightOutcome:
         """Return how the flight went."""
@@ -48,7 +49,7 @@ class FlightHistory:
             checks=self.checks,
             phases=tuple(self.phases),
             first_setpoint=start,
-            flown=min((self.stopped_at or self._clock()) - start, ends) if start else 0.0,
+            flown=min((self.stopped_at or self._now()) - start, ends) if start else 0.0,
             lateness=Lateness.of(self.late, self.skipped),
             deviation=Deviation.of([sample for sample in self.off_plan if sample[0] <= ends]),
             settled_after=settle_time([(t - ends, off) for t, off in self.off_plan if t > ends], SETTLED_WITHIN),

@@ -7,11 +7,11 @@ wait.
 """
 
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.pose_gate import PoseGate
 from cfplan.flight.mocap.pose_predictor import PosePredictor
 from cfplan.flight.mocap.poses import Pose, PoseSource
@@ -62,14 +62,13 @@ class FlightLoop:
         source: PoseSource,
         orders: OrderSource,
         history: FlightHistory,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        clock: Clock = REAL_CLOCK,
     ):
-        self.mission, self.limits, self.history, self.now = mission, mission.limits, history, clock
-        self._source, self._orders, self._sleep = source, orders, sleep
+        self.mission, self.limits, self.history, self.now = mission, mission.limits, history, clock.now
+        self._source, self._orders, self._clock = source, orders, clock
         self._monitor, self._pose_gate = AbortMonitor(mission.limits), PoseGate(mission.limits.pose.jump)
         self._predictor = PosePredictor()
-        self._deadlines = Deadlines(mission.rate, clock, sleep)
+        self._deadlines = Deadlines(mission.rate, clock)
         self._link: Link | None = None
         self._feeding = False  # poses are read and forwarded
         self.airborne = False
@@ -229,7 +228,7 @@ class FlightLoop:
 
     def restart_deadlines(self) -> None:
         """Count deadlines from now on; those that something slow on the ground has missed do not count."""
-        self._deadlines = Deadlines(self.mission.rate, self.now, self._sleep)
+        self._deadlines = Deadlines(self.mission.rate, self._clock)
 
     @property
     def skipped(self) -> int:

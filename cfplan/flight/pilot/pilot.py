@@ -5,12 +5,12 @@ commander: the commander gets its command first, and the priority only when it h
 """
 
 import math
-import time
 from collections.abc import Callable
 
 import numpy as np
 
 from cfplan.errors import CfplanError, ExitCode, PreflightError
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.pilot.abort_monitor import Abort, safety_abort
 from cfplan.flight.pilot.flight_history import FlightHistory
@@ -52,13 +52,12 @@ class Pilot:
         report: Callable[[Telemetry], None],
         orders: OrderSource,
         enter_real_time: Callable[[], None] = lambda: None,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        clock: Clock = REAL_CLOCK,
     ):
         self._mission, self._limits = mission, mission.limits
         self._connect, self._enter_real_time = connect, enter_real_time
         self._history = FlightHistory(report, clock)
-        self._loop = FlightLoop(mission, source, orders, self._history, clock, sleep)
+        self._loop = FlightLoop(mission, source, orders, self._history, clock)
         self._floor = 0.0  # m, height of the tracked body before take-off
 
     def fly(self) -> FlightOutcome:

@@ -7,13 +7,13 @@ driver: cflib's own sending holds a lock while a dying link joins the thread tha
 import math
 import struct
 import threading
-import time
 from collections.abc import Callable, Sequence
 from typing import IO, Any
 
 import numpy as np
 
 from cfplan.errors import LinkError
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.setpoints.packets import decompress_quaternion
 from cfplan.flight.telemetry import Estimate, Telemetry, Triple, VehicleStatus
 from cfplan.vehicle.airframe import GRAVITY
@@ -44,7 +44,7 @@ class Link:
         crazyflie: Any,
         uri: str,
         report: Callable[[Telemetry], None],
-        clock: Callable[[], float] = time.monotonic,
+        clock: Clock = REAL_CLOCK,
         radio_lock: IO[str] | None = None,  # keeps other pilots from the radio until the link closes
     ):
         self._crazyflie, self.uri, self._report, self._clock = crazyflie, uri, report, clock
@@ -151,7 +151,7 @@ class Link:
         try:
             self._crazyflie.param.set_value(name, value)
             self._crazyflie.param.request_param_update(name)
-            if not answered.wait(patience):
+            if not self._clock.wait(answered, patience):
                 raise LinkError(f"no answer to setting {name}", where=self.uri, hint="check the radio link")
         except (KeyError, AttributeError) as error:
             raise LinkError(
@@ -206,7 +206,7 @@ class Link:
 
     def _when(self, stamp_ms: int) -> float:
         """Return when, s, the vehicle wrote a message: after a pause of the radio, old ones arrive."""
-        now = self._clock()
+        now = self._clock.now()
         zero = now - stamp_ms * _MILLI
         if abs(zero - self._log_zero) > _STAMPS_WRAP / 2:  # the first, or the vehicle's 24 bits began anew
             self._log_zero = zero

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from cfplan.flight.clock import BEGIN, SteppedClock
 from cfplan.simulation.lab.lab import MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME, Fault, Truth
 from cfplan.simulation.lab.radio import Radio, RadioFault
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
@@ -18,13 +19,12 @@ from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
 from cfplan.simulation.virtual_vicon.server import Picture
 from cfplan.vehicle.airframe import Airframe
 
-BEGIN = 1000.0  # s, where the clock starts
 _WARM_UP = 200  # ms
 _RECONNECTS_AFTER = 0.3  # s after the cameras' connection is possible again
 
 
 class SteppedLab:
-    """A stepped lab: `clock` and `sleep` are for the pilot, `heard` is called with each packet from the vehicle."""
+    """A stepped lab: `clock` is the pilot's too, `heard` is called with each packet from the vehicle."""
 
     def __init__(
         self,
@@ -37,40 +37,19 @@ class SteppedLab:
         self.vehicle = VirtualCrazyflie(airframe, vehicle)
         self.vehicle.advance(_WARM_UP)
         self.vehicle.sent()
-        self.now = BEGIN
+        self.clock = SteppedClock(BEGIN, self._advance)
         self.radio = Radio(BEGIN, seed=11 + seed)
         self.cameras = Cameras(cameras or ViconSettings(seed=7 + seed), BEGIN)
         self.heard: Callable[[bytes], None] = lambda _: None
         self._origin = BEGIN - self.vehicle.tick / 1000
         self._pictures: list[tuple[float, Picture]] = []
         self._connected_from = BEGIN
-        self._events: list[tuple[float, Callable[[], None]]] = []
-        self._stalled = 0.0
         self._rows: list[np.ndarray] = []
 
-    # The pilot's clock.
-
-    def clock(self) -> float:
-        return self.now
-
-    def sleep(self, duration: float) -> None:
-        """Let time pass, and more of it if the pilot's computer stands still."""
-        end = self.now + max(duration, 0.0)
-        self._run_until(end)
-        while self._stalled:
-            end, self._stalled = self.now + self._stalled, 0.0
-            self._run_until(end)
-
-    def stall(self, duration: float) -> None:
-        """Let the pilot's computer stand still for `duration`, s, from its next sleep on."""
-        self._stalled += duration
-
-    # Events and faults.
-
-    def at(self, time: float, action: Callable[[], None]) -> None:
-        """Call `action` at a time, s; what it raises comes out of the pilot's sleep."""
-        self._events.append((time, action))
-        self._events.sort(key=lambda event: event[0])
+    @property
+    def now(self) -> float:
+        """The time, s."""
+        return self.clock.now()
 
     def disturb(self, fault: Fault) -> None:
         """Let something go wrong; its start counts from now."""
@@ -91,19 +70,12 @@ class SteppedLab:
         rows = np.array(self._rows).reshape(-1, ROW_SIZE)
         return Truth.of(rows, self.vehicle.supervisor.ever_locked)
 
-    def _run_until(self, end: float) -> None:
-        while self._events and self._events[0][0] <= end:
-            time, action = self._events.pop(0)
-            self._advance(time)
-            action()
-        self._advance(end)
-
     def _advance(self, end: float) -> None:
         """Advance the vehicle by milliseconds, from one event to the next."""
         target = int((end - self._origin) * 1000 + 1e-6)
         while self.vehicle.tick < target:
             tick = self.vehicle.tick
-            self.now = self._origin + tick / 1000
+            self.clock.reach(self._origin + tick / 1000)
             self._exchange()
             self._look()
             if tick % COMMANDER_PERIOD == 0:
@@ -113,7 +85,7 @@ class SteppedLab:
             self.vehicle.advance(step)
             for packet in self.vehicle.sent():
                 self.radio.answer(packet)
-        self.now = max(end, self.now)
+        self.clock.reach(end)
         self._exchange()
 
     def _next_look(self) -> int:

@@ -49,7 +49,7 @@ class SteppedLink(Link):
         """Send a packet as the radio's driver does: wait briefly for its queue, then drop the packet."""
         until = self._lab.now + PATIENCE
         while self._lab.radio.full and self._lab.now < until:
-            self._lab.sleep(_STEP)
+            self._lab.clock.sleep(_STEP)
         self._lab.radio.send(bytes((packet.header,)) + bytes(packet.data))
 
     def has_parameter(self, name: str) -> bool:
@@ -98,7 +98,7 @@ class SteppedLink(Link):
             self._lab.radio.send(pack(port, channel, payload))
             again = self._lab.now + max(_ASK_AGAIN, self._lab.vehicle.settings.parameter_delay)
             while self._lab.now < min(again, end):
-                self._lab.sleep(_STEP)
+                self._lab.clock.sleep(_STEP)
                 for came in self._answers:
                     if came[:2] == (port, channel) and came[2].startswith(head):
                         return came[2]
@@ -121,13 +121,13 @@ class SteppedLink(Link):
 
 def connect(lab: SteppedLab, report: Callable[[Telemetry], None]) -> SteppedLink:
     """Connect, as `cfplan.flight.radio.connection.connect` does."""
-    lab.sleep(0.1)
+    lab.clock.sleep(0.1)
     link = SteppedLink(lab, report)
     link.release_priority()
     link.ask_firmware()
     end = lab.now + _PATIENCE
     while not link.firmware and lab.now < end:
-        lab.sleep(_STEP)
+        lab.clock.sleep(_STEP)
     if not link.firmware:
         raise LinkError("nothing answers", where=URI, hint=f"port {PLATFORM_PORT} is silent")
     return link

@@ -46,17 +46,7 @@ def test_good_poses_are_forwarded_while_the_stream_runs(world, fly):
 
 
 def test_a_late_tick_carries_the_setpoint_of_its_moment(world, mission, fly):
-    stalls = iter([0.05])
-    honest = world.sleep
-
-    def sleep(duration: float) -> None:
-        honest(duration)
-        if Phase.STREAM in world.phases and world.now > world.stall_at:
-            honest(next(stalls, 0.0))
-
-    world.stall_at = math.inf
-    world.when(Phase.STREAM, 1.0, lambda: setattr(world, "stall_at", world.now))
-    world.sleep = sleep
+    world.when(Phase.STREAM, 1.0, lambda: world.clock.stall(0.05))
     outcome = fly()
     sent = [message for message in world.messages if isinstance(message, SetpointSent)]
     assert outcome.exit_code is ExitCode.OK

@@ -3,22 +3,10 @@
 import numpy as np
 import pytest
 
+from cfplan.flight.clock import SteppedClock
 from cfplan.flight.pilot.deadlines import Deadlines, Lateness
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.setpoints.packets import decode
-
-
-class Clock:
-    """Moves when it is slept on, and late by whatever is wished."""
-
-    def __init__(self):
-        self.now, self.oversleep = 10.0, 0.0
-
-    def __call__(self):
-        return self.now
-
-    def sleep(self, duration):
-        self.now += duration + self.oversleep
 
 
 @pytest.fixture
@@ -51,22 +39,21 @@ def test_the_reference_between_setpoints_is_between_them(payloads):
 
 
 def test_deadlines_do_not_drift_when_every_sleep_is_long():
-    clock = Clock()
-    deadlines = Deadlines(100.0, clock, clock.sleep)
-    clock.oversleep = 0.002
+    clock = SteppedClock(10.0, lambda end: clock.reach(end + 0.002))
+    deadlines = Deadlines(100.0, clock)
     due = [deadlines.wait() for _ in range(500)]
     assert due == pytest.approx(10.0 + np.arange(1, 501) / 100.0)
     assert deadlines.skipped == 0
 
 
 def test_a_stall_skips_deadlines_and_keeps_the_schedule():
-    clock = Clock()
-    deadlines = Deadlines(100.0, clock, clock.sleep)
+    clock = SteppedClock(10.0)
+    deadlines = Deadlines(100.0, clock)
     deadlines.wait()
-    clock.now += 0.2
+    clock.sleep(0.2)
     due = deadlines.wait()
-    assert due <= clock.now
-    assert clock.now - due < 0.0101
+    assert due <= clock.now()
+    assert clock.now() - due < 0.0101
     assert (due - 10.0) * 100.0 == pytest.approx(round((due - 10.0) * 100.0))
     assert deadlines.skipped in (18, 19)
 

@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 
 from cfplan.errors import LinkError
+from cfplan.flight.clock import BEGIN
 from cfplan.flight.telemetry import Estimate, VehicleStatus
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
-from cfplan.simulation.lab.stepped_lab import BEGIN, SteppedLab
+from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
@@ -31,19 +32,19 @@ def poses(lab):
 
 
 def test_time_goes_on_only_while_somebody_sleeps(lab):
-    assert lab.clock() == BEGIN
-    lab.sleep(0.25)
-    assert lab.clock() == pytest.approx(BEGIN + 0.25)
-    lab.stall(0.5)
-    lab.sleep(0.01)
-    assert lab.clock() == pytest.approx(BEGIN + 0.76)
+    assert lab.now == BEGIN
+    lab.clock.sleep(0.25)
+    assert lab.now == pytest.approx(BEGIN + 0.25)
+    lab.clock.stall(0.5)
+    lab.clock.sleep(0.01)
+    assert lab.now == pytest.approx(BEGIN + 0.76)
 
 
 def test_what_is_to_happen_happens_at_its_time(lab):
     seen = []
     for moment in (0.3, 0.1):
-        lab.at(BEGIN + moment, lambda: seen.append(lab.clock()))
-    lab.sleep(1.0)
+        lab.clock.at(BEGIN + moment, lambda: seen.append(lab.now))
+    lab.clock.sleep(1.0)
     assert seen == pytest.approx([BEGIN + 0.1, BEGIN + 0.3])
 
 
@@ -51,7 +52,7 @@ def test_the_link_hears_logs_dated_when_they_were_written(lab):
     heard = []
     link = connect(lab, heard.append)
     link.start_logs()
-    lab.sleep(1.0)
+    lab.clock.sleep(1.0)
     estimates = [message for message in heard if isinstance(message, Estimate)]
     assert len(estimates) == pytest.approx(100, abs=3)
     assert len([message for message in heard if isinstance(message, VehicleStatus)]) == pytest.approx(50, abs=3)
@@ -61,13 +62,13 @@ def test_the_link_hears_logs_dated_when_they_were_written(lab):
 def test_what_a_dead_radio_held_is_known_to_be_old(lab):
     link = connect(lab, lambda message: None)
     link.start_logs()
-    lab.sleep(1.0)
+    lab.clock.sleep(1.0)
     lab.disturb(RadioFault(RadioFaultKind.DEAD, 0.0, 0.6))
-    lab.sleep(0.605)
+    lab.clock.sleep(0.605)
     assert link.estimate is not None
-    assert lab.clock() - link.estimate.time > 0.5  # it came just now
-    lab.sleep(0.5)
-    assert lab.clock() - link.estimate.time < 0.05
+    assert lab.now - link.estimate.time > 0.5  # it came just now
+    lab.clock.sleep(0.5)
+    assert lab.now - link.estimate.time < 0.05
 
 
 def test_parameters_are_set_and_read_back(lab):
@@ -85,28 +86,28 @@ def test_a_slow_vehicle_is_waited_for_and_a_silent_one_is_not():
 
 
 def test_poses_are_where_the_vehicle_is_ten_milliseconds_late(lab, poses):
-    lab.sleep(3.0)
+    lab.clock.sleep(3.0)
     found = poses.poses()
     assert len(found) == pytest.approx(300, abs=3)
     assert found[-1].position == pytest.approx((0.0, 0.0, 0.0), abs=5e-3)
-    assert lab.clock() - found[-1].time == pytest.approx(0.015, abs=0.01)
+    assert lab.now - found[-1].time == pytest.approx(0.015, abs=0.01)
 
 
 @pytest.mark.parametrize(
     "kind", [FaultKind.OCCLUDE, FaultKind.STALL, FaultKind.FREEZE, FaultKind.BREAK, FaultKind.CLOSE]
 )
 def test_faulty_poses_never_come_out(lab, poses, kind):
-    lab.sleep(3.0)
+    lab.clock.sleep(3.0)
     poses.poses()
     lab.disturb(ViconFault(kind, 0.0, 1.0))
-    lab.sleep(0.9)
+    lab.clock.sleep(0.9)
     assert len(poses.poses()) <= 2
-    lab.sleep(1.0)
+    lab.clock.sleep(1.0)
     assert len(poses.poses()) > 30
 
 
 def test_the_truth_is_recorded_a_hundred_times_a_second(lab):
-    lab.sleep(1.0)
+    lab.clock.sleep(1.0)
     truth = lab.truth()
     assert len(truth.time) == pytest.approx(100, abs=2)
     assert not truth.locked
