@@ -8,8 +8,9 @@ from cfplan.errors import InputError
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.solution import Solution, Status
-from cfplan.safety.feasibility import infeasible_limit, violated_limit
+from cfplan.safety.feasibility import BOUNDARY_TOLERANCE, infeasible_limit, violated_limit
 from cfplan.safety.limits import PlanLimits
+from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
 
@@ -32,6 +33,7 @@ class PlanningTask:
     yaw_angle: float = 0.0  # rad: held where yaw is FIXED, else where it begins
     start: BoundaryState | None = None  # None: free within the limits (a rest end)
     end: BoundaryState | None = None
+    speed_caps: SpeedCaps | None = None  # along the path, besides the limit on speed
     refusal: Solution | None = field(init=False, compare=False, repr=False)
     """The answer of a planner that keeps all limits and boundary states, where no search is needed to see that none
     can be kept: the limits exclude hovering, or a boundary state breaks them. Other planners may answer otherwise."""
@@ -42,6 +44,11 @@ class PlanningTask:
         for name, boundary in (("start", self.start), ("end", self.end)):
             if boundary and not all(math.isfinite(value) for value in astuple(boundary)):
                 raise InputError(f"the {name} state is not finite: {boundary}")
+        if self.speed_caps and not self.speed_caps.lie_within(self.path.end):
+            raise InputError(
+                f"speed caps from s = {self.speed_caps.s[0]:g} to {self.speed_caps.s[-1]:g} leave the path, which ends "
+                f"at {self.path.end:g}"
+            )
         object.__setattr__(self, "refusal", self._refuse())
 
     def _refuse(self) -> Solution | None:
@@ -50,7 +57,14 @@ class PlanningTask:
         for name, boundary, s in (("start", self.start, 0.0), ("end", self.end, self.path.end)):
             if boundary and (reason := violated_limit(boundary, self.path, s, self.airframe, self.limits)):
                 return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
+            if boundary and self.speed_caps and (reason := self._violated_cap(boundary, s)):
+                return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
         return None
+
+    def _violated_cap(self, boundary: BoundaryState, s: float) -> str:
+        assert self.speed_caps
+        speed, cap = math.sqrt(boundary.h) * math.hypot(*self.path(s, 1)), float(self.speed_caps.at(s))
+        return f"speed is {speed:.4g} m/s, the cap {cap:.4g} m/s" if speed > (1.0 + BOUNDARY_TOLERANCE) * cap else ""
 
     def check_nodes(self) -> None:
         """Refuse fewer nodes than the path has shape for; for planners that lay a spline over the grid.

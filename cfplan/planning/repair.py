@@ -56,11 +56,11 @@ def repair(task: PlanningTask, profile: SpeedProfile, space: Space | None = None
         InfeasibleError: hovering, or the path itself, breaks a limit; says which.
         NotCertifiedError: the profile is not finite, not smooth, or h is not positive.
     """
-    path, airframe, limits = task.path, task.airframe, task.limits
+    path, airframe, limits, caps = task.path, task.airframe, task.limits, task.speed_caps
     before = duration_of(profile)
-    if not violates_at_nodes(path, profile, airframe, limits):
+    if not violates_at_nodes(path, profile, airframe, limits, caps):
         trajectory = Trajectory(path, profile, airframe)
-        certificate = certify(trajectory, limits, space)
+        certificate = certify(trajectory, limits, space, caps)
         if certificate.passed:
             return Repaired(trajectory, certificate, 1.0, trajectory.duration)
     for solution in refinements(task, profile):
@@ -68,10 +68,10 @@ def repair(task: PlanningTask, profile: SpeedProfile, space: Space | None = None
             return slow(task, profile, space, failed=solution.reason)
         refined, joints = solution.profile, solution.joints
         trajectory = Trajectory(path, refined, airframe)
-        certificate = certify(trajectory, limits, space)
+        certificate = certify(trajectory, limits, space, caps)
         if certificate.passed:
             break
-    slowed = slow_until_certified(trajectory, limits, space, certificate)
+    slowed = slow_until_certified(trajectory, limits, space, certificate, caps)
     return Repaired(
         slowed.trajectory, slowed.certificate, slowed.speed_factor, before, *_where_slower(profile, refined),
         joints=joints,
@@ -81,7 +81,7 @@ def repair(task: PlanningTask, profile: SpeedProfile, space: Space | None = None
 def slow(task: PlanningTask, profile: SpeedProfile, space: Space | None = None, *, failed: str = "") -> Repaired:
     """Slow the profile as a whole until it passes; one that does stays as it is. Raises as repair()."""
     trajectory = Trajectory(task.path, profile, task.airframe)
-    slowed = slow_until_certified(trajectory, task.limits, space)
+    slowed = slow_until_certified(trajectory, task.limits, space, caps=task.speed_caps)
     return Repaired(slowed.trajectory, slowed.certificate, slowed.speed_factor, trajectory.duration, failed=failed)
 
 

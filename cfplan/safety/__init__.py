@@ -1,3 +1,13 @@
 """What is allowed: limits from safety.yaml, the space, the certificate, and slowing until it passes."""
 
-__all__ = ["certificate", "feasibility", "limit_sets", "limits", "limits_file", "quantities", "slowing", "space"]
+__all__ = [
+    "certificate",
+    "feasibility",
+    "limit_sets",
+    "limits",
+    "limits_file",
+    "quantities",
+    "slowing",
+    "space",
+    "speed_caps",
+]

@@ -20,6 +20,7 @@ from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import AT_LEAST, QUANTITIES, Quantity
 from cfplan.safety.space import Space
+from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.dense import Segments
@@ -32,7 +33,9 @@ BATCH = 1_000  # samples at a time, about: as many as stay near the processor
 BLOCK = 512  # samples searched for a peak at once
 LEAST_POINTS = 11  # of a piece, its ends included
 WALLS = "distance to the walls"
+CAPPED_SPEED = "speed, capped"  # against the caps along the path, where there are any
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
+_SAME = 1e-12  # share of a path's length in s, nearer than which two places are one
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,16 +110,21 @@ class _Bound(NamedTuple):
     unused: float
 
 
-def certify(trajectory: Trajectory, limits: PlanLimits, space: Space | None = None) -> Certificate:
-    """Check every limit everywhere; the space too, where given. Never raises: what is not a number fails."""
+def certify(
+    trajectory: Trajectory, limits: PlanLimits, space: Space | None = None, caps: SpeedCaps | None = None
+) -> Certificate:
+    """Check every limit everywhere; space and speed caps too, where given. Never raises: what is not a number fails."""
     segments, (bounds, table) = _segments(trajectory), _bounds(trajectory.airframe, limits, space)
     walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
     source = dense.sample_source(trajectory.airframe, trajectory.path, trajectory.profile)
     values, places = _search(table, walls, BATCH, source, segments)
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     peaks = zip(bounds, values.tolist(), when, places.tolist(), where, strict=True)
+    margins = [_margin(*each) for each in peaks]
+    if caps is not None:
+        margins.append(_capped_speed(trajectory, caps, segments))
     return Certificate(
-        margins=tuple(_margin(*each) for each in peaks),
+        margins=tuple(margins),
         duration=trajectory.duration,
         samples=int(segments.counts.sum()),
     )
@@ -167,6 +175,36 @@ def _margin(bound: _Bound, peak: float, time: float, s: float, position: Sequenc
     )
 
 
+def _capped_speed(trajectory: Trajectory, caps: SpeedCaps, segments: Segments) -> Margin:
+    """Return the margin of speed against caps, sampled as the rest is, and also where caps bend and half-way between.
+
+    A place where they bend is an end, so no allowance is made across it.
+    """
+    steps = np.repeat((segments.right - segments.left) / (segments.counts - 1), segments.counts)
+    number = np.arange(len(steps)) - np.repeat(np.cumsum(segments.counts) - segments.counts, segments.counts)
+    bends, end = np.array(caps.s), trajectory.path.end
+    s = np.concatenate(
+        [np.repeat(segments.left, segments.counts) + number * steps, bends, (bends[1:] + bends[:-1]) / 2]
+    )
+    s = np.unique(s[s <= end])
+    s = s[np.append(True, np.diff(s) > _SAME * end)]
+    cap = caps.at(s)
+    square = trajectory.profile.at(s).h * np.square(trajectory.path(s, 1)).sum(axis=1) / cap**2
+    gap = np.diff(s)
+    sag = np.maximum(-np.diff(np.diff(square) / gap) * 2.0 / (gap[1:] + gap[:-1]), 0.0)  # second derivative downwards
+    at_bends = np.searchsorted(s, bends - 2.0 * _SAME * end)
+    sag[at_bends[(at_bends > 0) & (at_bends < len(s) - 1)] - 1] = 0.0
+    widest = np.maximum(gap[1:], gap[:-1])
+    bound = np.maximum(np.maximum(square[:-2], square[1:-1]), square[2:]) + _ALLOWANCE * widest**2 * sag
+    index = int(np.argmax(np.where(np.isnan(bound), np.inf, bound)))
+    share, at = math.sqrt(bound[index]), index + int(np.argmax(square[index : index + 3]))
+    x, y, z = trajectory.path(s[at]).tolist()
+    return Margin(
+        CAPPED_SPEED, "m/s", share * float(cap[at]), float(cap[at]), share, float(trajectory.time_at(s[at])),
+        float(s[at]), (x, y, z),
+    )  # fmt: skip
+
+
 def _segments(trajectory: Trajectory) -> Segments:
     """Cut at the grid points, at the breaks of the path, and where the timing was refined because h changes fast."""
     timing, path = trajectory.timing, trajectory.path
@@ -181,7 +219,7 @@ def _cut(
     """Return what `_segments` does, of the timing's pieces, which end at `s`, and its profile's table."""
     edges, count = every.copy(), 1
     for n in range(1, len(every)):
-        if every[n] - every[n - 1] > 1e-12 * every[-1]:
+        if every[n] - every[n - 1] > _SAME * every[-1]:
             edges[count] = every[n]
             count += 1
     edges = edges[:count]

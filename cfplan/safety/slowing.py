@@ -10,6 +10,7 @@ from cfplan.safety.feasibility import describe_hover, hover_violation
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import QUANTITIES
 from cfplan.safety.space import Space
+from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -29,7 +30,11 @@ class Slowed:
 
 
 def slow_until_certified(
-    trajectory: Trajectory, limits: PlanLimits, space: Space | None = None, certificate: Certificate | None = None
+    trajectory: Trajectory,
+    limits: PlanLimits,
+    space: Space | None = None,
+    certificate: Certificate | None = None,
+    caps: SpeedCaps | None = None,
 ) -> Slowed:
     """Return the trajectory itself where it passes, else at the largest speed factor that does, within RESOLUTION.
 
@@ -38,7 +43,7 @@ def slow_until_certified(
     Raises:
         InfeasibleError: no speed factor passes, because hovering or the path itself breaks a limit; says which.
     """
-    certificate = certificate or certify(trajectory, limits, space)
+    certificate = certificate or certify(trajectory, limits, space, caps)
     if certificate.passed:
         return Slowed(trajectory, certificate, 1.0)
     _check_hover(trajectory.airframe, limits)
@@ -57,7 +62,7 @@ def slow_until_certified(
         except NotCertifiedError:  # longer than any flight: too slow
             low = square
             continue
-        certificate = certify(slower, limits, space)
+        certificate = certify(slower, limits, space, caps)
         if certificate.passed:
             low, low_excess = square, _excess(certificate)
             best = Slowed(slower, certificate, square**0.5)

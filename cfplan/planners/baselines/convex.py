@@ -8,6 +8,7 @@ limits, and is as slow after repair as that costs.
 """
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import copp_py
@@ -22,6 +23,7 @@ from cfplan.planners.baselines.selection import select_fastest
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.limits import PlanLimits
+from cfplan.safety.speed_caps import allowed_speed
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.yaw_spline import YawSpline
 
@@ -74,8 +76,10 @@ def plan_convex(task: PlanningTask) -> Solution:
     airframe, limits, boundary = task.airframe, task.limits, _boundary(task)
     at = stations(task.path, spacing=PLAN_SPACING, turn=PLAN_TURN)
     fastest = np.full(len(at.length), limits.speed)
+    rows = inner_rows(at, airframe, limits, fastest)
+    rows = replace(rows, ceiling=np.minimum(rows.ceiling, allowed_speed(limits.speed, task.speed_caps, at.s) ** 2))
     try:
-        speeds = _solved(at, inner_rows(at, airframe, limits, fastest), boundary)
+        speeds = _solved(at, rows, boundary)
     except InfeasibleError as error:
         return Solution(Status.INFEASIBLE, None, str(error))
     along = YawSpline.along(task.path, task.nodes, task.yaw, task.yaw_angle)

@@ -28,7 +28,7 @@ def plan_min_snap(task: PlanningTask) -> Solution:
         grid, np.full(nodes + 1, fastest**2), zeros, zeros, zeros[1:], turning.yaw, turning.dyaw, turning.ddyaw
     )
     try:
-        slowed = slow_until_certified(Trajectory(path, profile, airframe), limits)
+        slowed = slow_until_certified(Trajectory(path, profile, airframe), limits, caps=task.speed_caps)
     except (InfeasibleError, NotCertifiedError) as error:
         return Solution(Status.INFEASIBLE, None, str(error))
     stats: dict[str, float | int | str] = {

@@ -6,8 +6,8 @@ import numpy as np
 
 from cfplan.errors import NotCertifiedError
 from cfplan.planners.task import PlanningTask
-from cfplan.safety.certificate import Certificate, certify
-from cfplan.safety.quantities import BY_NAME
+from cfplan.safety.certificate import CAPPED_SPEED, Certificate, certify
+from cfplan.safety.quantities import QUANTITIES
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -17,7 +17,7 @@ def select_fastest(task: PlanningTask, profiles: Iterable[SpeedProfile]) -> Spee
     best, least = None, np.inf
     for profile in profiles:
         try:
-            certificate = certify(Trajectory(task.path, profile, task.airframe), task.limits)
+            certificate = certify(Trajectory(task.path, profile, task.airframe), task.limits, caps=task.speed_caps)
         except NotCertifiedError:  # h falls to zero somewhere
             continue
         factor = _speed_factor(certificate)
@@ -28,7 +28,8 @@ def select_fastest(task: PlanningTask, profiles: Iterable[SpeedProfile]) -> Spee
 
 def _speed_factor(certificate: Certificate) -> float:
     """Return the factor on speed at which every limit would hold if each share grew as a power of speed."""
-    shares = [margin.share ** (1 / BY_NAME[margin.name].power) for margin in certificate.margins if not margin.passed]
+    powers = {quantity.name: quantity.power for quantity in QUANTITIES} | {CAPPED_SPEED: 1}
+    shares = [margin.share ** (1 / powers[margin.name]) for margin in certificate.margins if not margin.passed]
     if any(np.isnan(share) for share in shares):
         return 0.0
     return 1.0 / max(shares, default=1.0)

@@ -18,6 +18,7 @@ from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.feasibility import spare_turning
 from cfplan.safety.limits import PlanLimits
+from cfplan.safety.speed_caps import allowed_speed
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile_spline import profile_through
 from cfplan.vehicle.rotations import hopf_quaternion, product
@@ -115,7 +116,8 @@ def _bounds(task: PlanningTask, grid: NDArray, yaw: YawMode) -> dict[str, NDArra
     count = len(grid)
     low, high = np.full((count, VARIABLES), -np.inf), np.full((count, VARIABLES), np.inf)
     square = np.maximum(np.sum(path(grid, 1) ** 2, axis=1), 1e-12)
-    low[:, 0], high[:, 0] = H_LEAST, np.maximum(limits.speed**2 / square, 2 * H_LEAST)
+    speed = allowed_speed(limits.speed, task.speed_caps, grid)
+    low[:, 0], high[:, 0] = H_LEAST, np.maximum(speed**2 / square, 2 * H_LEAST)
     high[:, 0] = np.minimum(high[:, 0], _end_caps(path, grid, airframe, limits))
     low[:, 12:16] = limits.motor_thrust_min / airframe.hover_thrust
     high[:, 12:16] = limits.motor_thrust_max / airframe.hover_thrust

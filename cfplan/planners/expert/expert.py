@@ -50,7 +50,7 @@ def plan_expert(task: PlanningTask, *, penalties: Penalties | None = None, windo
     path, limits, nodes = task.path, task.limits, task.nodes
     yaw = YawSpline.along(path, nodes, task.yaw, task.yaw_angle, task.start, task.end)
     shape = Shape(nodes, task.yaw is YawMode.FREE, turning_limited=limits.angular_acceleration < math.inf)
-    whole = Segment(path, task.airframe, limits, Ends(task.start, task.end), yaw, layout_of(shape))
+    whole = Segment(path, task.airframe, limits, Ends(task.start, task.end), yaw, layout_of(shape), task.speed_caps)
 
     def search(segment: Segment, _near: NDArray) -> Tightened | str:
         problem = build_problem(segment, task.yaw_angle, penalties)

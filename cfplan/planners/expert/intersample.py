@@ -9,9 +9,10 @@ from cfplan.geometry.path import Path
 from cfplan.safety import quantities
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import scaled
+from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.measures import MEASURES
+from cfplan.vehicle.measures import MEASURES, SPEED
 from cfplan.vehicle.profile import SpeedProfile
 
 COUNT = 17  # places an interval
@@ -48,7 +49,7 @@ class Violation:
 class DensePath:
     """A path's derivatives at many places of every interval, evaluated once."""
 
-    def __init__(self, path: Path, nodes: int, held: NDArray) -> None:
+    def __init__(self, path: Path, nodes: int, held: NDArray, caps: SpeedCaps | None = None) -> None:
         """Take `held`, (N,): how far, 0 to 1, a boundary state decides each interval; its violation counts less."""
         self.held = held[:, None]
         step = path.end / nodes
@@ -67,6 +68,7 @@ class DensePath:
         self.derivatives = np.concatenate(
             [_by_place(path, step * (which[:, None] + places)) for which, places in self.groups], axis=2
         )
+        self.caps = None if caps is None else caps.at(step * self.interval + self.places)
 
     def violation(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Violation:
         """Return the violation by a profile with as many intervals; h must be positive."""
@@ -77,6 +79,7 @@ class DensePath:
     def _extremes(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> tuple[NDArray, NDArray]:
         """Return the highest and the lowest value of each row in each interval, (MEASURES, N)."""
         at = dense.dense_rows(airframe, self.derivatives, profile, self.places, self.interval)
+        _count_against_caps(at, self.caps, limits)
         highest, lowest = (np.empty((MEASURES, len(profile.dddh))) for _ in range(2))
         end = 0
         for which, places in self.groups:
@@ -86,12 +89,21 @@ class DensePath:
         return scaled(highest, limits), scaled(lowest, limits)
 
 
-def violates_at_nodes(path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> bool:
+def violates_at_nodes(
+    path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits, caps: SpeedCaps | None = None
+) -> bool:
     """Return whether a limit is exceeded at a node; where none is, the certificate still decides."""
     first, nodes = profile.s[:-1], np.arange(len(profile.s) - 1)
     at = dense.dense_rows(airframe, path.derivatives(first)[1:], profile, np.zeros(len(first)), nodes)
+    _count_against_caps(at, None if caps is None else caps.at(first), limits)
     rows = scaled(at, limits).T
     return bool((rows > quantities.UPPER).any() or (rows < quantities.LOWER).any())
+
+
+def _count_against_caps(measured: NDArray, caps: NDArray | None, limits: PlanLimits) -> None:
+    """Scale the squared speed in (MEASURES, P) so that the limit stands for the cap at each place, if that is lower."""
+    if caps is not None:
+        measured[SPEED] *= (limits.speed / np.minimum(caps, limits.speed)) ** 2
 
 
 def _by_place(path: Path, s: NDArray) -> NDArray:

@@ -13,6 +13,7 @@ from cfplan.planners.expert.initial_guess import guess
 from cfplan.planners.expert.intersample import Violation, spread
 from cfplan.planners.expert.layout import Layout
 from cfplan.safety.limits import PlanLimits
+from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.measures import SPEED
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile, yaw_within
@@ -55,6 +56,7 @@ class Segment:
     ends: Ends
     yaw: YawSpline  # given before the speed; where yaw is free, of no account
     layout: Layout
+    caps: SpeedCaps | None = None
 
     @property
     def unit(self) -> float:
@@ -105,7 +107,8 @@ def build_problem(
     if ends.joint is not None:
         margin[ends.joint - AROUND_JOINT : ends.joint + AROUND_JOINT] = JOINT_MARGIN
     nominal = np.linalg.norm(path(layout.speed_s * step, 1), axis=1)
-    highest = ((1.0 - margin[layout.speed_interval]) * limits.speed / np.maximum(nominal, REST)) ** 2 / unit
+    speed = allowed_speed(limits.speed, segment.caps, layout.speed_s * step)
+    highest = ((1.0 - margin[layout.speed_interval]) * speed / np.maximum(nominal, REST)) ** 2 / unit
     highest = np.minimum(highest, CEILING)
     for node, boundary in ((0, ends.start), (nodes, ends.end)):
         if boundary:

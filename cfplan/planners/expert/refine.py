@@ -52,7 +52,8 @@ def refinements(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize
     began = time.perf_counter()
     path, limits, nodes = task.path, task.limits, len(profile.s) - 1
     layout = layout_of(Shape(nodes, False, turning_limited=limits.angular_acceleration < math.inf))
-    whole = Segment(path, task.airframe, limits, Ends(task.start, task.end), YawSpline.of(profile), layout)
+    ends, yaw = Ends(task.start, task.end), YawSpline.of(profile)
+    whole = Segment(path, task.airframe, limits, ends, yaw, layout, task.speed_caps)
     near = np.maximum(h_coefficients(profile) / whole.unit, FLOOR)[:, None]
     if len(windows_of(nodes, *far_enough(window, path.end / nodes, limits))) > 1:
         yield _solution(whole, by_windows(whole, window, _refine_window, near), began)

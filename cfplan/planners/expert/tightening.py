@@ -29,7 +29,7 @@ def tighten_until_feasible(
     A round that fails leaves the solution of the one before: slowing will do the rest.
     """
     nodes = segment.layout.shape.nodes
-    dense = DensePath(segment.path, nodes, held_by(segment.ends, nodes))
+    dense = DensePath(segment.path, nodes, held_by(segment.ends, nodes), segment.caps)
     iterations = attempt.iterations
     for done in range(ROUNDS):
         violation = dense.violation(segment.profile(attempt.coefficients), segment.airframe, segment.limits)

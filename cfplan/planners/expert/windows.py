@@ -78,6 +78,7 @@ def by_windows(
             whole.airframe, whole.limits,
             Ends(state, ends.end if at_end else None, continues=not at_start, joint=None if at_end else kept), yaw,
             layout_of(Shape(last - first, shape.free_yaw, shape.turning_limited, (3 * at_start, 3 * at_end))),
+            whole.caps and whole.caps.part(first * step, last * step),
         )  # fmt: skip
         found = search(window, coefficients[first : last + 3])
         if isinstance(found, str):
