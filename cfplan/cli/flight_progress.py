@@ -1,11 +1,12 @@
 """The flight on the terminal while it goes on: a line a phase, and a bar along the path."""
 
 import contextlib
-import time
+import math
 from types import TracebackType
 
 from cfplan.cli.output import Steps
 from cfplan.errors import printable
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.telemetry import (
     Event,
     Level,
@@ -23,7 +24,7 @@ _REFRESH = 0.1  # s
 class FlightProgress:
     """Shows telemetry. On a terminal the bar moves; elsewhere only lines are printed."""
 
-    def __init__(self, *, duration: float, steps: Steps):
+    def __init__(self, *, duration: float, steps: Steps, clock: Clock = REAL_CLOCK):
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -45,8 +46,8 @@ class FlightProgress:
         self._pose: PoseReceived | None = None
         self._battery = 0.0
         self.heard_vehicle = False
-        self._shown = 0.0
-        self._began = time.monotonic()
+        self._shown = -math.inf  # s
+        self._clock, self._began = clock, clock.now()
 
     def __enter__(self) -> "FlightProgress":
         self._bar.start()
@@ -76,7 +77,7 @@ class FlightProgress:
         elif isinstance(message, VehicleStatus):
             self._battery = message.battery_voltage
             self.heard_vehicle = True
-        now = time.monotonic()
+        now = self._clock.now()
         if now - self._shown > _REFRESH:
             self._shown = now
             self._draw()

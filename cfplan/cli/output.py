@@ -2,8 +2,6 @@
 
 import json
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any
@@ -12,6 +10,7 @@ import click
 
 from cfplan.errors import CfplanError, printable
 from cfplan.files.json_values import json_value
+from cfplan.flight.clock import REAL_CLOCK, Clock, Repeated
 from cfplan.preparation.steps import StepResults, StepState, step
 
 _FIRST_NOTE, _TERMINAL_NOTES, _OTHER_NOTES = 1.0, 0.5, 4.0  # s until a wait is shown, and between later notes
@@ -26,33 +25,30 @@ class Steps:
     that is overwritten, elsewhere in another line every few seconds.
     """
 
-    def __init__(self, *, as_json: bool):
-        self.as_json = as_json
+    def __init__(self, *, as_json: bool, clock: Clock = REAL_CLOCK):
+        self.as_json, self._clock = as_json, clock
         self.meanwhile: Callable[[], str] = str  # what else goes on, shown beside what is waited for
         self._begun = 0.0
-        self._ended = threading.Event()
-        self._waiting: threading.Thread | None = None
+        self._waiting: Repeated | None = None
 
     def __call__(self, name: str, state: StepState, result: str) -> None:
         """Show how far a step is; an OnStep."""
         if self.as_json:
             return
         if state is StepState.BEGUN:
-            self._begun = time.perf_counter()
-            self._ended = threading.Event()
-            self._waiting = threading.Thread(target=_show_waiting, args=(name, self._ended, self), daemon=True)
-            self._waiting.start()
+            self._begun = self._clock.now()
+            note = _WaitingNote(name, self, self._clock)
+            self._waiting = self._clock.repeat(note.show, name="waiting note", last=note.wipe)
             return
         self._end_waiting()
         sign, colour = _MARKS[state]
         mark = click.style(sign, fg=colour)
-        took = f"{(time.perf_counter() - self._begun) * 1e3:.0f} ms"
+        took = f"{(self._clock.now() - self._begun) * 1e3:.0f} ms"
         click.echo(f"{mark} {name:<12} {took:>8}  {printable(result)}".rstrip())
 
     def _end_waiting(self) -> None:
-        self._ended.set()
         if self._waiting is not None:
-            self._waiting.join()
+            self._waiting.stop()
             self._waiting = None
 
     @contextmanager
@@ -79,19 +75,33 @@ class Steps:
             click.echo(text)
 
 
-def _show_waiting(name: str, ended: threading.Event, steps: Steps) -> None:
-    """Say again and again what is waited for, until it has ended."""
-    begun, on_terminal = time.perf_counter(), sys.stdout.isatty()
-    pause = _FIRST_NOTE
-    with suppress(BrokenPipeError):  # the reader of our output went away, as `| head` does
-        while not ended.wait(pause):
-            text = f"… {name}, {time.perf_counter() - begun:.0f} s"
-            if meanwhile := steps.meanwhile():
-                text += f" ({meanwhile})"
-            click.echo(f"\r\033[K{text}" if on_terminal else text, nl=not on_terminal)
-            pause = _TERMINAL_NOTES if on_terminal else _OTHER_NOTES
-        if on_terminal and pause != _FIRST_NOTE:
-            click.echo("\r\033[K", nl=False)
+class _WaitingNote:
+    """Says again and again what is waited for."""
+
+    def __init__(self, name: str, steps: Steps, clock: Clock):
+        self._name, self._steps, self._clock = name, steps, clock
+        self._begun, self._on_terminal = clock.now(), sys.stdout.isatty()
+        self._calls = 0
+
+    def show(self) -> float | None:
+        """Show it, but for the first time; return s until it is to be shown again."""
+        self._calls += 1
+        if self._calls == 1:
+            return _FIRST_NOTE
+        text = f"… {self._name}, {self._clock.now() - self._begun:.0f} s"
+        if meanwhile := self._steps.meanwhile():
+            text += f" ({meanwhile})"
+        try:
+            click.echo(f"\r\033[K{text}" if self._on_terminal else text, nl=not self._on_terminal)
+        except BrokenPipeError:  # the reader of our output went away, as `| head` does
+            return None
+        return _TERMINAL_NOTES if self._on_terminal else _OTHER_NOTES
+
+    def wipe(self) -> None:
+        """Clear the terminal's line."""
+        if self._on_terminal and self._calls > 1:
+            with suppress(BrokenPipeError):
+                click.echo("\r\033[K", nl=False)
 
 
 def print_json(document: Any) -> None:

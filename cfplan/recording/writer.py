@@ -1,17 +1,16 @@
 """Write a record's MCAP file while the flight goes on, without ever holding the flight up.
 
-`write` only puts a message into a queue. A thread takes the queued messages, four times a second, and writes them as
-one chunk, so that a process killed at any moment leaves all but its last instant behind.
+`write` only puts a message into a queue. Four times a second a thread writes the queued messages as one chunk, so that
+a process killed at any moment leaves all but its last instant behind.
 """
 
 import contextlib
 import io
 import json
 import logging
-import queue
 import re
-import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from functools import partial
@@ -21,6 +20,7 @@ from typing import IO, Any, Protocol, cast
 from mcap.writer import CompressionType, Writer
 
 from cfplan.errors import InputError
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.telemetry import Telemetry
 from cfplan.recording.header import RecordHeader, header_to_json
 from cfplan.recording.record import FLIGHT_FILE, SUMMARY_FILE
@@ -36,6 +36,11 @@ class RawFile(Protocol):
     def write(self, data: bytes, /) -> int | None: ...
     def truncate(self, size: int, /) -> int: ...
     def close(self) -> None: ...
+
+
+def new_file(path: Path) -> RawFile:
+    """Open a file that must not exist yet. Raises OSError."""
+    return io.FileIO(path, "x")
 
 
 def wall_time_at_zero() -> float:
@@ -84,13 +89,14 @@ class RecordWriter:
         header: RecordHeader,
         *,
         warn: Callable[[str], None] = _LOG.warning,
-        open_file: Callable[[Path], RawFile] = lambda path: io.FileIO(path, "x"),
+        open_file: Callable[[Path], RawFile] = new_file,
+        clock: Clock = REAL_CLOCK,
     ):
         self.folder = folder
         self.failure = ""
         self._warn = warn
         self._zero = header.wall_time_at_zero
-        self._queue: queue.SimpleQueue[Telemetry | None] = queue.SimpleQueue()
+        self._waiting: deque[Telemetry] = deque()
         path = folder / FLIGHT_FILE
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -104,8 +110,7 @@ class RecordWriter:
         except OSError as error:
             path.unlink(missing_ok=True)
             raise _cannot_write(path, error) from error
-        self._thread = threading.Thread(target=self._run, name="record writer", daemon=True)
-        self._thread.start()
+        self._writing = clock.repeat(self._write_chunk, name="record writer", last=self._end)
 
     def __enter__(self) -> "RecordWriter":
         return self
@@ -115,35 +120,28 @@ class RecordWriter:
 
     def write(self, message: Telemetry) -> None:
         """Take a message; returns at once and never raises."""
-        self._queue.put(message)
+        self._waiting.append(message)
 
     def close(self, summary: Mapping[str, Any] | None = None) -> None:
         """Write what is left and the summary, if there is one. May be called twice; never raises."""
-        if self._thread.is_alive():
-            self._queue.put(None)
-            self._thread.join()
+        self._writing.stop()
         if summary is not None:
             self._try(lambda: write_summary(self.folder, summary), "the summary")
 
-    def _run(self) -> None:
-        going = True
-        while going:
-            deadline = time.monotonic() + FLUSH_PERIOD
-            going = self._gather(deadline)
-            self._try(self._mcap.flush if going else self._finish, "the record")
+    def _write_chunk(self) -> float:
+        self._gather()
+        self._try(self._mcap.flush, "the record")
+        return FLUSH_PERIOD
+
+    def _end(self) -> None:
+        self._gather()
+        self._try(self._finish, "the record")
         self._sink.close()
 
-    def _gather(self, deadline: float) -> bool:
-        """Add messages to the chunk until the deadline; False where the last has come."""
-        while (left := deadline - time.monotonic()) > 0:
-            try:
-                message = self._queue.get(timeout=left)
-            except queue.Empty:
-                return True
-            if message is None:
-                return False
-            self._try(partial(self._add, message), "a message")
-        return True
+    def _gather(self) -> None:
+        """Add the waiting messages to the chunk."""
+        while self._waiting:
+            self._try(partial(self._add, self._waiting.popleft()), "a message")
 
     def _add(self, message: Telemetry) -> None:
         if self._sink.broken:

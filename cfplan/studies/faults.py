@@ -23,7 +23,7 @@ from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry, Triple
 from cfplan.recording.header import RecordHeader, header_under
 from cfplan.recording.reader import read_record
-from cfplan.recording.writer import RecordWriter
+from cfplan.recording.writer import RecordWriter, new_file
 from cfplan.simulation.lab.lab import Truth
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
@@ -131,15 +131,17 @@ def fault_table(
 
 def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0) -> FaultFlight:
     """Fly one, with a record, and judge it by the truth."""
+    lab = _lab(scenario, mission, seed)
     with tempfile.TemporaryDirectory() as folder:
         writer = RecordWriter(
             Path(folder),
             _header(mission),
             warn=lambda _: None,
-            **({"open_file": _FullDisk} if scenario.disk_full else {}),
+            open_file=_FullDisk if scenario.disk_full else new_file,
+            clock=lab.clock,
         )
         with writer:
-            flown = fly_stepped(scenario, mission, listen=writer.write, seed=seed)
+            flown = fly_stepped(scenario, mission, listen=writer.write, lab=lab)
         try:
             readable = len(read_record(Path(folder)).phases.time) > 0
         except CfplanError:
@@ -148,10 +150,15 @@ def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0) -> FaultFl
 
 
 def fly_stepped(
-    scenario: Scenario, mission: Mission, *, listen: Callable[[Telemetry], None] = lambda _: None, seed: int = 0
+    scenario: Scenario,
+    mission: Mission,
+    *,
+    listen: Callable[[Telemetry], None] = lambda _: None,
+    seed: int = 0,
+    lab: SteppedLab | None = None,
 ) -> SteppedFlight:
-    """Fly one in the stepped lab until everything has come to rest."""
-    lab = SteppedLab(mission.limits.airframe, vehicle=scenario.vehicle, cameras=scenario.cameras, seed=seed)
+    """Fly one in a stepped lab, by default a new one with that seed, until everything has come to rest."""
+    lab = lab or _lab(scenario, mission, seed)
     orders, flown = StudyOrders(), SteppedFlight(None, "", lab.truth(), math.nan)
 
     def strike() -> None:
@@ -199,6 +206,10 @@ def fly_stepped(
         lab.clock.sleep(_AFTERWARDS)
         flown.truth = lab.truth()
     return flown
+
+
+def _lab(scenario: Scenario, mission: Mission, seed: int) -> SteppedLab:
+    return SteppedLab(mission.limits.airframe, vehicle=scenario.vehicle, cameras=scenario.cameras, seed=seed)
 
 
 def judge(scenario: Scenario, flown: SteppedFlight, mission: Mission, readable: bool) -> FaultFlight:

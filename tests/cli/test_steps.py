@@ -1,19 +1,16 @@
 """A step is one line when it ends; a wait of more than a second says what it is and how long it has taken."""
 
-import time
-
 import pytest
 
 from cfplan.cli import output
 from cfplan.cli.output import Steps
 from cfplan.errors import InputError
+from cfplan.flight.clock import SteppedClock
 
 
 @pytest.fixture
-def impatient(monkeypatch):
-    """Waits are shown sooner."""
-    monkeypatch.setattr(output, "_FIRST_NOTE", 0.05)
-    monkeypatch.setattr(output, "_OTHER_NOTES", 0.05)
+def clock():
+    return SteppedClock()
 
 
 def test_a_quick_step_is_one_line_with_its_result(capsys):
@@ -48,25 +45,46 @@ def test_a_step_with_a_warning_has_no_tick(capsys):
     assert "✓" not in printed
 
 
-def test_a_long_step_says_meanwhile_what_is_waited_for(capsys, impatient):
-    with Steps(as_json=False).step("plan"):
-        time.sleep(0.5)
-    first, *_, last = capsys.readouterr().out.splitlines()
-    assert first == "… plan, 0 s"
+def test_a_long_step_says_meanwhile_what_is_waited_for(capsys, clock):
+    with Steps(as_json=False, clock=clock).step("plan"):
+        clock.sleep(0.9)
+        assert capsys.readouterr().out == ""
+        clock.sleep(5.0)
+    first, second, last = capsys.readouterr().out.splitlines()
+    assert (first, second) == ("… plan, 1 s", "… plan, 5 s")
     assert last.startswith("✓ plan")
+    assert "5900 ms" in last
 
 
-def test_waiting_prints_nothing_at_its_end(capsys, impatient):
-    steps = Steps(as_json=False)
+def test_what_else_goes_on_is_said_too(capsys, clock):
+    steps = Steps(as_json=False, clock=clock)
+    steps.meanwhile = lambda: "compiling 3 of 20"
+    with steps.step("plan"):
+        clock.sleep(1.5)
+    assert capsys.readouterr().out.splitlines()[0] == "… plan, 1 s (compiling 3 of 20)"
+
+
+def test_waiting_prints_nothing_at_its_end(capsys, clock):
+    steps = Steps(as_json=False, clock=clock)
     with steps.waiting("loading"):
         pass
     assert capsys.readouterr().out == ""
     with steps.waiting("loading"):
-        time.sleep(0.5)
-    assert set(capsys.readouterr().out.splitlines()) == {"… loading, 0 s"}
+        clock.sleep(1.5)
+    clock.sleep(100.0)
+    assert capsys.readouterr().out.splitlines() == ["… loading, 1 s"]
 
 
-def test_json_is_alone_on_standard_output(capsys, impatient):
-    with Steps(as_json=True).step("plan"):
-        time.sleep(0.2)
+def test_a_reader_that_went_away_is_no_error_of_a_wait(monkeypatch, clock):
+    def gone(*_, **__):
+        raise BrokenPipeError
+
+    with Steps(as_json=False, clock=clock).waiting("loading"):
+        monkeypatch.setattr(output.click, "echo", gone)
+        clock.sleep(10.0)
+
+
+def test_json_is_alone_on_standard_output(capsys, clock):
+    with Steps(as_json=True, clock=clock).step("plan"):
+        clock.sleep(5.0)
     assert capsys.readouterr().out == ""

@@ -1,10 +1,10 @@
 """The reporter sends telemetry out of the pilot's process without ever delaying the stream."""
 
 import threading
-import time
 from collections import deque
 from multiprocessing.connection import Connection
 
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.telemetry import Telemetry
 
 CAPACITY = 20_000  # messages: half a minute of a flight
@@ -18,41 +18,36 @@ class Reporter:
     If the reader is slow or stuck, the oldest messages are dropped, and counted.
     """
 
-    def __init__(self, connection: Connection, capacity: int = CAPACITY):
-        self._connection = connection
+    def __init__(self, connection: Connection, capacity: int = CAPACITY, clock: Clock = REAL_CLOCK):
+        self._connection, self._clock = connection, clock
         self._waiting: deque[Telemetry] = deque(maxlen=capacity)
         self.dropped = 0
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
-        self._thread.start()
+        self._sending = clock.repeat(self._send, name="telemetry")
 
     def __call__(self, message: Telemetry) -> None:
         if len(self._waiting) == self._waiting.maxlen:
             self.dropped += 1
         self._waiting.append(message)
 
-    def _run(self) -> None:
+    def _send(self) -> float | None:
+        batch = []
+        while self._waiting:
+            batch.append(self._waiting.popleft())
         try:
-            while not self._closing.is_set():
-                self._closing.wait(_PERIOD)
-                batch = []
-                while self._waiting:
-                    batch.append(self._waiting.popleft())
-                if batch:
-                    self._connection.send(batch)
+            if batch:
+                self._connection.send(batch)
         except OSError:
-            return  # no reader any more; the pilot learns that from its orders
+            return None  # no reader any more; the pilot learns that from its orders
+        return _PERIOD
 
     def close(self, last: object) -> None:
         """Send the waiting messages, then `last`, as far as the reader takes them within 2 s."""
-        end = time.monotonic() + _CLOSING_TIME
-        self._closing.set()
-        self._thread.join(_CLOSING_TIME)
-        if self._thread.is_alive():
+        end = self._clock.now() + _CLOSING_TIME
+        if not self._sending.stop(_CLOSING_TIME):
             return
         sending = threading.Thread(target=self._send_last, args=(last,), daemon=True)
         sending.start()
-        sending.join(max(0.1, end - time.monotonic()))
+        sending.join(max(0.1, end - self._clock.now()))
 
     def _send_last(self, last: object) -> None:
         try:

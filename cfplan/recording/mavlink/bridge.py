@@ -7,9 +7,7 @@ directions are kept in a .tlog: each behind its time, µs since 1970, 8 bytes bi
 
 import contextlib
 import ipaddress
-import select
 import socket
-import threading
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -19,6 +17,7 @@ from types import TracebackType
 from typing import IO, Any
 
 from cfplan.errors import InputError
+from cfplan.flight.clock import REAL_CLOCK, Clock, Repeated
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.telemetry import Estimate, Event, Level, PhaseEntered, SetpointSent, Telemetry, VehicleStatus
 from cfplan.recording.mavlink import messages
@@ -29,8 +28,9 @@ BROADCAST = 0
 _V1, _V2, _SIGNED = 0xFE, 0xFD, 0x01
 _LARGEST_DATAGRAM = 2048  # bytes; MAVLink's are never longer
 _DATAGRAMS_AT_ONCE = 50  # before it is time to send again
-_LONGEST_WAIT = 0.1  # s
+_SHORTEST_WAIT, _LONGEST_WAIT = 0.001, 0.1  # s between two looks at what is due
 _FLUSH_PERIOD = 1.0  # s, of the .tlog
+_GOODBYE = 2.0  # s that the end of a flight waits for the last packets
 _SEVERITY = {Level.INFO: 6, Level.WARNING: 4, Level.ERROR: 3}  # MAV_SEVERITY
 _WARNING = 4
 _FORM = "as in udp:127.0.0.1:14550, where the ground station listens"
@@ -75,10 +75,12 @@ class GroundStation:
     Only a ground station on this machine is heard where the place is one on this machine.
     """
 
-    def __init__(self, place: Place, log: Path | None = None, *, boot: float | None = None):
+    def __init__(self, place: Place, log: Path | None = None, *, boot: float | None = None, clock: Clock = REAL_CLOCK):
         """Raises InputError where the extra is missing, the place cannot be reached or the log cannot be written."""
         self._mav = _dialect().MAVLink(self, srcSystem=SYSTEM, srcComponent=COMPONENT)
-        self._latest = messages.Latest(time.monotonic() if boot is None else boot)
+        self._clock = clock
+        self._wall_zero = time.time() - clock.now()  # s since 1970 at which the clock was zero
+        self._latest = messages.Latest(clock.now() if boot is None else boot)
         self._texts: deque[tuple[int, str]] = deque(maxlen=200)
         self._orders: deque[Order] = deque(maxlen=100)
         self._due = [0.0] * len(messages.RATES)
@@ -97,18 +99,17 @@ class GroundStation:
         self._flushed = 0.0
         self.failure = ""  # why the log is not whole, one line; empty where it is
         self.heard = 0  # packets from ground stations
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
+        self._serving: Repeated | None = None
 
     def __enter__(self) -> "GroundStation":
-        self._thread.start()
+        self._serving = self._clock.repeat(self._serve, name="mavlink", last=self._say_goodbye, wake=self._socket)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._ending.set()
-        self._thread.join(2.0)
+        if self._serving is not None:
+            self._serving.stop(_GOODBYE)
         self._socket.close()
         if self._log is not None:
             with contextlib.suppress(OSError):
@@ -142,19 +143,22 @@ class GroundStation:
         with contextlib.suppress(OSError):  # no one listens there now
             self._socket.sendto(packet, self._to)
 
-    def _run(self) -> None:
-        while not self._ending.is_set():
-            for act in (self._listen, self._send_due):
-                try:
-                    act()
-                except Exception as error:  # a fault here must not silence a stop that comes later
-                    self._fail(f"fault in MAVLink: {error!r}")
+    def _serve(self) -> float:
+        """Hear what has come, send what is due, and return s until something is due again."""
+        for act in (self._listen, self._send_due):
+            try:
+                act()
+            except Exception as error:  # a fault here must not silence a stop that comes later
+                self._fail(f"fault in MAVLink: {error!r}")
+        return min(_LONGEST_WAIT, max(_SHORTEST_WAIT, min(self._due) - self._clock.now()))
+
+    def _say_goodbye(self) -> None:
         with contextlib.suppress(Exception):
             self._send_texts()
             self._mav.send(messages.heartbeat(self._mav, self._latest))
 
     def _send_due(self) -> None:
-        now = time.monotonic()
+        now = self._clock.now()
         for index, (make, rate) in enumerate(messages.RATES):
             if now >= self._due[index]:
                 self._due[index] = max(self._due[index] + 1 / rate, now + 0.5 / rate)
@@ -177,11 +181,9 @@ class GroundStation:
                 self._mav.send(message)
 
     def _listen(self) -> None:
-        patience = min(_LONGEST_WAIT, max(0.001, min(self._due) - time.monotonic()))
         for _ in range(_DATAGRAMS_AT_ONCE):
-            if not select.select([self._socket], [], [], patience)[0]:
+            if not self._clock.readable([self._socket], 0.0):
                 return
-            patience = 0.0
             try:
                 data, sender = self._socket.recvfrom(_LARGEST_DATAGRAM)
             except OSError:  # what was sent before came back as not deliverable
@@ -228,7 +230,7 @@ class GroundStation:
         if self._log is None:
             return
         try:
-            self._log.write((time.time_ns() // 1000).to_bytes(8, "big") + packet)
+            self._log.write(round(1e6 * (self._wall_zero + self._clock.now())).to_bytes(8, "big") + packet)
         except (OSError, ValueError) as error:
             self._fail(f"the .tlog ends early: {error}")
             self._log = None

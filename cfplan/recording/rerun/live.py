@@ -1,12 +1,11 @@
 """Show a flight in rerun as it happens, from the main process's telemetry; the pilot's process takes no part.
 
-Messages are only put into a queue; a thread sends the queued ones as columns, ten times a second. The viewer is a
+Messages are only put into a queue; ten times a second a thread sends the queued ones as columns. The viewer is a
 separate process at a low priority: the setpoints come first.
 """
 
 import contextlib
 import subprocess
-import threading
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from types import TracebackType
 import rerun as rr
 import rerun.blueprint as rrb
 
+from cfplan.flight.clock import REAL_CLOCK, Clock, Repeated
 from cfplan.flight.telemetry import PoseReceived, SetpointSent, Telemetry, VehicleStatus
 from cfplan.recording.header import RecordHeader
 from cfplan.recording.plots import FLOWN, WANTED, plots
@@ -68,45 +68,57 @@ def live_blueprint(header: RecordHeader) -> rrb.Blueprint:
 class LiveView:
     """Sends a flight to a stream while it is entered; `show` takes a message and returns at once."""
 
-    def __init__(self, stream: rr.RecordingStream, header: RecordHeader, folder: Path = Path()):
-        self._stream, self._header, self._folder = stream, header, folder
+    def __init__(
+        self, stream: rr.RecordingStream, header: RecordHeader, folder: Path = Path(), clock: Clock = REAL_CLOCK
+    ):
+        self._stream, self._header, self._folder, self._clock = stream, header, folder, clock
         self._waiting: deque[Telemetry] = deque(maxlen=CAPACITY)
         self._start: float | None = None  # s, of the first message: 0 on the timeline
         self._carried: dict[type, Telemetry] = {}
         self._drawn: set[str] = set()  # the outlines that stand already
         self.failure = ""  # why the view ends early, one line
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="live view", daemon=True)
+        self._laid_out = False
+        self._sending: Repeated | None = None
 
     def __enter__(self) -> "LiveView":
-        self._thread.start()
+        self._sending = self._clock.repeat(self._show_waiting, name="live view", last=self._end)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._ending.set()
-        self._thread.join(_GOODBYE)
+        if self._sending is not None:
+            self._sending.stop(_GOODBYE)
 
     def show(self, message: Telemetry) -> None:
         """Take a message."""
         self._waiting.append(message)
 
-    def _run(self) -> None:
+    def _show_waiting(self) -> float | None:
         try:
-            empty = _part(self._header, [])
-            self._stream.send_recording_name(self._header.name)
-            log_room(self._stream, self._header)
-            log_styles(self._stream, plots(empty))
-            log_plan(self._stream, replace(empty, folder=self._folder))
-            while not self._ending.wait(PERIOD):
-                self._send()
+            if not self._laid_out:
+                self._lay_out()
             self._send()
-            self._stream.flush(timeout_sec=_GOODBYE / 2)
         except Exception as error:  # a viewer that was closed must not be heard of in the flight
             self.failure = f"the live view ended: {error}"
+            return None
+        return PERIOD
+
+    def _end(self) -> None:
+        if not self.failure and self._show_waiting() is not None:
+            with contextlib.suppress(Exception):
+                self._stream.flush(timeout_sec=_GOODBYE / 2)
         with contextlib.suppress(Exception):
             self._stream.disconnect()
+
+    def _lay_out(self) -> None:
+        """Send what does not change during the flight."""
+        empty = _part(self._header, [])
+        self._stream.send_recording_name(self._header.name)
+        log_room(self._stream, self._header)
+        log_styles(self._stream, plots(empty))
+        log_plan(self._stream, replace(empty, folder=self._folder))
+        self._laid_out = True
 
     def _send(self) -> None:
         fresh: list[Telemetry] = []

@@ -1,13 +1,12 @@
 """The live view: the flight as the messages come, never in the way of whoever brings them."""
 
-import time
-
 import numpy as np
 import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
 from cfplan.errors import InputError
+from cfplan.flight.clock import SteppedClock
 from cfplan.flight.telemetry import PhaseEntered, PoseReceived, SetpointSent
 from cfplan.recording.record import Record
 from cfplan.recording.rerun import layout, live
@@ -28,15 +27,16 @@ def rows(file, entity, component):
 
 @pytest.fixture(scope="module")
 def watched(flight, tmp_path_factory):
-    """The made-up flight, shown at a hundred times its speed."""
+    """The made-up flight, shown in batches of five hundred messages."""
     file = tmp_path_factory.mktemp("live") / "live.rrd"
     stream = rr.RecordingStream("cfplan")
     stream.save(file, default_blueprint=live_blueprint(flight.header))
-    with LiveView(stream, flight.header) as view:
+    clock = SteppedClock()
+    with LiveView(stream, flight.header, clock=clock) as view:
         for index, message in enumerate(flight.messages):
             view.show(message)
-            if index % 500 == 0:
-                time.sleep(0.02)
+            if index % 500 == 499:
+                clock.sleep(live.PERIOD)
     assert view.failure == ""
     return file
 
@@ -79,9 +79,11 @@ def test_a_view_that_breaks_is_not_heard_of_in_the_flight(flight, monkeypatch):
         raise RuntimeError("the viewer was closed")
 
     monkeypatch.setattr(live, "log_columns", broken)
-    with LiveView(rr.RecordingStream("cfplan"), flight.header) as view:
+    clock = SteppedClock()
+    with LiveView(rr.RecordingStream("cfplan"), flight.header, clock=clock) as view:
         for message in flight.messages[:2000]:
             view.show(message)
+            clock.sleep(0.01)
     assert "the viewer was closed" in view.failure
 
 
