@@ -112,7 +112,7 @@ def make_mission(
     """Encode a stop from every setpoint and certify them all. Raises NotCertifiedError."""
     with step(on_step, "stops") as results:
         mission = mission_of(encoded, limits)
-        stops = certify_stops(mission.stops, limits, mission.rate)
+        stops = certify_stops(mission.stops, encoded.motion, limits, mission.rate)
         stops.require(limits)
         results.append(f"certified from each of {stops.count} setpoints, {stops.as_planned} within the plan's limits")
     return mission, stops

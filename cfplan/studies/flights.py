@@ -10,8 +10,9 @@ import numpy as np
 
 from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.pilot.mission import mission_of
-from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
-from cfplan.flight.setpoints.packets import encode
+from cfplan.flight.setpoints.encoding import RATE, EncodedFlight, encode_motion, motion_at
+from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD
 from cfplan.geometry.path_file import load_path_file
 from cfplan.preparation.plan_flight import PlannedFlight, plan_flight
 from cfplan.preparation.prepare_flight import encode_flight, rehearse
@@ -182,9 +183,10 @@ def _rehearsed(name: str, planned: PlannedFlight, encoded: EncodedFlight) -> Reh
 
 def _without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFlight:
     """Return the same flight with the acceleration of the motion alone."""
-    states = trajectory.at(encoded.times + encoded.lead)
-    setpoints = replace(encoded.decoded, acceleration=states.acceleration)
-    return replace(encoded, payloads=encode(setpoints), decoded=setpoints)
+    times = encoded.times + encoded.lead
+    motion = replace(motion_at(trajectory, times), acceleration=trajectory.at(times).acceleration)
+    payloads = encode_motion(motion, trajectory.at(times + BRAKE_LEAD).acceleration, encoded.gains)
+    return replace(encoded, payloads=payloads, decoded=decode(payloads))
 
 
 def _judged(name: str, seed: int, trajectory: Trajectory, flight: RealTimeFlight) -> JudgedFlight:

@@ -131,3 +131,23 @@ def quaternions_of(matrices: NDArray) -> NDArray:
     for n in range(len(matrices)):
         write_quaternion(out[n], matrices[n])
     return out
+
+
+@njit(error_model="numpy")
+def rotations_of(vectors: NDArray) -> NDArray:
+    """Return the (N, 3, 3) matrices of rotation vectors, (N, 3) rad (Rodrigues)."""
+    out = np.empty((len(vectors), 3, 3))
+    for n in range(len(vectors)):
+        x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
+        angle = math.sqrt(x * x + y * y + z * z)
+        sine = math.sin(angle) / angle if angle > 1e-12 else 1.0
+        versine = 2.0 * (math.sin(angle / 2) / angle) ** 2 if angle > 1e-12 else 0.5
+        out[n, 0, 0], out[n, 1, 1], out[n, 2, 2] = (
+            1 - versine * (y * y + z * z),
+            1 - versine * (x * x + z * z),
+            1 - versine * (x * x + y * y),
+        )
+        out[n, 0, 1], out[n, 1, 0] = versine * x * y - sine * z, versine * x * y + sine * z
+        out[n, 0, 2], out[n, 2, 0] = versine * x * z + sine * y, versine * x * z - sine * y
+        out[n, 1, 2], out[n, 2, 1] = versine * y * z - sine * x, versine * y * z + sine * x
+    return out

@@ -10,7 +10,7 @@ import pytest
 from cfplan.cli import confirm
 from cfplan.errors import InputError
 from cfplan.flight.pilot.mission import Mission
-from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
+from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.link_loss import simulate_link_loss
@@ -33,7 +33,7 @@ def mission():
             body_rate=np.zeros((101, 3)),
         )
     )
-    return Mission(payloads, encode_stops(payloads, 100.0), load_limits(REPOSITORY / "safety.yaml"))
+    return Mission(payloads, encode_stops(decode(payloads), 100.0), load_limits(REPOSITORY / "safety.yaml"))
 
 
 @pytest.fixture

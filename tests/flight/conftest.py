@@ -288,7 +288,7 @@ def world() -> World:
 @pytest.fixture
 def mission() -> Mission:
     payloads = make_payloads()
-    return Mission(payloads, encode_stops(payloads, 100.0), make_limits())
+    return Mission(payloads, encode_stops(decode(payloads), 100.0), make_limits())
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from septic_flight import septic_payloads
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.process import fly
+from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, Telemetry
 from cfplan.safety.limits import GroundManoeuvres, Limits
@@ -40,7 +41,7 @@ def limits() -> Limits:
 @pytest.fixture(scope="session")
 def mission(limits) -> Mission:
     payloads = short_payloads()
-    return Mission(payloads, encode_stops(payloads, 100.0), limits, hold_time=0.5)
+    return Mission(payloads, encode_stops(decode(payloads), 100.0), limits, hold_time=0.5)
 
 
 @dataclass

@@ -147,9 +147,10 @@ def test_bytes_are_judged_by_what_a_setpoint_tells(quantity, trajectory):
 @each_quantity
 def test_stops_are_judged_by_the_table(quantity, trajectory):
     slower = Trajectory(trajectory.path, trajectory.profile.slowed(0.5), AIRFRAME)
-    stops = encode_stops(encode_trajectory(slower).payloads, RATE)
+    motion = encode_trajectory(slower).motion
+    stops = encode_stops(motion, RATE)
     safety = load_limits(Path(__file__).parents[2] / "safety.yaml")
-    found = stop_certificate.certify_stops(stops, safety, RATE)
+    found = stop_certificate.certify_stops(stops, motion, safety, RATE)
     found.require(safety)
     assert (quantity.name in found.worst) == (quantity.in_stop is not None)
     if quantity.in_stop:

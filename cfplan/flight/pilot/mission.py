@@ -80,7 +80,8 @@ class Mission:
 
 def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0) -> Mission:
     """Return the mission that flies these setpoints, with a stop from each of them."""
-    return Mission(encoded.payloads, encode_stops(encoded.payloads, RATE), limits, encoded.lead, hold_time)
+    stops = encode_stops(encoded.motion, RATE, gains=encoded.gains)
+    return Mission(encoded.payloads, stops, limits, encoded.lead, hold_time)
 
 
 def manoeuvre_time(distance: float, mean_speed: float) -> float:

@@ -21,7 +21,9 @@ from cfplan.flight.pilot.prearm import prepare
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.radio.link import GO_TO, LAND, TAKE_OFF, Link
 from cfplan.flight.radio.supervisor_bits import ARMED, FLYING, HIGH_LEVEL_ACTIVE, LOCKED
-from cfplan.flight.setpoints.hover_to_hover import encode_hover_to_hover
+from cfplan.flight.setpoints.encoding import encode_motion
+from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
+from cfplan.flight.setpoints.rate_trade import ahead
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Level, Phase, Telemetry, Triple
 from cfplan.vehicle.rotations import yaw_of
@@ -148,8 +150,9 @@ class Pilot:
     def _way(self, begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float) -> Stream:
         """Return setpoints from hover to hover, with a way to stop from each."""
         rate = self._mission.rate
-        payloads = encode_hover_to_hover(begin, yaw, end, end_yaw, duration, rate)
-        return Stream(payloads, rate, stop_from=lambda row: encode_stops(payloads, rate, rows=np.array([row]))[0])
+        motion = hover_to_hover(begin, yaw, end, end_yaw, duration, rate)
+        payloads = encode_motion(motion, ahead(motion.acceleration, rate))
+        return Stream(payloads, rate, stop_from=lambda row: encode_stops(motion, rate, rows=np.array([row]))[0])
 
     def _follow(self, stream: Stream) -> None:
         """Fly a stream to its end."""

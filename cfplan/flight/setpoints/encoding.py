@@ -5,11 +5,14 @@ thrust vector: z along it, y along z × [cos ψ, sin ψ, 0]. The planned attitud
 the one with which the controller arrives at just that attitude is ψ = atan2(-y₁, y₂) of the planned body y axis. Sent
 is the quaternion with the planned thrust axis and that Euler yaw; at 30° of tilt it is up to 8° of yaw away from the
 planned attitude, and the controller, reading it, is not.
+
+Roll and pitch rates are not sent as they are planned: most of them is sent as a turn of that attitude, which makes the
+same torque and lets the vehicle level out where setpoints stop (see rate_trade.py).
 """
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -17,29 +20,37 @@ from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, encode
+from cfplan.flight.setpoints.rate_trade import (
+    BRAKE_LEAD,
+    FIRMWARE_GAINS,
+    AttitudeGains,
+    harmless_rates,
+    trade_rates,
+    turns_for,
+)
 from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import INSTANT
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.measures import measures_of
-from cfplan.vehicle.rotations import heading_of, matrices_of, write_quaternion
-from cfplan.vehicle.trajectory import FullState, Trajectory
+from cfplan.vehicle.rotations import heading_of, matrices_of, quaternions_of, rotations_of, write_quaternion
+from cfplan.vehicle.trajectory import Trajectory
 
 RATE = 100.0  # Hz
 HOLD = 0.5  # s of hover after the end, so that what the vehicle keeps when the stream stops is a hover
 
-# s by which body rates are sent ahead of the rest. The controller turns them into torque, which the motors give late:
-# at lags of 0.07 to 0.13 s this takes up to a third off the worst deviation and costs at most half a centimetre.
-RATE_LEAD = 0.015
+# s by which body rates are sent ahead of the rest: the controller turns them into torque, which the motors give late.
+RATE_LEAD = 0.018
 
-# s by which the length of the thrust vector is sent ahead of its direction, as motors give it late. At lags of 0.05 to
-# 0.13 s it takes a third to two thirds off the worst deviation; without lag it costs half a centimetre at 2 m/s and
-# three at 5. What is sent is still a thrust of the plan, so no limit is nearer.
-THRUST_LEAD = 0.06
+# s by which the length of the thrust vector is sent ahead of its direction, as motors give it late. Both leads were
+# chosen together, for the least deviations in the dry run of all paths at motor lags of 0.07, 0.105 and 0.13 s. What is
+# sent is still a thrust of the plan, so no limit is nearer.
+THRUST_LEAD = 0.077
 
 HALF_QUANTUM = 0.5e-3  # of position m, velocity m/s, acceleration m/s², body rate rad/s
 ATTITUDE_QUANTUM = np.radians(0.25)  # the largest angle by which compressing turns a quaternion
 _ROUNDING = 1e-9
+_LEAST_LIFT = math.cos(math.radians(75.0))  # the controller's heading is not defined at a tilt of 90°
 _BATCH = 4096  # setpoints at a time, so that memory does not grow with the states of a long flight
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
 
@@ -51,9 +62,11 @@ class EncodedFlight:
     times: NDArray  # (N,) s after the start of the stream, when each payload is due
     payloads: NDArray  # (N, 29) uint8
     decoded: FullStateSetpoints  # what the vehicle reads from them
+    motion: FullStateSetpoints  # what they make the vehicle fly: planned, without what is sent ahead
     lead: float  # s by which each setpoint is ahead of the trajectory at its time
     rate_lead: float  # s by which its body rate is ahead of that
     thrust_lead: float  # s by which the length of its thrust vector is ahead of that
+    gains: AttitudeGains  # of the vehicle that these packets are for
 
     @property
     def duration(self) -> float:
@@ -69,6 +82,7 @@ def encode_trajectory(
     lead: float = 0.0,
     rate_lead: float = RATE_LEAD,
     thrust_lead: float = THRUST_LEAD,
+    gains: AttitudeGains = FIRMWARE_GAINS,
 ) -> EncodedFlight:
     """Encode a flight: full states at `rate`, Hz, then hover at the end for at least `hold`, s.
 
@@ -80,19 +94,24 @@ def encode_trajectory(
         raise NotCertifiedError(f"cannot sample {trajectory.duration} s at {rate} Hz with a hold of {hold} s")
     moving = int(np.ceil(trajectory.duration * rate)) + 1
     times = np.arange(moving + int(np.ceil(hold * rate))) / rate
-    payloads = np.concatenate(
-        [
-            encode(setpoints_at(trajectory, times[rows] + lead, rate_lead, thrust_lead), rows.start)
-            for rows in _batches(len(times))
-        ]
-    )
-    return EncodedFlight(times, payloads, decode(payloads), lead, rate_lead, thrust_lead)
+    payloads = []
+    for rows in _batches(len(times)):
+        moments = times[rows] + lead
+        motion = motion_at(trajectory, moments, rate_lead, thrust_lead)
+        coming = trajectory.at(moments + BRAKE_LEAD).acceleration
+        payloads.append(encode_motion(motion, coming, gains, rows.start))
+    sent = np.concatenate(payloads)
+    planned = motion_at(trajectory, times + lead, 0.0, 0.0)
+    return EncodedFlight(times, sent, decode(sent), planned, lead, rate_lead, thrust_lead, gains)
 
 
-def setpoints_at(
+def motion_at(
     trajectory: Trajectory, times: NDArray, rate_lead: float = RATE_LEAD, thrust_lead: float = THRUST_LEAD
 ) -> FullStateSetpoints:
-    """Return what the controller is asked for at times (N,), s; the acceleration includes the compensation for drag."""
+    """Return the motion that setpoints are to make, at times (N,), s: the attitudes and rates to fly.
+
+    The acceleration is that of the thrust, less gravity: it includes the compensation for drag.
+    """
     states = trajectory.at(times)
     thrust = trajectory.at(times + thrust_lead).specific_thrust
     acceleration = thrust[:, None] * states.thrust_axis
@@ -101,9 +120,21 @@ def setpoints_at(
         position=states.position,
         velocity=states.velocity,
         acceleration=acceleration,
-        quaternion=command_quaternion(states.quaternion),
+        quaternion=states.quaternion,
         body_rate=trajectory.at(times + rate_lead).body_rate,
     )
+
+
+def encode_motion(
+    motion: FullStateSetpoints, acceleration_ahead: NDArray, gains: AttitudeGains = FIRMWARE_GAINS, first: int = 0
+) -> NDArray:
+    """Return the payloads, (N, 29) uint8, that make the vehicle fly a motion and are harmless when they stop.
+
+    `acceleration_ahead`, (N, 3) m/s², is that of the motion BRAKE_LEAD later; `first` is the number of the first
+    setpoint, for the error's text. Raises NotCertifiedError where a value is not finite or does not fit.
+    """
+    sent = trade_rates(motion, acceleration_ahead, gains)
+    return encode(replace(sent, quaternion=command_quaternion(sent.quaternion)), first)
 
 
 def _batches(count: int) -> Iterator[slice]:
@@ -123,74 +154,118 @@ def controller_attitude(thrust: NDArray, quaternion: NDArray) -> NDArray:
 def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimits) -> None:
     """Certify the bytes against the trajectory, which is evaluated afresh: nothing that encoding computed is used.
 
-    Every field of the decoded payloads lies within half a quantum of the trajectory at its time, the quaternion and
-    the attitude that the controller makes of it within what its bits allow; speed, acceleration, body rate, tilt and
-    specific thrust are within the limits and their quanta; the last setpoint is a hover at the end of the path. Raises
-    NotCertifiedError with the setpoint at fault.
+    Turned back by what the body rates leave to the attitude, what the controller makes of the decoded payloads lies
+    within half a quantum of the trajectory at its time, the attitude within what its bits allow; speed, acceleration,
+    body rate, tilt and specific thrust of that motion are within the limits and their quanta, and what is sent within
+    bounds of its own; the last setpoint is a hover at the end of the path. Raises NotCertifiedError with the setpoint
+    at fault.
     """
     payloads = np.asarray(encoded.payloads)
     if payloads.ndim != 2 or payloads.shape != (len(encoded.times), PAYLOAD_SIZE) or len(payloads) == 0:
         raise NotCertifiedError(f"payloads of shape {payloads.shape} for {len(encoded.times)} times")
     for rows in _batches(len(payloads)):
-        require = partial(_require, first=rows.start)
-        require(payloads[rows, 0] == FULL_STATE_TYPE, "the payload is no full state", payloads[rows, 0])
-        decoded, times = decode(payloads[rows]), encoded.times[rows] + encoded.lead
+        times = encoded.times[rows] + encoded.lead
         planned = trajectory.at(times)
         thrust = trajectory.at(times + encoded.thrust_lead).specific_thrust
-        body_rate = trajectory.at(times + encoded.rate_lead).body_rate
-        compensation = _check_values(decoded, planned, thrust, body_rate, require)
-        _check_attitude(decoded, planned, require)
-        _check_limits(decoded, planned.acceleration + compensation, limits, require)
+        motion = FullStateSetpoints(
+            position=planned.position,
+            velocity=planned.velocity,
+            acceleration=thrust[:, None] * planned.thrust_axis - _GRAVITY,
+            quaternion=planned.quaternion,
+            body_rate=trajectory.at(times + encoded.rate_lead).body_rate,
+        )
+        coming = trajectory.at(times + BRAKE_LEAD).acceleration
+        flown = check_motion(payloads[rows], motion, coming, encoded.gains, rows.start)
+        # What is sent makes up for drag besides, so the planned acceleration is judged, with the packet's error.
+        acceleration = planned.acceleration + flown.acceleration - motion.acceleration
+        _check_limits(flown, acceleration, limits, partial(_require, first=rows.start))
     _require_hover(decode(payloads[-1:]), trajectory, len(payloads))
 
 
-def _check_values(
-    decoded: FullStateSetpoints, planned: FullState, thrust: NDArray, body_rate: NDArray, require: Callable[..., None]
-) -> NDArray:
-    """Check position, velocity, acceleration and body rate; return the error of the acceleration, (N, 3) m/s²."""
+def check_motion(
+    payloads: NDArray, motion: FullStateSetpoints, acceleration_ahead: NDArray, gains: AttitudeGains, first: int = 0
+) -> FullStateSetpoints:
+    """Check that payloads, (N, 29) uint8, make the vehicle fly this motion; return the motion that they make.
+
+    The motion returned is that of the bytes: the thrust along the attitude at which the controller's torque is that of
+    the motion's rates, and the rates that the setpoint's attitude and rates ask for at the motion's attitude. Raises
+    NotCertifiedError with the number of the setpoint at fault, counted from `first`.
+    """
+    require = partial(_require, first=first)
+    require(payloads[:, 0] == FULL_STATE_TYPE, "the payload is no full state", payloads[:, 0])
+    decoded, frames = decode(payloads), matrices_of(motion.quaternion)
+    _check_values("position", decoded.position - motion.position, require)
+    _check_values("velocity", decoded.velocity - motion.velocity, require)
+    sent_rate = np.concatenate([harmless_rates(motion, acceleration_ahead, gains), motion.body_rate[:, 2:]], axis=1)
+    _check_values("body_rate", decoded.body_rate - sent_rate, require)
+
+    traded = motion.body_rate[:, :2] - decoded.body_rate[:, :2]
+    turn = rotations_of(turns_for(traded, gains))
+    wanted, along = frames @ turn, turn[:, 2, 2]  # cosine between thrust as flown and as sent
     force = decoded.acceleration + _GRAVITY
-    errors = {
-        "position": decoded.position - planned.position,
-        "velocity": decoded.velocity - planned.velocity,
-        "acceleration": force - thrust[:, None] * planned.thrust_axis,
-        "body_rate": decoded.body_rate - body_rate,
-    }
-    for name, error in errors.items():
-        largest = np.abs(error).max(axis=1)
-        require(
-            largest <= HALF_QUANTUM + _ROUNDING, f"{name} in the packet is not that of the trajectory, off by", largest
-        )
-    return errors["acceleration"]
+    thrust = np.linalg.norm(motion.acceleration + _GRAVITY, axis=1) / along
+    _check_values("acceleration", force - thrust[:, None] * wanted[:, :, 2], require)
+    _check_attitude(decoded, force, wanted, turn, frames, require)
+
+    # The attitude at which the torque is that of the motion's rates, and the rates asked for at the motion's attitude.
+    back = frames @ np.swapaxes(wanted, 1, 2)
+    flown = np.einsum("nij,nj->ni", back, force) * along[:, None]
+    lean = np.einsum("nij,ni->nj", frames, force) / np.linalg.norm(force, axis=1)[:, None]
+    rates = gains.full_rate * np.stack([-lean[:, 1], lean[:, 0], np.zeros(len(lean))], axis=1)
+    return replace(
+        decoded,
+        acceleration=flown - _GRAVITY,
+        quaternion=quaternions_of(back @ controller_attitude(force, decoded.quaternion)),
+        body_rate=decoded.body_rate + rates,
+    )
 
 
-def _check_attitude(decoded: FullStateSetpoints, planned: FullState, require: Callable[..., None]) -> None:
-    """Check the quaternion, and the attitude that the controller makes of it and of the thrust vector."""
-    force = decoded.acceleration + _GRAVITY
-    turned = _angles(matrices_of(decoded.quaternion), matrices_of(command_quaternion(planned.quaternion)))
+def _check_values(name: str, error: NDArray, require: Callable[..., None]) -> None:
+    """Check that the errors, (N, 3), of a field are those of rounding."""
+    largest = np.abs(error).max(axis=1)
+    require(largest <= HALF_QUANTUM + _ROUNDING, f"{name} in the packet is not that of the trajectory, off by", largest)
+
+
+def _check_attitude(
+    decoded: FullStateSetpoints,
+    force: NDArray,
+    wanted: NDArray,
+    turn: NDArray,
+    frames: NDArray,
+    require: Callable[..., None],
+) -> None:
+    """Check the quaternion, and the attitude that the controller makes of it and of the thrust vector.
+
+    `wanted`, (N, 3, 3), is `frames`, the attitudes to fly, with the `turn` that stands for rates; turned back by it,
+    the controller's must be the attitude to fly.
+    """
+    turned = _angles(matrices_of(decoded.quaternion), matrices_of(command_quaternion(quaternions_of(wanted))))
     require(turned <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", turned)
-    made = _angles(controller_attitude(force, decoded.quaternion), matrices_of(planned.quaternion))
+    off = _angles(controller_attitude(force, decoded.quaternion) @ np.swapaxes(turn, 1, 2), frames)
     # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(tilt) as far.
     level = force[:, 2] / np.linalg.norm(force, axis=1)
-    require(made * level <= ATTITUDE_QUANTUM, "the controller would not make the planned attitude, off by rad", made)
+    require(level >= _LEAST_LIFT, "the thrust that is sent leans too far, with a vertical share of", level)
+    require(off * level <= ATTITUDE_QUANTUM, "the controller would not make the planned torque, off by rad", off)
 
 
 def _check_limits(
-    decoded: FullStateSetpoints, acceleration: NDArray, limits: PlanLimits, require: Callable[..., None]
+    flown: FullStateSetpoints, acceleration: NDArray, limits: PlanLimits, require: Callable[..., None]
 ) -> None:
-    """Check that each setpoint keeps the limits; `acceleration`, (N, 3), is the planned one with the packet's error."""
+    """Check that the motion of setpoints keeps the limits; `acceleration`, (N, 3), is that of the motion alone."""
     quantum = np.sqrt(3) * HALF_QUANTUM + _ROUNDING
-    force = decoded.acceleration + _GRAVITY
+    force = flown.acceleration + _GRAVITY
     thrust = np.linalg.norm(force, axis=1)
     measured = measures_of(
-        velocity=decoded.velocity,
+        velocity=flown.velocity,
         acceleration=acceleration,
-        body_rate=decoded.body_rate,
+        body_rate=flown.body_rate,
         thrust_axis=force / thrust[:, None],
         specific_thrust=thrust,
     )
+    lean = quantum / thrust  # an error turns the thrust vector so far
     for quantity in INSTANT:
         value, limit = quantity.worst(measured), quantity.allowed(limits)
-        rounding = quantum / thrust if quantity.unit == "rad" else quantum  # an error turns the thrust vector so far
+        rounding = {"rad": lean, "rad/s": quantum + FIRMWARE_GAINS.full_rate * lean}.get(quantity.unit, quantum)
         require(
             quantity.excess(value, limit) <= rounding,
             f"{quantity.noun} in the packet breaks its limit, {limit:.4g} {quantity.unit}, with",

@@ -7,29 +7,33 @@ While setpoints come, the vehicle's own time-outs watch over it: it levels out w
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
+from cfplan.flight.setpoints.encoding import controller_attitude
+from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.flight.telemetry import Triple
-from cfplan.vehicle.rotations import about_z
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import about_z, quaternions_of
 
 
-def encode_hover_to_hover(
+def hover_to_hover(
     begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float, rate: float
-) -> NDArray:
-    """Return (N, 29) uint8 at `rate`, Hz: straight from `begin` to `end`, m, in `duration`, s; yaw the shorter way."""
+) -> FullStateSetpoints:
+    """Return N rows at `rate`, Hz: straight from `begin` to `end`, m, in `duration`, s; yaw the shorter way.
+
+    So slow a motion leans and rolls too little to be worth roll and pitch rates.
+    """
     share = np.linspace(0.0, 1.0, max(round(duration * rate), 1) + 1)
     along = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     speed = 30.0 * share**2 * (1.0 - share) ** 2 / duration
     change = 60.0 * share * (1.0 - share) * (1.0 - 2.0 * share) / duration**2
     way, turn = np.subtract(end, begin), math.remainder(end_yaw - yaw, math.tau)
     zero = np.zeros_like(share)
-    return encode(
-        FullStateSetpoints(
-            position=begin + along[:, None] * way,
-            velocity=speed[:, None] * way,
-            acceleration=change[:, None] * way,
-            quaternion=about_z(yaw + turn * along),
-            body_rate=np.stack([zero, zero, turn * speed], axis=1),
-        )
+    acceleration = change[:, None] * way
+    leaning = controller_attitude(acceleration + np.array([0.0, 0.0, GRAVITY]), about_z(yaw + turn * along))
+    return FullStateSetpoints(
+        position=begin + along[:, None] * way,
+        velocity=speed[:, None] * way,
+        acceleration=acceleration,
+        quaternion=quaternions_of(leaning),
+        body_rate=np.stack([zero, zero, turn * speed], axis=1),
     )

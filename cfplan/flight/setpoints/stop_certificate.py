@@ -1,4 +1,4 @@
-"""The certificate of the stops: their bytes, as the vehicle decodes them, held against the limits.
+"""The certificate of the stops: the motion that their bytes make the vehicle fly, held against the limits.
 
 A stop may exceed the limits of the plan: where a turn is flown at its limit, braking adds to it. Longer stops gain
 little (5.7 m/s² instead of 5.8 for twice the way), so all are short, and must keep what the table of quantities says
@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.encoding import check_motion
+from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
+from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains
+from cfplan.flight.setpoints.stops import chunks, stop_motion
 from cfplan.safety.limits import Limits
 from cfplan.safety.quantities import AT_MOST, PACKET_ROUNDING, QUANTITIES
 from cfplan.vehicle.airframe import GRAVITY, Airframe
@@ -20,7 +23,6 @@ from cfplan.vehicle.flatness import motor_thrusts
 from cfplan.vehicle.measures import measures_of
 
 BOUND = tuple(quantity for quantity in QUANTITIES if quantity.in_stop)
-_CHUNK = 1000  # stops at a time
 _SPAN = 2  # setpoints on each side, over which body rates are differentiated, as packets round them to a millirad/s
 
 
@@ -49,11 +51,32 @@ class StopCertificate:
                 )
 
 
-def certify_stops(stops: NDArray, limits: Limits, rate: float) -> StopCertificate:
-    """Return the worst values of stops (N, M, 29) uint8 at `rate`, Hz."""
-    worst = np.concatenate(
-        [_worst(stops[first : first + _CHUNK], limits.airframe, rate) for first in range(0, len(stops), _CHUNK)], axis=1
-    )
+def certify_stops(
+    stops: NDArray,
+    motion: FullStateSetpoints,
+    limits: Limits,
+    rate: float,
+    rows: NDArray | None = None,
+    gains: AttitudeGains = FIRMWARE_GAINS,
+) -> StopCertificate:
+    """Return the worst values of stops (N, M, 29) uint8 at `rate`, Hz, from each row of a motion, or from `rows`.
+
+    Raises NotCertifiedError where the bytes do not make the vehicle fly just that stop.
+    """
+    begin = np.arange(len(motion.position)) if rows is None else rows
+    duration = (stops.shape[1] - 1) / rate
+    measured = []
+    for some in chunks(len(stops)):
+        wanted, coming = stop_motion(motion, begin[some], rate, duration)
+        payloads = stops[some].reshape(-1, PAYLOAD_SIZE)
+        try:
+            flown = check_motion(payloads, wanted, coming, gains, some.start * stops.shape[1])
+        except NotCertifiedError as error:
+            number = int(error.where.split()[-1])
+            where = f"setpoint {number % stops.shape[1]} of the stop from {begin[number // stops.shape[1]]}"
+            raise NotCertifiedError(error.what, where=where, hint=error.hint) from None
+        measured.append(_worst(flown, stops.shape[1], limits.airframe, rate))
+    worst = np.concatenate(measured, axis=1)
     allowed = np.array([quantity.allowed(limits.plan) for quantity in BOUND])
     sides = np.array([quantity.side for quantity in BOUND])
     excess = sides[:, None] * (worst - allowed[:, None])
@@ -63,12 +86,10 @@ def certify_stops(stops: NDArray, limits: Limits, rate: float) -> StopCertificat
     return StopCertificate(len(stops), int(as_planned), dict(zip(names, worst_of_all.tolist(), strict=True)))
 
 
-def _worst(stops: NDArray, airframe: Airframe, rate: float) -> NDArray:
-    """Return (len(BOUND), N): the worst value of each quantity in each of the stops, (N, M, 29)."""
-    decoded = decode(stops)
-    shape = (*stops.shape[:2], 3)
+def _worst(flown: FullStateSetpoints, length: int, airframe: Airframe, rate: float) -> NDArray:
+    """Return (len(BOUND), N): the worst value of each quantity in each of N stops of `length` rows."""
     velocity, sent, body_rate = (
-        values.reshape(shape) for values in (decoded.velocity, decoded.acceleration, decoded.body_rate)
+        values.reshape(-1, length, 3) for values in (flown.velocity, flown.acceleration, flown.body_rate)
     )
     force = sent + np.array([0.0, 0.0, GRAVITY])
     thrust = np.linalg.norm(force, axis=2)

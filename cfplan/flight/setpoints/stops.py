@@ -8,59 +8,102 @@ on the path itself, where it was certified to be, and ends level at rest. With r
 r falls as a smoothstep, so the braking deceleration is at most 1.5 v₀ / duration.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude
-from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
+from cfplan.flight.setpoints.encoding import (
+    RATE_LEAD,
+    THRUST_LEAD,
+    command_quaternion,
+    controller_attitude,
+    encode_motion,
+)
+from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
+from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains, ahead
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import about_z, quaternions_of, yaw_of
 
 DURATION = 0.8  # s, from full speed to rest: 3.75 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
+_CHUNK = 1000  # stops at a time, so that memory does not grow with all fields of all stops
 
 
-def encode_stops(payloads: NDArray, rate: float, duration: float = DURATION, rows: NDArray | None = None) -> NDArray:
-    """Return (N, M, 29) uint8: stop i begins with setpoint i's place and ends in hover; M setpoints at `rate`.
+def encode_stops(
+    motion: FullStateSetpoints,
+    rate: float,
+    duration: float = DURATION,
+    rows: NDArray | None = None,
+    gains: AttitudeGains = FIRMWARE_GAINS,
+) -> NDArray:
+    """Return (N, M, 29) uint8: stop i begins with the place of the motion's row i and ends in hover; M at `rate`, Hz.
 
-    Where `rows` are given, those of these setpoints alone.
+    `motion` is what the setpoints of the flight make the vehicle fly, N rows at `rate`. Where `rows` are given, stops
+    from these alone.
     """
-    reference = decode(payloads)
-    begin = np.arange(len(payloads)) if rows is None else rows
-    steps = round(duration * rate)
+    begin = np.arange(len(motion.position)) if rows is None else rows
+    out = np.empty((len(begin), round(duration * rate) + 1, PAYLOAD_SIZE), dtype=np.uint8)
+    for some in chunks(len(begin)):
+        stops, coming = stop_motion(motion, begin[some], rate, duration)
+        out[some] = encode_motion(stops, coming, gains).reshape(-1, *out.shape[1:])
+    return out
+
+
+def chunks(count: int) -> Iterator[slice]:
+    """Return slices of so many stops as are made at a time."""
+    return (slice(first, min(first + _CHUNK, count)) for first in range(0, count, _CHUNK))
+
+
+def stop_motion(
+    motion: FullStateSetpoints,
+    begin: NDArray,
+    rate: float,
+    duration: float = DURATION,
+    *,
+    rate_lead: float = RATE_LEAD,
+    thrust_lead: float = THRUST_LEAD,
+) -> tuple[FullStateSetpoints, NDArray]:
+    """Return the stops from rows `begin`, (K,), of a motion, one after another, K · M rows, as motion to fly.
+
+    With it comes the acceleration of each row BRAKE_LEAD later, (K · M, 3). Body rates and the length of the thrust
+    vector are ahead by the leads, s, as in the setpoints of a plan.
+    """
+    steps, count = round(duration * rate), len(motion.position)
     share = np.arange(steps + 1) / steps
     clock_rate = 1.0 - share**2 * (3.0 - 2.0 * share)
     slowing = -6.0 * share * (1.0 - share) / duration
     elapsed = duration * rate * (share - share**3 + share**4 / 2.0)  # in setpoints; the integral of clock_rate
-    place = np.minimum(begin[:, None] + elapsed, len(payloads) - 1.0)
-    row = np.minimum(place.astype(int), max(len(payloads) - 2, 0))
+    place = np.minimum(begin[:, None] + elapsed, count - 1.0)
+    row = np.minimum(place.astype(int), max(count - 2, 0))
     between = (place - row)[..., None]
 
     def at(values: NDArray) -> NDArray:
         after = values[np.minimum(row + 1, len(values) - 1)]
         return values[row] + between * (after - values[row])
 
-    velocity = at(reference.velocity)
-    acceleration = clock_rate[:, None] ** 2 * at(reference.acceleration) + slowing[:, None] * velocity
-    turn = at(np.unwrap(yaw_of(reference.quaternion.T))[:, None])[..., 0].reshape(-1)
+    velocity = at(motion.velocity)
+    acceleration = clock_rate[:, None] ** 2 * at(motion.acceleration) + slowing[:, None] * velocity
+    turn = at(np.unwrap(yaw_of(command_quaternion(motion.quaternion).T))[:, None])[..., 0].reshape(-1)
     made = controller_attitude(acceleration.reshape(-1, 3) + _GRAVITY, about_z(turn))
     attitude = quaternions_of(made)
-    shape = (len(begin), steps + 1)
-    body_rate = _ahead(_turn_rates(attitude.reshape(*shape, 4), rate), RATE_LEAD * rate)
+    body_rate = _ahead(_turn_rates(attitude.reshape(len(begin), steps + 1, 4), rate), rate_lead * rate)
     body_rate[:, -1] = 0.0  # the vehicle may be left with the last setpoint
-    return encode(
-        FullStateSetpoints(
-            position=at(reference.position).reshape(-1, 3),
-            velocity=(clock_rate[:, None] * velocity).reshape(-1, 3),
-            acceleration=acceleration.reshape(-1, 3),
-            quaternion=command_quaternion(attitude),
-            body_rate=body_rate.reshape(-1, 3),
-        )
-    ).reshape(*shape, -1)
+    force = acceleration + _GRAVITY
+    thrust = np.linalg.norm(force, axis=2, keepdims=True)
+    sent = _ahead(thrust, thrust_lead * rate) / thrust * force - _GRAVITY
+    stops = FullStateSetpoints(
+        position=at(motion.position).reshape(-1, 3),
+        velocity=(clock_rate[:, None] * velocity).reshape(-1, 3),
+        acceleration=sent.reshape(-1, 3),
+        quaternion=attitude,
+        body_rate=body_rate.reshape(-1, 3),
+    )
+    return stops, ahead(acceleration, rate).reshape(-1, 3)
 
 
 def _ahead(values: NDArray, by: float) -> NDArray:
-    """Return (..., M, 3): the rows `by` rows later on; the last holds."""
+    """Return (..., M, K): the rows `by` rows later on; the last holds."""
     place = np.minimum(np.arange(values.shape[-2]) + by, values.shape[-2] - 1.0)
     row = place.astype(int)
     after = np.minimum(row + 1, values.shape[-2] - 1)

@@ -11,12 +11,14 @@ from cfplan.flight.setpoints.encoding import (
     RATE_LEAD,
     THRUST_LEAD,
     check_bytes,
+    check_motion,
     command_quaternion,
     controller_attitude,
     encode_trajectory,
-    setpoints_at,
+    motion_at,
 )
 from cfplan.flight.setpoints.packets import decode, encode
+from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, BRAKE_RATE_MAX, FIRMWARE_GAINS, AttitudeGains
 from cfplan.geometry.min_snap import min_snap
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY
@@ -49,6 +51,18 @@ def encoded(trajectory):
     return encode_trajectory(trajectory)
 
 
+def ahead_of(encoded, trajectory):
+    return trajectory.at(encoded.times + BRAKE_LEAD).acceleration
+
+
+@pytest.fixture(scope="module")
+def flown(encoded, trajectory):
+    """The motion that the bytes make the vehicle fly."""
+    return check_motion(
+        encoded.payloads, motion_at(trajectory, encoded.times), ahead_of(encoded, trajectory), FIRMWARE_GAINS
+    )
+
+
 def test_a_setpoint_is_due_every_ten_milliseconds_until_well_after_the_end(encoded, trajectory):
     assert np.diff(encoded.times) == pytest.approx(0.01)
     assert encoded.times[0] == 0.0
@@ -71,26 +85,50 @@ def test_it_begins_and_ends_in_hover(encoded, trajectory):
 def test_the_acceleration_field_makes_up_for_drag(trajectory):
     """Newton's second law: mass times planned acceleration is thrust, weight and drag together."""
     encoded = encode_trajectory(trajectory, thrust_lead=0.0)
+    motion = motion_at(trajectory, encoded.times, thrust_lead=0.0)
+    flown = check_motion(encoded.payloads, motion, ahead_of(encoded, trajectory), FIRMWARE_GAINS)
     states = trajectory.at(encoded.times)
     turn = Rotation.from_quat(states.quaternion)
     air = turn.inv().apply(states.velocity)
     drag = -turn.apply(air * [AIRFRAME.drag[0], AIRFRAME.drag[0], AIRFRAME.drag[1]])
-    thrust = AIRFRAME.mass * (encoded.decoded.acceleration + np.array([0, 0, GRAVITY]))
+    thrust = AIRFRAME.mass * (flown.acceleration + np.array([0, 0, GRAVITY]))
     weight = AIRFRAME.mass * np.array([0, 0, -GRAVITY])
     assert (thrust + weight + drag) / AIRFRAME.mass == pytest.approx(states.acceleration, abs=1e-3)
     assert np.linalg.norm(drag, axis=1).max() / AIRFRAME.mass > 0.5
 
 
-def test_body_rates_are_sent_ahead(encoded, trajectory):
+def test_body_rates_are_flown_ahead(flown, encoded, trajectory):
     later = trajectory.at(encoded.times + RATE_LEAD).body_rate
-    assert encoded.decoded.body_rate == pytest.approx(later, abs=0.6e-3)
+    assert flown.body_rate == pytest.approx(later, abs=2e-3)
 
 
-def test_thrust_is_sent_ahead_and_its_direction_is_not(encoded, trajectory):
-    force = encoded.decoded.acceleration + np.array([0, 0, GRAVITY])
+def test_thrust_is_flown_ahead_and_its_direction_is_not(flown, encoded, trajectory):
+    force = flown.acceleration + np.array([0, 0, GRAVITY])
     thrust = np.linalg.norm(force, axis=1)
     assert thrust == pytest.approx(trajectory.at(encoded.times + THRUST_LEAD).specific_thrust, abs=1e-3)
     assert force / thrust[:, None] == pytest.approx(trajectory.at(encoded.times).thrust_axis, abs=2e-4)
+
+
+def test_roll_and_pitch_rates_that_are_sent_are_small_and_the_yaw_rate_is_whole(encoded, trajectory):
+    sent, planned = encoded.decoded.body_rate, trajectory.at(encoded.times + RATE_LEAD).body_rate
+    assert np.linalg.norm(planned[:, :2], axis=1).max() > 0.8
+    assert np.linalg.norm(sent[:, :2], axis=1).max() <= BRAKE_RATE_MAX + 1e-3
+    assert sent[:, 2] == pytest.approx(planned[:, 2], abs=0.6e-3)
+
+
+def test_the_torque_at_the_planned_attitude_is_that_of_the_planned_rates(encoded, trajectory):
+    """Mellinger's attitude error, (Rd' R - R' Rd)/2, and his gains, written out."""
+    planned, later = trajectory.at(encoded.times), trajectory.at(encoded.times + RATE_LEAD).body_rate
+    sent = encoded.decoded
+    wanted = controller_attitude(sent.acceleration + np.array([0, 0, GRAVITY]), sent.quaternion)
+    flown = Rotation.from_quat(planned.quaternion).as_matrix()
+    error = np.swapaxes(wanted, 1, 2) @ flown - np.swapaxes(flown, 1, 2) @ wanted
+    turning = -70000.0 * np.stack([error[:, 2, 1], error[:, 0, 2]], axis=1)
+    torque = turning + 20000.0 * (sent.body_rate - planned.body_rate)[:, :2]
+    assert torque == pytest.approx(20000.0 * (later - planned.body_rate)[:, :2], abs=40.0)  # of 32000
+    force = sent.acceleration + np.array([0, 0, GRAVITY])
+    along = np.einsum("ni,ni->n", force, flown[:, :, 2])
+    assert along == pytest.approx(trajectory.at(encoded.times + THRUST_LEAD).specific_thrust, abs=2e-3)
 
 
 def attitudes(tilt_max: float, count: int = 5000):
@@ -146,12 +184,12 @@ def test_an_encoder_that_samples_the_trajectory_at_other_times_is_found(trajecto
     """The check evaluates the trajectory by itself, so a fault of the encoder's sampling does not hide in both."""
 
     def shifted(trajectory, times, *leads):
-        right, wrong = setpoints_at(trajectory, times, *leads), setpoints_at(trajectory, times - late, *leads)
+        right, wrong = motion_at(trajectory, times, *leads), motion_at(trajectory, times - late, *leads)
         return replace(right, **{name: getattr(wrong, name)})
 
-    monkeypatch.setattr("cfplan.flight.setpoints.encoding.setpoints_at", shifted)
+    monkeypatch.setattr("cfplan.flight.setpoints.encoding.motion_at", shifted)
     made = encode_trajectory(trajectory)
-    with pytest.raises(NotCertifiedError, match=name):
+    with pytest.raises(NotCertifiedError, match=f"{name}|body_rate"):  # braking goes by velocity and heading
         check_bytes(made, trajectory, LIMITS)
 
 
@@ -182,10 +220,11 @@ def test_a_flipped_bit_in_any_byte_of_a_packet_is_found(encoded, trajectory, byt
     assert caught.value.where == f"setpoint {row}"
 
 
+@pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("name", ["position", "velocity", "acceleration", "body_rate"])
-def test_a_field_off_by_a_thousandth_is_found(encoded, trajectory, name):
+def test_a_field_off_by_a_thousandth_is_found(encoded, trajectory, name, axis):
     told = decode(encoded.payloads)
-    getattr(told, name)[40, 2] += 0.001
+    getattr(told, name)[40, axis] += 0.001
     changed = replace(encoded, payloads=encode(told))
     with pytest.raises(NotCertifiedError, match=name) as caught:
         check_bytes(changed, trajectory, LIMITS)
@@ -199,6 +238,20 @@ def test_an_attitude_off_by_a_degree_of_yaw_is_found(encoded, trajectory):
     ).as_quat()
     with pytest.raises(NotCertifiedError, match="quaternion"):
         check_bytes(replace(encoded, payloads=encode(told)), trajectory, LIMITS)
+
+
+def test_packets_for_other_gains_are_found(trajectory):
+    made = encode_trajectory(trajectory, gains=AttitudeGains(kw_xy=22000.0))
+    check_bytes(made, trajectory, LIMITS)
+    with pytest.raises(NotCertifiedError, match="body_rate"):
+        check_bytes(replace(made, gains=FIRMWARE_GAINS), trajectory, LIMITS)
+
+
+def test_rates_that_are_not_traded_are_found(trajectory, monkeypatch):
+    """The planned rates and attitudes make the same torque, but carry the vehicle away when setpoints stop."""
+    monkeypatch.setattr("cfplan.flight.setpoints.encoding.trade_rates", lambda motion, *_: motion)
+    with pytest.raises(NotCertifiedError, match="body_rate"):
+        check_bytes(encode_trajectory(trajectory), trajectory, LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -235,7 +288,7 @@ def test_a_path_out_of_the_packets_range_is_refused_with_the_setpoint():
     with pytest.raises(NotCertifiedError, match="position") as caught:
         encode_trajectory(Trajectory(path, profile, AIRFRAME))
     row = int(caught.value.where.split()[1])
-    assert setpoints_at(Trajectory(path, profile, AIRFRAME), np.array([row / 100])).position[0, 0] > 32.767
+    assert motion_at(Trajectory(path, profile, AIRFRAME), np.array([row / 100])).position[0, 0] > 32.767
 
 
 @pytest.mark.parametrize("bad", [{"rate": 0.0}, {"hold": -1.0}, {"lead": np.nan}, {"rate": np.nan}])

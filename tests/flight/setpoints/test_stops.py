@@ -3,50 +3,56 @@
 import numpy as np
 import pytest
 
-from cfplan.flight.setpoints.encoding import controller_attitude
-from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
-from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude
+from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
+from cfplan.flight.setpoints.rate_trade import BRAKE_RATE_MAX
+from cfplan.flight.setpoints.stops import encode_stops, stop_motion
 from cfplan.vehicle.airframe import GRAVITY
 
 
 @pytest.fixture
-def circle() -> np.ndarray:
-    """The payloads of a circle of 1 m at 1.8 m/s, level flight, yaw along the way."""
+def circle() -> FullStateSetpoints:
+    """A circle of 1 m at 1.8 m/s, level flight, yaw along the way."""
     time = np.arange(300) / 100.0
     angle = 1.8 * time
     zero = np.zeros_like(angle)
     yaw = angle + np.pi / 2
-    return encode(
-        FullStateSetpoints(
-            position=np.stack([np.cos(angle), np.sin(angle), zero + 1.0], axis=1),
-            velocity=1.8 * np.stack([-np.sin(angle), np.cos(angle), zero], axis=1),
-            acceleration=-(1.8**2) * np.stack([np.cos(angle), np.sin(angle), zero], axis=1),
-            quaternion=np.stack([zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1),
-            body_rate=np.stack([zero, zero, zero + 1.8], axis=1),
-        )
+    return FullStateSetpoints(
+        position=np.stack([np.cos(angle), np.sin(angle), zero + 1.0], axis=1),
+        velocity=1.8 * np.stack([-np.sin(angle), np.cos(angle), zero], axis=1),
+        acceleration=-(1.8**2) * np.stack([np.cos(angle), np.sin(angle), zero], axis=1),
+        quaternion=np.stack([zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1),
+        body_rate=np.stack([zero, zero, zero + 1.8], axis=1),
     )
 
 
+def stop_from(motion: FullStateSetpoints, row: int, **given) -> FullStateSetpoints:
+    """The motion of one stop, nothing of it ahead."""
+    return stop_motion(motion, np.array([row]), 100.0, **{"rate_lead": 0.0, "thrust_lead": 0.0} | given)[0]
+
+
 def test_a_stop_stays_on_the_path_and_ends_at_rest(circle):
-    stop = decode(encode_stops(circle, 100.0)[100])
+    stop = stop_from(circle, 100)
     radius = np.linalg.norm(stop.position[:, :2], axis=1)
     assert radius == pytest.approx(1.0, abs=2e-3)
     assert np.all(stop.velocity[-1] == 0.0)
-    assert np.all(stop.body_rate[-1] == 0.0)
-    assert np.all(np.abs(stop.acceleration[-1]) <= 1e-3)
+    last = decode(encode_stops(circle, 100.0)[100, -1:])
+    for field in (last.velocity, last.body_rate):
+        assert np.all(field == 0.0)
+    assert np.all(np.abs(last.acceleration) <= 1e-3)
 
 
 def test_a_stop_begins_where_the_setpoint_was(circle):
-    reference, stops = decode(circle), encode_stops(circle, 100.0)
+    stops = encode_stops(circle, 100.0)
     for row in (0, 57, 150):
         first = decode(stops[row, :1])
-        assert first.position[0] == pytest.approx(reference.position[row], abs=1e-3)
-        assert first.velocity[0] == pytest.approx(reference.velocity[row], abs=1e-3)
-        assert first.acceleration[0] == pytest.approx(reference.acceleration[row], abs=1e-3)
+        assert first.position[0] == pytest.approx(circle.position[row], abs=1e-3)
+        assert first.velocity[0] == pytest.approx(circle.velocity[row], abs=1e-3)
+        assert stop_from(circle, row).acceleration[0] == pytest.approx(circle.acceleration[row], abs=1e-9)
 
 
 def test_velocity_and_acceleration_are_the_derivatives_of_position(circle):
-    stop = decode(encode_stops(circle, 100.0)[100])
+    stop = stop_from(circle, 100)
     velocity = (stop.position[4:] - stop.position[:-4]) / 0.04
     acceleration = (stop.velocity[4:] - stop.velocity[:-4]) / 0.04
     assert velocity == pytest.approx(stop.velocity[2:-2], abs=0.05)
@@ -54,20 +60,42 @@ def test_velocity_and_acceleration_are_the_derivatives_of_position(circle):
 
 
 def test_the_stop_takes_at_most_its_share_of_deceleration(circle):
-    stop = decode(encode_stops(circle, 100.0, duration=0.8)[100])
+    stop = stop_from(circle, 100, duration=0.8)
     along = np.sum(stop.acceleration * stop.velocity, axis=1) / np.maximum(np.linalg.norm(stop.velocity, axis=1), 0.1)
     assert np.min(along) == pytest.approx(-1.5 * 1.8 / 0.8, rel=0.03)
 
 
 def test_body_rates_are_those_of_the_attitudes_that_the_controller_makes(circle):
-    stop = decode(encode_stops(circle, 100.0)[100])
-    made = controller_attitude(stop.acceleration + np.array([0.0, 0.0, GRAVITY]), stop.quaternion)
+    stop = stop_from(circle, 100)
+    made = controller_attitude(stop.acceleration + np.array([0.0, 0.0, GRAVITY]), command_quaternion(stop.quaternion))
     turn = np.swapaxes(made[:-8], 1, 2) @ made[8:]  # over 80 ms, so that the quaternion's rounding is small
     rate = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
-    ahead = (stop.body_rate[3:-5] + stop.body_rate[2:-6]) / 2.0  # sent 15 ms ahead
-    assert rate / 2.0 / 0.08 == pytest.approx(ahead, abs=0.35)
+    assert rate / 2.0 / 0.08 == pytest.approx(stop.body_rate[4:-4], abs=0.2)
+
+
+def test_rates_and_the_length_of_the_thrust_vector_are_sent_ahead(circle):
+    stop, sent = stop_from(circle, 100), stop_from(circle, 100, rate_lead=0.02, thrust_lead=0.05)
+    assert sent.body_rate[:-3] == pytest.approx(stop.body_rate[2:-1])
+    gravity = np.array([0.0, 0.0, GRAVITY])
+    force, now, later = sent.acceleration[:-5] + gravity, stop.acceleration[:-5] + gravity, stop.acceleration[5:]
+    assert np.linalg.norm(force, axis=1) == pytest.approx(np.linalg.norm(later + gravity, axis=1))
+    assert np.cross(force, now) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_stop_at_the_end_of_the_plan_does_not_run_past_it(circle):
-    reference, stops = decode(circle), encode_stops(circle, 100.0)
-    assert decode(stops[-1]).position == pytest.approx(np.tile(reference.position[-1], (81, 1)), abs=1e-3)
+    stops = encode_stops(circle, 100.0)
+    assert decode(stops[-1]).position == pytest.approx(np.tile(circle.position[-1], (81, 1)), abs=1e-3)
+
+
+def test_roll_and_pitch_rates_are_sent_as_attitude(circle):
+    planned, sent = stop_from(circle, 100, rate_lead=RATE_LEAD), decode(encode_stops(circle, 100.0)[100])
+    assert np.linalg.norm(planned.body_rate[:, :2], axis=1).max() > 1.0
+    assert np.linalg.norm(sent.body_rate[:, :2], axis=1).max() <= BRAKE_RATE_MAX + 1e-3
+    assert sent.body_rate[:, 2] == pytest.approx(planned.body_rate[:, 2], abs=0.6e-3)
+
+
+def test_many_stops_are_made_by_parts_alike(circle, monkeypatch):
+    whole = encode_stops(circle, 100.0)
+    monkeypatch.setattr("cfplan.flight.setpoints.stops._CHUNK", 70)
+    np.testing.assert_array_equal(encode_stops(circle, 100.0), whole)
+    np.testing.assert_array_equal(encode_stops(circle, 100.0, rows=np.array([5, 280])), whole[[5, 280]])

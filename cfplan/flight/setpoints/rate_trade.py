@@ -1,0 +1,163 @@
+"""The rate trade: body rates sent as a turn of the attitude, so that a vehicle whose setpoints stop levels out.
+
+The Mellinger controller's torque about body x and y is 2 kR sin φ + kw (ω_sent - ω), φ being the turn from the attitude
+to the wanted one. Any share of the rate can therefore be moved into the wanted attitude, and the torque stays the same:
+
+    Δ  = (ω - ω_sent)_xy                         ω: the rate to fly
+    φ  = asin(|Δ| kw / 2kR) along Δ              in body axes, no z
+    q' = q ⊗ exp(φ)                              sent instead of q
+    a' = T / cos|φ| · z(q') - g                  T: specific thrust; it acts along the true axis, hence the cosine
+
+This matters once setpoints stop: the firmware then wants a level attitude, yet keeps the last roll and pitch rates, and
+settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25° for 1.5 s. So the rates that are sent are only
+those with which that tilt brakes what speed will be left: v_left = 0.41 v + 0.089 s · a(t + 0.15 s), horizontally, as
+the vehicle first holds its last place for half a second.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.flight.setpoints.packets import FullStateSetpoints
+from cfplan.machine_code import njit
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import heading_of, product, yaw_of
+
+BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ahead of the setpoint
+SPEED_LEFT = 0.41  # share of the velocity that is left when the firmware begins to level out
+SPEED_GAINED = 0.089  # s, speed gained until then for each m/s² of acceleration
+BRAKING = 1.0  # 1/s, deceleration by level-out over the speed left
+BRAKE_RATE_MAX = 0.6  # rad/s; 4.9° of tilt, for 1.5 s
+TRADED_RATE_MAX = 4.5  # rad/s; what exceeds it is sent as a rate, as φ grows to 90° at 7 rad/s
+_QUANTUM = 1e-3  # rad/s, of rates in a packet
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeGains:
+    """The firmware's gains that the trade rests on, by their names in the group ctrlMel, with its defaults."""
+
+    kR_xy: float = 70000.0
+    kw_xy: float = 20000.0
+
+    @property
+    def full_rate(self) -> float:
+        """Return the rate, rad/s, that a turn of the attitude by 90° makes up for: 2 kR / kw."""
+        return 2.0 * self.kR_xy / self.kw_xy
+
+
+FIRMWARE_GAINS = AttitudeGains()
+GAIN_TOLERANCE = 0.05
+"""Share by which 2 kR / kw of a vehicle may differ from that of the packets; 10 % makes deviations of up to 3.1 cm."""
+
+
+def trade_rates(
+    motion: FullStateSetpoints, acceleration_ahead: NDArray, gains: AttitudeGains = FIRMWARE_GAINS
+) -> FullStateSetpoints:
+    """Return setpoints with the same torque and thrust as the motion, but harmless roll and pitch rates.
+
+    `motion` has the attitudes and rates to fly and, as acceleration, the thrust to give less gravity;
+    `acceleration_ahead`, (N, 3) m/s², is that of the motion BRAKE_LEAD later. The rates come out in whole millirad/s,
+    as packets hold them, and the attitudes make up for just those.
+    """
+    rate, quaternion, acceleration = _traded(
+        np.array(motion.velocity, dtype=float),
+        np.array(motion.acceleration, dtype=float),
+        np.array(acceleration_ahead, dtype=float),
+        np.array(motion.quaternion, dtype=float),
+        np.array(motion.body_rate, dtype=float),
+        gains.full_rate,
+    )
+    return replace(motion, acceleration=acceleration, quaternion=quaternion, body_rate=rate)
+
+
+def harmless_rates(
+    motion: FullStateSetpoints, acceleration_ahead: NDArray, gains: AttitudeGains = FIRMWARE_GAINS
+) -> NDArray:
+    """Return the roll and pitch rates to send, (N, 2) rad/s: those that brake, and what exceeds TRADED_RATE_MAX.
+
+    The check of the bytes compares with these, so they are computed apart from trade_rates, from a(t) to tilt to rate.
+    """
+    speed_left = SPEED_LEFT * motion.velocity[:, :2] + SPEED_GAINED * acceleration_ahead[:, :2]
+    yaw = yaw_of(motion.quaternion.T)
+    forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    pull = -BRAKING * np.stack([np.sum(speed_left * forward, axis=1), np.sum(speed_left * left, axis=1)], axis=1)
+    size = np.maximum(np.linalg.norm(pull, axis=1), 1e-12)
+    rate = np.minimum(gains.full_rate * np.sin(np.arctan2(size, GRAVITY)), BRAKE_RATE_MAX)
+    braking = (rate / size)[:, None] * np.stack([-pull[:, 1], pull[:, 0]], axis=1)
+    traded = motion.body_rate[:, :2] - braking
+    most = TRADED_RATE_MAX / np.maximum(np.linalg.norm(traded, axis=1), TRADED_RATE_MAX)
+    return np.asarray(motion.body_rate[:, :2] - most[:, None] * traded)
+
+
+def turns_for(rate: NDArray, gains: AttitudeGains = FIRMWARE_GAINS) -> NDArray:
+    """Return the rotation vectors φ, (N, 3) rad in body axes, that make up for roll and pitch rates, (N, 2) rad/s."""
+    size = np.linalg.norm(rate, axis=1)
+    angle = np.arcsin(np.minimum(size / gains.full_rate, 1.0))
+    share = np.where(size > 0.0, angle / np.where(size > 0.0, size, 1.0), 0.0)
+    return np.concatenate([rate * share[:, None], np.zeros((len(rate), 1))], axis=1)
+
+
+def ahead(acceleration: NDArray, rate: float) -> NDArray:
+    """Return accelerations, (..., N, 3) at `rate`, Hz, as they are BRAKE_LEAD later; the last one holds."""
+    place = np.minimum(np.arange(acceleration.shape[-2]) + round(BRAKE_LEAD * rate), acceleration.shape[-2] - 1)
+    return acceleration[..., place, :]
+
+
+@njit(error_model="numpy")
+def _traded(
+    velocity: NDArray,
+    acceleration: NDArray,
+    acceleration_ahead: NDArray,
+    quaternion: NDArray,
+    body_rate: NDArray,
+    full_rate: float,
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return what trade_rates gives: body rates (N, 3), attitudes (N, 4) and accelerations (N, 3)."""
+    rates, attitudes, accelerations = body_rate.copy(), np.empty_like(quaternion), np.empty_like(acceleration)
+    for n in range(len(velocity)):
+        wx, wy = body_rate[n, 0], body_rate[n, 1]
+        brake_x, brake_y = _braking_rate(velocity[n], acceleration_ahead[n], quaternion[n], full_rate)
+        dx, dy = wx - brake_x, wy - brake_y
+        size = math.sqrt(dx * dx + dy * dy)
+        share = TRADED_RATE_MAX / size if size > TRADED_RATE_MAX else 1.0
+        rates[n, 0] = math.floor((wx - share * dx) / _QUANTUM + 0.5) * _QUANTUM
+        rates[n, 1] = math.floor((wy - share * dy) / _QUANTUM + 0.5) * _QUANTUM
+
+        dx, dy = wx - rates[n, 0], wy - rates[n, 1]
+        size = math.sqrt(dx * dx + dy * dy)
+        sine = min(size / full_rate, 1.0)
+        half = 0.5 * math.asin(sine)
+        along = math.sin(half) / size if size > 0.0 else 0.0
+        turned = product(quaternion[n], (along * dx, along * dy, 0.0, math.cos(half)))
+        for k in range(4):
+            attitudes[n, k] = turned[k]
+
+        x, y, z, w = turned
+        fx, fy, fz = acceleration[n, 0], acceleration[n, 1], acceleration[n, 2] + GRAVITY
+        thrust = math.sqrt(fx * fx + fy * fy + fz * fz) / math.sqrt(1.0 - sine * sine)
+        scale = 2.0 * thrust / (x * x + y * y + z * z + w * w)
+        accelerations[n, 0] = scale * (x * z + y * w)
+        accelerations[n, 1] = scale * (y * z - x * w)
+        accelerations[n, 2] = thrust - scale * (x * x + y * y) - GRAVITY
+    return rates, attitudes, accelerations
+
+
+@njit(error_model="numpy")
+def _braking_rate(
+    velocity: NDArray, acceleration_ahead: NDArray, quaternion: NDArray, full_rate: float
+) -> tuple[float, float]:
+    """Return the roll and pitch rates, rad/s, at which level-out settles at a tilt that brakes the speed left."""
+    x, y = heading_of(quaternion)
+    size = math.sqrt(x * x + y * y)
+    cos, sin = (x / size, y / size) if size > 0.0 else (1.0, 0.0)
+    pull_x = -BRAKING * (SPEED_LEFT * velocity[0] + SPEED_GAINED * acceleration_ahead[0])
+    pull_y = -BRAKING * (SPEED_LEFT * velocity[1] + SPEED_GAINED * acceleration_ahead[1])
+    forward, left = cos * pull_x + sin * pull_y, cos * pull_y - sin * pull_x
+    pull = math.sqrt(forward * forward + left * left)
+    scale = full_rate / math.sqrt(GRAVITY * GRAVITY + pull * pull)  # sin(atan(pull / g)) / pull
+    if scale * pull > BRAKE_RATE_MAX:
+        scale = BRAKE_RATE_MAX / pull
+    return -scale * left, scale * forward
