@@ -298,6 +298,12 @@ def llvm_functions(title: str, module: str, source: Callable[[], str], names: tu
 _engines: list[Any] = []  # that own the code of functions handed out
 
 
+def vector_width() -> int:
+    """Return how many doubles a register of this processor holds: wider vectors would only crowd the registers."""
+    features = llvm.get_host_cpu_features()
+    return 8 if features.get("avx512f") else 4 if features.get("avx") else 2
+
+
 def _target_machine() -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()

@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.machine_code import llvm_functions
-from cfplan.planners.expert.point_constraints import ROWS, family, variables
+from cfplan.machine_code import llvm_functions, vector_width
+from cfplan.planners.expert.point_constraints import LANES, ROWS, family, variables
 from cfplan.planners.solver.barrier import TERMS
 
 UNIFORM = (2, 3)  # arguments that are the same at all points
@@ -26,7 +26,8 @@ def source() -> str:
     """Return the LLVM source of all kernels."""
     from cfplan.planners.expert import derivatives, llvm_emitter
 
-    return llvm_emitter.source([f for free_yaw in (False, True) for f in derivatives.point_kernels(free_yaw)], UNIFORM)
+    functions = [f for free_yaw in (False, True) for f in derivatives.point_kernels(free_yaw)]
+    return llvm_emitter.source(functions, UNIFORM, min(LANES, vector_width()))
 
 
 @lru_cache(maxsize=1)

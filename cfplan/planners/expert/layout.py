@@ -84,13 +84,18 @@ def layout_of(shape: Shape) -> Layout:
 
 
 class Sparsity(NamedTuple):
-    """How v, the intervals and the points belong together, for compiled loops."""
+    """How v, the intervals and the points belong together, for compiled loops.
 
-    interval: NDArray  # (P,) of each point
-    slots: NDArray  # (N, k) entry of v of each of an interval's coefficients, -1 where it is fixed
-    entries: NDArray  # (N, k(k+1)/2, 2) of the flattened matrix for each pair, -1 if fixed, and how often it counts
+    Points, and linear rows, lie in runs: of as many intervals, one after another. (R, 3): the first point of each run,
+    its interval, and how many. So the loops pass through memory in order, several numbers at a time, which takes
+    unsigned numbers: compiled code looks at the sign of an index.
+    """
+
+    runs: NDArray  # of the P points
+    slots: NDArray  # (k, N) entry of v of each of an interval's coefficients, -1 where it is fixed
+    entries: NDArray  # (2, k(k+1)/2, N) of the flattened matrix for each pair, -1 if fixed, and how often it counts
     linear: NDArray  # (4, E) weights of four of an interval's coefficients in each linear row
-    linear_interval: NDArray  # (E,)
+    linear_runs: NDArray  # of the E rows
     of_yaw: int  # how many of the linear rows, the last ones, weigh yaw's coefficients, not those of h
 
 
@@ -99,7 +104,7 @@ class Variables:
     """Which coefficients are variables."""
 
     slots: NDArray  # (N+3, 1 or 2) entry of v of each coefficient, -1 where it is fixed
-    local: NDArray  # (N, k) where an interval's coefficients lie in the flattened table
+    local: NDArray  # (k, N) where an interval's coefficients lie in the flattened table
     positive: int  # how many coefficients of h have an entry of v of their own
     size: int  # of v
     band: int  # how far apart two coefficients that meet can be
@@ -112,16 +117,19 @@ def variables_of(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, boo
     nodes, free_yaw = layout.shape.nodes, layout.shape.free_yaw
     table, own = _slots(nodes, 2 if free_yaw else 1, held, rests)
     k = point_constraints.variables(free_yaw)
-    local = np.arange(nodes)[:, None] + np.array([0, 1, 2, 3, 0, 1, 2][:k]), np.array([0, 0, 0, 0, 1, 1, 1][:k])
+    local = (
+        np.array([0, 1, 2, 3, 0, 1, 2][:k])[:, None] + np.arange(nodes),
+        np.array([0, 0, 0, 0, 1, 1, 1][:k])[:, None],
+    )
     slots = table[local]
-    free = np.where(slots >= 0, slots, slots.max(axis=1, keepdims=True))
-    band = int((free.max(axis=1) - free.min(axis=1)).max())
+    free = np.where(slots >= 0, slots, slots.max(axis=0))
+    band = int((free.max(axis=0) - free.min(axis=0)).max())
     right, left = np.array([(a, b) for b in range(k) for a in range(b, k)]).T
-    low, high = np.minimum(slots[:, left], slots[:, right]), np.maximum(slots[:, left], slots[:, right])
+    low, high = np.minimum(slots[left], slots[right]), np.maximum(slots[left], slots[right])
     entry = np.where(low >= 0, high * (band + 1) + high - low, _FIXED)
-    entries = np.stack([entry, np.where((low == high) & (left != right), 2, 1)], axis=-1)
+    entries = np.stack([entry, np.where((low == high) & (left != right)[:, None], 2, 1)])
     positive = np.flatnonzero(own[:, 0])
-    sparsity = Sparsity(layout.interval, slots, entries, *_linear_rows(layout, positive))
+    sparsity = Sparsity(_runs(layout.interval), slots, entries, *_linear_rows(layout, positive))
     return Variables(table, local[0] * table.shape[1] + local[1], len(positive), table.size, band, sparsity)
 
 
@@ -146,8 +154,7 @@ def _slots(nodes: int, columns: int, held: tuple[bool, bool], rests: tuple[bool,
 
 
 def _linear_rows(layout: Layout, positive: NDArray) -> tuple[NDArray, NDArray, int]:
-    """Return (weights (4, E), interval, how many of yaw): h where the speed limit holds, the coefficients of h, and
-    where yaw starts."""
+    """Return (weights (4, E), runs, how many of yaw): h where the speed limit holds, its coefficients, yaw's start."""
     of_positive = np.clip(positive - 1, 0, layout.shape.nodes - 1)
     weights = [np.stack(weights_at(layout.speed_place)), np.eye(4)[positive - of_positive].T]
     interval = [layout.speed_interval, of_positive]
@@ -155,4 +162,10 @@ def _linear_rows(layout: Layout, positive: NDArray) -> tuple[NDArray, NDArray, i
         weights.append(np.append(0.0, yaw_spline.AT_NODE[0])[:, None])
         interval.append(np.zeros(1, dtype=int))
     linear = np.ascontiguousarray(np.concatenate(weights, axis=1))
-    return linear, np.concatenate(interval), int(layout.shape.free_yaw)
+    return linear, _runs(np.concatenate(interval)), int(layout.shape.free_yaw)
+
+
+def _runs(interval: NDArray) -> NDArray:
+    """Return the runs, (R, 3), in which these intervals follow one another."""
+    first = np.flatnonzero(np.diff(interval, prepend=-2) != 1)
+    return np.stack([first, interval[first], np.diff(first, append=len(interval))], axis=1).astype(np.uint64)

@@ -1,4 +1,4 @@
-"""Writes CasADi functions out as LLVM source that evaluates them at many points, eight points with one instruction.
+"""Writes CasADi functions out as LLVM source that evaluates them at many points, several with one instruction.
 
 Arrays hold a quantity a row and a point a column. What is the same at all points is computed once, before the loop over
 the points; each number is divided by once, and multiplied with the reciprocal from then on.
@@ -9,10 +9,8 @@ from collections.abc import Collection, Sequence
 
 import casadi
 
-from cfplan.planners.expert.point_constraints import LANES
 from cfplan.vehicle import trigonometry
 
-_WIDE = f"<{LANES} x double>"
 _FREELY = "nsz contract"  # products and sums may be fused; nothing else may be rearranged
 _OPERATIONS = {casadi.OP_ADD: "fadd", casadi.OP_SUB: "fsub", casadi.OP_MUL: "fmul"}
 _READ, _WRITTEN = "!alias.scope !1, !noalias !2", "!alias.scope !2, !noalias !1"  # results overlap no argument
@@ -27,74 +25,83 @@ attributes #0 = { alignstack=64 "min-legal-vector-width"="512" "prefer-vector-wi
 """
 
 
-def source(functions: Sequence[casadi.Function], uniform: Collection[int]) -> str:
+def source(functions: Sequence[casadi.Function], uniform: Collection[int], lanes: int) -> str:
     """Return LLVM source of void f(points, inputs…, results…); the inputs numbered in `uniform` are one column.
 
-    Raises NotImplementedError for an instruction that is not known here.
+    `lanes` points are taken with one instruction, and `points` must be a multiple of that. Raises NotImplementedError
+    for an instruction that is not known here.
     """
-    return _preamble() + "\n".join(_function(each, uniform) for each in functions) + _ENDING
+    return _preamble(lanes) + "\n".join(_function(each, uniform, lanes) for each in functions) + _ENDING
 
 
 def _number(value: float) -> str:
     return f"0x{struct.unpack('>Q', struct.pack('>d', float(value)))[0]:016X}"
 
 
-def _vector(value: float) -> str:
-    return f"<{', '.join([f'double {_number(value)}'] * LANES)}>"
+def _vector_type(lanes: int) -> str:
+    return f"<{lanes} x double>"
 
 
-def _preamble() -> str:
+def _vector(number: str, lanes: int) -> str:
+    return f"<{', '.join([f'double {number}'] * lanes)}>"
+
+
+def _preamble(lanes: int) -> str:
     """Return sine and cosine as in trigonometry.py; rounding r - 3/8 is the floor where r is a multiple of 1/4."""
     lines: list[str] = []
+    wide, mask = _vector_type(lanes), f"<{lanes} x i1>"
+
+    def constant(value: float) -> str:
+        return _vector(_number(value), lanes)
 
     def emit(text: str) -> str:
         lines.append(f"  %v{len(lines)} = {text}")
         return f"%v{len(lines) - 1}"
 
     def op(name: str, a: str, b: str) -> str:
-        return emit(f"{name} {_FREELY} {_WIDE} {a}, {b}")
+        return emit(f"{name} {_FREELY} {wide} {a}, {b}")
 
     def rounded(a: str) -> str:
-        return emit(f"call {_WIDE} @llvm.rint.v{LANES}f64({_WIDE} {a})")
+        return emit(f"call {wide} @llvm.rint.v{lanes}f64({wide} {a})")
 
     def polynomial(z: str, coefficients: Sequence[float]) -> str:
-        total = _vector(coefficients[-1])
+        total = constant(coefficients[-1])
         for coefficient in coefficients[-2::-1]:
-            total = op("fadd", _vector(coefficient), op("fmul", z, total))
+            total = op("fadd", constant(coefficient), op("fmul", z, total))
         return total
 
     def equals(a: str, value: float) -> str:
-        return emit(f"fcmp oeq {_WIDE} {a}, {_vector(value)}")
+        return emit(f"fcmp oeq {wide} {a}, {constant(value)}")
 
-    turns = rounded(op("fmul", "%angle", _vector(trigonometry.PER_QUARTER)))
+    turns = rounded(op("fmul", "%angle", constant(trigonometry.PER_QUARTER)))
     x = "%angle"
     for part in trigonometry.QUARTER:
-        x = op("fsub", x, op("fmul", turns, _vector(part)))
+        x = op("fsub", x, op("fmul", turns, constant(part)))
     z = op("fmul", x, x)
     sine = op("fadd", x, op("fmul", op("fmul", x, z), polynomial(z, trigonometry.SINE)))
     cosine = op("fmul", op("fmul", z, z), polynomial(z, trigonometry.COSINE))
-    cosine = op("fadd", op("fsub", _vector(1.0), op("fmul", _vector(0.5), z)), cosine)
+    cosine = op("fadd", op("fsub", constant(1.0), op("fmul", constant(0.5), z)), cosine)
     total = op("fadd", turns, "%quarters")
-    whole = rounded(op("fsub", op("fmul", _vector(0.25), total), _vector(0.375)))
-    quadrant = op("fsub", total, op("fmul", _vector(4.0), whole))
-    odd = emit(f"or <{LANES} x i1> {equals(quadrant, 1.0)}, {equals(quadrant, 3.0)}")
-    value = emit(f"select <{LANES} x i1> {odd}, {_WIDE} {cosine}, {_WIDE} {sine}")
-    negative = emit(f"fcmp oge {_WIDE} {quadrant}, {_vector(2.0)}")
-    opposite = emit(f"fneg {_WIDE} {value}")
-    result = emit(f"select <{LANES} x i1> {negative}, {_WIDE} {opposite}, {_WIDE} {value}")
+    whole = rounded(op("fsub", op("fmul", constant(0.25), total), constant(0.375)))
+    quadrant = op("fsub", total, op("fmul", constant(4.0), whole))
+    odd = emit(f"or {mask} {equals(quadrant, 1.0)}, {equals(quadrant, 3.0)}")
+    value = emit(f"select {mask} {odd}, {wide} {cosine}, {wide} {sine}")
+    negative = emit(f"fcmp oge {wide} {quadrant}, {constant(2.0)}")
+    opposite = emit(f"fneg {wide} {value}")
+    result = emit(f"select {mask} {negative}, {wide} {opposite}, {wide} {value}")
     body = "\n".join(lines)
-    return f"""declare {_WIDE} @llvm.sqrt.v{LANES}f64({_WIDE})
+    return f"""declare {wide} @llvm.sqrt.v{lanes}f64({wide})
 declare double @llvm.sqrt.f64(double)
-declare {_WIDE} @llvm.rint.v{LANES}f64({_WIDE})
-define internal {_WIDE} @wave({_WIDE} %angle, {_WIDE} %quarters) alwaysinline {{
+declare {wide} @llvm.rint.v{lanes}f64({wide})
+define internal {wide} @wave({wide} %angle, {wide} %quarters) alwaysinline {{
 {body}
-  ret {_WIDE} {result}
+  ret {wide} {result}
 }}
 """
 
 
-def _function(f: casadi.Function, uniform: Collection[int]) -> str:
-    writer = _Writer(uniform)
+def _function(f: casadi.Function, uniform: Collection[int], lanes: int) -> str:
+    writer = _Writer(uniform, lanes)
     for k in range(f.n_instructions()):
         writer.add(f, k)
     inputs = "".join(f", ptr nocapture readonly %in{i}" for i in range(f.n_in()))
@@ -108,7 +115,7 @@ entry:
 loop:
   %p = phi i64 [0, %entry], [%next, %loop]
 {inside}
-  %next = add i64 %p, {LANES}
+  %next = add i64 %p, {lanes}
   %more = icmp slt i64 %next, %points
   br i1 %more, label %loop, label %end
 end:
@@ -120,10 +127,11 @@ end:
 class _Writer:
     """The lines before the loop over points, and those inside, as a function's instructions are added one by one."""
 
-    def __init__(self, uniform: Collection[int]):
+    def __init__(self, uniform: Collection[int], lanes: int):
         self.before: list[str] = []
         self.inside: list[str] = []
         self.uniform_inputs = uniform
+        self.lanes, self.vector = lanes, _vector_type(lanes)
         self.narrow: set[str] = set()  # values that are one double, the same at all points
         self.slots: dict[int, str] = {}  # what each of the virtual machine's registers holds
         self.widened: dict[str, str] = {}
@@ -136,7 +144,9 @@ class _Writer:
             self.slots[outputs[0]] = self._load(*inputs)
         elif operation == casadi.OP_OUTPUT:
             place = self._place(f"%out{outputs[0]}", outputs[1])
-            self.inside.append(f"store {_WIDE} {self._wide(self.slots[inputs[0]])}, ptr {place}, align 8, {_WRITTEN}")
+            self.inside.append(
+                f"store {self.vector} {self._wide(self.slots[inputs[0]])}, ptr {place}, align 8, {_WRITTEN}"
+            )
         elif operation == casadi.OP_CONST:
             self.slots[outputs[0]] = _number(f.instruction_constant(number))
         else:
@@ -160,18 +170,20 @@ class _Writer:
         if operation == casadi.OP_NEG:
             return self._emit(f"fneg {self._type(a)} {a}", not self._is_narrow(a))
         if operation == casadi.OP_SQRT:
-            kind = "f64" if self._is_narrow(a) else f"v{LANES}f64"
+            kind = "f64" if self._is_narrow(a) else f"v{self.lanes}f64"
             return self._emit(f"call {self._type(a)} @llvm.sqrt.{kind}({self._type(a)} {a})", not self._is_narrow(a))
         if operation in (casadi.OP_SIN, casadi.OP_COS):
-            quarters = _vector(0.0 if operation == casadi.OP_SIN else 1.0)
-            return self._emit(f"call {_WIDE} @wave({_WIDE} {self._wide(a)}, {_WIDE} {quarters})", True)
+            quarters = _vector(_number(0.0 if operation == casadi.OP_SIN else 1.0), self.lanes)
+            return self._emit(
+                f"call {self.vector} @wave({self.vector} {self._wide(a)}, {self.vector} {quarters})", True
+            )
         if operation == casadi.OP_FMAX:  # the number that is the same everywhere where the other is none
             a, b = (self._wide(each) for each in ((a, b) if self._is_narrow(b) else (b, a)))
-            larger = self._emit(f"fcmp ogt {_WIDE} {a}, {b}", True)
-            return self._emit(f"select <{LANES} x i1> {larger}, {_WIDE} {a}, {_WIDE} {b}", True)
+            larger = self._emit(f"fcmp ogt {self.vector} {a}, {b}", True)
+            return self._emit(f"select <{self.lanes} x i1> {larger}, {self.vector} {a}, {self.vector} {b}", True)
         if operation == casadi.OP_LE:
-            holds = self._emit(f"fcmp ole {_WIDE} {self._wide(a)}, {self._wide(b)}", True)
-            return self._emit(f"uitofp <{LANES} x i1> {holds} to {_WIDE}", True)
+            holds = self._emit(f"fcmp ole {self.vector} {self._wide(a)}, {self._wide(b)}", True)
+            return self._emit(f"uitofp <{self.lanes} x i1> {holds} to {self.vector}", True)
         return None
 
     def _emit(self, text: str, varies: bool) -> str:
@@ -185,24 +197,24 @@ class _Writer:
         return value in self.narrow or value.startswith("0x")
 
     def _type(self, value: str) -> str:
-        return "double" if self._is_narrow(value) else _WIDE
+        return "double" if self._is_narrow(value) else self.vector
 
     def _wide(self, value: str) -> str:
-        """Return the value as a vector, its own or one of eight equal numbers."""
+        """Return the value as a vector, its own or one of equal numbers."""
         if not self._is_narrow(value):
             return value
         if value.startswith("0x"):
-            return f"<{', '.join([f'double {value}'] * LANES)}>"
+            return _vector(value, self.lanes)
         if value not in self.widened:
-            one = self._emit(f"insertelement {_WIDE} poison, double {value}, i32 0", False)
-            all_lanes = f"shufflevector {_WIDE} {one}, {_WIDE} poison, <{LANES} x i32> zeroinitializer"
+            one = self._emit(f"insertelement {self.vector} poison, double {value}, i32 0", False)
+            all_lanes = f"shufflevector {self.vector} {one}, {self.vector} poison, <{self.lanes} x i32> zeroinitializer"
             self.widened[value] = self._emit(all_lanes, False)
         return self.widened[value]
 
     def _op(self, name: str, a: str, b: str) -> str:
         if self._is_narrow(a) and self._is_narrow(b):
             return self._emit(f"{name} {_FREELY} double {a}, {b}", False)
-        return self._emit(f"{name} {_FREELY} {_WIDE} {self._wide(a)}, {self._wide(b)}", True)
+        return self._emit(f"{name} {_FREELY} {self.vector} {self._wide(a)}, {self._wide(b)}", True)
 
     def _reciprocal(self, value: str) -> str:
         if value not in self.reciprocals:
@@ -219,4 +231,4 @@ class _Writer:
         if argument in self.uniform_inputs:
             place = self._emit(f"getelementptr double, ptr %in{argument}, i64 {row}", False)
             return self._emit(f"load double, ptr {place}, align 8, {_READ}", False)
-        return self._emit(f"load {_WIDE}, ptr {self._place(f'%in{argument}', row)}, align 8, {_READ}", True)
+        return self._emit(f"load {self.vector}, ptr {self._place(f'%in{argument}', row)}, align 8, {_READ}", True)

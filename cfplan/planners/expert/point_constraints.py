@@ -20,7 +20,7 @@ LOWER, UPPER, JUMPS = quantities.LOWER[:ROWS], quantities.UPPER[:ROWS], quantiti
 POINT_DATA = 17  # γ' to γ'''' (12), place in the interval 0 to 1, weight of the penalties, ψ, ψ', ψ''
 COMMON_DATA = 9 + 2 * measures.MEASURES  # the airframe (8), scale; offset and scale of each row of the table
 PLACE, WEIGHT, YAW = 12, 13, 14  # rows of the point data
-LANES = 8  # points that the kernels take with one instruction
+LANES = 8  # points come in multiples of this, which the kernels may take with one instruction
 LEAST = 1e-6  # x below this counts as this: a solver that tries h < 0 must not meet what is not a number
 UNBOUNDED = 1e8  # stands for no limit, in a row's own unit
 

@@ -36,15 +36,15 @@ class SplineProgram:
         self._variables = it = variables_of(problem.layout, problem.ends.held, problem.rests)
         self._fixed = problem.coefficients
         self._fixed_local = problem.coefficients.ravel()[it.local]
-        self._linear = len(it.sparsity.linear_interval)
+        self._linear = it.sparsity.linear.shape[1]
         self._kernels = kernels(
             problem.layout.shape.free_yaw, problem.point_data, problem.common, OBJECTIVE_SCALE * problem.penalties,
             self._linear,
         )  # fmt: skip
         # Within one call of evaluate() or linearise():
         self._local = np.empty(it.local.shape)
-        self._at_points = np.empty((it.local.shape[1], problem.point_data.shape[1]))
-        self._work = np.empty((derivative_rows(it.local.shape[1]), problem.point_data.shape[1]))
+        self._at_points = np.empty((len(it.local), problem.point_data.shape[1]))
+        self._work = np.empty((derivative_rows(len(it.local)), problem.point_data.shape[1]))
         self._scale = OBJECTIVE_SCALE * math.sqrt(problem.step**2 / problem.unit)  # of time in node units
         self.rows = point_constraints.ROWS
         self.bounds = self._bounds(problem)
@@ -76,15 +76,14 @@ class SplineProgram:
     def evaluate(self, v: NDArray) -> Values:
         """Return f and g at v."""
         it = self._variables.sparsity
-        _gather(v, it.slots, it.interval, self._fixed_local, self._local, self._at_points)
+        _gather(v, it.slots, it.runs, self._fixed_local, self._local, self._at_points)
         constraints, penalty = self._kernels.evaluate(self._at_points)
         return Values(_complete(constraints, penalty, self._local, it, self._scale), constraints)
 
     def linearise(self, v: NDArray, terms: NDArray) -> Linearisation:
         """Return the derivatives at v, where the constraints have these barrier.TERMS."""
         it = self._variables
-        slots, interval = it.sparsity.slots, it.sparsity.interval
-        _gather(v, slots, interval, self._fixed_local, self._local, self._at_points)
+        _gather(v, it.sparsity.slots, it.sparsity.runs, self._fixed_local, self._local, self._at_points)
         jacobian = self._kernels.differentiate(self._at_points, terms, self._work)
         gradients, matrix = np.zeros((len(terms), it.size)), np.zeros((it.size, it.band + 1))
         _assemble(self._work, it.sparsity, terms, self._local, self._scale, gradients, matrix)
@@ -107,30 +106,36 @@ def _smallest(table, slots, size):
 
 @register_jitable
 def _spread(v, slots, fixed, local):
-    """Fill in each interval's coefficients, (N, k)."""
-    for i in range(slots.shape[0]):
-        for a in range(slots.shape[1]):
-            local[i, a] = v[slots[i, a]] if slots[i, a] >= 0 else fixed[i, a]
+    """Fill in each interval's coefficients, (k, N)."""
+    for a in range(slots.shape[0]):
+        for i in range(slots.shape[1]):
+            local[a, i] = v[slots[a, i]] if slots[a, i] >= 0 else fixed[a, i]
 
 
 @register_jitable(fastmath=_FREELY)
 def _weigh(sparsity, local, result):
-    """Fill in what is linear in the coefficients, (N, k), of each interval."""
-    linear, linear_interval = sparsity.linear, sparsity.linear_interval
-    of_h, of_yaw = len(linear_interval) - sparsity.of_yaw, local.shape[1] - 4
-    for j in range(len(linear_interval)):
-        first, i = 0 if j < of_h else of_yaw, linear_interval[j]
-        value = linear[0, j] * local[i, first] + linear[1, j] * local[i, first + 1]
-        result[j] = value + linear[2, j] * local[i, first + 2] + linear[3, j] * local[i, first + 3]
+    """Fill in what is linear in the coefficients, (k, N), of each interval."""
+    linear, of_h = sparsity.linear, len(result) - sparsity.of_yaw
+    runs = sparsity.linear_runs
+    for r in range(len(runs)):
+        row, interval, count = runs[r, 0], runs[r, 1], runs[r, 2]
+        first = 0 if row < of_h else len(local) - 4
+        for n in range(count):
+            j, i = row + n, interval + n
+            value = linear[0, j] * local[first, i] + linear[1, j] * local[first + 1, i]
+            result[j] = value + linear[2, j] * local[first + 2, i] + linear[3, j] * local[first + 3, i]
 
 
 @njit(error_model="numpy")
-def _gather(v, slots, interval, fixed, local, at_points):
-    """Fill in the coefficients of each interval, (N, k), and of each point, (k, P)."""
+def _gather(v, slots, runs, fixed, local, at_points):
+    """Fill in the coefficients of each interval, (k, N), and of each point, (k, P)."""
     _spread(v, slots, fixed, local)
-    for a in range(local.shape[1]):
-        for p in range(len(interval)):
-            at_points[a, p] = local[interval[p], a]
+    for r in range(len(runs)):
+        point, interval, count = runs[r, 0], runs[r, 1], runs[r, 2]
+        for a in range(len(local)):
+            to, of = at_points[a], local[a]
+            for n in range(count):
+                to[point + n] = of[interval + n]
 
 
 @njit(error_model="numpy", fastmath=_FREELY)
@@ -139,26 +144,32 @@ def _complete(constraints, penalty, local, sparsity, scale):
 
     The time in node units is Σ ∫ds/√x over all intervals.
     """
-    _weigh(sparsity, local, constraints[len(constraints) - len(sparsity.linear_interval) :])
+    _weigh(sparsity, local, constraints[len(constraints) - sparsity.linear.shape[1] :])
     time, total = 0.0, 0.0
-    for i in range(local.shape[0]):
-        for q in range(len(_WEIGHTS)):
-            x = 0.0
-            for a in range(4):
-                x += _AT_PLACES[q, a] * local[i, a]
-            time += _WEIGHTS[q] / math.sqrt(max(x, point_constraints.LEAST))
+    for q in range(len(_WEIGHTS)):
+        for i in range(local.shape[1]):
+            time += _WEIGHTS[q] / math.sqrt(_x_at(_AT_PLACES[q], local, i))
     for p in range(len(penalty)):
         total += penalty[p]
     return scale * time + total
 
 
-@njit(error_model="numpy", fastmath=_FREELY)
-def _sum_by_interval(at_points, interval, count):
+@register_jitable(forceinline=True, fastmath=_FREELY)
+def _x_at(weights, local, i):
+    """Return x in interval i, from these four weights of its coefficients, (k, N)."""
+    x = weights[0] * local[0, i] + weights[1] * local[1, i] + weights[2] * local[2, i]
+    return max(x + weights[3] * local[3, i], point_constraints.LEAST)
+
+
+@register_jitable(fastmath=_FREELY)
+def _sum_by_interval(at_points, runs, count):
     result = np.zeros((len(at_points), count))
-    for a in range(len(at_points)):
-        row, summed = at_points[a], result[a]
-        for p in range(len(interval)):
-            summed[interval[p]] += row[p]
+    for r in range(len(runs)):
+        point, interval, length = runs[r, 0], runs[r, 1], runs[r, 2]
+        for a in range(len(at_points)):
+            row, summed = at_points[a], result[a]
+            for n in range(length):
+                summed[interval + n] += row[point + n]
     return result
 
 
@@ -171,31 +182,33 @@ def _entry(column, row, size):
 @register_jitable(fastmath=_FREELY)
 def _add_linear(sparsity, terms, k, gradients, hessian):
     """Add the linear constraints to the gradients and the Hessian of each interval."""
-    linear, linear_interval = sparsity.linear, sparsity.linear_interval
-    count = len(linear_interval)
-    before, of_h = terms.shape[1] - count, count - sparsity.of_yaw
-    for begin, end, first in ((0, of_h, 0), (of_h, count, k - 4)):
+    linear, rows = sparsity.linear, sparsity.linear.shape[1]
+    of_rows = terms[:, terms.shape[1] - rows :]
+    runs = sparsity.linear_runs
+    for r in range(len(runs)):
+        begin, interval, count = runs[r, 0], runs[r, 1], runs[r, 2]
+        first = 0 if begin < rows - sparsity.of_yaw else k - 4
         for b in range(4):
             for kind in range(1, len(terms)):
                 row = gradients[kind * k + first + b]
-                for j in range(begin, end):
-                    row[linear_interval[j]] += terms[kind, before + j] * linear[b, j]
+                for n in range(count):
+                    row[interval + n] += of_rows[kind, begin + n] * linear[b, begin + n]
             for a in range(b, 4):
                 row = hessian[_entry(first + b, first + a, k)]
-                for j in range(begin, end):
-                    row[linear_interval[j]] += terms[0, before + j] * linear[b, j] * linear[a, j]
+                for n in range(count):
+                    both = linear[b, begin + n] * linear[a, begin + n]
+                    row[interval + n] += of_rows[0, begin + n] * both
 
 
 @register_jitable(fastmath=_FREELY)
 def _add_time(local, scale, gradients, hessian):
     """Add the time spent in each interval."""
-    count, k = local.shape
+    k, count = local.shape
     slope, bend = np.empty(count), np.empty(count)  # derivatives of the time by x
     for q in range(len(_WEIGHTS)):
         weight = _AT_PLACES[q]
         for i in range(count):
-            x = weight[0] * local[i, 0] + weight[1] * local[i, 1] + weight[2] * local[i, 2]
-            x = max(x + weight[3] * local[i, 3], point_constraints.LEAST)
+            x = _x_at(weight, local, i)
             slope[i] = -0.5 * scale * _WEIGHTS[q] / (x * math.sqrt(x))
             bend[i] = -1.5 * slope[i] / x
         for b in range(4):
@@ -211,34 +224,37 @@ def _add_time(local, scale, gradients, hessian):
 def _assemble(at_points, sparsity, terms, local, scale, gradients, matrix):
     """Add up gradients and matrix, zero at first, from the kernel's at points, the linear constraints and the time."""
     slots, entries, kinds = sparsity.slots, sparsity.entries, len(terms)
-    count, k = local.shape
-    of_gradients = _sum_by_interval(at_points[: kinds * k], sparsity.interval, count)
-    of_hessian = _sum_by_interval(at_points[kinds * k :], sparsity.interval, count)
+    k, count = local.shape
+    of_gradients = _sum_by_interval(at_points[: kinds * k], sparsity.runs, count)
+    of_hessian = _sum_by_interval(at_points[kinds * k :], sparsity.runs, count)
     _add_linear(sparsity, terms, k, of_gradients, of_hessian)
     _add_time(local, scale, of_gradients, of_hessian)
     flat = matrix.ravel()
-    for i in range(count):
-        for a in range(k):
-            if slots[i, a] >= 0:
+    for a in range(k):
+        for i in range(count):
+            if slots[a, i] >= 0:
                 for kind in range(kinds):
-                    gradients[kind, slots[i, a]] += of_gradients[kind * k + a, i]
-        for e in range(entries.shape[1]):
-            if entries[i, e, 0] >= 0:
-                flat[entries[i, e, 0]] += entries[i, e, 1] * of_hessian[e, i]
+                    gradients[kind, slots[a, i]] += of_gradients[kind * k + a, i]
+    for e in range(entries.shape[1]):
+        for i in range(count):
+            if entries[0, e, i] >= 0:
+                flat[entries[0, e, i]] += entries[1, e, i] * of_hessian[e, i]
 
 
 @njit(error_model="numpy", fastmath=_FREELY)
 def _jvp(jacobian, sparsity, dv):
     """Return J dv, (m,); `jacobian` is the kernel's at points."""
-    count, k = sparsity.slots.shape
-    interval, points = sparsity.interval, jacobian.shape[1]
+    k, points = len(sparsity.slots), jacobian.shape[1]
     rows = jacobian.shape[0] // k
-    local, of_point = np.zeros((count, k)), np.empty(points)
+    local, of_point = np.zeros(sparsity.slots.shape), np.empty(points)
     _spread(dv, sparsity.slots, local, local)
-    result = np.zeros(rows * points + len(sparsity.linear_interval))
+    result = np.zeros(rows * points + sparsity.linear.shape[1])
     for a in range(k):
-        for p in range(points):
-            of_point[p] = local[interval[p], a]
+        row = local[a]
+        for r in range(len(sparsity.runs)):
+            point, interval, count = sparsity.runs[r, 0], sparsity.runs[r, 1], sparsity.runs[r, 2]
+            for n in range(count):
+                of_point[point + n] = row[interval + n]
         for r in range(rows):
             for p in range(points):
                 result[r * points + p] += jacobian[a * rows + r, p] * of_point[p]
