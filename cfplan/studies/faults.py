@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cfplan.errors import CfplanError, ExitCode
-from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome, Rung
 from cfplan.flight.pilot.pilot import Pilot
@@ -92,14 +92,6 @@ class FaultFlight:
 
 
 @dataclass(slots=True)
-class StudyOrders:
-    """What the operator of a scenario orders."""
-
-    worst: Order | None = None
-    gone: bool = False
-
-
-@dataclass(slots=True)
 class SteppedFlight:
     """What a flight in the stepped lab left behind."""
 
@@ -159,7 +151,7 @@ def fly_stepped(
 ) -> SteppedFlight:
     """Fly one in a stepped lab, by default a new one with that seed, until everything has come to rest."""
     lab = lab or _lab(scenario, mission, seed)
-    orders, flown = StudyOrders(), SteppedFlight(None, "", lab.truth(), math.nan)
+    orders, flown = HeldOrders(), SteppedFlight(None, "", lab.truth(), math.nan)
 
     def strike() -> None:
         flown.struck = lab.now

@@ -10,7 +10,7 @@ from septic_flight import septic_payloads
 
 from cfplan.flight.clock import SteppedClock
 from cfplan.flight.mocap.poses import Pose
-from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.pilot import Pilot
 from cfplan.flight.radio.link import GO_TO, LAND, TAKE_OFF
@@ -65,12 +65,6 @@ def make_payloads(distance: float = 2.0, duration: float = 2.0, height: float = 
 
 
 @dataclass
-class FakeOrders:
-    worst: Order | None = None
-    gone: bool = False
-
-
-@dataclass
 class World:
     """The clock, the vehicle as its link shows it, and motion capture, in one."""
 
@@ -102,7 +96,7 @@ class World:
     forwarded: list[tuple[float, ...]] = field(default_factory=list)
     calls: list[str] = field(default_factory=list)
     signs_of_life: list[float] = field(default_factory=list)
-    orders: FakeOrders = field(default_factory=FakeOrders)
+    orders: HeldOrders = field(default_factory=HeldOrders)
     motors_off_in_the_air: float = 0.0
     armed: bool = False
     closed: bool = False

@@ -1,22 +1,22 @@
-"""A short flight, and a way to fly it: real cflib, real processes, real time."""
+"""A short flight, and a way to fly it in real time: real cflib, real processes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from septic_flight import septic_payloads
+from stepped_flight import Flight
 
 from cfplan.flight.pilot.mission import Mission
-from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
-from cfplan.flight.telemetry import Event, Phase, PhaseEntered, Telemetry
+from cfplan.flight.telemetry import Telemetry
 from cfplan.safety.limits import GroundManoeuvres, Limits
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.lab.lab import Lab, Truth, start_lab
+from cfplan.simulation.lab.lab import Lab, start_lab
 from cfplan.simulation.lab.room import RoomPoseSource
 from cfplan.simulation.lab.sim_driver import SimDriver
 
@@ -32,10 +32,7 @@ def short_payloads(distance: float = 1.5, duration: float = 2.5, height: float =
 @pytest.fixture(scope="session")
 def limits() -> Limits:
     quick = GroundManoeuvres(take_off_height=0.5, take_off_speed=0.4, go_to_speed=0.6, land_speed=0.4)
-    limits = load_limits(SAFETY_FILE)
-    # The computer that runs tests stands still now and then; that this ends a flight is tested on the pilot's own.
-    patient = replace(limits.pose, age_brake=0.5, age_land=1.5)
-    return replace(limits, ground=quick, pose=patient, lateness=0.1)
+    return replace(load_limits(SAFETY_FILE), ground=quick)
 
 
 @pytest.fixture(scope="session")
@@ -44,29 +41,16 @@ def mission(limits) -> Mission:
     return Mission(payloads, encode_stops(decode(payloads), 100.0), limits, hold_time=0.5)
 
 
-@dataclass
-class Flight:
-    """What a flight left behind."""
-
-    outcome: FlightOutcome
-    telemetry: list[Telemetry]
-    truth: Truth
-
-    def of(self, kind: type) -> list[Telemetry]:
-        return [message for message in self.telemetry if isinstance(message, kind)]
-
-    @property
-    def phases(self) -> list[Phase]:
-        return [message.phase for message in self.of(PhaseEntered)]
-
-    @property
-    def said(self) -> list[str]:
-        return [message.text for message in self.of(Event)]
+@pytest.fixture(scope="session")
+def patient_mission(mission) -> Mission:
+    """The same for real time: the computer that runs tests stands still now and then."""
+    pose = replace(mission.limits.pose, age_brake=0.5, age_land=1.5)
+    return replace(mission, limits=replace(mission.limits, pose=pose, lateness=0.1))
 
 
 @pytest.fixture(scope="session")
-def fly_in(mission):
-    """Flies in a lab, and lets `react` see each message as it comes."""
+def fly_in(patient_mission):
+    """Flies in a lab in real time, and lets `react` see each message as it comes."""
 
     def flight(lab: Lab, react: Callable[[Telemetry], None] = lambda _: None) -> Flight:
         telemetry: list[Telemetry] = []
@@ -76,7 +60,7 @@ def fly_in(mission):
             react(message)
 
         source = RoomPoseSource(lab.number)
-        outcome = fly(mission, uri=lab.uri, drivers=[SimDriver], pose_source=source, on_telemetry=note)
+        outcome = fly(patient_mission, uri=lab.uri, drivers=[SimDriver], pose_source=source, on_telemetry=note)
         return Flight(outcome, telemetry, lab.truth())
 
     return flight
@@ -84,6 +68,6 @@ def fly_in(mission):
 
 @pytest.fixture(scope="module")
 def lab(limits):
-    """One lab for the flights that leave its vehicle fit to fly."""
+    """One lab in real time for the flights that leave its vehicle fit to fly."""
     with start_lab(limits.airframe) as running:
         yield running

@@ -10,6 +10,7 @@ import sys
 import termios
 import threading
 from collections import deque
+from dataclasses import dataclass
 from enum import IntEnum
 from types import FrameType, TracebackType
 from typing import Any
@@ -26,6 +27,18 @@ class Order(IntEnum):
 
     LAND = 1
     CUT = 2
+
+
+@dataclass
+class HeldOrders:
+    """What the pilot knows of the operator and of the main process; an OrderSource."""
+
+    worst: Order | None = None  # the gravest order so far
+    gone: bool = False  # the main process has ended
+
+    def give(self, order: Order) -> None:
+        """Take an order; a lesser one than before changes nothing."""
+        self.worst = max(order, self.worst or order)
 
 
 def orders_of(keys: bytes) -> list[Order]:

@@ -10,14 +10,15 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from types import TracebackType
 
 from cfplan.errors import CfplanError, LinkError
 from cfplan.flight.mocap.poses import PoseSource
-from cfplan.flight.pilot.keys import Keyboard, Order
+from cfplan.flight.pilot.keys import HeldOrders, Keyboard, Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.pilot import Pilot
@@ -109,46 +110,67 @@ def fly(
     held = Keyboard() if keyboard is None else contextlib.nullcontext(keyboard)
     with held as entered, pilot or start_pilot(drivers) as started:
         started.assign(mission, uri, pose_source)
-        return _attend(started.process, started.telemetry, started.orders, entered, on_telemetry, more_orders)
+        attendant = Attendant(partial(_send, started.orders), entered, on_telemetry, more_orders)
+        return _attend(started.process, started.telemetry, entered, attendant)
 
 
-def _attend(
-    process: BaseProcess,
-    telemetry: Connection,
-    orders: Connection,
-    keyboard: Keyboard,
-    on_telemetry: Callable[[Telemetry], None],
-    more_orders: Callable[[], Sequence[Order]],
-) -> FlightOutcome:
-    """Pass telemetry one way and orders the other; return the pilot's last message."""
-    failure: BaseException | None = None
+class Attendant:
+    """The main process's side of a flight: it passes telemetry one way and orders the other.
+
+    A listener that fails lands the vehicle, and its failure is raised when the flight has ended.
+    """
+
+    def __init__(
+        self,
+        give: Callable[[Order], None],
+        keyboard: Keyboard,
+        on_telemetry: Callable[[Telemetry], None],
+        more_orders: Callable[[], Sequence[Order]],
+    ):
+        self._give, self._keyboard, self._on_telemetry, self._more_orders = give, keyboard, on_telemetry, more_orders
+        self.failure: BaseException | None = None  # of a listener
+
+    def pass_orders(self) -> None:
+        """Give the pilot the orders since the last call."""
+        for order in (*self._keyboard.orders(), *self._more_orders()):
+            self._give(order)
+
+    def tell(self, messages: Sequence[Telemetry]) -> None:
+        """Tell the listener, unless it has failed."""
+        if self.failure is None:
+            try:
+                for message in messages:
+                    self._on_telemetry(message)
+            except BaseException as error:  # a fault here must not break the flight
+                self.failure = error
+                self._give(Order.LAND)
+
+    def conclude(self, last: FlightOutcome | CfplanError) -> FlightOutcome:
+        """Return the outcome of a flight by the pilot's last message. Raises what failed, here or there."""
+        if self.failure is not None:
+            raise self.failure
+        if isinstance(last, CfplanError):
+            raise last
+        return last
+
+
+def _attend(process: BaseProcess, telemetry: Connection, keyboard: Keyboard, attendant: Attendant) -> FlightOutcome:
+    """Attend to a pilot's process until its last message."""
     while True:
         watched: list[Connection | int] = [telemetry]
         if keyboard.descriptor is not None:
             watched.append(keyboard.descriptor)
         ready = wait(watched, _POLL_PERIOD)
-        for order in (*keyboard.orders(), *more_orders()):
-            _send(orders, order)
+        attendant.pass_orders()
         if telemetry not in ready:
             continue
         try:
             message = telemetry.recv()
         except (EOFError, OSError):
-            raise _died(process) from failure
-        if isinstance(message, list):
-            if failure is None:
-                try:
-                    for each in message:
-                        on_telemetry(each)
-                except BaseException as error:  # a fault here must not break the flight
-                    failure = error
-                    _send(orders, Order.LAND)
-            continue
-        if failure is not None:
-            raise failure
-        if isinstance(message, CfplanError):
-            raise message
-        return message
+            raise _died(process) from attendant.failure
+        if not isinstance(message, list):
+            return attendant.conclude(message)
+        attendant.tell(message)
 
 
 def _died(process: BaseProcess) -> LinkError:
@@ -177,13 +199,12 @@ def _signals_ignored():
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
-class OrderReceiver:
+class OrderReceiver(HeldOrders):
     """Orders of the main process to the pilot, read by a thread; `gone` when the main process has ended."""
 
     def __init__(self, connection: Connection):
+        super().__init__()
         self._connection = connection
-        self.worst: Order | None = None
-        self.gone = False
         threading.Thread(target=self._run, name="orders", daemon=True).start()
 
     def _run(self) -> None:
@@ -192,9 +213,6 @@ class OrderReceiver:
                 self.give(self._connection.recv())
         except (EOFError, OSError, TypeError):  # TypeError: it was closed here while it was read
             self.gone = True
-
-    def give(self, order: Order) -> None:
-        self.worst = max(order, self.worst or order)
 
 
 def _run(drivers: tuple[type, ...], telemetry: Connection, orders_connection: Connection) -> None:
@@ -226,7 +244,7 @@ def _run(drivers: tuple[type, ...], telemetry: Connection, orders_connection: Co
             orders=orders,
             enter_real_time=_enter_real_time,
         )
-        last = pilot.fly()
+        last = replace(pilot.fly(), telemetry_dropped=report.dropped)
     except CfplanError as error:
         last = error
     except Exception as error:  # on the ground; in the air the pilot lands first
