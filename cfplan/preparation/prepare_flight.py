@@ -20,6 +20,11 @@ from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import DryRun, dry_run
 from cfplan.simulation.link_loss import LinkLoss, simulate_link_loss
 
+OUTSIDE_HINT = (
+    "keep the path farther from the walls or fly it slower; in a room with nets, write `outside: warn` under "
+    "`link_loss` in safety.yaml"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class PreparedFlight:
@@ -46,7 +51,7 @@ def prepare_flight(
     Raises:
         InputError: a file or an option is wrong.
         InfeasibleError: the path leaves the space, or no profile keeps the limits.
-        NotCertifiedError: the certificate, the bytes, the dry run or a stop does not pass.
+        NotCertifiedError: the certificate, the bytes, the dry run, link loss or a stop does not pass.
     """
     options = options or FlightOptions()
     planned = plan_flight(source, limits, options, on_step)
@@ -99,10 +104,15 @@ def rehearse(planned: PlannedFlight, encoded: EncodedFlight, on_step: OnStep = i
 
 
 def find_link_loss(encoded: EncodedFlight, limits: Limits, on_step: OnStep = ignore_steps) -> LinkLoss:
-    """Simulate that the pilot or the radio dies at moments all along the flight, and return the worst."""
+    """Simulate that the pilot or the radio dies at moments all along the flight, and return the worst.
+
+    Raises NotCertifiedError where the vehicle comes down outside the walls, unless safety.yaml says only to warn.
+    """
     with step(on_step, "link loss") as results:
         lost = simulate_link_loss(encoded.payloads, limits)
         (results.warn if lost.beyond > 0 else results.append)(str(lost))
+        if lost.beyond > 0 and not limits.link_loss.only_warn:
+            raise NotCertifiedError(str(lost), where="link loss", hint=OUTSIDE_HINT)
     return lost
 
 

@@ -82,6 +82,15 @@ class PoseLimits:
 
 
 @dataclass(frozen=True, slots=True)
+class LinkLossLimits:
+    """Where the vehicle may come down by itself after its last setpoint, should the pilot or the radio die."""
+
+    only_warn: bool = (
+        False  # of a flight after which that is outside the walls, for rooms with nets; else it is refused
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class FirmwareSettings:
     """Settings that the pilot writes to the vehicle and reads back."""
 
@@ -115,4 +124,5 @@ class Limits:
     pose: PoseLimits
     firmware: FirmwareSettings
     ground: GroundManoeuvres
+    link_loss: LinkLossLimits = LinkLossLimits()
     lateness: float = 0.005  # s, by which this computer may miss its deadlines before take-off, 99th percentile

@@ -4,7 +4,7 @@ import math
 from dataclasses import fields
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
@@ -20,6 +20,7 @@ from cfplan.safety.limits import (
     GroundManoeuvres,
     Ladder,
     Limits,
+    LinkLossLimits,
     PlanLimits,
     PoseLimits,
     within_reserve,
@@ -108,6 +109,10 @@ class _Pose(_Section):
     yaw_agreement_deg: Annotated[float, Field(gt=0.0, le=90.0)]
 
 
+class _LinkLoss(_Section):
+    outside: Literal["refuse", "warn"] = "refuse"
+
+
 class _Firmware(_Section):
     controller: Annotated[int, Field(ge=1, le=6)]
     estimator: Annotated[int, Field(ge=1, le=3)]
@@ -129,6 +134,7 @@ class _SafetyFile(_Section):
     space: _Space
     battery: _Battery
     pose: _Pose
+    link_loss: _LinkLoss = _LinkLoss()
     firmware: _Firmware
     ground: _Ground
     lateness: Annotated[float, Field(gt=0.0, le=0.1)]
@@ -167,6 +173,7 @@ def load_limits(file: Path | str) -> Limits:
         pose=PoseLimits(**pose, yaw_agreement=yaw_agreement),
         firmware=_made(FirmwareSettings, content.firmware, oldest=tuple(map(int, content.firmware.oldest.split(".")))),
         ground=_made(GroundManoeuvres, content.ground),
+        link_loss=LinkLossLimits(only_warn=content.link_loss.outside == "warn"),
         lateness=content.lateness,
     )
     _check_vehicle_can(limits, places)

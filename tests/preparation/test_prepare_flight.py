@@ -48,10 +48,22 @@ def test_every_step_is_reported_once_in_the_order_of_the_data(limits, steps):
     assert prepared.planned.lower_bound <= prepared.plan.trajectory.duration
 
 
-@pytest.mark.parametrize(("beyond", "state"), [(-0.1, StepState.FINISHED), (3.2, StepState.WARNED)])
-def test_a_link_loss_that_ends_beyond_the_walls_is_a_warning(limits, monkeypatch, steps, beyond, state):
+def after_link_loss(limits, monkeypatch, steps, beyond, only_warn) -> None:
     monkeypatch.setattr(preparation, "simulate_link_loss", lambda *_: LinkLoss(1.0, 4.0, beyond))
+    limits = replace(limits, link_loss=replace(limits.link_loss, only_warn=only_warn))
     find_link_loss(encode_flight(plan_flight(LINE, limits)), limits, steps)
+
+
+def test_a_link_loss_that_ends_beyond_the_walls_is_refused(limits, monkeypatch, steps):
+    with pytest.raises(NotCertifiedError, match=r"3\.2 m beyond the walls") as caught:
+        after_link_loss(limits, monkeypatch, steps, 3.2, only_warn=False)
+    assert "outside: warn" in caught.value.hint
+    assert steps.names(StepState.FAILED) == ["link loss"]
+
+
+@pytest.mark.parametrize(("beyond", "state"), [(-0.1, StepState.FINISHED), (3.2, StepState.WARNED)])
+def test_where_safety_yaml_says_so_it_is_a_warning(limits, monkeypatch, steps, beyond, state):
+    after_link_loss(limits, monkeypatch, steps, beyond, only_warn=True)
     assert steps.names(state) == ["link loss"]
 
 

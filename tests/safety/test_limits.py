@@ -69,7 +69,10 @@ def test_a_vehicle_file_lies_beside_the_safety_file(tmp_path):
     assert load_limits(changed(tmp_path, {"vehicle": "mine.yaml"})).airframe.mass == 0.03
 
 
-@pytest.mark.parametrize("place", [".".join(place) for place in keys() if place[-1] != "stop_tilt_deg"])
+OPTIONAL = {"stop_tilt_deg", "link_loss", "outside"}  # which older files lack
+
+
+@pytest.mark.parametrize("place", [".".join(place) for place in keys() if place[-1] not in OPTIONAL])
 def test_no_key_may_be_missing(tmp_path, place):
     content = copy.deepcopy(CONTENT)
     *above, key = place.split(".")
@@ -86,7 +89,7 @@ def test_no_key_may_be_missing(tmp_path, place):
 NUMBERS = [
     ".".join(p)
     for p in keys()
-    if p[-1] not in ("vehicle", "low", "high", "latency", "controller", "estimator", "watchdog")
+    if p[-1] not in ("vehicle", "low", "high", "latency", "controller", "estimator", "watchdog", "outside")
 ]
 
 
@@ -138,6 +141,9 @@ def test_unknown_keys_are_errors(tmp_path, place):
         ({"ground.take_off_height": 0.1}, "ends outside the space"),
         ({"firmware.oldest": "new"}, "oldest"),
         ({"firmware.controller": 9}, "controller"),
+        ({"link_loss.outside": "ignore"}, r"link_loss.outside.*refuse.*warn"),
+        ({"link_loss.outside": True}, r"link_loss.outside.*refuse.*warn"),
+        ({"link_loss": "warn"}, "link_loss"),
     ],
 )
 def test_limits_that_contradict_each_other_or_the_vehicle_are_refused(tmp_path, changes, message):
@@ -155,6 +161,15 @@ def test_the_tilt_of_stops_is_read(tmp_path):
     assert load_limits(older).flight.stop_tilt == pytest.approx(math.radians(35))
     looser = load_limits(changed(tmp_path, {"flight.stop_tilt_deg": 38}))
     assert looser.flight.stop_tilt == pytest.approx(math.radians(38))
+
+
+def test_a_flight_that_link_loss_takes_outside_is_refused_unless_the_file_says_to_warn(tmp_path):
+    assert not load_limits(SAFETY).link_loss.only_warn
+    assert load_limits(changed(tmp_path, {"link_loss.outside": "warn"})).link_loss.only_warn
+    content = {key: value for key, value in CONTENT.items() if key != "link_loss"}
+    older = tmp_path / "older.yaml"
+    older.write_text(yaml.safe_dump(content))
+    assert not load_limits(older).link_loss.only_warn
 
 
 def test_the_place_of_a_wrong_value_is_its_line_and_column(tmp_path):
