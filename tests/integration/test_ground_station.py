@@ -1,10 +1,14 @@
-"""MAVSDK as the ground station of a flight on the virtual Crazyflie: what it sees, and what it can do."""
+"""MAVSDK as the ground station of a flight on the virtual Crazyflie: what it sees, and what it can do.
+
+The flight is stepped: it stands still while MAVSDK, which goes by the computer's clock, looks at it or acts.
+"""
 
 import contextlib
 import math
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,20 +18,20 @@ import pytest
 from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk
 from mavsdk.plugins.action import Action, ActionError, ActionResult
 from mavsdk.plugins.telemetry import Telemetry as StationTelemetry
+from stepped_flight import Flight, at_setpoint, fly_stepped
 
 from cfplan.errors import ExitCode
+from cfplan.flight.clock import BEGIN
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome, Rung
-from cfplan.flight.pilot.process import fly
 from cfplan.flight.radio.supervisor_bits import ARMED
-from cfplan.flight.telemetry import Estimate, Phase, PhaseEntered, SetpointSent, Telemetry, VehicleStatus
+from cfplan.flight.telemetry import Estimate, Phase, PhaseEntered, Telemetry, VehicleStatus
 from cfplan.recording.mavlink.bridge import GroundStation, Place
-from cfplan.simulation.lab.lab import Lab, start_lab
-from cfplan.simulation.lab.room import RoomPoseSource
-from cfplan.simulation.lab.sim_driver import SimDriver
+from cfplan.recording.mavlink.frames import ned
 
 pytestmark = pytest.mark.integration
 SCRIPTS = Path(sys.executable).parent
+PATIENCE = 60.0  # s of the computer's time, spent only where something never comes
 
 
 class Station:
@@ -46,7 +50,7 @@ class Station:
 
     def meet(self) -> None:
         """Wait for the vehicle."""
-        system = self._mavsdk.first_autopilot(timeout_s=5.0)
+        system = self._mavsdk.first_autopilot(timeout_s=PATIENCE)
         assert system is not None
         self.telemetry, self.action = StationTelemetry(system), Action(system)
 
@@ -62,10 +66,10 @@ class Seen:
     """What the ground station showed at one moment, beside what the pilot reported."""
 
     armed: tuple[bool, bool]
-    # as the ground station shows it, as the vehicle's supervisor says
+    # as the ground station shows it, as the pilot reported it
     position: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
-    voltage: float
+    voltage: tuple[float, float]
     estimate: Estimate
 
 
@@ -86,27 +90,25 @@ def station() -> Iterator[Station]:
     made.close()
 
 
-def fly_with(
-    station: Station, mission: Mission, lab: Lab, log: Path, react: Callable[[Telemetry], None]
-) -> FlightOutcome:
+def fly_with(station: Station, mission: Mission, log: Path, react: Callable[[Telemetry], None]) -> Flight:
     """Fly, told by a ground station as well as by the keys."""
-    with GroundStation(station.place, log) as link:
+    with GroundStation(station.place, log, boot=BEGIN) as link:
         station.meet()
 
         def tell(message: Telemetry) -> None:
             link.show(message)
             react(message)
 
-        outcome = fly(
-            mission,
-            uri=lab.uri,
-            drivers=[SimDriver],
-            pose_source=RoomPoseSource(lab.number),
-            on_telemetry=tell,
-            more_orders=link.orders,
-        )
+        flight = fly_stepped(mission, tell, more_orders=link.orders)
     assert link.failure == ""
-    return outcome
+    return flight
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.01)
+    assert condition()
 
 
 def refused(action: Callable[[], object]) -> ActionResult:
@@ -115,34 +117,49 @@ def refused(action: Callable[[], object]) -> ActionResult:
     return caught.value.result
 
 
-@pytest.fixture
-def landed(lab, mission, tmp_path_factory, once) -> Watched:
+@pytest.fixture(scope="module")
+def landed(mission, tmp_path_factory) -> Watched:
     """A flight that the ground station looks at, tries to arm and to take off with, and lands."""
-
-    def fly_watched() -> Watched:
-        with contextlib.closing(Station()) as station:
-            return watched_flight(station, lab, mission, tmp_path_factory.mktemp("log") / "flight.tlog")
-
-    return once(fly_watched)
+    with contextlib.closing(Station()) as station:
+        return watched_flight(station, mission, tmp_path_factory.mktemp("log") / "flight.tlog")
 
 
-def watched_flight(station: Station, lab: Lab, mission: Mission, log: Path) -> Watched:
+def watched_flight(station: Station, mission: Mission, log: Path) -> Watched:
     watched = Watched(log)
     newest: Estimate | None = None
     status: VehicleStatus | None = None
 
-    def look(name: str) -> None:
+    def shown() -> Seen:
         assert newest is not None
         assert status is not None
         telemetry = station.telemetry
         place, turn = telemetry.position_velocity_ned().position, telemetry.attitude_quaternion()
-        watched.seen[name] = Seen(
+        return Seen(
             armed=(telemetry.armed(), bool(status.supervisor & ARMED)),
             position=(place.north_m, place.east_m, place.down_m),
             quaternion=(turn.w, turn.x, turn.y, turn.z),
-            voltage=telemetry.battery().voltage_v,
+            voltage=(telemetry.battery().voltage_v, status.battery_voltage),
             estimate=newest,
         )
+
+    def up_to_date() -> bool:
+        seen = shown()
+        return (
+            seen.armed[0] == seen.armed[1]
+            and math.isclose(*seen.voltage, abs_tol=0.001)
+            and math.dist(seen.position, ned(seen.estimate.position)) < 0.001
+        )
+
+    def look(name: str) -> None:
+        wait_until(up_to_date)
+        watched.seen[name] = shown()
+
+    def land() -> None:
+        look("air")
+        watched.refused += [refused(station.action.arm), refused(station.action.disarm)]
+        station.action.land()
+
+    at_full_speed = at_setpoint(120, land)
 
     def react(message: Telemetry) -> None:
         nonlocal newest, status
@@ -153,12 +170,9 @@ def watched_flight(station: Station, lab: Lab, mission: Mission, log: Path) -> W
         elif isinstance(message, PhaseEntered) and message.phase is Phase.ARM:
             look("ground")
             watched.refused += [refused(station.action.arm), refused(station.action.takeoff)]
-        elif isinstance(message, SetpointSent) and message.index >= 120 and "air" not in watched.seen:
-            look("air")
-            watched.refused += [refused(station.action.arm), refused(station.action.disarm)]
-            station.action.land()
+        at_full_speed(message)
 
-    watched.outcome = fly_with(station, mission, lab, log, react)
+    watched.outcome = fly_with(station, mission, log, react).outcome
     return watched
 
 
@@ -167,12 +181,13 @@ def test_a_ground_station_sees_position_attitude_battery_and_arming(landed):
     assert ground.armed[0] == ground.armed[1]
     assert air.armed == (True, True)
     x, y, z = air.estimate.position
-    assert math.dist(air.position, (y, x, -z)) < 0.25  # which is what the vehicle does in 0.2 s
+    assert math.dist(air.position, (y, x, -z)) < 0.001
     assert air.position[2] < -0.4
     w, qx, qy, qz = air.quaternion
     facing_east = np.array([math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
     assert abs(np.dot([w, qx, qy, qz], facing_east)) > 0.95
-    assert ground.voltage == pytest.approx(4.15, abs=0.1)
+    assert ground.voltage[0] == pytest.approx(4.15, abs=0.1)
+    assert air.voltage[0] == pytest.approx(air.voltage[1], abs=0.001)
 
 
 def test_arming_and_taking_off_are_refused(landed):
@@ -197,20 +212,13 @@ def test_mavlogdump_reads_the_flight_and_nothing_is_lost(landed):
     assert " 0 lost" in lost.stdout
 
 
-@pytest.mark.parametrize(("command", "number"), [("kill", 4), ("terminate", 5)])
-def test_the_ground_station_stops_the_motors(limits, mission, station, tmp_path, command, number):
-    done = False
+@pytest.mark.parametrize("command", ["kill", "terminate"])
+def test_the_ground_station_stops_the_motors(mission, station, tmp_path, command):
+    def stop() -> None:
+        assert getattr(station.action, command)() is ActionResult.SUCCESS
 
-    def react(message: Telemetry) -> None:
-        nonlocal done
-        if not done and isinstance(message, SetpointSent) and message.index >= 80:
-            done = True
-            assert getattr(station.action, command)() is ActionResult.SUCCESS
-
-    with start_lab(limits.airframe, number=number) as lab:
-        outcome = fly_with(station, mission, lab, tmp_path / "flight.tlog", react)
-        truth = lab.truth()
-    assert outcome.exit_code is ExitCode.ENDED_BY_PILOT, outcome.reason
-    assert outcome.rung is Rung.CUT
-    assert not truth.motor[-1].any()
-    assert truth.locked
+    flight = fly_with(station, mission, tmp_path / "flight.tlog", at_setpoint(80, stop))
+    assert flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT, flight.outcome.reason
+    assert flight.outcome.rung is Rung.CUT
+    assert not flight.truth.motor[-1].any()
+    assert flight.truth.locked
