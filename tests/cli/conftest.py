@@ -65,3 +65,21 @@ def path_file(tmp_path):
         return file
 
     return write
+
+
+PATIENT_AND_QUICK = {
+    "age_brake": 0.5, "age_land": 1.5, "lateness": 0.1,  # for a busy computer
+    "take_off_speed": 0.5, "go_to_speed": 1.0, "land_speed": 0.5,  # to be done sooner
+}  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def patient_safety_file(tmp_path_factory):
+    """A safety.yaml for flights in real time on a computer that may be busy."""
+    text = (REPOSITORY / "safety.yaml").read_text()
+    for key, value in PATIENT_AND_QUICK.items():
+        text, count = re.subn(rf"^( *{key}): \S+", rf"\1: {value}", text, flags=re.MULTILINE)
+        assert count == 1, f"{key} is not in safety.yaml"
+    file = tmp_path_factory.mktemp("patient") / "safety.yaml"
+    file.write_text(text)
+    return file
