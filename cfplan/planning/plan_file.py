@@ -18,9 +18,10 @@ from pydantic import TypeAdapter, ValidationError
 import cfplan
 from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.path import Path
-from cfplan.planning.plan_result import Plan
+from cfplan.planning.plan_result import LocalSlowing, Plan
 from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits
+from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import FullState, Trajectory
@@ -52,6 +53,7 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
         "notes": list(plan.notes),
         "lower_bound": plan.lower_bound,
         "joints": list(plan.joints),
+        "slowing": None if plan.slowing is None else asdict(plan.slowing),
         "provenance": dict(provenance or {}),
         "certificate": plan.certificate.to_dict(),
         "airframe": asdict(plan.airframe),
@@ -120,12 +122,13 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
     joints = tuple(map(float, metadata.get("joints", ())))  # older files have none
     if not all(0.0 < joint < path.end for joint in joints):
         raise ValueError("a joint lies outside the path")
+    slowing = _rebuilt_slowing(metadata.get("slowing"), path)
     return Plan(
         path=path,
         airframe=airframe,
         limits=limits,
         trajectory=trajectory,
-        certificate=certify(trajectory, limits.plan, limits.space),
+        certificate=certify(trajectory, limits.plan, limits.space, slowing.caps if slowing else None),
         planner=str(metadata["planner"]),
         nodes=int(metadata["nodes"]),
         repair_speed_factor=float(metadata["slowed"]),
@@ -134,7 +137,18 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
         notes=tuple(map(str, metadata["notes"])),
         lower_bound=None if metadata["lower_bound"] is None else float(metadata["lower_bound"]),
         joints=joints,
+        slowing=slowing,
     )
+
+
+def _rebuilt_slowing(slowing: dict[str, Any] | None, path: Path) -> LocalSlowing | None:
+    """Return the slowing of a file, None where it has none, as older ones."""
+    if slowing is None:
+        return None
+    caps = SpeedCaps.of(slowing["caps"]["s"], slowing["caps"]["speed"])
+    if not caps.lie_within(path.end):
+        raise ValueError("a speed cap lies outside the path")
+    return LocalSlowing(caps, float(slowing["before"]), tuple(map(str, slowing["reasons"])))
 
 
 def _times(trajectory: Trajectory) -> np.ndarray:

@@ -1,13 +1,32 @@
 """Plan: the result of planning, importable without any planner."""
 
+import math
 from dataclasses import dataclass
 
+from cfplan.errors import InputError
 from cfplan.geometry.path import Path
 from cfplan.safety.certificate import Certificate
 from cfplan.safety.limits import Limits
+from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class LocalSlowing:
+    """Where a plan is slower than its limits allow, and why.
+
+    Raises InputError where the time without caps is no time or there is no reason.
+    """
+
+    caps: SpeedCaps
+    before: float  # s of flight without them
+    reasons: tuple[str, ...]  # "link loss near the wall x = 2.25 m", the first the worst
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.before) and self.before > 0.0 and self.reasons):
+            raise InputError(f"local slowing of {self.before} s of flight for {len(self.reasons)} reasons")
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +47,22 @@ class Plan:
     lower_bound: float | None = None
     """s, below which no flight keeps the limits of speed, acceleration and collective thrust; None: not computed"""
     joints: tuple[float, ...] = ()  # s, where the windows of a long profile meet
+    slowing: LocalSlowing | None = None  # None: nowhere slower than the limits allow
 
     @property
     def profile(self) -> SpeedProfile:
         """Return the profile as flown, slowing included."""
         return self.trajectory.profile
+
+    @property
+    def time_lost(self) -> float:
+        """Return the share of time that local slowing costs; 0 where there is none."""
+        return self.trajectory.duration / self.slowing.before - 1.0 if self.slowing else 0.0
+
+    def describe_slowing(self) -> str:
+        """Return one line, "0.3 % slower for link loss near the wall x = 2.25 m"; empty where there is no slowing."""
+        if not self.slowing:
+            return ""
+        first, *others = self.slowing.reasons
+        more = f" and {len(others)} places more" if len(others) > 1 else f" and {others[0]}" if others else ""
+        return f"{100 * self.time_lost:.1f} % slower for {first}{more}"

@@ -16,6 +16,9 @@ import cfplan
 from cfplan.errors import InputError
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import load_plan, save_plan
+from cfplan.planning.plan_result import LocalSlowing
+from cfplan.safety.certificate import CAPPED_SPEED
+from cfplan.safety.speed_caps import SpeedCaps
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +70,46 @@ def test_a_joint_outside_the_path_is_no_sound_plan(saved, tmp_path, joint):
     file = rewritten(saved, tmp_path / "p.parquet", lambda metadata: metadata["joints"].append(joint))
     with pytest.raises(InputError, match="joint"):
         load_plan(file)
+
+
+@pytest.fixture(scope="module")
+def slowed(made):
+    caps = SpeedCaps.of(made.profile.s, np.full(len(made.profile.s), 5.0))
+    return replace(made, slowing=LocalSlowing(caps, 0.9 * made.trajectory.duration, ("link loss near a wall",)))
+
+
+def test_where_a_plan_is_slower_is_kept_and_certified_and_older_files_tell_of_nothing(slowed, saved, tmp_path):
+    save_plan(slowed, tmp_path / "slowed.parquet")
+    loaded = load_plan(tmp_path / "slowed.parquet")
+    assert loaded.slowing == slowed.slowing
+    assert loaded.certificate.margins[-1].name == CAPPED_SPEED
+    assert loaded.describe_slowing() == "11.1 % slower for link loss near a wall"
+    older = load_plan(rewritten(saved, tmp_path / "older.parquet", lambda metadata: metadata.pop("slowing")))
+    assert older.slowing is None
+    assert (older.time_lost, older.describe_slowing()) == (0.0, "")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda slowing: slowing.pop("caps"),
+        lambda slowing: slowing.update(before=-1.0),
+        lambda slowing: slowing.update(before=None),
+        lambda slowing: slowing.update(reasons=[]),
+        lambda slowing: slowing.update(reasons=3),
+        lambda slowing: slowing["caps"]["s"].append(1e6),
+        lambda slowing: slowing["caps"]["s"].__setitem__(-1, 1e6),
+        lambda slowing: slowing["caps"]["speed"].__setitem__(2, 0.0),
+        lambda slowing: slowing["caps"]["speed"].__setitem__(2, math.nan),
+        lambda slowing: slowing["caps"].update(s=[[0.0]], speed=[[1.0]]),
+    ],
+)
+def test_slowing_that_is_not_sound_makes_no_plan(slowed, tmp_path, change):
+    save_plan(slowed, tmp_path / "slowed.parquet")
+    file = rewritten(tmp_path / "slowed.parquet", tmp_path / "p.parquet", lambda metadata: change(metadata["slowing"]))
+    with pytest.raises(InputError) as error:
+        load_plan(file)
+    assert "\n" not in str(error.value)
 
 
 def test_a_limit_that_is_left_open_stays_open(made, limits, tmp_path):
