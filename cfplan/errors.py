@@ -3,12 +3,19 @@
 from enum import IntEnum
 from unicodedata import category
 
+_LONGEST = 600  # characters of a message, and of a hint
+
 
 def printable(text: str) -> str:
     """Return one line without control characters, which names from files and networks may hold: they are escaped."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or category(c) == "Zs" else c.encode("unicode_escape").decode() for c in text)
+
+
+def _shortened(text: str) -> str:
+    """Return a text that a terminal shows whole, where a file put very much into a message."""
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
 class ExitCode(IntEnum):
@@ -39,8 +46,8 @@ class CfplanError(Exception):
 
     def __str__(self) -> str:
         place = f"{self.where}: " if self.where else ""
-        remedy = f" (hint: {self.hint})" if self.hint else ""
-        return printable(f"{place}{self.what}{remedy}")
+        remedy = f" (hint: {_shortened(self.hint)})" if self.hint else ""
+        return printable(f"{place}{_shortened(self.what)}{remedy}")
 
     def __reduce__(self):  # keyword-only arguments must survive the way between processes
         return _rebuild, (type(self), self.what, self.where, self.hint)

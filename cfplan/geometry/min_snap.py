@@ -52,7 +52,11 @@ def smooth_through(points: ArrayLike) -> Path:
     """
     points, times = _checked(points, 1.0, MIN_DENSE_SPACING)
     if len(points) < 4:
-        raise InputError(f"a smooth path with free ends needs at least four points, not {len(points)}")
+        raise InputError(
+            f"a smooth path with free ends needs at least four points, not {len(points)}",
+            where="points",
+            hint="give more points, or lay a path of least snap through these",
+        )
     return with_rest_ends(times, _pieces(points, times, rest=False))
 
 
@@ -63,9 +67,15 @@ def check_points(points: NDArray, spacing: float = MIN_SPACING, where: Callable[
     """
     where = where or (lambda index: f"waypoint {index + 1}")
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"each waypoint must be x, y, z; the array has shape {points.shape}")
+        raise InputError(
+            f"each waypoint must be x, y, z; the array has shape {points.shape}",
+            where="waypoints",
+            hint="give an array (K, 3) in metres",
+        )
     if len(points) < 2:
-        raise InputError(f"a path needs at least two waypoints, not {len(points)}", hint="give a start and an end")
+        raise InputError(
+            f"a path needs at least two waypoints, not {len(points)}", where="waypoints", hint="give a start and an end"
+        )
     bad = ~(np.abs(points) <= MAX_COORDINATE).all(axis=1)
     if bad.any():
         index = int(np.argmax(bad))
@@ -88,7 +98,9 @@ def _checked(waypoints: ArrayLike, nominal_speed: float, spacing: float) -> tupl
     points = np.asarray(waypoints, dtype=float)
     check_points(points, spacing)
     if not (np.isfinite(nominal_speed) and nominal_speed > 0.0):
-        raise InputError(f"the nominal speed must be positive, not {nominal_speed}")
+        raise InputError(
+            f"the nominal speed must be positive, not {nominal_speed}", where="nominal_speed", hint="1 m/s is usual"
+        )
     return points, np.linalg.norm(np.diff(points, axis=0), axis=1) / nominal_speed
 
 

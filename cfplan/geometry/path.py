@@ -36,11 +36,19 @@ class Path:
         breaks = np.array(self.breaks, dtype=float)
         table = np.array(self.coefficients, dtype=float, order="C")
         if breaks.ndim != 1 or table.ndim != 3 or table.shape[::2] != (len(breaks) - 1, 3) or not table.shape[1]:
-            raise InputError(f"breaks {breaks.shape} and coefficients {table.shape} do not make a path")
+            raise InputError(
+                f"breaks {breaks.shape} and coefficients {table.shape} do not make a path",
+                where="path",
+                hint="M pieces have M + 1 breaks and coefficients of shape (M, D, 3)",
+            )
         if not (np.isfinite(breaks).all() and np.isfinite(table).all()):
-            raise InputError("breaks or coefficients of a path are not finite numbers")
+            raise InputError(
+                "breaks or coefficients of a path are not finite numbers",
+                where="path",
+                hint="its points are too many, too close or too far apart to be numbers; give others",
+            )
         if breaks[0] != 0.0 or (np.diff(breaks) <= 0.0).any():
-            raise InputError("breaks of a path must ascend from 0")
+            raise InputError("breaks of a path must ascend from 0", where="path", hint="give each piece a length")
         origins = breaks[:-1].copy()
         origins[-1] = breaks[-1]
         tables = [table]

@@ -38,9 +38,17 @@ def random_waypoints(
     """
     low, high = np.asarray(box, dtype=float)
     if not (np.isfinite([low, high]).all() and (low <= high).all()):
-        raise InputError(f"a box needs a low and a high corner, not {np.asarray(box).tolist()}")
+        raise InputError(
+            f"a box needs a low and a high corner, not {np.asarray(box).tolist()}",
+            where="box",
+            hint="give the low corner first, in metres",
+        )
     if not 2 <= count_range[0] <= count_range[1]:
-        raise InputError(f"a path needs at least two waypoints, not {count_range[0]} to {count_range[1]}")
+        raise InputError(
+            f"a path needs at least two waypoints, not {count_range[0]} to {count_range[1]}",
+            where="waypoints",
+            hint="give the least number first, and at least 2",
+        )
     random = generator(seed)
     count = int(random.integers(count_range[0], count_range[1], endpoint=True))
     points = [random.uniform(low, high)]
@@ -51,7 +59,11 @@ def random_waypoints(
         if np.linalg.norm(point - points[-1]) >= spacing:
             points.append(point)
     else:
-        raise InputError(f"no room for waypoints {spacing} m apart in a box of {(high - low).tolist()} m")
+        raise InputError(
+            f"no room for waypoints {spacing} m apart in a box of {(high - low).tolist()} m",
+            where="box",
+            hint="give a larger box",
+        )
     return np.array(points)
 
 
@@ -64,7 +76,9 @@ def perturbed(path: Path, epsilon: float, seed: int | np.random.SeedSequence) ->
     a rest end stays at rest.
     """
     if not (np.isfinite(epsilon) and epsilon >= 0.0):
-        raise InputError(f"a perturbation must be at least 0, not {epsilon}")
+        raise InputError(
+            f"a perturbation must be at least 0, not {epsilon}", where="epsilon", hint="give metres, as 0.05"
+        )
     spans = max(5, round(path.end / KNOT_SPACING))
     knots = np.linspace(0.0, path.end, spans + 1)
     control = _in_ball(generator(seed), spans + _DEGREE, epsilon)

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 from cfplan.errors import CfplanError, ExitCode, InputError
 from cfplan.learning.dataset_spec import SPEC_FILE, DatasetSpec, load_spec, require_same
-from cfplan.learning.labels import make_rows
+from cfplan.learning.labels import SCHEMA, TIMING_SCHEMA, make_rows
 from cfplan.planners.solution import Status
 
 SHARDS, TIMING = "shards", "timing"
@@ -78,13 +78,13 @@ def make_dataset(
 def read_dataset(folder: Path) -> tuple[DatasetSpec, pa.Table]:
     """Read all rows that exist, in order. Raises InputError where the folder is no dataset or a shard is damaged."""
     spec = load_spec(folder)
-    return spec, _read(folder, SHARDS)
+    return spec, _read(folder, SHARDS, SCHEMA)
 
 
 def read_timing(folder: Path) -> pa.Table:
     """Read how long the solve of each existing row took."""
     load_spec(folder)
-    return _read(folder, TIMING)
+    return _read(folder, TIMING, TIMING_SCHEMA)
 
 
 def describe(folder: Path) -> dict[str, Any]:
@@ -94,9 +94,10 @@ def describe(folder: Path) -> dict[str, Any]:
     solved = rows.filter(pa.compute.equal(rows["status"], Status.SOLVED.name))
     share = _numbers(solved, "certified_share")
     values = {name: _numbers(solved, name) for name in ("length", "travel_time", "peak_speed", "iterations")}
-    values["mean_speed"] = values["length"] / values["travel_time"]
+    with np.errstate(all="ignore"):  # damaged rows
+        values["mean_speed"] = values["length"] / values["travel_time"]
     values["solve_seconds"] = _numbers(timing, "solve_seconds")
-    active = Counter(name for names in solved["active_limits"].to_pylist() for name in names)
+    active = Counter(str(name) for names in solved["active_limits"].to_pylist() for name in names or ())
     return {
         "folder": str(folder),
         "spec": asdict(spec),
@@ -221,19 +222,24 @@ def _write(file: Path, content: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def _read(folder: Path, part: str) -> pa.Table:
+def _read(folder: Path, part: str, schema: pa.Schema) -> pa.Table:
     files = sorted((folder / part).glob("*.parquet"))
     if not files:
         raise InputError("no rows yet", where=str(folder), hint="give `cfplan dataset make` again to go on")
     tables = []
     for file in files:
         try:
-            tables.append(pq.read_table(file))
+            table = pq.read_table(file)
         except (OSError, pa.ArrowException) as error:
-            raise InputError(
-                f"damaged ({error})", where=str(file), hint="delete it and give `cfplan dataset make` again"
-            ) from None
+            raise _damaged(" ".join(str(error).split())[:160], file) from None
+        if not table.schema.equals(schema):
+            raise _damaged("its columns are not those of a dataset", file)
+        tables.append(table.replace_schema_metadata(None))
     return pa.concat_tables(tables)
+
+
+def _damaged(why: str, file: Path) -> InputError:
+    return InputError(f"damaged ({why})", where=str(file), hint="delete it and give `cfplan dataset make` again")
 
 
 def _numbers(table: pa.Table, name: str) -> np.ndarray:

@@ -13,6 +13,9 @@ from cfplan.errors import InputError
 from cfplan.geometry.yaw import YawMode
 
 SPEC_FILE = "dataset.json"
+_MOST = 10_000_000  # paths, copies of one, rows of a shard
+_MOST_WAYPOINTS, _MOST_NODES = 1000, 100_000
+_REMEDY = "give another folder, or make the dataset again"
 
 
 class Relabel(StrEnum):
@@ -43,15 +46,15 @@ class DatasetSpec:
     def __post_init__(self) -> None:
         low, high = self.waypoints
         wrong = [
-            ("count", self.count < 1, "at least 1"),
+            ("count", not 1 <= self.count <= _MOST, f"from 1 to {_MOST}"),
             ("seed", self.seed < 0, "at least 0"),
             ("boxes", not self.boxes or not all(_is_box(box) for box in self.boxes), "of three lengths in m each"),
-            ("waypoints", not 2 <= low <= high, "two or more, least first"),
-            ("nodes", self.nodes < 4, "at least 4"),
-            ("copies", self.copies < 0, "at least 0"),
+            ("waypoints", not 2 <= low <= high <= _MOST_WAYPOINTS, f"2 to {_MOST_WAYPOINTS}, least first"),
+            ("nodes", not 4 <= self.nodes <= _MOST_NODES, f"from 4 to {_MOST_NODES}"),
+            ("copies", not 0 <= self.copies <= _MOST, f"from 0 to {_MOST}"),
             ("epsilon", not 0 <= self.epsilon < float("inf"), "at least 0"),
             ("epsilon", (self.epsilon > 0) != (self.copies > 0), "given together with copies"),
-            ("shard_rows", self.shard_rows < 1, "at least 1"),
+            ("shard_rows", not 1 <= self.shard_rows <= _MOST, f"from 1 to {_MOST}"),
         ]
         for name, is_wrong, allowed in wrong:
             if is_wrong:
@@ -88,23 +91,27 @@ def _is_box(sides: tuple[float, ...]) -> bool:
 
 def load_spec(folder: Path) -> DatasetSpec:
     """Read the spec of a dataset folder. Raises InputError where there is none or it cannot be read."""
+    from pydantic import TypeAdapter  # takes its time to import
+
     file = folder / SPEC_FILE
     if not file.is_file():
         raise InputError(
             f"no {SPEC_FILE} there", where=str(folder), hint="make a dataset with `cfplan dataset make DIR`"
         )
     try:
-        content = json.loads(file.read_text())
+        text = file.read_text(encoding="utf-8")
+        content = json.loads(text)
         known = {field.name for field in fields(DatasetSpec)}
         if not isinstance(content, dict) or set(content) != known:
             raise ValueError(f"its keys are not those of cfplan {__version__}")
-        content |= {"boxes": tuple(tuple(b) for b in content["boxes"]), "waypoints": tuple(content["waypoints"])}
-        return DatasetSpec(**content | {"yaw": YawMode(content["yaw"]), "relabel": Relabel(content["relabel"])})
-    except (ValueError, TypeError, UnicodeDecodeError) as error:
+        return TypeAdapter(DatasetSpec).validate_json(text, strict=True)
+    except InputError as error:
+        raise InputError(error.what, where=str(file), hint=_REMEDY) from None
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", where=str(file), hint="check its permissions") from None
+    except (ValueError, TypeError, RecursionError) as error:
         raise InputError(
-            f"not a dataset description: {error}",
-            where=str(file),
-            hint="give another folder, or make the dataset again",
+            f"not a dataset description: {' '.join(str(error).split())[:200]}", where=str(file), hint=_REMEDY
         ) from None
 
 

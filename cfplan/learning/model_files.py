@@ -25,6 +25,7 @@ from cfplan.vehicle.airframe import Airframe
 
 WEIGHTS, CARD = "weights.safetensors", "card.json"
 FORMAT = 1
+LARGEST = 10_000  # layers, hidden numbers of each, and intervals of a window
 TIGHTEST = 0.5  # of a model's limit: for tighter ones repair would do more than the model
 _RETRAIN = "train it again with `cfplan train`"
 _RESTORE = "restore both files from where the model came, or train it again with `cfplan train`"
@@ -112,14 +113,14 @@ def load_card(folder: Path) -> Card:
         raise InputError(
             f"no model: {CARD} is missing", where=str(folder), hint="train one with `cfplan train`"
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"cannot be read: {error}", where=str(file), hint=_RESTORE) from None
     if not isinstance(text, dict) or text.get("format") != FORMAT:
         found = text.get("format") if isinstance(text, dict) else None
         raise InputError(f"a model of format {found}, not {FORMAT}", where=str(file), hint=_RETRAIN)
     try:
         card = _card(text)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(
             f"not a model card: {' '.join(str(error).split())[:160]}", where=str(file), hint=_RESTORE
         ) from None
@@ -156,7 +157,7 @@ def load_model(folder: Path, airframe: Airframe | None = None) -> Model:
     except (SafetensorError, ValueError, KeyError) as error:
         raise InputError(f"not weights: {error}", where=where, hint=_RESTORE) from None
     expected = tensor_shapes(card.architecture, card.hidden, card.layers)
-    if {name: values.shape for name, values in weights.items()} != expected:
+    if not expected or {name: values.shape for name, values in weights.items()} != expected:
         raise InputError(
             f"not the weights of a {card.architecture} of {card.layers} x {card.hidden}, as the card says",
             where=where,
@@ -229,6 +230,18 @@ def _distance(own: PlanLimits, wanted: PlanLimits) -> float:
 
 
 def _card(text: Mapping[str, Any]) -> Card:
+    """Return the card. Raises ValueError where a number is not one that a model can have."""
     from pydantic import TypeAdapter
 
-    return TypeAdapter(Card).validate_python(text)
+    card = TypeAdapter(Card).validate_python(text)
+    sizes = {"hidden": card.hidden, "layers": card.layers, "window": card.window}
+    figures = asdict(card.airframe) | asdict(card.limits)
+    for name, value in (sizes | figures).items():
+        for number in value if isinstance(value, tuple) else (value,):
+            if not isinstance(number, str) and not number >= (1 if name in sizes else 0):
+                raise ValueError(f"{name} is {number}")
+            if name in sizes and number > LARGEST:
+                raise ValueError(f"{name} is {number}, more than {LARGEST}")
+    if not all(value > 0 for name, value in asdict(card.limits).items() if not name.endswith("_min")):
+        raise ValueError("a limit is 0")
+    return card

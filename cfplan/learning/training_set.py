@@ -114,24 +114,54 @@ def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> Tr
             where=str(folder),
             hint="see `cfplan dataset info`, and make another",
         )
-    breaks, coefficients = usable["breaks"].to_pylist(), usable["coefficients"].to_pylist()
-    paths = tuple(
-        Path(np.array(b), np.array(c).reshape(len(b) - 1, -1, 3)) for b, c in zip(breaks, coefficients, strict=True)
-    )
-    h = np.stack([_column(usable, name, spec.nodes) for name in ("h", "dh", "ddh", "dddh")], axis=1)
-    yaw = np.stack([_column(usable, name, spec.nodes) for name in ("yaw", "dyaw", "ddyaw")], axis=1)
+    length, travel_time = (_positive(usable, name, folder) for name in ("length", "travel_time"))
+    paths = _paths(usable, folder)
+    h = np.stack([_column(usable, name, spec.nodes, folder) for name in ("h", "dh", "ddh", "dddh")], axis=1)
+    yaw = np.stack([_column(usable, name, spec.nodes, folder) for name in ("yaw", "dyaw", "ddyaw")], axis=1)
     chosen = LIMIT_SETS[spec.limits]
-    length, travel_time = usable["length"].to_numpy(), usable["travel_time"].to_numpy()
     return TrainingSet(
         spec, bounds(chosen.airframe, chosen.limits), usable["row"].to_numpy(), paths,
         Labels(*_joined(paths), length, h, yaw), travel_time,
     )  # fmt: skip
 
 
-def _column(rows: pa.Table, name: str, nodes: int) -> NDArray:
+def _column(rows: pa.Table, name: str, nodes: int, folder: FilePath) -> NDArray:
     """Return (R, N+1); a column of N values a row is padded at the end."""
-    values = np.array(rows[name].to_pylist())
-    return np.pad(values, ((0, 0), (0, nodes + 1 - values.shape[1])), mode="edge")
+    expected = nodes + (name not in ("dddh", "ddyaw"))
+    column = rows[name].combine_chunks()
+    if (
+        column.null_count
+        or not pa.compute.all(pa.compute.equal(pa.compute.list_value_length(column), expected)).as_py()
+    ):
+        raise _damaged(f"{name} has not {expected} values in every row", folder)
+    values = column.flatten().to_numpy(zero_copy_only=False).reshape(len(column), expected)
+    if not np.isfinite(values).all() or (name == "h" and not (values >= 0.0).all()):
+        raise _damaged(f"{name} holds what no label has", folder)
+    return np.pad(values, ((0, 0), (0, nodes + 1 - expected)), mode="edge")
+
+
+def _positive(rows: pa.Table, name: str, folder: FilePath) -> NDArray:
+    """Return (R,)."""
+    values = rows[name].to_numpy().astype(float)
+    if not ((values > 0.0) & (values < np.inf)).all():
+        raise _damaged(f"{name} is not positive in every row", folder)
+    return values
+
+
+def _paths(rows: pa.Table, folder: FilePath) -> tuple[Path, ...]:
+    paths = []
+    for row, breaks, coefficients in zip(
+        *(rows[name].to_pylist() for name in ("row", "breaks", "coefficients")), strict=True
+    ):
+        try:
+            paths.append(Path(np.array(breaks), np.array(coefficients).reshape(len(breaks) - 1, -1, 3)))
+        except (InputError, ValueError, TypeError) as error:
+            raise _damaged(f"the path of row {row}: {error}", folder) from None
+    return tuple(paths)
+
+
+def _damaged(why: str, folder: FilePath) -> InputError:
+    return InputError(f"damaged: {why}", where=str(folder), hint="make the dataset again with `cfplan dataset make`")
 
 
 def _joined(paths: tuple[Path, ...]) -> tuple[NDArray, NDArray, NDArray]:

@@ -40,14 +40,20 @@ class PlanningTask:
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.yaw_angle):
-            raise InputError(f"the yaw angle must be a finite number, not {self.yaw_angle}")
+            raise InputError(
+                f"the yaw angle must be a finite number, not {self.yaw_angle}", where="yaw_angle", hint="give radians"
+            )
         for name, boundary in (("start", self.start), ("end", self.end)):
             if boundary and not all(math.isfinite(value) for value in astuple(boundary)):
-                raise InputError(f"the {name} state is not finite: {boundary}")
+                raise InputError(
+                    f"the {name} state is not finite: {boundary}", where=name, hint="leave it out for a path at rest"
+                )
         if self.speed_caps and not self.speed_caps.lie_within(self.path.end):
             raise InputError(
                 f"speed caps from s = {self.speed_caps.s[0]:g} to {self.speed_caps.s[-1]:g} leave the path, which ends "
-                f"at {self.path.end:g}"
+                f"at {self.path.end:g}",
+                where="speed caps",
+                hint="give places from 0 to the end of the path",
             )
         object.__setattr__(self, "refusal", self._refuse())
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.signal import correlate
+from scipy.signal import oaconvolve
 
 from cfplan.errors import InputError
 from cfplan.recording.importers.mocap_log import LoggedSubject
@@ -165,12 +165,12 @@ def _on_grid(time: NDArray, position: NDArray, reference: Reference) -> tuple[fl
 
     # Sums over the plan's samples for every shift: of weights, of both, of their squares and of their product.
     ones = np.ones(len(plan))
-    count = correlate(weight, ones, method="fft")
-    sums = [correlate(weight * axis, ones, method="fft") for axis in log.T]
-    plan_sums = [correlate(weight, axis, method="fft") for axis in plan.T]
-    squares = correlate(weight * np.sum(log**2, axis=1), ones, method="fft")
-    plan_squares = correlate(weight, np.sum(plan**2, axis=1), method="fft")
-    products = sum(correlate(weight * a, b, method="fft") for a, b in zip(log.T, plan.T, strict=True))
+    count = _correlated(weight, ones)
+    sums = [_correlated(weight * axis, ones) for axis in log.T]
+    plan_sums = [_correlated(weight, axis) for axis in plan.T]
+    squares = _correlated(weight * np.sum(log**2, axis=1), ones)
+    plan_squares = _correlated(weight, np.sum(plan**2, axis=1))
+    products = sum(_correlated(weight * a, b) for a, b in zip(log.T, plan.T, strict=True))
     seen = np.maximum(count, 1.0)
     mean = [(a - b) / seen for a, b in zip(sums, plan_sums, strict=True)]
     variance = (squares - 2 * products + plan_squares) / seen - sum(axis**2 for axis in mean)
@@ -179,6 +179,11 @@ def _on_grid(time: NDArray, position: NDArray, reference: Reference) -> tuple[fl
     best = int(np.argmin(cost))
     left_over = float(cost[best]) / spread if spread > 0 else np.inf
     return float(time[0] + (best - (len(plan) - 1)) * STEP), left_over
+
+
+def _correlated(log: NDArray, plan: NDArray) -> NDArray:
+    """Return the sum over the plan of log times plan for every shift: block by block, as logs may last for hours."""
+    return oaconvolve(log, plan[::-1])
 
 
 def _closely(guess: float, time: NDArray, position: NDArray, reference: Reference) -> float:

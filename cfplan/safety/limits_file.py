@@ -145,6 +145,7 @@ Kind = TypeVar("Kind")
 
 def _made(kind: type[Kind], section: _Section, **others: Any) -> Kind:
     """A dataclass from the section with the same keys; `others` replace what the file says differently."""
+    # fields() wants a class that mypy knows to be a dataclass, and no bound of a type variable says that
     names = {field.name for field in fields(kind)} - others.keys()  # type: ignore[arg-type]
     values = {name: getattr(section, name) for name in names}
     ladders = {name: Ladder(v.brake, v.land, v.cut) for name, v in values.items() if isinstance(v, _Ladder)}

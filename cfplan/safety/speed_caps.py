@@ -23,11 +23,15 @@ class SpeedCaps:
 
     def __post_init__(self) -> None:
         if not self.s or len(self.s) != len(self.speed):
-            raise InputError(f"speed caps need a speed at each place: {len(self.s)} places, {len(self.speed)} speeds")
+            raise InputError(
+                f"speed caps need a speed at each place: {len(self.s)} places, {len(self.speed)} speeds",
+                where="speed caps",
+                hint="give as many speeds as places",
+            )
         if not all(map(math.isfinite, self.s)) or any(b <= a for a, b in zip(self.s, self.s[1:], strict=False)):
-            raise InputError("the places of speed caps must be finite and rise")
+            raise InputError("places of speed caps must be finite and rise", where="speed caps", hint="sort them by s")
         if not all(math.isfinite(speed) and speed > 0.0 for speed in self.speed):
-            raise InputError("speed caps must be finite and positive")
+            raise InputError("speed caps must be finite and positive", where="speed caps", hint="give speeds in m/s")
 
     @staticmethod
     def of(s: ArrayLike, speed: ArrayLike) -> "SpeedCaps":

@@ -83,7 +83,7 @@ def bench(
         InputError: an unknown planner, box or limit set, or no path at all.
     """
     if paths < 1:
-        raise InputError("paths must be at least 1", where="paths")
+        raise InputError("paths must be at least 1", where="paths", hint="give --paths 30, as is usual")
     for box in boxes:
         find_box(box)
     chosen = [find_limit_set(name) for name in limit_sets]

@@ -62,7 +62,11 @@ def dense_feasibility(
     for box in boxes:
         find_box(box)
     if paths < len(pairs):
-        raise InputError(f"paths must be at least {len(pairs)}, one for each box and limit set", where="paths")
+        raise InputError(
+            f"paths must be at least {len(pairs)}, one for each box and limit set",
+            where="paths",
+            hint="give more paths, or fewer boxes and limit sets",
+        )
     candidate, each = find_candidate(planner), paths // len(pairs)
 
     def measure() -> Iterator[PlannerTrial]:

@@ -120,7 +120,7 @@ def learned_study(
         InputError: an unknown box or limit set, no path at all, or no model for a limit set.
     """
     if paths < 1:
-        raise InputError("paths must be at least 1", where="paths")
+        raise InputError("paths must be at least 1", where="paths", hint="give --paths 30, as is usual")
     for box in boxes:
         find_box(box)
     pairs = [(box, find_limit_set(name)) for name in limit_sets for box in boxes]

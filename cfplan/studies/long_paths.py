@@ -105,7 +105,11 @@ def long_paths(
         InputError: an unknown box or limit set, no path or length at all, or no model for the limit set.
     """
     if paths < 1 or repeats < 1 or not lengths or not min(lengths) > 0 or not np.isfinite(max(lengths)):
-        raise InputError("lengths must be above 0 m, paths and repeats at least 1", where="lengths")
+        raise InputError(
+            "lengths must be above 0 m, paths and repeats at least 1",
+            where="lengths",
+            hint="leave them out for the usual ones",
+        )
     find_box(box)
     chosen, seeds = find_limit_set(limits), range(first_seed, first_seed + paths)
     total, made, interrupted = len(lengths) * paths * repeats, 0, False
@@ -170,7 +174,11 @@ def _planned(path: Path, chosen: LimitSet) -> tuple[Repaired, tuple[float, float
     solution = plan_learned(task)
     planned = time.process_time()
     if solution.profile is None:
-        raise CfplanError(solution.reason or str(solution.status))
+        raise CfplanError(
+            solution.reason or str(solution.status),
+            where="learned planner",
+            hint="train a model for these limits, or choose another limit set",
+        )
     found = repair(task, solution.profile)
     repaired = time.process_time()
     check_bytes(encode_trajectory(found.trajectory), found.trajectory, chosen.limits)

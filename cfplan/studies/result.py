@@ -129,7 +129,9 @@ def read_result(file: Path) -> StudyResult:
             provenance=Provenance.from_json(document["provenance"]),
         )
     except OSError as error:
-        raise InputError(error.strerror or str(error), where=str(file)) from None
+        raise InputError(
+            error.strerror or str(error), where=str(file), hint="name a file that a study has written"
+        ) from None
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"not the result of a study: {error!r}", where=str(file), hint="cfplan study … -o FILE writes one"

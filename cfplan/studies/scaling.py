@@ -58,7 +58,11 @@ def scaling(
         InputError: an unknown planner, box or limit set, no repeats, or a size below 10.
     """
     if repeats < 1 or not sizes or min(sizes) < 10:
-        raise InputError("repeats must be at least 1, and sizes at least 10 intervals", where="sizes")
+        raise InputError(
+            "repeats must be at least 1, and sizes at least 10 intervals",
+            where="sizes",
+            hint="leave them out for the usual ones",
+        )
     find_box(box)
     chosen, found = find_limit_set(limits), find_planner(planner)
 
@@ -101,7 +105,11 @@ def path_of_length(length: float, box: str, seed: int) -> Path:
             path = min_snap(points[:count])
         if abs(path.length - length) <= LENGTH_ERROR * length:
             return path
-    raise InputError(f"no random path of {length:g} m was found in the box {box}", where="length")
+    raise InputError(
+        f"no random path of {length:g} m was found in the box {box}",
+        where="length",
+        hint="choose a longer path, or a smaller box",
+    )
 
 
 def _row(nodes: int, paths: Sequence[Path], first: Solve, solves: Sequence[Solve]) -> dict[str, Any]:

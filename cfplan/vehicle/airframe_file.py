@@ -9,7 +9,8 @@ from cfplan.errors import InputError
 from cfplan.files.yaml_with_places import read_yaml_with_places
 from cfplan.vehicle.airframe import Airframe
 
-Inertia = Annotated[float, Field(gt=0.0, le=1.0)]
+# Bounds far beyond what flies indoors: beyond them digits would be lost, or a unit is wrong.
+Inertia = Annotated[float, Field(ge=1e-8, le=1.0)]
 Drag = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
@@ -17,13 +18,13 @@ class _AirframeFile(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     name: Annotated[str, Field(min_length=1, max_length=100)]
-    mass: Annotated[float, Field(gt=0.0, le=10.0)]
+    mass: Annotated[float, Field(ge=1e-3, le=10.0)]
     inertia: tuple[Inertia, Inertia, Inertia]
-    arm: Annotated[float, Field(gt=0.0, le=1.0)]
-    thrust_to_torque: Annotated[float, Field(gt=0.0, le=1.0)]
+    arm: Annotated[float, Field(ge=1e-3, le=1.0)]
+    thrust_to_torque: Annotated[float, Field(ge=1e-6, le=1.0)]
     motor_thrust_min: Annotated[float, Field(ge=0.0, le=100.0)]
     motor_thrust_max: Annotated[float, Field(gt=0.0, le=100.0)]
-    motor_time_constant: Annotated[float, Field(gt=0.0, le=1.0)]
+    motor_time_constant: Annotated[float, Field(ge=1e-4, le=1.0)]
     drag: tuple[Drag, Drag]
     source: Annotated[str, Field(min_length=1, max_length=1000)]
     rotor_reaction: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0

@@ -16,6 +16,7 @@ from cfplan.vehicle.profile import SpeedProfile, h_within, yaw_within
 
 TOLERANCE = 1e-12  # s, of each piece
 LONGEST = 3600.0  # s, beyond which a profile is a mistake
+_REMEDY = "plan the path anew; for a profile from elsewhere, h must be positive and smooth"
 _SPLITS = 40  # halvings of an interval before its speed counts as zero
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = (_NODES + 1.0) / 2.0, _WEIGHTS / 2.0
@@ -53,10 +54,12 @@ def measure(profile: SpeedProfile) -> Timing:
     nodes = check(profile)
     left, duration, interval, polynomial, stuck = _split(nodes)
     if not np.isnan(stuck):
-        raise NotCertifiedError("the speed falls to almost zero", where=f"s = {stuck:.6g}")
+        raise NotCertifiedError("the speed falls to almost zero", where=f"s = {stuck:.6g}", hint=_REMEDY)
     total = float(duration.sum())
     if not total <= LONGEST:
-        raise NotCertifiedError(f"the speed profile takes {total:.0f} s, longer than any flight")
+        raise NotCertifiedError(
+            f"the speed profile takes {total:.0f} s, longer than any flight", where="the whole path", hint=_REMEDY
+        )
     return Timing(
         profile=profile,
         s=np.append(left, profile.s[-1]),
@@ -82,7 +85,11 @@ def check(profile: SpeedProfile) -> NDArray:
     for name in SpeedProfile.__slots__:
         values = getattr(profile, name)
         if values.shape != (intervals + (name not in ("dddh", "ddyaw")),) or intervals < 1:
-            raise NotCertifiedError(f"the speed profile has {values.shape} values of {name} for {intervals} intervals")
+            raise NotCertifiedError(
+                f"the speed profile has {values.shape} values of {name} for {intervals} intervals",
+                where="the whole path",
+                hint=_REMEDY,
+            )
     nodes = profile.table()
     sound, least, jumps, allowed = _inspect(nodes)
     if sound:
@@ -91,17 +98,22 @@ def check(profile: SpeedProfile) -> NDArray:
     if wrong.any():
         column = int(np.argmax(wrong.any(axis=0)))
         raise NotCertifiedError(
-            f"the speed profile's {SpeedProfile.__slots__[column]} is not finite", where=_node(nodes, wrong[:, column])
+            f"the speed profile's {SpeedProfile.__slots__[column]} is not finite",
+            where=_node(nodes, wrong[:, column]),
+            hint=_REMEDY,
         )
     if not np.all(np.diff(nodes[:, 0]) > 0):
-        raise NotCertifiedError("the speed profile's grid does not ascend")
+        raise NotCertifiedError("the speed profile's grid does not ascend", where="the whole path", hint=_REMEDY)
     if not np.all(least > 0):
-        raise NotCertifiedError("the speed profile falls to zero or below", where=_node(nodes, ~(least > 0)))
+        raise NotCertifiedError(
+            "the speed profile falls to zero or below", where=_node(nodes, ~(least > 0)), hint=_REMEDY
+        )
     for column, jump, limit in zip(_CONTINUOUS, jumps.T, allowed, strict=True):
         if not np.all(jump <= limit):
             raise NotCertifiedError(
                 f"the speed profile's {SpeedProfile.__slots__[column]} jumps",
                 where=_node(nodes, np.append(0.0, jump) == jump.max()),
+                hint=_REMEDY,
             )
     return nodes
 

@@ -54,7 +54,9 @@ class Trajectory:
         start, end = float(self.profile.s[0]), float(self.profile.s[-1])
         if abs(start) > _SAME_S or abs(end - self.path.end) > _SAME_S * (1.0 + self.path.end):
             raise NotCertifiedError(
-                f"the speed profile goes from s = {start:g} to {end:g}, the path to {self.path.end:g}"
+                f"the speed profile goes from s = {start:g} to {end:g}, the path to {self.path.end:g}",
+                where="the speed profile",
+                hint="plan along this path anew",
             )
 
     @property

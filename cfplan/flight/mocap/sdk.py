@@ -57,13 +57,13 @@ class SdkDriver:
     def wait(self) -> Frame:
         """Wait for the next frame and return it. May hang."""
         if self._client is None:
-            raise LinkError("the stream is closed", where=str(self._uri))
+            raise LinkError("the stream is closed", where=str(self._uri), hint="connect again")
         try:
             self._client.waitForNextFrame()
             received = time.monotonic()
             seen = self._client.rigidBodies
         except RuntimeError as why:
-            raise LinkError(str(why), where=str(self._uri)) from why
+            raise LinkError(str(why), where=str(self._uri), hint="is the system still running there?") from why
         bodies = tuple(_body(name, body) for name, body in seen.items())
         known = {subject.name for subject in self._scene.subjects} if self._scene else self._names
         self._names |= seen.keys()

@@ -91,7 +91,11 @@ def encode_trajectory(
     not finite or does not fit its 16 bits.
     """
     if not (np.isfinite([trajectory.duration, lead, rate_lead, thrust_lead]).all() and rate > 0 and hold >= 0):
-        raise NotCertifiedError(f"cannot sample {trajectory.duration} s at {rate} Hz with a hold of {hold} s")
+        raise NotCertifiedError(
+            f"cannot sample {trajectory.duration} s at {rate} Hz with a hold of {hold} s",
+            where="the encoding",
+            hint="give finite times, a rate above 0 and a hold of at least 0",
+        )
     moving = int(np.ceil(trajectory.duration * rate)) + 1
     times = np.arange(moving + int(np.ceil(hold * rate))) / rate
     payloads = []
@@ -162,7 +166,11 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimi
     """
     payloads = np.asarray(encoded.payloads)
     if payloads.ndim != 2 or payloads.shape != (len(encoded.times), PAYLOAD_SIZE) or len(payloads) == 0:
-        raise NotCertifiedError(f"payloads of shape {payloads.shape} for {len(encoded.times)} times")
+        raise NotCertifiedError(
+            f"payloads of shape {payloads.shape} for {len(encoded.times)} times",
+            where="the encoding",
+            hint="encode the trajectory anew",
+        )
     for rows in _batches(len(payloads)):
         times = encoded.times[rows] + encoded.lead
         planned = trajectory.at(times)
@@ -289,7 +297,11 @@ def _require(good: NDArray, what: str, values: NDArray, first: int = 0) -> None:
     """Raise NotCertifiedError at the first bad row; `first` is the number of the setpoint in row 0."""
     if not np.all(good):
         row = int(np.flatnonzero(~good)[0])
-        raise NotCertifiedError(f"{what} {values[row]:.4g}", where=f"setpoint {first + row}")
+        raise NotCertifiedError(
+            f"{what} {values[row]:.4g}",
+            where=f"setpoint {first + row}",
+            hint="plan more slowly, with --speed 0.9; if the plan keeps its limits there, please report this",
+        )
 
 
 def _angles(first: NDArray, second: NDArray) -> NDArray:

@@ -79,6 +79,7 @@ def _milli(name: str, values: NDArray, first: int) -> NDArray:
         raise NotCertifiedError(
             f"{name} {np.asarray(values)[row]} does not fit a packet (at most {LARGEST})",
             where=f"setpoint {first + row}",
+            hint="keep the flight within that of the room's origin, and its limits below that",
         )
     return np.round(np.asarray(values) * 1000.0).astype("<i2")
 
@@ -90,7 +91,9 @@ def compress_quaternion(quaternion: NDArray, first: int = 0) -> NDArray:
     """
     compressed, bad = _compressed(np.array(quaternion, dtype=float))
     if bad >= 0:
-        raise NotCertifiedError("the quaternion is zero or not finite", where=f"setpoint {first + bad}")
+        raise NotCertifiedError(
+            "the quaternion is zero or not finite", where=f"setpoint {first + bad}", hint="plan the trajectory anew"
+        )
     return compressed
 
 

@@ -114,7 +114,9 @@ def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
         elif value > ceiling[index] * BOUNDARY_SLACK:
             raise InfeasibleError(
                 f"a boundary state of {value**0.5:.3f} m/s is faster than the limits allow there, "
-                f"{ceiling[index] ** 0.5:.3f} m/s"
+                f"{ceiling[index] ** 0.5:.3f} m/s",
+                where=f"{'start' if index == 0 else 'end'} of the path",
+                hint="start slower, or loosen the limits",
             )
         ceiling[index] = max(value, 1e-9)  # the library wants it positive
         ends.append(float(value))
@@ -140,7 +142,11 @@ def _solved(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
     try:
         return copp_py.solver.topp2_ra.solve(_problem(at, rows, boundary))
     except copp_py.core.CoppError as error:
-        raise InfeasibleError(f"the convex problem has no solution: {error}") from error
+        raise InfeasibleError(
+            f"the convex problem has no solution: {error}",
+            where="the whole path",
+            hint="loosen the limits, or start slower",
+        ) from error
 
 
 def _least_times(at: Stations, top: NDArray, limits: PlanLimits) -> NDArray:

@@ -60,7 +60,11 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
         check_times(subject.time, repr(subject.name), where=str(file))
         check_places(subject.position, repr(subject.name), where=str(file))
     if not any(subject.seen.any() for subject in log.subjects):
-        raise InputError("the log holds no pose", where=str(file), hint="; ".join(log.notes))
+        raise InputError(
+            "the log holds no pose",
+            where=str(file),
+            hint="; ".join(log.notes) or "the subjects were never seen, or their positions are not numbers",
+        )
     return log
 
 

@@ -55,11 +55,13 @@ def unit_quaternions(quaternion: NDArray, *, tolerance: float = 0.05) -> NDArray
 
     Raises ValueError naming the first row whose length is off by more than the tolerance: that is no quaternion.
     """
-    length = np.linalg.norm(quaternion, axis=1)
+    with np.errstate(all="ignore"):  # what is absurd becomes NaN, or has a wrong length
+        length = np.linalg.norm(quaternion, axis=1)
     wrong = np.flatnonzero((np.abs(length - 1) > tolerance) & (length > 0))
     if len(wrong):
         raise ValueError(int(wrong[0]), float(length[wrong[0]]))
-    return quaternion / np.where(length > 0, length, np.nan)[:, None]
+    with np.errstate(all="ignore"):
+        return quaternion / np.where((length > 0) & (length < np.inf), length, np.nan)[:, None]
 
 
 def ascending(time: NDArray) -> NDArray:

@@ -160,7 +160,8 @@ def _subject(name: str, world: Rotation, time: NDArray, position: NDArray, quate
     known = np.isfinite(turn).all(axis=1)
     if known.any():
         turn[known] = (world * Rotation.from_quat(turn[known]) * _FRD).as_quat()
-    return LoggedSubject(name, time, position @ world.as_matrix().T, turn)
+    with np.errstate(invalid="ignore"):  # a vehicle may report NaN or infinity
+        return LoggedSubject(name, time, position @ world.as_matrix().T, turn)
 
 
 def _at(time: NDArray, attitude: NDArray) -> NDArray:

@@ -74,7 +74,12 @@ def read_head(lines: list[str], *, where: str, rotations: Rotations | None) -> S
             hint="a section begins with its name, its rate, the subjects and the columns",
         )
     delimiter = max(",;\t", key=lines[3].count)
-    names, headings, units = (_cells(line, delimiter) for line in (lines[2], lines[3], (*lines, "")[4]))
+    try:
+        names, headings, units = (_cells(line, delimiter) for line in (lines[2], lines[3], (*lines, "")[4]))
+    except csv.Error as error:
+        raise InputError(
+            f"the head of section {name!r} cannot be read: {error}", where=where, hint="export the section again"
+        ) from None
     headings = [heading.upper() for heading in headings]
     if "FRAME" not in headings:
         raise InputError(

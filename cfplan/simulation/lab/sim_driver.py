@@ -59,7 +59,7 @@ class SimDriver(CRTPDriver):
         if not uri.startswith(_SCHEME):
             raise WrongUriType(f"not a {_SCHEME} URI")
         if self._socket is not None:
-            raise LinkError("the link is open already", where=uri)
+            raise LinkError("the link is open already", where=uri, hint="close it first")
         number = lab_number(uri)
         address = lab_address(number)
         if address is None:

@@ -351,8 +351,10 @@ def _reproduce_residual_error(poses: NDArray, belief: NDArray) -> None:
     """
     from scipy.spatial.transform import Rotation  # slow to import, and few vehicles need it
 
+    if not 0.0 < np.linalg.norm(belief) < np.inf:  # the filter has diverged
+        return
     believed = Rotation.from_quat(belief)
     for row in poses:
-        if np.any(row[3:7]):
+        if 0.0 < np.linalg.norm(row[3:7]) < np.inf:
             measured = Rotation.from_quat(row[3:7])
             row[3:7] = (believed * measured * believed.inv()).as_quat()
