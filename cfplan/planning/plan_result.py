@@ -26,7 +26,11 @@ class LocalSlowing:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.before) and self.before > 0.0 and self.reasons):
-            raise InputError(f"local slowing of {self.before} s of flight for {len(self.reasons)} reasons")
+            raise InputError(
+                f"local slowing of {self.before} s of flight for {len(self.reasons)} reasons",
+                where="local slowing",
+                hint="give the flight's time before, above 0, and at least one reason",
+            )
 
 
 @dataclass(frozen=True, slots=True)
