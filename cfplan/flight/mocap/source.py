@@ -1,10 +1,11 @@
 """Poses for the pilot from a motion capture system."""
 
 import math
-import time
 from collections import Counter
+from collections.abc import Callable
 
 from cfplan.errors import CfplanError, InputError, LinkError
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Frame, Scene
@@ -18,6 +19,7 @@ OPEN_WITHIN = 3.5  # s to see the first good poses
 _RATE_SLACK = 1.2  # times the expected rate may be forwarded; more only burdens the radio
 _FARTHEST = 30.0  # m from the origin; no lab is larger, but a lab in millimetres is
 _LARGEST_TILT = math.radians(45)  # of a vehicle that stands on the floor
+_READ_PERIOD = 0.005  # s between looks for them
 _ENOUGH = 5  # good poses that prove a body
 
 
@@ -33,15 +35,24 @@ class MocapSource:
     then there is silence.
     """
 
-    def __init__(self, uri: MocapUri, limits: PoseLimits, *, open_within: float = OPEN_WITHIN):
+    def __init__(
+        self,
+        uri: MocapUri,
+        limits: PoseLimits,
+        *,
+        open_within: float = OPEN_WITHIN,
+        clock: Clock = REAL_CLOCK,
+        make_feed: Callable[[MocapUri], Feed] = Feed,
+    ):
         self._uri, self._limits, self._open_within = uri, limits, open_within
+        self._clock, self._make_feed = clock, make_feed
         self._feed: Feed | None = None
         self._first: list[Pose] = []
         self._begin()
 
     def _begin(self) -> None:
         self._classifier = PoseClassifier(self._limits.jump)
-        self._clock = FrameClock(self._limits.latency)
+        self._frame_clock = FrameClock(self._limits.latency)
         self._scene: Scene | None = None
         self._next = -math.inf
         self.fault = ""  # why no pose comes; "" while good poses come
@@ -58,7 +69,7 @@ class MocapSource:
     @property
     def sees_delays(self) -> bool:
         """Whether delayed frames are recognised: some seconds after opening, if frames have numbers."""
-        return self._clock.sure
+        return self._frame_clock.sure
 
     @property
     def child_id(self) -> int | None:
@@ -68,8 +79,8 @@ class MocapSource:
     def open(self) -> None:
         """Connect, and check that the body is seen upright and in metres. Raises a CfplanError within 5 s otherwise."""
         self._begin()
-        deadline = time.monotonic() + self._open_within
-        self._feed = Feed(self._uri)
+        deadline = self._clock.now() + self._open_within
+        self._feed = self._make_feed(self._uri)
         try:
             self._feed.start()
             while len(self._first) < _ENOUGH:
@@ -79,9 +90,9 @@ class MocapSource:
                 if failure is not None:
                     self._first += self._read()  # its last words say more
                     raise failure
-                if time.monotonic() > deadline:
+                if self._clock.now() > deadline:
                     raise self._nothing_came()
-                time.sleep(0.005)
+                self._clock.sleep(_READ_PERIOD)
             for pose in self._first:
                 _check_looks(pose, str(self._uri))
         except BaseException:
@@ -125,7 +136,7 @@ class MocapSource:
 
     def _classify(self, frame: Frame) -> Pose | None:
         body = next(iter(frame.bodies), None)
-        taken = self._clock.taken(frame.received, frame.number, frame.rate, frame.latency)
+        taken = self._frame_clock.taken(frame.received, frame.number, frame.rate, frame.latency)
         verdict = self._classifier.classify(taken, body, frame.number)
         if verdict is not Verdict.GOOD or body is None:
             self.fault = str(verdict)

@@ -2,12 +2,12 @@
 
 import math
 import statistics
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from cfplan.errors import CfplanError, LinkError
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Frame, Scene, TrackedBody
@@ -148,16 +148,23 @@ class Surveyor:
         )
 
 
-def survey(uri: MocapUri, seconds: float, show: Callable[[Survey], None] = lambda _: None) -> Survey:
+def survey(
+    uri: MocapUri,
+    seconds: float,
+    show: Callable[[Survey], None] = lambda _: None,
+    *,
+    clock: Clock = REAL_CLOCK,
+    make_feed: Callable[[MocapUri], Feed] = Feed,
+) -> Survey:
     """Return a survey of all that a system sends in `seconds`; `show` gets the survey so far a few times a second.
 
     Raises a CfplanError if no frame comes, or if the URI names an unknown body.
     """
     surveyor, shown = Surveyor(), 0.0
-    with Feed(replace(uri, subject="")) as feed:
+    with make_feed(replace(uri, subject="")) as feed:
         feed.start()
-        end = time.monotonic() + FIRST_FRAME_WITHIN
-        while time.monotonic() < end:
+        end = clock.now() + FIRST_FRAME_WITHIN
+        while clock.now() < end:
             for message in feed.messages():
                 if isinstance(message, CfplanError):
                     raise message
@@ -166,14 +173,14 @@ def survey(uri: MocapUri, seconds: float, show: Callable[[Survey], None] = lambd
                     _check_subject(uri, {subject.name for subject in message.subjects})
                 elif isinstance(message, Frame):
                     if not surveyor.frames:
-                        end = time.monotonic() + seconds
+                        end = clock.now() + seconds
                     surveyor.add(message)
             if failure := feed.failure():
                 raise failure
-            if surveyor.frames and time.monotonic() - shown > _SHOW_PERIOD:
-                shown = time.monotonic()
+            if surveyor.frames and clock.now() - shown > _SHOW_PERIOD:
+                shown = clock.now()
                 show(surveyor.report())
-            time.sleep(_READ_PERIOD)
+            clock.sleep(_READ_PERIOD)
         if not surveyor.frames:
             hint = "is the system live and streaming?"
             raise LinkError(f"no frame within {FIRST_FRAME_WITHIN:g} s ({feed.stage})", where=str(uri), hint=hint)

@@ -137,7 +137,7 @@ class SteppedPoses(MocapSource):
     """The pilot's source of poses from the lab's cameras, dated and classified as in a real flight."""
 
     def __init__(self, lab: SteppedLab, limits: PoseLimits, subject: str = "cf1"):
-        super().__init__(parse_uri(f"vicon://lab/{subject}", subject_needed=True), limits)
+        super().__init__(parse_uri(f"vicon://lab/{subject}", subject_needed=True), limits, clock=lab.clock)
         self._lab = lab
 
     def open(self) -> None:

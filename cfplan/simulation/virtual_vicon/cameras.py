@@ -71,6 +71,10 @@ class Cameras:
         """Let something go wrong; its start counts from now."""
         self._faults.add(fault, now)
 
+    def heal(self, now: float) -> None:
+        """Let everything that went wrong be right again."""
+        self._faults.end(now)
+
     def look(self, time: float, position: Triple, quaternion: Quaternion) -> None:
         """See the vehicle where it is at a time, s."""
         settings, faults = self._settings, self._faults

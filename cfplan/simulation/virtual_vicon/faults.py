@@ -47,6 +47,10 @@ class Faults:
         """Add a fault; its start counts from now."""
         self._all.append((now + fault.start, now + fault.start + fault.duration, fault))
 
+    def end(self, now: float) -> None:
+        """Let all faults end, also those that have not begun."""
+        self._all = [(start, min(end, now), fault) for start, end, fault in self._all]
+
     def acting(self, kind: FaultKind, time: float, subject: str | None = None) -> ViconFault | None:
         """Return a fault of this kind that acts on this body at this time; None if there is none."""
         for start, end, fault in self._all:

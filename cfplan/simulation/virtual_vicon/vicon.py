@@ -1,17 +1,16 @@
 """A virtual Vicon: cameras, their faults, and a DataStream server that Vicon's own client accepts.
 
 Nothing here waits or reads a clock, except `serve`: the owner says where the vehicle is at each `next_look`, and calls
-`step` every few milliseconds. `serve` does both from a thread.
+`step` every few milliseconds. `serve` does both, beside everything else.
 """
 
 import socket
-import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from cfplan.errors import InputError
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.telemetry import Quaternion
 from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
 from cfplan.simulation.virtual_vicon.faults import Seen, ViconFault
@@ -88,28 +87,26 @@ class VirtualVicon(Cameras):
 def serve(
     settings: ViconSettings | None = None,
     pose: Callable[[float], Seen] = lambda _: ((0.0, 0.0, 0.0), _LEVEL),
+    clock: Clock = REAL_CLOCK,
 ) -> Iterator["Served"]:
-    """Run a virtual Vicon in a thread; `pose` returns the vehicle's pose at a time, s, since the start."""
-    served = Served(settings or ViconSettings(), pose)
-    thread = threading.Thread(target=served.run, name="virtual vicon", daemon=True)
-    thread.start()
+    """Run a virtual Vicon; `pose` returns the vehicle's pose at a time, s, since the start."""
+    served = Served(settings or ViconSettings(), pose, clock)
+    running = clock.repeat(served.step, name="virtual vicon")
     try:
         yield served
     finally:
-        served.ended.set()
-        thread.join()
+        running.stop()
         served.vicon.close()
 
 
 class Served:
-    """A virtual Vicon that runs in a thread."""
+    """A virtual Vicon that runs."""
 
-    def __init__(self, settings: ViconSettings, pose: Callable[[float], Seen]):
-        self.start = time.monotonic()
+    def __init__(self, settings: ViconSettings, pose: Callable[[float], Seen], clock: Clock):
+        self._clock, self.start = clock, clock.now()
         self.vicon = VirtualVicon(settings, self.start)
         self.settings, self._pose = settings, pose
-        self.ended = threading.Event()
-        self._injected: deque[ViconFault] = deque()
+        self._wishes: deque[Callable[[float], None]] = deque()
 
     @property
     def uri(self) -> str:
@@ -122,16 +119,19 @@ class Served:
 
     def inject(self, fault: ViconFault) -> None:
         """Let something go wrong; its start counts from now."""
-        self._injected.append(fault)
+        self._wishes.append(lambda now: self.vicon.inject(fault, now))
 
-    def run(self) -> None:
-        """Run until `ended` is set."""
-        vicon = self.vicon
-        while not self.ended.wait(_STEP):
-            now = time.monotonic()
-            while self._injected:
-                vicon.inject(self._injected.popleft(), now)
-            while vicon.next_look <= now:
-                at = vicon.next_look
-                vicon.look(at, *self._pose(at - self.start))
-            vicon.step(now)
+    def heal(self) -> None:
+        """Let everything that went wrong be right again."""
+        self._wishes.append(self.vicon.heal)
+
+    def step(self) -> float:
+        """Look, and send what is due; return s until this is needed again."""
+        vicon, now = self.vicon, self._clock.now()
+        while self._wishes:
+            self._wishes.popleft()(now)
+        while vicon.next_look <= now:
+            at = vicon.next_look
+            vicon.look(at, *self._pose(at - self.start))
+        vicon.step(now)
+        return _STEP

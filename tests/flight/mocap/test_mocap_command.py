@@ -39,8 +39,8 @@ def run(*arguments):
 
 @pytest.mark.integration
 def test_bodies_rate_and_remarks_are_one_document(vicon):
-    found = json.loads(run("mocap", vicon.uri, "--json", "--seconds", "0.5"))
-    assert 50 < found["rate"] < 150
+    found = json.loads(run("mocap", vicon.uri, "--json", "--seconds", "1.0"))
+    assert found["rate"] > 0  # how exactly is tested on the stepped clock, with the virtual Vicon
     assert found["announced_rate"] == 100
     assert found["latency"] == pytest.approx(0.01)
     bodies = {body["name"]: body for body in found["bodies"]}
