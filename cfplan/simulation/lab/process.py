@@ -1,20 +1,19 @@
-"""The lab's process: it runs the virtual Crazyflie and the room in real time, against absolute deadlines."""
+"""The lab's process: it runs the virtual Crazyflie and the room by a clock, against absolute deadlines."""
 
 import gc
 import math
 import os
-import select
 import signal
 import socket
 import struct
 import sys
-import time
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
 import numpy as np
 
 from cfplan.errors import CfplanError, InputError
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.real_time import lock_memory
 from cfplan.simulation.lab.lab import CLOSE, LATEST, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME, TRUTH
 from cfplan.simulation.lab.radio import Radio, RadioFault
@@ -63,8 +62,16 @@ class Recorder:
 class LabLoop:
     """Vehicle, room and sockets on one clock."""
 
-    def __init__(self, airframe: Airframe, vehicle: VehicleSettings, room: RoomSettings, port: int = 0):
+    def __init__(
+        self,
+        airframe: Airframe,
+        vehicle: VehicleSettings,
+        room: RoomSettings,
+        port: int = 0,
+        clock: Clock = REAL_CLOCK,
+    ):
         self.vehicle = VirtualCrazyflie(airframe, vehicle)
+        self._clock = clock
         self._seed = vehicle.seed
         self._on_board = room.on_board
         if room.on_board:
@@ -78,7 +85,7 @@ class LabLoop:
         self._client: _Address | None = None
         self._heard = 0.0
         self._subscribers: dict[_Address, float] = {}
-        self._origin = 0.0
+        self._origin = math.nan  # s, when the vehicle's tick 0 was
         self._radio: Radio | None = None  # None while the link is perfect
 
     def _warm_up(self) -> None:
@@ -90,20 +97,27 @@ class LabLoop:
         """Run until told to end, or until the parent process has ended."""
         parent = os.getppid()
         sources: list[int] = [self.link.fileno(), self.poses.fileno(), control.fileno()]
-        self._origin = time.monotonic() - self.vehicle.tick / 1000
+        self.serve()
         while os.getppid() == parent:
-            wait = max(0.0, self._due() - time.monotonic())
-            readable = select.select(sources, [], [], wait)[0]
-            self._catch_up()
-            if sources[0] in readable:
-                self._read_link()
-            if sources[1] in readable:
-                self._read_subscriptions()
+            readable = self._clock.readable(sources, self.until_due())
+            self.serve()
             if sources[2] in readable and not self._obey(control):
                 return
 
+    def serve(self) -> None:
+        """Do what is due by now, for the vehicle, the room and the sockets."""
+        if math.isnan(self._origin):
+            self._origin = self._clock.now() - self.vehicle.tick / 1000
+        self._catch_up()
+        self._read_link()
+        self._read_subscriptions()
+
+    def until_due(self) -> float:
+        """Return s until `serve` is needed again, unless a packet comes sooner."""
+        return max(0.0, self._due() - self._clock.now())
+
     def _due(self) -> float:
-        """Return when, s, the loop must wake next for something visible outside; incoming packets wake it too."""
+        """Return when, s, something visible outside is due next."""
         tick = self.vehicle.tick
         if self._radio is not None and self._radio.busy:
             return self._origin + (tick + 1) / 1000
@@ -114,7 +128,7 @@ class LabLoop:
         return min(self._origin + after / 1000, self.capture.next_due)
 
     def _catch_up(self) -> None:
-        now = time.monotonic()
+        now = self._clock.now()
         if now - self._origin - self.vehicle.tick / 1000 > _LARGEST_LAG:
             self._origin = now - self.vehicle.tick / 1000
         target = int((now - self._origin) * 1000)
@@ -163,21 +177,23 @@ class LabLoop:
                     self.poses.sendto(packet, address)
 
     def _read_link(self) -> None:
-        for packet, sender in _datagrams(self.link):
+        came = _datagrams(self.link)
+        for packet, sender in came:
             if packet == NULL_PACKET:  # a scan, or a driver that checks for a vehicle
                 self.link.sendto(pack(Port.LINK, 3, b""), sender)
                 continue
-            self._client, self._heard = sender, time.monotonic()
+            self._client, self._heard = sender, self._clock.now()
             if self._radio is not None:
                 self._radio.send(packet)
             else:
                 self.vehicle.receive(packet)
-        self._send_out(time.monotonic())
+        if came:
+            self._send_out(self._clock.now())
 
     def _read_subscriptions(self) -> None:
         for packet, sender in _datagrams(self.poses):
             if packet == SUBSCRIBE:
-                self._subscribers[sender] = time.monotonic()
+                self._subscribers[sender] = self._clock.now()
             else:
                 self._subscribers.pop(sender, None)
 
@@ -190,12 +206,12 @@ class LabLoop:
             rows = self.record.rows(-1 if request == LATEST else 0)
             control.send((rows, self.vehicle.supervisor.ever_locked))
         elif isinstance(request, ViconFault) and self.vicon is not None:
-            self.vicon.inject(request, time.monotonic())
+            self.vicon.inject(request, self._clock.now())
         elif isinstance(request, VehicleFault):
             self.vehicle.inject(request)
         elif isinstance(request, RadioFault):
-            self._radio = self._radio or Radio(time.monotonic(), self._seed)
-            self._radio.inject(request, time.monotonic())
+            self._radio = self._radio or Radio(self._clock.now(), self._seed)
+            self._radio.inject(request, self._clock.now())
         return request != CLOSE
 
 
@@ -250,7 +266,7 @@ def serve(control: Connection) -> None:
         control.send(error)
         return
     if room.vicon is not None:
-        loop.vicon = VirtualVicon(room.vicon, time.monotonic())
+        loop.vicon = VirtualVicon(room.vicon, REAL_CLOCK.now())
     gc.collect()
     gc.freeze()
     _take_priority()

@@ -7,7 +7,6 @@ would from a real system: late and noisy.
 import os
 import socket
 import struct
-import time
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError, LinkError
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.poses import Pose
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 
@@ -119,6 +119,7 @@ class RoomPoseSource:
     """The poses of the simulated room of a lab; a PoseSource. Can go to another process before it is opened."""
 
     number: int = 0  # of the lab, as in sim://0
+    clock: Clock = REAL_CLOCK
     fault: str = ""
     _socket: socket.socket | None = None
     _first: list[Pose] | None = None
@@ -131,12 +132,12 @@ class RoomPoseSource:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect((address[0], address[1] + 1))
         self._socket.setblocking(False)
-        give_up = time.monotonic() + _OPEN_TIMEOUT
-        while time.monotonic() < give_up:
+        give_up = self.clock.now() + _OPEN_TIMEOUT
+        while self.clock.now() < give_up:
             self._first = self.poses()
             if self._first:
                 return
-            time.sleep(0.005)
+            self.clock.sleep(0.005)
         self.close()
         raise LinkError(f"no pose from the simulated room {self.number}", hint="its lab has ended; start it again")
 
@@ -144,7 +145,7 @@ class RoomPoseSource:
         if self._socket is None:
             return []
         found, self._first = self._first or [], None
-        now = time.monotonic()
+        now = self.clock.now()
         try:
             if now - self._renewed > _RENEW_AFTER:
                 self._renewed = now
