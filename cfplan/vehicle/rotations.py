@@ -77,6 +77,16 @@ def product(first: Quaternion, second: Quaternion) -> tuple[Scalar, Scalar, Scal
     )
 
 
+@register_jitable(forceinline=True)
+def axes_of(x: float, y: float, z: float, w: float) -> tuple[Vector, Vector, Vector]:
+    """Return the body's axes x, y, z in the world, of a unit quaternion: the columns of its matrix, as scalars."""
+    return (
+        (1 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w)),
+        (2.0 * (x * y - z * w), 1 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w)),
+        (2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1 - 2.0 * (x * x + y * y)),
+    )
+
+
 @njit
 def matrix_of(quaternion: NDArray) -> NDArray:
     """Return the (3, 3) matrix of a unit quaternion, (4,): its columns are the body's axes."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import matrix_of, yaw_of
+from cfplan.vehicle.rotations import Vector, axes_of, heading_of
 
 CONTROL_PERIOD = 0.002  # s
 
@@ -60,44 +60,42 @@ def step_mellinger(
     control: NDArray, memory: NDArray, gains: NDArray, setpoint: NDArray, mode: NDArray, state: NDArray
 ) -> None:
     """Step the controller by CONTROL_PERIOD: write `control` and update `memory`."""
-    pull = np.empty(3)  # force that the errors of position call for
-    for axis in range(3):
-        kp, kd = (gains[_KP_XY], gains[_KD_XY]) if axis < 2 else (gains[_KP_Z], gains[_KD_Z])
-        ki, i_range = (gains[_KI_XY], gains[_I_RANGE_XY]) if axis < 2 else (gains[_KI_Z], gains[_I_RANGE_Z])
-        error = setpoint[axis] - state[axis]
-        memory[axis] = _clamp(memory[axis] + error * CONTROL_PERIOD, i_range)
-        pull[axis] = kp * error + kd * (setpoint[3 + axis] - state[3 + axis]) + ki * memory[axis]
+    pull_x = _pull(memory, gains, setpoint, state, 0)
+    pull_y = _pull(memory, gains, setpoint, state, 1)
+    pull_z = _pull(memory, gains, setpoint, state, 2)
 
-    yaw = 0.0
+    turn = axes_of(state[6], state[7], state[8], state[9])
+    yaw = 1.0, 0.0  # cosine and sine
     if mode[MODE_YAW] == VELOCITY_MODE:
-        yaw = yaw_of(state[6:10]) + setpoint[15] * CONTROL_PERIOD
+        ahead = np.arctan2(turn[0][1], turn[0][0]) + setpoint[15] * CONTROL_PERIOD
+        yaw = np.cos(ahead), np.sin(ahead)
     elif mode[MODE_YAW] == ABSOLUTE:
-        yaw = setpoint[18]
+        yaw = np.cos(setpoint[18]), np.sin(setpoint[18])
     elif mode[MODE_QUATERNION] == ABSOLUTE:
-        yaw = yaw_of(setpoint[9:13])
+        x, y = heading_of((setpoint[9], setpoint[10], setpoint[11], setpoint[12]))
+        yaw = _direction(x, y)
 
-    turn = matrix_of(state[6:10])
     by_position = mode[MODE_X] == ABSOLUTE
     manual = mode[MODE_ROLL] == ABSOLUTE and mode[MODE_PITCH] == ABSOLUTE and mode[MODE_Z] == DISABLE
     thrust = 0.0
     if manual and not by_position:
         desired = _attitude(setpoint[16], -setpoint[17], yaw)
     else:
-        force_x, force_y, force_z = 0.0, 0.0, gains[_MASS] * GRAVITY + pull[2]
+        force_x, force_y, force_z = 0.0, 0.0, gains[_MASS] * GRAVITY + pull_z
         if by_position:
-            force_x = gains[_MASS] * setpoint[6] + pull[0]
-            force_y = gains[_MASS] * setpoint[7] + pull[1]
+            force_x = gains[_MASS] * setpoint[6] + pull_x
+            force_y = gains[_MASS] * setpoint[7] + pull_y
             force_z += gains[_MASS] * setpoint[8]
         else:
             # Level out: the firmware keeps height and the direction that it points in.
-            yaw = yaw_of(state[6:10])
-        thrust = force_x * turn[0, 2] + force_y * turn[1, 2] + force_z * turn[2, 2]
+            yaw = _direction(turn[0][0], turn[0][1])
+        thrust = _dot((force_x, force_y, force_z), turn[2])
         desired = _thrust_frame(force_x, force_y, force_z, yaw)
 
     # Roll, pitch and yaw errors; pitch counts nose up, which is negative about the body's y axis.
-    tilt_x = _along(desired, 2, turn, 1) - _along(turn, 2, desired, 1)
-    tilt_y = _along(turn, 0, desired, 2) - _along(desired, 0, turn, 2)
-    tilt_z = _along(desired, 1, turn, 0) - _along(turn, 1, desired, 0)
+    tilt_x = _dot(desired[2], turn[1]) - _dot(turn[2], desired[1])
+    tilt_y = _dot(turn[0], desired[2]) - _dot(desired[0], turn[2])
+    tilt_z = _dot(desired[1], turn[0]) - _dot(turn[1], desired[0])
     rate_x, rate_y, rate_z = state[10], -state[11], state[12]
     wanted_x, wanted_y, wanted_z = setpoint[13], -setpoint[14], setpoint[15]
     surge_x = ((wanted_x - memory[8]) - (rate_x - memory[6])) / CONTROL_PERIOD
@@ -119,8 +117,19 @@ def step_mellinger(
         control[2] = _clamp(pitch, _MOMENT_LIMIT)
         control[3] = _clamp(-spin, _MOMENT_LIMIT)
     else:
-        control[1:4] = 0.0
-        memory[0:6] = 0.0
+        control[1] = control[2] = control[3] = 0.0
+        for k in range(6):
+            memory[k] = 0.0
+
+
+@register_jitable(forceinline=True)
+def _pull(memory: NDArray, gains: NDArray, setpoint: NDArray, state: NDArray, axis: int) -> float:
+    """Return the force that the error of position along an axis calls for, N; it updates its integral."""
+    kp, kd = (gains[_KP_XY], gains[_KD_XY]) if axis < 2 else (gains[_KP_Z], gains[_KD_Z])
+    ki, i_range = (gains[_KI_XY], gains[_I_RANGE_XY]) if axis < 2 else (gains[_KI_Z], gains[_I_RANGE_Z])
+    error = setpoint[axis] - state[axis]
+    memory[axis] = _clamp(memory[axis] + error * CONTROL_PERIOD, i_range)
+    return kp * error + kd * (setpoint[3 + axis] - state[3 + axis]) + ki * memory[axis]
 
 
 @njit
@@ -144,32 +153,36 @@ def _clamp(value: float, limit: float) -> float:
 
 
 @register_jitable
-def _along(a: NDArray, i: int, b: NDArray, j: int) -> float:
-    """Return the dot product of column i of `a` and column j of `b`."""
-    return a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit
-def _attitude(roll: float, pitch: float, yaw: float) -> NDArray:
-    """Return the (3, 3) rotation of Euler angles ZYX, rad."""
-    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
-    frame = np.empty((3, 3))
-    frame[0, 0], frame[0, 1], frame[0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
-    frame[1, 0], frame[1, 1], frame[1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
-    frame[2, 0], frame[2, 1], frame[2, 2] = -sp, cp * sr, cp * cr
-    return frame
+@register_jitable
+def _direction(x: float, y: float) -> tuple[float, float]:
+    """Return cosine and sine of the direction of (x, y)."""
+    size = np.sqrt(x * x + y * y)
+    return (x / size, y / size) if size > 0.0 else (1.0, 0.0)
 
 
-@njit
-def _thrust_frame(x: float, y: float, z: float, yaw: float) -> NDArray:
-    """Return the (3, 3) rotation whose z axis is along a force and whose x axis lies over the direction of yaw."""
+@register_jitable
+def _attitude(roll: float, pitch: float, yaw: tuple[float, float]) -> tuple[Vector, Vector, Vector]:
+    """Return the axes of a body with Euler angles ZYX, rad; yaw by its cosine and sine."""
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    cy, sy = yaw
+    return (
+        (cy * cp, sy * cp, -sp),
+        (cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr),
+        (cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr),
+    )
+
+
+@register_jitable
+def _thrust_frame(x: float, y: float, z: float, yaw: tuple[float, float]) -> tuple[Vector, Vector, Vector]:
+    """Return the axes of a body whose z is along a force and whose x lies over the direction of yaw."""
+    cy, sy = yaw
     norm = np.sqrt(x * x + y * y + z * z)
     zx, zy, zz = x / norm, y / norm, z / norm
-    yx, yy, yz = -zz * np.sin(yaw), zz * np.cos(yaw), zx * np.sin(yaw) - zy * np.cos(yaw)
+    yx, yy, yz = -zz * sy, zz * cy, zx * sy - zy * cy
     norm = np.sqrt(yx * yx + yy * yy + yz * yz)
     yx, yy, yz = yx / norm, yy / norm, yz / norm
-    frame = np.empty((3, 3))
-    frame[0, 0], frame[1, 0], frame[2, 0] = yy * zz - yz * zy, yz * zx - yx * zz, yx * zy - yy * zx
-    frame[0, 1], frame[1, 1], frame[2, 1] = yx, yy, yz
-    frame[0, 2], frame[1, 2], frame[2, 2] = zx, zy, zz
-    return frame
+    return (yy * zz - yz * zy, yz * zx - yx * zz, yx * zy - yy * zx), (yx, yy, yz), (zx, zy, zz)
