@@ -81,8 +81,13 @@ TIMEOUTS: tuple[tuple[tuple[int, ...], Timeouts], ...] = (((2023, 6), Timeouts()
 
 def version_of(text: str) -> tuple[int, ...]:
     """Return the version in what a vehicle says of its firmware: "2025.09.1 (abc)" is (2025, 9, 1), "" is ()."""
-    found = re.match(r"\s*(\d+(?:\.\d+)*)", text)
-    return tuple(int(part) for part in found[1].split(".")) if found else ()
+    found = re.search(r"\d+(?:\.\d+)*", text)
+    return tuple(int(part) for part in found[0].split(".")) if found else ()
+
+
+def version_text(version: tuple[int, ...]) -> str:
+    """Return a version as Bitcraze writes it: (2025, 9, 1) is "2025.09.1"."""
+    return ".".join(f"{part:02d}" if place == 1 else str(part) for place, part in enumerate(version))
 
 
 def timeouts_of(version: tuple[int, ...]) -> Timeouts:
@@ -93,4 +98,4 @@ def timeouts_of(version: tuple[int, ...]) -> Timeouts:
     for since, timeouts in reversed(TIMEOUTS):
         if version >= since:
             return timeouts
-    raise ValueError(f"the time-outs of firmware {'.'.join(map(str, version)) or 'unknown'} are not known")
+    raise ValueError(f"the time-outs of firmware {version_text(version) or 'unknown'} are not known")

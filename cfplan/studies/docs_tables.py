@@ -3,6 +3,8 @@
 <!-- table: results/bench.json#time-4.5x8x2-hardware -->     its title and its cells
 <!-- columns: results/bench.json#time-4.5x8x2-hardware -->   what its columns mean
 <!-- measured: results/bench.json -->                        command, date, commit and machine
+<!-- preflight: parameters -->                               what preflight requires on board; also signs, unknowable,
+                                                             time-outs
 <!-- end -->                                                 ends any of them
 """
 
@@ -10,12 +12,18 @@ import re
 from pathlib import Path
 
 from cfplan.errors import InputError
+from cfplan.flight.firmware import TIMEOUTS, version_text
+from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, UNKNOWABLE
 from cfplan.studies.provenance import Provenance
 from cfplan.studies.result import Table, read_result
 
 _BLOCK = re.compile(
     r"(?P<begin><!-- (?P<kind>table|columns|measured): (?P<file>[^#\s]+)(?:#(?P<name>\S+))? -->\n).*?"
     r"(?P<end><!-- end -->)",
+    re.DOTALL,
+)
+_RULES = re.compile(
+    r"(?P<begin><!-- preflight: (?P<name>\S+) -->\n).*?(?P<end><!-- end -->)",
     re.DOTALL,
 )
 
@@ -32,7 +40,13 @@ def with_tables(page: str, folder: Path) -> str:
             text = write(result.table(match["name"] or ""))
         return f"{match['begin']}\n{text}\n\n{match['end']}"
 
-    return _BLOCK.sub(block, page)
+    def rules(match: re.Match[str]) -> str:
+        if match["name"] not in RULES:
+            raise InputError(f"no such table: preflight: {match['name']}", hint=f"one of {', '.join(RULES)}")
+        titles, cells = RULES[match["name"]]()
+        return f"{match['begin']}\n{_grid(titles, cells)}\n\n{match['end']}"
+
+    return _RULES.sub(rules, _BLOCK.sub(block, page))
 
 
 def write_tables(folder: Path) -> list[Path]:
@@ -52,7 +66,11 @@ def write_tables(folder: Path) -> list[Path]:
 
 def _cells(table: Table) -> str:
     titles, cells = table.cells()
-    return "\n".join([f"**{table.title}**", "", _line(titles), "|---" * len(titles) + "|", *map(_line, cells)])
+    return f"**{table.title}**\n\n{_grid(titles, cells)}"
+
+
+def _grid(titles: list[str], cells: list[list[str]]) -> str:
+    return "\n".join([_line(titles), "|---" * len(titles) + "|", *map(_line, cells)])
 
 
 def _line(cells: list[str]) -> str:
@@ -68,3 +86,34 @@ def _measured(made: Provenance) -> str:
     commit = f"commit {made.commit[:12]}{' with changes' if made.modified else ''}"
     machine = f"{made.machine.processor}, {made.machine.cores} cores, Python {made.machine.python}"
     return f"    {made.command}\n\nMeasured on {made.date[:10]} at {commit}; {machine}."
+
+
+def _parameters() -> tuple[list[str], list[list[str]]]:
+    titles = ["parameter", "must be", "what cfplan does", "why", "since firmware"]
+    return titles, [
+        [
+            f"`{rule.name}`", rule.wanted, str(rule.action), rule.reason,
+            (version_text(rule.since) or "any") + (f"; without it: {rule.missing}" if rule.missing else ""),
+        ]
+        for rule in PARAMETER_RULES
+    ]  # fmt: skip
+
+
+def _signs() -> tuple[list[str], list[list[str]]]:
+    return ["sign", "how it is known"], [[sign.name, sign.reason] for sign in COMMANDER_SIGNS]
+
+
+def _unknowable() -> tuple[list[str], list[list[str]]]:
+    return ["what no vehicle tells", "why"], [list(row) for row in UNKNOWABLE]
+
+
+def _timeouts() -> tuple[list[str], list[list[str]]]:
+    titles = ["since firmware", "levels out after", "motors off after", "watchdog", "looked at every"]
+    return titles, [
+        [version_text(since), *(f"{seconds:g} s" for seconds in (each.level_out, each.motors_off, each.keep_alive,
+                                                                  each.period))]
+        for since, each in TIMEOUTS
+    ]  # fmt: skip
+
+
+RULES = {"parameters": _parameters, "signs": _signs, "unknowable": _unknowable, "time-outs": _timeouts}

@@ -13,6 +13,7 @@ from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.pilot import Pilot
+from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES
 from cfplan.flight.radio.link import GO_TO, LAND, TAKE_OFF
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
@@ -59,6 +60,9 @@ def make_limits() -> Limits:
     )  # fmt: skip
 
 
+GOOD_VALUES = {rule.name: rule.value(make_limits()) for rule in PARAMETER_RULES}
+
+
 def make_payloads(distance: float = 2.0, duration: float = 2.0, height: float = 1.0) -> np.ndarray:
     """A straight flight along x, from rest to rest, with its yaw turning by 0.5 rad."""
     return septic_payloads(distance, duration, height, turn=0.5)
@@ -86,6 +90,7 @@ class World:
     other_body: bool = False  # motion capture tracks one that stays on the floor
     stubborn: dict[str, float] = field(default_factory=dict)
     replies: dict[int, int] = field(default_factory=dict)
+    has_setpoint: bool = False
     extra_bits: int = 0
     pose_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     poses_frozen: bool = False
@@ -216,11 +221,15 @@ class World:
         self.parameters[name] = self.stubborn.get(name, value)
         return self.parameters[name]
 
+    def read_parameters(self, names) -> dict[str, float]:
+        known = [name for name in names if self.has_parameter(name)]
+        return {name: self.parameters.get(name, GOOD_VALUES[name]) for name in known}
+
     def start_logs(self) -> None:
         self._logging = True
 
-    def stop_variance_log(self) -> None:
-        self.calls.append("variance log off")
+    def stop_preflight_logs(self) -> None:
+        self.calls.append("preflight logs off")
 
     def release_priority(self) -> None:
         self.calls.append("release")

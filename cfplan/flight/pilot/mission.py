@@ -12,9 +12,6 @@ from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.rotations import yaw_of
 
-# Standard deviations that the vehicle's filter gives poses, as Crazyswarm2 sets them. The large one avoids yaw trouble.
-EXTERNAL_POSITION_STD = 1e-3  # m
-EXTERNAL_ATTITUDE_STD = 5e-2  # rad
 _SHORTEST_MANOEUVRE = 1.5  # s
 
 
@@ -54,28 +51,6 @@ class Mission:
     def take_off_height(self) -> float:
         """Height of the hover after take-off, m above the origin."""
         return self.limits.ground.take_off_height
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """Parameters that are set on the vehicle and read back before the feed of poses begins."""
-        return {
-            "stabilizer.estimator": self.limits.firmware.estimator,
-            "stabilizer.controller": self.limits.firmware.controller,
-            "ctrlMel.mass": self.limits.airframe.mass,
-            "ctrlMel.massThrust": self.limits.airframe.command_per_thrust,
-            "locSrv.extPosStdDev": EXTERNAL_POSITION_STD,
-            "locSrv.extQuatStdDev": EXTERNAL_ATTITUDE_STD,
-        }
-
-    @property
-    def parameters_if_known(self) -> dict[str, float]:
-        """Parameters that are set if the vehicle has them, from firmware 2026.04 on: rotor drag over mass, 1/s.
-
-        A filter that does not know of drag takes the tilt that holds against it for acceleration: at 2 m/s its
-        attitude is 4° off. Along the thrust axis it measures what drag does.
-        """
-        drag = self.limits.airframe.drag[0] / self.limits.airframe.mass
-        return {"kalman.dragB_x": drag, "kalman.dragB_y": drag}
 
 
 def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0) -> Mission:

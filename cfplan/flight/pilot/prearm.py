@@ -6,7 +6,8 @@ from collections.abc import Callable
 from cfplan.errors import InputError, PreflightError
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.flight_loop import TRIES, FlightLoop
-from cfplan.flight.pilot.preflight import PreflightSnapshot, run_checks
+from cfplan.flight.pilot.preflight import PreflightSnapshot, check_traffic, run_checks
+from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES, Action, Traffic
 from cfplan.flight.radio.link import Link
 from cfplan.flight.radio.supervisor_bits import ARMED, CAN_BE_ARMED, CAN_FLY
 from cfplan.flight.real_time import uses_fifo_scheduling
@@ -15,6 +16,9 @@ from cfplan.vehicle.rotations import yaw_of
 
 CONVERGED_WITHIN = 0.03  # m, estimate from pose
 CONVERGED_FOR = 1.0  # s
+_OBSERVED_FOR = 1.0  # s
+_LISTENS_ARMED_FOR = 0.2  # s, some messages of each log
+_ALL = 0xFFFF  # bits of supervisor.info
 
 
 def prepare(
@@ -26,20 +30,13 @@ def prepare(
 
     Raises a CfplanError if the vehicle or its poses are not available, or a check fails, and what a tick raises.
     """
-    mission = loop.mission
     loop.history.enter(Phase.CONNECT)
     loop.connect(connect)
     loop.history.enter(Phase.RELEASE)
     loop.link.release_priority()
     loop.history.enter(Phase.CONFIGURE)
     loop.restart_deadlines()
-    wanted = mission.parameters
-    for name, value in mission.parameters_if_known.items():
-        if loop.link.has_parameter(name):
-            wanted[name] = value
-        else:
-            loop.history.say(Level.WARNING, f"the vehicle has no {name}: expect it some centimetres off at speed")
-    read_back = {name: loop.link.set_parameter(name, value) for name, value in wanted.items()}
+    read = _configure(loop)
     loop.link.start_logs()
     loop.until(lambda: loop.link.estimate is not None and loop.link.status is not None, 3.0)
     if loop.link.estimate is None or loop.link.status is None:
@@ -47,15 +44,28 @@ def prepare(
     enter_real_time()
     _feed(loop)
     _converge(loop)
-    _preflight(loop, wanted, read_back)
+    _preflight(loop, read)
     loop.history.enter(Phase.ARM)
     loop.restart_deadlines()
     floor = loop.pose().position[2]
     for _ in range(TRIES):  # a busy radio may give one up
         loop.link.arm(True)
         if loop.until(lambda: loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, 1.0):
+            _listen_while_armed(loop)
             return floor
     raise PreflightError("the vehicle does not arm", hint="restart the vehicle")
+
+
+def _configure(loop: FlightLoop) -> dict[str, float]:
+    """Set what the table says, and return all of its parameters as the vehicle then has them."""
+    link, limits = loop.link, loop.mission.limits
+    for rule in PARAMETER_RULES:
+        if link.has_parameter(rule.name):
+            if rule.action is Action.SET:
+                link.set_parameter(rule.name, rule.value(limits))
+        elif rule.missing:
+            loop.history.say(Level.WARNING, f"the vehicle has no {rule.name}: {rule.missing}")
+    return link.read_parameters([rule.name for rule in PARAMETER_RULES])
 
 
 def _feed(loop: FlightLoop) -> None:
@@ -99,11 +109,11 @@ def _converge(loop: FlightLoop) -> None:
         loop.history.say(Level.WARNING, "the vehicle's estimate does not settle")
 
 
-def _preflight(loop: FlightLoop, wanted: dict[str, float], read_back: dict[str, float]) -> None:
+def _preflight(loop: FlightLoop, read: dict[str, float]) -> None:
     """Run the preflight checks, up to three times: an auto-arming vehicle is briefly not ready."""
     loop.history.enter(Phase.PREFLIGHT)
     for _ in range(TRIES):
-        loop.history.checks = run_checks(_observe(loop, wanted, read_back))
+        loop.history.checks = run_checks(_observe(loop, read))
         if all(check.passed for check in loop.history.checks):
             break
     for check in loop.history.checks:
@@ -116,19 +126,11 @@ def _preflight(loop: FlightLoop, wanted: dict[str, float], read_back: dict[str, 
             where="preflight",
             hint=failed[0].hint,
         )
-    loop.link.stop_variance_log()
 
 
-def _observe(loop: FlightLoop, wanted: dict[str, float], read_back: dict[str, float]) -> PreflightSnapshot:
+def _observe(loop: FlightLoop, read: dict[str, float]) -> PreflightSnapshot:
     """Observe for a second and return what is known of the vehicle."""
-    could_fly = False
-
-    def look() -> bool:
-        nonlocal could_fly
-        could_fly = could_fly or bool(loop.bits(CAN_FLY | CAN_BE_ARMED))
-        return False
-
-    loop.until(look, 1.0)
+    traffic = _listen(loop, _OBSERVED_FOR)
     link = loop.link
     assert link.estimate is not None  # the log has come since configuring
     assert link.status is not None
@@ -137,10 +139,10 @@ def _observe(loop: FlightLoop, wanted: dict[str, float], read_back: dict[str, fl
         protocol=link.protocol,
         firmware=link.firmware,
         round_trip=link.round_trip,
-        could_fly=could_fly,
+        could_fly=bool(traffic.supervisor & (CAN_FLY | CAN_BE_ARMED)),
+        traffic=traffic,
         status=link.status,
-        wanted=wanted,
-        read_back=read_back,
+        parameters=read,
         poses=tuple(loop.recent),
         pose_age=loop.now() - loop.pose().time,
         estimate=link.estimate,
@@ -148,3 +150,26 @@ def _observe(loop: FlightLoop, wanted: dict[str, float], read_back: dict[str, fl
         waking=Lateness.of(tuple(loop.waking), 0),
         uses_fifo_scheduling=uses_fifo_scheduling(),
     )
+
+
+def _listen(loop: FlightLoop, duration: float) -> Traffic:
+    """Return what is heard of other commanders in `duration`, s."""
+    bits, setpoint = 0, False
+
+    def look() -> bool:
+        nonlocal bits, setpoint
+        bits, setpoint = bits | loop.bits(_ALL), setpoint or loop.link.has_setpoint
+        return False
+
+    loop.until(look, duration)
+    return Traffic(bits, tuple(loop.link.replies), setpoint)
+
+
+def _listen_while_armed(loop: FlightLoop) -> None:
+    """Listen once more: a vehicle that is not armed drops setpoints and shows none. Raises PreflightError."""
+    heard = check_traffic(_listen(loop, _LISTENS_ARMED_FOR))
+    loop.link.stop_preflight_logs()
+    if not heard.passed:
+        raise PreflightError(
+            f"{heard.name}: {heard.value}, must be {heard.threshold}", where="vehicle", hint=heard.hint
+        )

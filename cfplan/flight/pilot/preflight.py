@@ -1,16 +1,17 @@
 """Preflight: the table of checks before arming, each a small function with a value, a threshold and a verdict."""
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from cfplan.flight.firmware import NEWEST_KNOWN, Timeouts, timeouts_of, version_of, version_text
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Check
+from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, Traffic
 from cfplan.flight.radio.supervisor_bits import FAULTS, FLYING
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Estimate, VehicleStatus
@@ -33,8 +34,8 @@ class PreflightSnapshot:
     """The supervisor reported at least once in the last second that it can fly or, as brushless vehicles do, that it
     waits to be armed."""
     status: VehicleStatus
-    wanted: Mapping[str, float]  # parameters as they were set
-    read_back: Mapping[str, float]  # the same as the vehicle then had them
+    traffic: Traffic
+    parameters: Mapping[str, float]  # those of the table, as the vehicle has them; without those that it lacks
     poses: Sequence[Pose]  # of about the last second, oldest first
     pose_age: float  # s, of the newest
     estimate: Estimate
@@ -45,8 +46,8 @@ class PreflightSnapshot:
 
 
 def run_checks(snapshot: PreflightSnapshot) -> tuple[Check, ...]:
-    """Every check, in the order of the table."""
-    return tuple(check(snapshot) for check in CHECKS)
+    """Every check, in the order of the table; parameters have a line a group, and one for each that is wrong."""
+    return (*(check(snapshot) for check in CHECKS), *check_parameters(snapshot))
 
 
 def check_protocol(snapshot: PreflightSnapshot) -> Check:
@@ -58,9 +59,9 @@ def check_protocol(snapshot: PreflightSnapshot) -> Check:
 
 def check_firmware(snapshot: PreflightSnapshot) -> Check:
     oldest = snapshot.mission.limits.firmware.oldest
-    found = tuple(int(part) for part in re.findall(r"\d+", snapshot.firmware)[: max(3, len(oldest))])
+    found = version_of(snapshot.firmware)
     return Check(
-        "firmware", snapshot.firmware or "unknown", "≥ " + ".".join(map(str, oldest)), bool(found) and found >= oldest,
+        "firmware", snapshot.firmware or "unknown", "≥ " + version_text(oldest), bool(found) and found >= oldest,
         "update the vehicle's firmware: older filters go wrong with yaw beyond 90°",
     )  # fmt: skip
 
@@ -96,15 +97,50 @@ def check_endurance(snapshot: PreflightSnapshot) -> Check:
     return Check("flight time", f"{flight:.1f} s", f"≤ {longest:.0f} s", flight <= longest, "plan a shorter path")
 
 
-def check_parameters(snapshot: PreflightSnapshot) -> Check:
-    wrong = [
-        f"{name} is {snapshot.read_back.get(name, math.nan):g}, not {wanted:g}"
-        for name, wanted in snapshot.wanted.items()
-        if not math.isclose(snapshot.read_back.get(name, math.nan), wanted, rel_tol=1e-6)
-    ]
+def check_timeouts(snapshot: PreflightSnapshot) -> Check:
+    """The certificate of link loss rests on the supervisor's time-outs, which the vehicle does not tell."""
+    version, assumed = version_of(snapshot.firmware), Timeouts()
+    try:
+        found = timeouts_of(version)
+    except ValueError:
+        found = None
+    text = f"level after {found.level_out:g} s, off after {found.motors_off:g} s" if found else "unknown"
+    if version > NEWEST_KNOWN:
+        text += f"; the firmware is newer than {version_text(NEWEST_KNOWN)}, the newest that cfplan was read from"
     return Check(
-        "parameters read back", "; ".join(wrong) or f"{len(snapshot.wanted)} as set", "as set", not wrong,
-        "restart the vehicle",
+        "supervisor's time-outs", text, f"level after {assumed.level_out:g} s, off after {assumed.motors_off:g} s",
+        found == assumed, "fly with a firmware from 2023.06 on",
+    )  # fmt: skip
+
+
+def check_parameters(snapshot: PreflightSnapshot) -> tuple[Check, ...]:
+    """A line for each group of the table whose parameters are all right, and for each parameter that is wrong."""
+    limits = snapshot.mission.limits
+    found: list[Check] = []
+    for group, rules in PARAMETER_GROUPS.items():
+        wrong = [rule for rule in rules if not rule.accepts(snapshot.parameters.get(rule.name), limits)]
+        if not wrong:
+            found.append(Check(group, f"{len(rules)} in order", "as docs/preflight.md lists them", True))
+        for rule in wrong:
+            value = snapshot.parameters.get(rule.name)
+            found.append(
+                Check(
+                    rule.name, "missing" if value is None else f"{value:g}", rule.threshold(limits), False,
+                    f"{rule.hint}. {rule.reason}",
+                )
+            )  # fmt: skip
+    return tuple(found)
+
+
+def check_commanders(snapshot: PreflightSnapshot) -> Check:
+    return check_traffic(snapshot.traffic)
+
+
+def check_traffic(traffic: Traffic) -> Check:
+    seen = [sign for sign in COMMANDER_SIGNS if sign.seen(traffic)]
+    return Check(
+        "other commanders", "; ".join(sign.name for sign in seen) or "none heard", "none", not seen,
+        f"end every other client, app and remote control of this vehicle. {seen[0].reason}" if seen else "",
     )  # fmt: skip
 
 
@@ -189,11 +225,12 @@ def check_waking(snapshot: PreflightSnapshot) -> Check:
 CHECKS: tuple[Callable[[PreflightSnapshot], Check], ...] = (
     check_protocol,
     check_firmware,
+    check_timeouts,
     check_round_trip,
     check_supervisor,
+    check_commanders,
     check_battery,
     check_endurance,
-    check_parameters,
     check_pose_rate,
     check_pose_age,
     check_agreement,

@@ -33,6 +33,9 @@ STATUS_LOG = (
     + [("pm.vbatMV", "uint16_t"), ("supervisor.info", "uint16_t")],
     20,
 )
+# The setpoint in force: place, velocity and acceleration, and from firmware 2026.08 on the modes, which tell of any.
+TARGET_LOG = ([(f"ctrltargetZ.{name}", "int16_t") for name in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az")], 40)
+TARGET_MODES = [(f"ctrltarget.mode_{name}", "uint8_t") for name in ("x", "y", "z", "roll", "pitch", "yaw", "quat")]
 VARIANCE_LOG = ([(f"kalman.var{axis}", "float") for axis in "XYZ"], 10)
 
 
@@ -53,9 +56,10 @@ class Link:
         self.estimate: Estimate | None = None
         self.status: VehicleStatus | None = None
         self.position_variance: Triple | None = None  # m² along x, y, z
+        self.has_setpoint = False  # the controller has one, from whomever; known until `stop_preflight_logs`
         self.replies: dict[int, int] = {}  # command of the on-board commander: the code that it answered, 0 for done
         self.firmware = ""
-        self._variance_block: Any = None
+        self._preflight_blocks: list[Any] = []
         # s, when the vehicle's clock of ms was zero, according to the quickest messages; when the last message came
         self._log_zero, self._log_heard = math.inf, 0.0
         crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
@@ -136,6 +140,38 @@ class Link:
     def has_parameter(self, name: str) -> bool:
         return self._crazyflie.param.toc.get_element_by_complete_name(name) is not None
 
+    def has_log_variable(self, name: str) -> bool:
+        return self._crazyflie.log.toc.get_element_by_complete_name(name) is not None
+
+    def read_parameters(self, names: Sequence[str], patience: float = 2.0) -> dict[str, float]:
+        """Return the values of those parameters that the vehicle has, as it has them now.
+
+        Raises LinkError if the vehicle does not answer for `patience`, s.
+        """
+        known = [name for name in names if self.has_parameter(name)]
+        values: dict[str, float] = {}
+        answered = threading.Event()
+
+        def note(name: str, text: str) -> None:
+            values[name] = float(text)
+            answered.set()
+
+        parameters = self._crazyflie.param
+        for name in known:
+            parameters.add_update_callback(*name.split("."), note)
+        try:
+            for name in known:
+                parameters.request_param_update(name)
+            while len(values) < len(known):
+                if not self._clock.wait(answered, patience):
+                    missing = next(name for name in known if name not in values)
+                    raise LinkError(f"no answer to reading {missing}", where=self.uri, hint="check the radio link")
+                answered.clear()
+        finally:
+            for name in known:
+                parameters.remove_update_callback(*name.split("."), note)
+        return values
+
     def set_parameter(self, name: str, value: float, patience: float = 2.0) -> float:
         """Write a parameter and return it as read back. Raises LinkError if the vehicle lacks it or does not answer."""
         group, _, short = name.partition(".")
@@ -162,14 +198,20 @@ class Link:
         return values[-1]
 
     def start_logs(self) -> None:
-        """Start the logs that keep `estimate`, `status` and `position_variance`; report the first two."""
+        """Start the logs of `estimate`, `status`, `position_variance` and `has_setpoint`; report the first two."""
         self._log("estimate", ESTIMATE_LOG, self._on_estimate)
         self._log("status", STATUS_LOG, self._on_status)
-        self._variance_block = self._log("variance", VARIANCE_LOG, self._on_variance)
+        variables, period_ms = TARGET_LOG
+        variables = variables + [each for each in TARGET_MODES if self.has_log_variable(each[0])]
+        self._preflight_blocks = [
+            self._log("variance", VARIANCE_LOG, self._on_variance),
+            self._log("target", (variables, period_ms), self._on_target),
+        ]
 
-    def stop_variance_log(self) -> None:
-        if self._variance_block is not None:
-            self._variance_block.stop()
+    def stop_preflight_logs(self) -> None:
+        """Stop the logs of `position_variance` and `has_setpoint`: in flight the radio has better to do."""
+        for block in self._preflight_blocks:
+            block.stop()
 
     def _log(self, name: str, variables: tuple[list[tuple[str, str]], int], note: Callable[..., None]) -> Any:
         from cflib.crazyflie.log import LogConfig
@@ -239,6 +281,9 @@ class Link:
 
     def _on_variance(self, _: int, data: dict[str, float], __: Any) -> None:
         self.position_variance = data["kalman.varX"], data["kalman.varY"], data["kalman.varZ"]
+
+    def _on_target(self, _: int, data: dict[str, int], __: Any) -> None:
+        self.has_setpoint = any(data.values())
 
     def _on_reply(self, packet: Any) -> None:
         if len(packet.data) >= 4:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.flight.firmware import MellingerGains
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY
@@ -38,8 +39,8 @@ _QUANTUM = 1e-3  # rad/s, of rates in a packet
 class AttitudeGains:
     """The firmware's gains that the trade rests on, by their names in the group ctrlMel, with its defaults."""
 
-    kR_xy: float = 70000.0
-    kw_xy: float = 20000.0
+    kR_xy: float = MellingerGains().kR_xy
+    kw_xy: float = MellingerGains().kw_xy
 
     @property
     def full_rate(self) -> float:

@@ -1,7 +1,7 @@
 """The pilot's link and poses in a stepped lab: the real code, without threads, sockets or processes."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,7 +24,7 @@ _ROUND_TRIP_MS = 2.0
 _READ, _WRITE, _DATA = 1, 2, 2
 _CREATE_BLOCK, _APPEND_BLOCK, _RESET_LOG, _START_BLOCK, _STOP_BLOCK = 6, 7, 5, 8, 4
 _CREATED = 27  # bytes of variables that fit into the first packet
-_LOG_TYPES = {"int16_t": (5, "h"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "float": (7, "f")}
+_LOG_TYPES = {"uint8_t": (1, "B"), "int16_t": (5, "h"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "float": (7, "f")}
 
 
 class SteppedLink(Link):
@@ -55,6 +55,12 @@ class SteppedLink(Link):
     def has_parameter(self, name: str) -> bool:
         return name in self._parameters
 
+    def has_log_variable(self, name: str) -> bool:
+        return name in self._variables
+
+    def read_parameters(self, names: Sequence[str], patience: float = 2.0) -> dict[str, float]:
+        return {name: self._read(name, patience) for name in names if self.has_parameter(name)}
+
     def set_parameter(self, name: str, value: float, patience: float = 2.0) -> float:
         number = self._parameters.get(name)
         if number is None:
@@ -63,8 +69,13 @@ class SteppedLink(Link):
         head = struct.pack("<H", number)
         number_of_kind = value if layout == "<f" else int(value)
         self._ask(Port.PARAMETERS, _WRITE, head + struct.pack(layout, number_of_kind), head, patience)
+        return self._read(name, patience)
+
+    def _read(self, name: str, patience: float) -> float:
+        number = self._parameters[name]
+        head = struct.pack("<H", number)
         answer = self._ask(Port.PARAMETERS, _READ, head, head, patience)
-        return float(struct.unpack_from(layout, answer, 3)[0])
+        return float(struct.unpack_from(self._lab.vehicle.parameters.toc.variables[number].format, answer, 3)[0])
 
     def _log(self, name: str, variables: tuple[list[tuple[str, str]], int], note: Callable[..., None]) -> Any:
         entries, period = variables

@@ -137,6 +137,7 @@ pid_attitude: f32 roll_kp* roll_ki* roll_kd* roll_kff* pitch_kp* pitch_ki* pitch
 pid_rate: f32 roll_kp* roll_ki* roll_kd* roll_kff* pitch_kp* pitch_ki* pitch_kd* pitch_kff* yaw_kp* yaw_ki* yaw_kd*
   yaw_kff* omxFiltCut* omyFiltCut* omzFiltCut*; i8 rateFiltEn*
 pm: f32 lowVoltage* criticalLowVoltage*
+powerDist: u32 idleThrust*
 posCtlPid: f32 xKp* xKi* xKd* xKff* yKp* yKi* yKd* yKff* zKp* zKi* zKd* zKff* rLimit* pLimit* xVelMax* yVelMax*
   zVelMax*; u16 thrustBase* thrustMin*
 posCtrlIndi: f32 K_xi_x K_xi_y K_xi_z K_dxi_x K_dxi_y K_dxi_z pq_clamping
@@ -157,3 +158,22 @@ usd: u8 canLog! logging
 usec: u8 reset
 velCtlPid: f32 vxKp* vxKi* vxKd* vxKFF* vyKp* vyKi* vyKd* vyKFF* vzKp* vzKi* vzKd* vzKFF*
 """
+
+# What firmware before a version lacks, parameters and log variables.
+CAME_WITH: dict[tuple[int, ...], tuple[str, ...]] = {
+    (2024, 10): ("supervisor.landedTimeout", "supervisor.tmblChckEn", "hlCommander.groupmask"),
+    (2025, 2): ("supervisor.prefltTimeout",),
+    (2026, 4): (
+        "kalman.dragB_x", "kalman.dragB_y", "kalman.dragB_z", "kalman.cop_x", "kalman.cop_y", "kalman.cop_z",
+    ),
+    (2026, 8): (
+        "supervisor.spinupTimeout", "supervisor.crashDetectGs", "ctrltarget.thrust", "ctrltarget.mode_x",
+        "ctrltarget.mode_y", "ctrltarget.mode_z", "ctrltarget.mode_roll", "ctrltarget.mode_pitch",
+        "ctrltarget.mode_yaw", "ctrltarget.mode_quat",
+    ),
+}  # fmt: skip
+
+
+def lacking(version: tuple[int, ...]) -> frozenset[str]:
+    """Return the names that a firmware does not have."""
+    return frozenset(name for since, names in CAME_WITH.items() if version < since for name in names)

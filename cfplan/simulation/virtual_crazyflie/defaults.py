@@ -2,6 +2,7 @@
 
 from cfplan.flight.firmware import GAIN_PARAMETERS, MellingerGains
 from cfplan.simulation.dynamics.kalman import Prior
+from cfplan.simulation.virtual_crazyflie.collision_avoidance import FARTHEST
 from cfplan.simulation.virtual_crazyflie.pid import default_gains, default_limits
 
 PID, MELLINGER = 1, 2
@@ -15,7 +16,6 @@ PRIOR_PARAMETERS = tuple(
         "initialZ", "initialYaw", "maxPos", "maxVel", "dragB_x", "dragB_y", "dragB_z",
     )
 )  # fmt: skip
-PRIOR_DRAG = tuple(name for name in PRIOR_PARAMETERS if name.startswith("kalman.drag"))
 
 _GAIN_NAMES = ("p", "i", "d")
 # The PID controller's gains in the order of its loops, and its limits; the limits inside the loops are scaled ones.
@@ -45,6 +45,14 @@ DEFAULTS: dict[str, float] = {
     **dict(zip(PRIOR_PARAMETERS, Prior().pack(), strict=True)),
     "stabilizer.controller": PID,
     "stabilizer.estimator": COMPLEMENTARY,
+    **{f"colAv.ellipsoid{axis}": radius for axis, radius in zip("XYZ", (0.3, 0.3, 0.9), strict=True)},
+    **{f"colAv.bbox{end}{axis}": far for end, far in (("Min", -FARTHEST), ("Max", FARTHEST)) for axis in "XYZ"},
+    "colAv.horizon": 1.0,
+    "colAv.maxSpeed": 0.5,
+    "colAv.sidestepThrsh": 0.25,
+    "colAv.maxPeerLocAge": 5000,
+    "colAv.vorTol": 1e-5,
+    "colAv.vorIters": 100,
     "supervisor.tmblChckEn": 1,
     "supervisor.prefltTimeout": 30000,
     "supervisor.landedTimeout": 3000,

@@ -1,7 +1,7 @@
 """Log blocks: the table of variables, and packets of their values at set periods (CRTP port 5)."""
 
 import errno
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from math import copysign, inf, isfinite
 from struct import calcsize, unpack_from
@@ -27,9 +27,13 @@ MOST_BYTES = 26
 Getter = Callable[[], float]
 
 
-def log_toc() -> Toc:
-    """Return the table of all log variables."""
-    variables = [Variable(group, name, *_TYPES[kind]) for group, kind, name in read_catalogue(LOG_VARIABLES)]
+def log_toc(without: Collection[str] = ()) -> Toc:
+    """Return the table of all log variables except those that this firmware lacks."""
+    variables = [
+        Variable(group, name, *_TYPES[kind])
+        for group, kind, name in read_catalogue(LOG_VARIABLES)
+        if f"{group}.{name}" not in without
+    ]
     return make_toc(tuple(variables), trailer=bytes((MOST_BLOCKS, MOST_VARIABLES)))
 
 
@@ -52,10 +56,10 @@ def _nothing() -> float:
 class LogBlocks:
     """The log blocks of a client. `getters` return the values, by name; a variable without one stays zero."""
 
-    def __init__(self, getters: Mapping[str, Getter]):
-        self.toc = log_toc()
+    def __init__(self, getters: Mapping[str, Getter], *, without: Collection[str] = ()):
+        self.toc = log_toc(without)
         known = self.toc.index()
-        unknown = set(getters) - set(known)
+        unknown = set(getters) - set(known) - set(without)
         if unknown:
             raise KeyError(f"not in the table: {sorted(unknown)}")
         self._getters = [getters.get(entry.full_name, _nothing) for entry in self.toc.variables]

@@ -64,6 +64,16 @@ class Parameters:
         if name in self._ids:
             self._watchers[self._ids[name]] = changed
 
+    def restore(self, stored: Mapping[str, float]) -> None:
+        """Take values over that were stored before power-up; a name that this firmware lacks is ignored."""
+        for name, value in stored.items():
+            if name in self._ids:
+                self[name] = value
+                number = self._ids[name]
+                self._stored[number] = self._values[number]
+                if number in self._watchers:
+                    self._watchers[number](self._values[number])
+
     def receive(self, channel: int, payload: bytes) -> bytes | None:
         """Take a packet; return the answer's payload, on the same channel, None where the firmware is silent."""
         if channel == _TOC:

@@ -1,5 +1,6 @@
 """Settings of a virtual Crazyflie: its sensors, firmware and state at start."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from cfplan.simulation.virtual_crazyflie.services import FIRMWARE_VERSION, PROTOCOL_VERSION
@@ -32,6 +33,7 @@ class VehicleSettings:
     protocol: int = PROTOCOL_VERSION
     firmware: str = FIRMWARE_VERSION
     seed: int = 1  # of the sensors' noise
+    stored: Mapping[str, float] = field(default_factory=dict)  # parameters that it has other values of than the usual
     stubborn: tuple[str, ...] = ()  # parameters that writing does not change
     parameter_delay: float = 0.0  # s until it answers a write
     busy: bool = False  # the vehicle refuses every command to the on-board commander

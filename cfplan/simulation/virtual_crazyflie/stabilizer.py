@@ -58,6 +58,8 @@ class Loop(NamedTuple):
     noise: NDArray  # (8191, 6) gyroscope rad/s, accelerometer m/s², biases included
     wind: NDArray  # (3,) m/s
     efficiency: NDArray  # (4,) share of its thrust that each motor gives
+    override: NDArray  # (5,) motorPowerSet: whether its commands count, 2 and 3 the first for all; 16-bit commands
+    idle: NDArray  # (1,) 16-bit command that no motor falls below while it may turn
 
 
 class Stabilizer:
@@ -82,6 +84,8 @@ class Stabilizer:
             noise=_sensor_noise(settings.sensors, settings.seed),
             wind=STILL_AIR.copy(),
             efficiency=FULL_EFFICIENCY.copy(),
+            override=np.zeros(5),
+            idle=np.zeros(1),
         )
         estimate(self.loop.kalman, self.loop.belief)
         self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N
@@ -176,6 +180,10 @@ def _drive(loop: Loop, body: NDArray, allowed: bool, per_command: float, asked: 
     off = True
     command = np.empty(4)
     for motor in range(4):
+        if allowed and not loop.motors[motor] > loop.idle[0]:
+            loop.motors[motor] = loop.idle[0]
+        if loop.override[0] > 0.0:
+            loop.motors[motor] = loop.override[1 + motor if loop.override[0] == 1.0 else 1]
         if not (allowed and loop.motors[motor] > 0.0):  # NaN is off too, as its cast to an integer is
             loop.motors[motor] = 0.0
         off = off and loop.motors[motor] == 0.0

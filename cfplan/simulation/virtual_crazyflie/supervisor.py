@@ -33,7 +33,7 @@ _STAYS_ARMED = _MAY_FLY | {State.ARMING}
 
 PERIOD = 40  # ms
 LEVEL_OUT_AFTER, SHUT_DOWN_AFTER = 500, 2000  # ms without a setpoint
-_FLYING_HYSTERESIS = 2000  # ms without thrust
+_FLYING_HYSTERESIS = 2000  # ms without more than idle thrust
 _KEEP_ALIVE_WITHIN = 1000  # ms between keep-alive packets, after the first one
 _TILTED, _TILTED_FOR = 0.5, 1000  # g along the body's z axis, ms
 _UPSIDE_DOWN, _UPSIDE_DOWN_FOR = -0.2, 100
@@ -49,6 +49,7 @@ class Settings:
     landed_timeout: int = 3000  # ms
     crash_detection: float = 0.0  # g beyond 1; 0 is off
     stop: bool = False  # emergency stop
+    idle_thrust: float = 0.0  # 16-bit units, of the power distribution
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +139,7 @@ class Supervisor:
             self._enter(state, tick)
 
     def _conditions(self, tick: int, setpoint_tick: int, acceleration: NDArray, motors: NDArray) -> _Conditions:
-        if np.any(motors > 0):
+        if np.any(motors > self.settings.idle_thrust):
             self._thrust_tick = tick
         age = tick - setpoint_tick
         starved = self._keep_alive is not None and tick >= self._keep_alive + _KEEP_ALIVE_WITHIN

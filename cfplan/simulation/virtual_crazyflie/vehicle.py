@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from cfplan.flight.firmware import GAIN_PARAMETERS
 from cfplan.simulation.dynamics.body import MASS, THRUST_MAX
 from cfplan.simulation.virtual_crazyflie.battery import Battery
+from cfplan.simulation.virtual_crazyflie.catalogue import lacking
+from cfplan.simulation.virtual_crazyflie.collision_avoidance import CollisionAvoidance
 from cfplan.simulation.virtual_crazyflie.commander import Commander, Priority
 from cfplan.simulation.virtual_crazyflie.defaults import (
     COMPLEMENTARY,
@@ -19,7 +21,6 @@ from cfplan.simulation.virtual_crazyflie.defaults import (
     PID_GAIN_PARAMETERS,
     PID_LIMIT_PARAMETERS,
     PID_SPEED_PARAMETERS,
-    PRIOR_DRAG,
     PRIOR_PARAMETERS,
 )
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
@@ -49,8 +50,7 @@ _LEGACY_ARM, _LEGACY_RECOVER = 1, 2  # platform commands
 _NO_POSES = np.zeros((0, 9))
 
 _SUPERVISOR_SINCE = 12  # protocol with which the port came
-_DRAG_SINCE = (2026, 4)  # firmware
-_RESIDUAL_CORRECT_SINCE = (2025, 9, 1)
+_RESIDUAL_CORRECT_SINCE = (2025, 9, 1)  # firmware
 
 
 class VirtualCrazyflie:
@@ -60,12 +60,12 @@ class VirtualCrazyflie:
         self.settings = settings or VehicleSettings()
         self.tick = 0
         self._version = tuple(int(part) for part in re.findall(r"\d+", self.settings.firmware))
-        lacking = PRIOR_DRAG if self._version < _DRAG_SINCE else ()
-        self.parameters = Parameters(DEFAULTS, without=lacking, stubborn=self.settings.stubborn)
+        without = lacking(self._version)
+        self.parameters = Parameters(DEFAULTS, without=without, stubborn=self.settings.stubborn)
         self.stabilizer = Stabilizer(
             airframe,
             self.settings,
-            prior=np.array([0.0 if name in lacking else self.parameters[name] for name in PRIOR_PARAMETERS]),
+            prior=np.array([0.0 if name in without else self.parameters[name] for name in PRIOR_PARAMETERS]),
             gains=np.array([self.parameters[name] for name in GAIN_PARAMETERS]),
         )
         wanted = self.settings.auto_arming
@@ -89,11 +89,14 @@ class VirtualCrazyflie:
                 battery=self.battery,
                 setpoint=lambda: self.setpoint,
                 info=self.info,
-            )
+            ),
+            without=without,
         )
         self._airframe = airframe
         self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks at which they begin and end
+        self._avoidance = CollisionAvoidance()
         self._watch_parameters()
+        self.parameters.restore(self.settings.stored)
 
     def use_kalman(self) -> None:
         """Choose the Kalman filter, as a positioning deck does at start."""
@@ -215,7 +218,8 @@ class VirtualCrazyflie:
 
     def _stabilize(self, ticks: int) -> None:
         supervisor = self.supervisor
-        self.setpoint = self.commander.setpoint if supervisor.motors_allowed else Setpoint()
+        asked = self.commander.setpoint if supervisor.motors_allowed else Setpoint()
+        self.setpoint = self._avoidance.rewrite(asked, self.stabilizer.loop.belief[0:3])
         poses = self.localization.take(self.parameters["locSrv.extPosStdDev"], self.parameters["locSrv.extQuatStdDev"])
         if len(poses) and self._version < _RESIDUAL_CORRECT_SINCE:
             _reproduce_residual_error(poses, self.stabilizer.loop.belief[6:10])
@@ -319,10 +323,27 @@ class VirtualCrazyflie:
         watch("supervisor.prefltTimeout", lambda value: setattr(supervised, "preflight_timeout", int(value)))
         watch("supervisor.landedTimeout", lambda value: setattr(supervised, "landed_timeout", int(value)))
         watch("supervisor.crashDetectGs", lambda value: setattr(supervised, "crash_detection", value))
+        for place, name in enumerate(("enable", "m1", "m2", "m3", "m4")):
+            watch(f"motorPowerSet.{name}", fill(self.stabilizer.loop.override, place))
+        watch("powerDist.idleThrust", self._set_idle_thrust)
+        avoided = self._avoidance
+        watch("colAv.enable", lambda value: setattr(avoided, "enable", bool(value)))
+        watch("colAv.horizon", lambda value: setattr(avoided, "horizon", value))
+        watch("colAv.maxSpeed", lambda value: setattr(avoided, "max_speed", value))
+        watch("colAv.sidestepThrsh", lambda value: setattr(avoided, "sidestep", value))
+        watch("colAv.vorTol", lambda value: setattr(avoided, "tolerance", value))
+        for place, axis in enumerate("XYZ"):
+            watch(f"colAv.bboxMin{axis}", fill(avoided.low, place))
+            watch(f"colAv.bboxMax{axis}", fill(avoided.high, place))
         watch("stabilizer.stop", lambda value: setattr(supervised, "stop", bool(value)))
         watch("stabilizer.controller", self._choose_controller)
         watch("stabilizer.estimator", self._choose_estimator)
         watch("kalman.resetEstimation", self._reset_estimation)
+
+    def _set_idle_thrust(self, value: float) -> None:
+        """Set what no motor falls below; the firmware ignores it in vehicles that arm themselves."""
+        idle = 0.0 if self.supervisor.auto_arming else value
+        self.stabilizer.loop.idle[0] = self.supervisor.settings.idle_thrust = idle
 
     def _choose_controller(self, value: float) -> None:
         if value not in (PID, MELLINGER):

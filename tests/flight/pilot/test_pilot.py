@@ -254,7 +254,7 @@ def test_a_parameter_that_the_vehicle_changes_back_fails_preflight(world, fly):
     world.stubborn["stabilizer.controller"] = 1
     outcome = fly()
     assert outcome.exit_code is ExitCode.PREFLIGHT
-    assert "stabilizer.controller is 1, not 2" in outcome.reason
+    assert "stabilizer.controller: 1, must be 2" in outcome.reason
 
 
 def test_the_vehicle_is_told_of_its_drag_where_it_has_a_place_for_it(world, fly):

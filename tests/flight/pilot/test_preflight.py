@@ -2,15 +2,22 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from cfplan.flight.firmware import GAIN_PARAMETERS
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.preflight import PreflightSnapshot, run_checks
-from cfplan.flight.radio.supervisor_bits import CAN_FLY, FLYING, LOCKED, TUMBLED
+from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, Action, Traffic
+from cfplan.flight.radio.supervisor_bits import CAN_FLY, FLYING, HIGH_LEVEL_ACTIVE, LOCKED, TUMBLED
 from cfplan.flight.telemetry import Estimate, VehicleStatus
+from cfplan.safety.limits_file import load_limits
 
+SHIPPED = load_limits(Path(__file__).parents[3] / "safety.yaml")
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 STILL = (0.0, 0.0, 0.0)
 PLACE = (0.0, 0.0, 0.02)
@@ -33,8 +40,8 @@ def ground(mission):
         round_trip=0.003,
         could_fly=True,
         status=status(),
-        wanted=mission.parameters,
-        read_back=mission.parameters,
+        traffic=Traffic(CAN_FLY, (), setpoint=False),
+        parameters={rule.name: rule.value(mission.limits) for rule in PARAMETER_RULES},
         poses=poses(),
         pose_age=0.01,
         estimate=Estimate(1.0, PLACE, STILL, STILL, LEVEL),
@@ -57,7 +64,6 @@ def test_a_vehicle_in_order_passes_every_line(ground):
         ("radio protocol", {"protocol": 7}),
         ("firmware", {"firmware": "2025.02"}),
         ("firmware", {"firmware": "2025.09"}),
-        ("firmware", {"firmware": ""}),
         ("link round trip", {"round_trip": 0.2}),
         ("link round trip", {"round_trip": 0.0}),
         ("supervisor", {"could_fly": False}),
@@ -66,7 +72,9 @@ def test_a_vehicle_in_order_passes_every_line(ground):
         ("supervisor", {"status": status(bits=CAN_FLY | FLYING)}),
         ("battery at rest", {"status": status(voltage=3.8)}),
         ("battery at rest", {"status": status(voltage=math.nan)}),
-        ("parameters read back", {"read_back": {}}),
+        ("other commanders", {"traffic": Traffic(CAN_FLY | HIGH_LEVEL_ACTIVE, (), setpoint=False)}),
+        ("other commanders", {"traffic": Traffic(CAN_FLY, (7,), setpoint=False)}),
+        ("other commanders", {"traffic": Traffic(CAN_FLY, (), setpoint=True)}),
         ("pose rate", {"poses": poses(rate=30.0)}),
         ("pose rate", {"poses": poses()[:1]}),
         ("pose age", {"pose_age": 0.3}),
@@ -79,6 +87,74 @@ def test_a_vehicle_in_order_passes_every_line(ground):
 )
 def test_each_line_fails_alone(ground, name, change):
     assert failures(replace(ground, **change)) == [name]
+
+
+def test_a_firmware_with_other_time_outs_is_refused_even_where_it_may_be_that_old(ground, mission):
+    old = replace(mission.limits, firmware=replace(mission.limits.firmware, oldest=(2023, 2)))
+    before = replace(ground, firmware="2023.02", mission=replace(mission, limits=old))
+    assert failures(before) == ["supervisor's time-outs"]
+
+
+def test_a_vehicle_that_does_not_tell_its_firmware_is_refused(ground):
+    assert failures(replace(ground, firmware="")) == ["firmware", "supervisor's time-outs"]
+
+
+def test_a_firmware_newer_than_those_known_flies_and_says_so(ground):
+    newer = replace(ground, firmware="2031.11")
+    assert failures(newer) == []
+    assert any("newer than 2026.08" in check.value for check in run_checks(newer))
+
+
+def outside(rule, limits):
+    """Values just outside what a rule allows, and values that are none."""
+    intervals = rule.allowed(limits)
+    step = max(abs(end) for interval in intervals for end in interval if math.isfinite(end)) * 1e-3 or 1.0
+    ends = [low - step for low, _ in intervals] + [high + step for _, high in intervals if math.isfinite(high)]
+    return [value for value in ends if not any(low <= value <= high for low, high in intervals)] + [math.nan]
+
+
+@pytest.mark.parametrize("rule", PARAMETER_RULES, ids=lambda rule: rule.name)
+def test_each_parameter_fails_alone_with_its_value_what_is_allowed_and_why(ground, mission, rule):
+    for value in outside(rule, mission.limits):
+        parameters = {**ground.parameters, rule.name: value}
+        (check,) = (check for check in run_checks(replace(ground, parameters=parameters)) if not check.passed)
+        assert check.name == rule.name
+        assert check.value == f"{value:g}"
+        assert check.threshold.startswith(rule.threshold(mission.limits))
+        assert rule.reason in check.hint
+        assert rule.hint in check.hint
+
+
+@pytest.mark.parametrize("rule", PARAMETER_RULES, ids=lambda rule: rule.name)
+def test_a_vehicle_that_lacks_a_parameter_flies_only_where_the_table_says_so(ground, rule):
+    parameters = {name: value for name, value in ground.parameters.items() if name != rule.name}
+    assert failures(replace(ground, parameters=parameters)) == ([] if rule.optional else [rule.name])
+
+
+@pytest.mark.parametrize("rule", PARAMETER_RULES, ids=lambda rule: rule.name)
+@given(value=st.floats(width=32))
+def test_what_a_rule_accepts_is_what_its_intervals_hold(rule, value):
+    held = any(low - 1e-6 * low <= value <= high + 1e-6 * high for low, high in rule.allowed(SHIPPED))
+    assert rule.accepts(value, SHIPPED) == held
+
+
+def test_the_table_is_complete_and_names_each_parameter_once():
+    names = [rule.name for rule in PARAMETER_RULES]
+    assert len(names) == len(set(names))
+    assert set(GAIN_PARAMETERS) <= set(names)
+    for rule in PARAMETER_RULES:
+        assert rule.reason.endswith(".")
+        assert not rule.hint.endswith(".")
+        assert rule.optional or not rule.since, "a firmware that may fly could lack it"
+    for sign in COMMANDER_SIGNS:
+        assert sign.reason.endswith(".")
+
+
+def test_what_is_set_is_one_value(mission):
+    for rule in PARAMETER_RULES:
+        if rule.action is Action.SET:
+            ((low, high),) = rule.allowed(mission.limits)
+            assert low == high
 
 
 def test_a_vehicle_near_the_wall_may_not_take_off(ground):
@@ -98,8 +174,12 @@ def test_a_plan_longer_than_the_battery_is_refused(ground, mission):
     assert failures(replace(ground, mission=replace(mission, limits=short))) == ["flight time"]
 
 
-def test_every_line_says_its_value_and_what_to_do(ground):
-    for check in run_checks(ground):
+def test_every_line_says_its_value_and_each_that_fails_what_to_do(ground):
+    silent = replace(
+        ground, protocol=0, firmware="", round_trip=0.0, status=status(voltage=0.0, bits=LOCKED), parameters={},
+        traffic=Traffic(HIGH_LEVEL_ACTIVE, (7,), setpoint=True), pose_age=1.0, poses=poses(rate=1.0),
+    )  # fmt: skip
+    for check in (*run_checks(ground), *run_checks(silent)):
         assert check.value
         assert check.threshold
-        assert check.hint
+        assert check.passed or check.hint

@@ -1,0 +1,200 @@
+"""Preflight against the virtual Crazyflie: each row of its table made wrong on board, and what it would have led to."""
+
+import struct
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from septic_flight import septic_payloads
+from wrong_values import wrong_on_board
+
+from cfplan.errors import CfplanError, ExitCode
+from cfplan.flight.firmware import GAIN_PARAMETERS, gains_for
+from cfplan.flight.pilot import prearm, preflight
+from cfplan.flight.pilot.keys import HeldOrders
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.pilot.pilot import Pilot
+from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, Action
+from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.flight.telemetry import Phase, PhaseEntered
+from cfplan.preparation.prepare_flight import prepare_flight
+from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.dynamics.body import hovering
+from cfplan.simulation.dynamics.closed_loop import fly_setpoints
+from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_crazyflie.supervisor import State
+from cfplan.simulation.virtual_crazyflie.wire import Port, pack
+
+REPOSITORY = Path(__file__).parents[2]
+LIMITS = load_limits(REPOSITORY / "safety.yaml")
+ZERO_ATTITUDE = pack(Port.ATTITUDE_SETPOINT, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 0))
+HOVER_HERE = pack(Port.SETPOINT, 0, struct.pack("<Bffff", 7, 0.5, 0.5, 0.4, 0.0))
+SPIN_UP = pack(Port.HIGH_LEVEL, 0, struct.pack("<BBff?f", 7, 0, 0.4, 0.0, True, 2.0))
+ASKS_TWICE_A_SECOND = pack(Port.HIGH_LEVEL, 0, bytes((3, 0)))  # stop, which a vehicle at rest obeys by doing nothing
+
+
+@pytest.fixture(scope="module")
+def mission():
+    payloads = septic_payloads(2.0, 2.5, 1.0)
+    return Mission(payloads, encode_stops(decode(payloads), 100.0), LIMITS)
+
+
+class Flown:
+    """One flight in the stepped lab; another client may send `guest` every 20 ms from a phase on."""
+
+    def __init__(self, mission, guest=b"", phase=Phase.CONNECT, period=0.02, **settings):
+        self.lab = SteppedLab(LIMITS.airframe, vehicle=VehicleSettings(**{"auto_arming": False, **settings}))
+        self.phases, self.armed = [], False
+
+        def visit():
+            self.lab.vehicle.receive(guest)
+            self.lab.clock.at(self.lab.now + period, visit)
+
+        def hear(message):
+            self.armed = self.armed or self.lab.vehicle.supervisor.armed
+            if isinstance(message, PhaseEntered):
+                self.phases.append(message.phase)
+                if guest and message.phase is phase:
+                    visit()
+
+        try:
+            self.outcome = Pilot(
+                mission,
+                connect=lambda waiting: connect(self.lab, hear),
+                source=SteppedPoses(self.lab, LIMITS.pose),
+                report=hear,
+                orders=HeldOrders(),
+                clock=self.lab.clock,
+            ).fly()
+            self.reason, self.code = self.outcome.reason, self.outcome.exit_code
+        except CfplanError as error:
+            self.outcome, self.reason, self.code = None, str(error), error.exit_code
+
+
+@pytest.mark.parametrize("firmware", [("2025.09.1", 10), ("2026.04", 12), ("2026.08", 12)], ids=lambda each: each[0])
+@pytest.mark.parametrize("auto_arming", [False, True])
+def test_a_vehicle_as_it_comes_flies(mission, firmware, auto_arming):
+    version, protocol = firmware
+    flown = Flown(mission, firmware=version, protocol=protocol, auto_arming=auto_arming)
+    assert flown.code is ExitCode.OK, flown.reason
+    assert flown.outcome.deviation.max < 0.1
+
+
+@pytest.mark.parametrize("rule", PARAMETER_RULES, ids=lambda rule: rule.name)
+def test_each_parameter_that_is_wrong_on_board_keeps_the_vehicle_on_the_floor(mission, rule, monkeypatch):
+    monkeypatch.setattr(prearm, "TRIES", 1)  # more change nothing, and take their time
+    wrong = wrong_on_board(rule, LIMITS)
+    flown = Flown(mission, stored={rule.name: wrong}, stubborn=(rule.name,))
+    assert flown.code is ExitCode.PREFLIGHT
+    assert f"{rule.name}: {wrong:g}, must be {rule.threshold(LIMITS)}" in flown.reason
+    (check,) = (check for check in flown.outcome.checks if check.name == rule.name)
+    assert rule.reason in check.hint
+    assert rule.hint in check.hint
+    assert Phase.ARM not in flown.phases
+    assert not flown.armed
+
+
+@pytest.mark.parametrize(
+    "rule", [rule for rule in PARAMETER_RULES if rule.action is Action.SET], ids=lambda rule: rule.name
+)
+def test_what_is_set_flies_whatever_it_was_before(mission, rule):
+    flown = Flown(mission, stored={rule.name: wrong_on_board(rule, LIMITS)})
+    assert flown.code is ExitCode.OK, flown.reason
+    assert flown.lab.vehicle.parameters[rule.name] == pytest.approx(rule.value(LIMITS))
+
+
+@pytest.mark.parametrize(
+    ("sign", "guest", "period", "auto_arming"),
+    [
+        (0, SPIN_UP, 1.0, True),
+        (1, ASKS_TWICE_A_SECOND, 0.5, False),
+        (2, HOVER_HERE, 0.02, True),
+        (2, ZERO_ATTITUDE, 0.02, True),
+    ],
+)
+def test_another_commander_is_heard_before_arming(mission, sign, guest, period, auto_arming):
+    flown = Flown(mission, guest, period=period, auto_arming=auto_arming)
+    assert flown.code is ExitCode.PREFLIGHT
+    assert COMMANDER_SIGNS[sign].name in flown.reason
+    assert Phase.ARM not in flown.phases
+
+
+@pytest.mark.parametrize("guest", [HOVER_HERE, ZERO_ATTITUDE])
+def test_one_that_an_unarmed_vehicle_does_not_obey_is_heard_before_take_off(mission, guest):
+    flown = Flown(mission, guest)
+    assert flown.code is ExitCode.PREFLIGHT
+    assert "the controller has a setpoint" in flown.reason
+    assert Phase.TAKE_OFF not in flown.phases
+    flown.lab.clock.sleep(0.2)
+    assert not flown.lab.vehicle.supervisor.armed
+
+
+def test_before_2026_08_a_joystick_at_rest_is_heard_only_by_what_it_does(mission):
+    """What the table says cannot be known: the modes of a setpoint are not logged."""
+    flown = Flown(mission, ZERO_ATTITUDE, firmware="2026.04", auto_arming=True)
+    assert all(check.passed for check in flown.outcome.checks)
+    assert flown.code is not ExitCode.OK
+    assert flown.lab.truth().position[:, 2].max() < 0.2
+
+
+def test_gains_that_may_fly_fly_what_the_dry_run_flew():
+    """Every gain at an end of what is accepted, kR_xy and kw_xy in the direction in which they hurt most."""
+    flight = prepare_flight(REPOSITORY / "flights" / "line.yaml", LIMITS)
+    own = gains_for(LIMITS.airframe)
+    rules = {rule.name: rule for rule in PARAMETER_RULES}
+    trajectory, state = flight.planned.plan.trajectory, flight.planned.plan.trajectory.at(0.0)
+
+    def deviation(gains):
+        loop = fly_setpoints(
+            flight.encoded.decoded,
+            flight.encoded.times,
+            LIMITS.airframe,
+            hovering(LIMITS.airframe, state.position, float(state.yaw)),
+            duration=trajectory.duration,
+            gains=gains,
+            floor=-1e9,
+        )
+        return np.linalg.norm(loop.position - trajectory.at(loop.time).position, axis=1).max()
+
+    for end in (0, 1):
+        ends = {
+            field.name: rules[name].allowed(LIMITS)[-1][end if field.name != "kw_xy" else 1 - end]
+            for field, name in zip(fields(own), GAIN_PARAMETERS, strict=True)
+        }
+        assert deviation(replace(own, **ends)) < deviation(own) + 0.01
+
+
+# What the rows prevent: the same flights with the table switched off.
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    monkeypatch.setattr(preflight, "PARAMETER_GROUPS", {})
+    monkeypatch.setattr(prearm, "PARAMETER_RULES", tuple(r for r in PARAMETER_RULES if r.action is Action.SET))
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [{"colAv.enable": 1}, {"ctrlMel.kR_xy": 7000.0}, {"kalman.maxVel": 0.5}, {"supervisor.crashDetectGs": 0.05}],
+    ids=lambda stored: next(iter(stored)),
+)
+def test_without_the_table_the_flight_goes_wrong(mission, unchecked, stored):
+    flown = Flown(mission, stored=stored)
+    ended_badly = flown.outcome is None or flown.outcome.rung > Rung.NONE or flown.code is not ExitCode.OK
+    assert ended_badly or flown.outcome.deviation.max > 0.15, flown.reason
+
+
+def test_without_the_table_a_motor_test_turns_motors_that_nobody_asked_for(mission, unchecked):
+    flown = Flown(mission, stored={"motorPowerSet.enable": 1, "motorPowerSet.m1": 9000})
+    assert flown.code is not ExitCode.OK
+    assert flown.lab.truth().motor[:, 0].max() == 9000
+
+
+def test_a_vehicle_that_refused_stays_unlocked(mission):
+    flown = Flown(mission, stored={"colAv.enable": 1})
+    assert flown.lab.vehicle.supervisor.state is not State.LOCKED
