@@ -248,12 +248,18 @@ class _Kept(_Cache):
     def flush(self) -> None: ...
 
 
-def njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Compile a function at its first call for each set of argument types, as numba.njit does, and keep the result."""
+def njit(
+    function: Callable[..., Any] | None = None, *, interpreted: Callable[..., Any] | None = None, **options: Any
+) -> Any:
+    """Compile a function at its first call for each set of argument types, as numba.njit does, and keep the result.
+
+    `interpreted` does the same with numpy, for all elements at once, where loops would take Python too long: see
+    without_compiling().
+    """
     if function is None:
-        return lambda each: njit(each, **options)
-    if _calls is not None:
-        return _Noting(function, options)
+        return lambda each: njit(each, interpreted=interpreted, **options)
+    if _stand_in is not None:
+        return _stand_in(function, interpreted or function, options)
     return _compiling(function, options)
 
 
@@ -332,19 +338,26 @@ class Call(NamedTuple):
     types: tuple[Any, ...]
 
 
-_calls: dict[Call, None] | None = None  # so far, in order, where calls are noted
+_calls: dict[Call, None] = {}  # so far, in order, where calls are noted
 
 
-class _Noting:
-    """Stands for a compiled function where calls are noted, runs as Python, and notes calls from plain Python alone."""
+class _Interpreted:
+    """Stands for a compiled function where nothing is compiled, and runs as Python."""
+
+    def __init__(self, function: Callable[..., Any], interpreted: Callable[..., Any], options: dict[str, Any]):
+        self.function, self.interpreted, self.options = function, interpreted, options
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.interpreted(*arguments)
+
+
+class _Noting(_Interpreted):
+    """Stands for a compiled function where calls are noted: those from plain Python alone."""
 
     depth = 0
 
-    def __init__(self, function: Callable[..., Any], options: dict[str, Any]):
-        self.function, self.options = function, options
-
     def __call__(self, *arguments: Any) -> Any:
-        if _Noting.depth == 0 and _calls is not None:
+        if _Noting.depth == 0:
             parameters = list(inspect.signature(self.function).parameters.values())
             types = [typeof(each, Purpose.argument) for each in arguments]
             types += [Omitted(each.default) for each in parameters[len(arguments) :]]
@@ -356,22 +369,56 @@ class _Noting:
             _Noting.depth -= 1
 
 
+_stand_in: type[_Interpreted] | None = None  # what njit returns now, instead of compiled functions
+
+
 @contextmanager
 def noted_calls() -> Iterator[dict[Call, None]]:
     """Run the functions of modules that are first imported in the block as Python, and yield the calls of them."""
-    global _calls
-    _calls = {}
+    global _stand_in
+    _stand_in = _Noting
+    _calls.clear()
     try:
         yield _calls
     finally:
-        _calls = None
-        for module in [each for name, each in sys.modules.items() if name.startswith("cfplan.")]:
-            for name, value in list(vars(module).items()):
-                if isinstance(value, _Noting):
-                    made = getattr(sys.modules[value.function.__module__], value.function.__qualname__)
-                    if made is value:
-                        made = _compiling(value.function, value.options)
-                    setattr(module, name, made)
+        compile_from_here()
+
+
+@contextmanager
+def without_compiling() -> Iterator[None]:
+    """Run the functions of modules that are first imported in the block as Python; behind it, or once
+    compile_from_here() is called, they are compiled.
+
+    Results differ from those of compiled functions by rounding. What would raise a warning is silent, as it is in
+    compiled code.
+    """
+    global _stand_in
+    _stand_in = _Interpreted
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    finally:
+        compile_from_here()
+
+
+def interprets() -> bool:
+    """Return whether functions run as Python now, without_compiling()."""
+    return _stand_in is _Interpreted
+
+
+def compile_from_here() -> None:
+    """End without_compiling(): functions of the modules imported in it are compiled from now on."""
+    global _stand_in
+    if _stand_in is None:
+        return
+    _stand_in = None
+    for module in [each for name, each in sys.modules.items() if name.startswith("cfplan.")]:
+        for name, value in list(vars(module).items()):
+            if isinstance(value, _Interpreted):
+                made = getattr(sys.modules[value.function.__module__], value.function.__qualname__)
+                if made is value:
+                    made = _compiling(value.function, value.options)
+                setattr(module, name, made)
 
 
 def is_compiled(call: Call) -> bool:
@@ -392,6 +439,11 @@ def compile_call(call: Call) -> bool:
 def _file_of(call: Call) -> str:
     function = getattr(importlib.import_module(call.module), call.function)
     return function._cache.file_name(call.types)
+
+
+def claim(name: str) -> bool:
+    """Return whether no other process has claimed the name; it is this one's until it ends."""
+    return _locks.take(name, wait=False)
 
 
 def delete_unused() -> None:

@@ -130,7 +130,19 @@ def _tanh(x: np.float32) -> np.float32:
     return above / (_B0 + y * (_B2 + y * (_B4 + y * _B6)))
 
 
-@njit(fastmath=True, error_model="numpy")
+def _run_interpreted(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, cell: NDArray) -> None:
+    steps, hidden = out.shape[0], last.shape[1]
+    for direction, weights in enumerate(recurrent):
+        h, c, column = last[direction], cell[direction], direction * hidden
+        for t in range(steps) if direction == 0 else range(steps - 1, -1, -1):
+            gates = projected[t, 4 * column : 4 * (column + hidden)] + h @ weights
+            let_in, keep, _, let_out = (_HALF + _HALF * np.tanh(_HALF * gates)).reshape(4, hidden)
+            c[:] = keep * c + let_in * np.tanh(gates[2 * hidden : 3 * hidden])
+            h[:] = let_out * np.tanh(c)
+            out[t, column : column + hidden] = h
+
+
+@njit(interpreted=_run_interpreted, fastmath=True, error_model="numpy")
 def _run(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, cell: NDArray) -> None:
     """Run an LSTM layer over all steps; gates in torch's order: input, forget, cell, output."""
     steps, hidden = out.shape[0], last.shape[1]

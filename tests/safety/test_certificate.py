@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
-from cfplan.safety.certificate import _raise_peaks, _segments, certify
+from cfplan.safety.certificate import _bounds, _raise_peaks, _search, _search_interpreted, _segments, certify
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
@@ -72,6 +72,20 @@ def test_what_just_passes_keeps_every_limit_on_a_far_finer_grid(make_profile, wa
     assert true["motor thrust, most"] <= LIMITS.motor_thrust_max
     assert -true["motor thrust, least"] >= LIMITS.motor_thrust_min
     assert -true["specific thrust, least"] >= LIMITS.specific_thrust_min
+
+
+@pytest.mark.parametrize("batch", [3, 1_000])
+@pytest.mark.parametrize("broken", [False, True])
+def test_numpy_finds_the_peaks_that_compiled_loops_find(trajectory, batch, broken):
+    _, table = _bounds(AIRFRAME, LIMITS, SPACE)
+    source = dense.sample_source(AIRFRAME, trajectory.path, trajectory.profile)
+    if broken:
+        source.nodes[7, 3] = np.nan
+    given = table, np.array([SPACE.low, SPACE.high]), batch, source, _segments(trajectory)
+    (values, places), (expected, expected_places) = _search_interpreted(*given), _search(*given)
+    assert np.isnan(values).any() == broken
+    np.testing.assert_allclose(values, expected, rtol=1e-11)
+    np.testing.assert_allclose(places, expected_places, atol=1e-11)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.machine_code import llvm_functions, vector_width
+from cfplan.machine_code import interprets, llvm_functions, vector_width
 from cfplan.planners.expert.point_constraints import LANES, ROWS, family, variables
 from cfplan.planners.solver.barrier import TERMS
 
@@ -99,7 +99,7 @@ def _address(array: NDArray) -> int:
 
 
 class InterpretedKernels:
-    """The kernels by CasADi's virtual machine, point by point, to check the machine code by; see Kernels."""
+    """The kernels by CasADi's virtual machine, point by point: ready at once, and a check of the other; see Kernels."""
 
     def __init__(self, free_yaw: bool, data: NDArray, common: NDArray, weights: NDArray, spare: int) -> None:
         from cfplan.planners.expert.derivatives import point_kernels
@@ -117,3 +117,8 @@ class InterpretedKernels:
         jacobian, gradients, hessian = self._derivatives(coefficients, *self._given, *at_points)
         work[: gradients.shape[0]], work[gradients.shape[0] :] = np.array(gradients), np.array(hessian)
         return np.array(jacobian)
+
+
+def kernels_at_hand() -> type[Kernels]:
+    """Return the kernels as machine code; where nothing is compiled now, by CasADi's virtual machine."""
+    return InterpretedKernels if interprets() else CompiledKernels
