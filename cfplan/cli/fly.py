@@ -74,13 +74,15 @@ def fly(
         with steps.waiting("loading planners and simulator"):
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
+            from cfplan.cli.warm_up import compiling_paused
             from cfplan.preparation.plan_flight import FlightOptions
             from cfplan.preparation.prepare_flight import prepare_flight
         prepared = prepare_flight(path_or_plan, limits, FlightOptions(**planning), steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             click.echo("not flown", err=True)
             return int(ExitCode.ENDED_BY_PILOT)
-        folder, outcome, summary = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
+        with compiling_paused():
+            folder, outcome, summary = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
     _print_result(prepared, folder, outcome, summary, as_json)
     return int(outcome.exit_code)
 

@@ -71,14 +71,16 @@ def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compile_
     """Find and read safety.yaml, once a command, as its first step; begin to compile what the command will need."""
     with steps.step("limits") as results:
         safety_file = find_safety_file(given, path_file)
+        compiling = ""
         if compile_to is not None:
             from cfplan.cli.warm_up import compile_ahead
 
-            compile_ahead(compile_to, safety_file, steps)
+            compiling = compile_ahead(compile_to, safety_file, steps)
 
         from cfplan.safety.limits_file import load_limits
 
         limits = load_limits(safety_file)
         plan = limits.plan
         results.append(f"{limits.vehicle}, {plan.speed:g} m/s, {plan.acceleration:g} m/s² ({safety_file})")
+        results += [compiling] if compiling else []
     return limits

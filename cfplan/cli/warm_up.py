@@ -1,9 +1,12 @@
 """Compiles what flights need ahead of time, in other processes, and shows how far that is."""
 
+import os
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 
 import click
@@ -12,16 +15,22 @@ from cfplan.cli.output import Steps
 from cfplan.preparation.compiled_calls import Stage, find_calls
 
 SHOWN_EVERY = 4.0  # s
+LEAST_PRIORITY = 19  # see nice(2)
 
 
 class Worker:
-    """A process that compiles the calls of a stage, one after the other, from the end or from a place of its own."""
+    """A process that compiles the calls of a stage, one after the other, from the end or from a place of its own.
+
+    It goes on when this process ends.
+    """
 
     def __init__(self, stage: Stage, safety_file: Path, first: str):
         self.done = self.total = 0
+        self._arguments = stage, safety_file, first
         self.process = subprocess.Popen(
             [sys.executable, "-m", "cfplan.cli.warm_up", stage.name, str(safety_file), first],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+            start_new_session=True,
         )  # fmt: skip
         threading.Thread(target=self._listen, daemon=True).start()
 
@@ -41,19 +50,39 @@ class Worker:
         self.process.kill()
         self.process.wait()
 
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Stop, and begin anew behind the block if not all was compiled."""
+        done = self.process.poll() == 0
+        self.stop()
+        yield
+        if not done:
+            Worker(*self._arguments)
 
-def compile_ahead(stage: Stage, safety_file: Path, steps: Steps) -> None:
-    """Compile what a command is going to need, from the end of its way, while it starts from the beginning.
 
-    Does nothing where all is compiled. Stops as the command ends.
+def compile_ahead(stage: Stage, safety_file: Path, steps: Steps) -> str:
+    """Compile what a command is going to need in another process, from the end of its way; return words that say so.
+
+    Where planning is not compiled either, the command goes without_compiling(). Does nothing where all is compiled.
     """
-    from cfplan.machine_code import kept
+    from cfplan.machine_code import kept, without_compiling
 
-    if not kept() or _ready_file(stage).exists():
-        return
-    worker = Worker(stage, safety_file, "last")
-    click.get_current_context().call_on_close(worker.stop)
-    steps.meanwhile = worker.progress
+    context = click.get_current_context()
+    if kept() and _ready(stage):
+        return ""
+    if kept():
+        worker = context.meta[__name__] = Worker(stage, safety_file, "last")
+        steps.meanwhile = worker.progress
+        if _ready(Stage.PLAN):
+            return ""
+    context.with_resource(without_compiling())
+    return "planning without machine code" + (", which is compiled meanwhile" if kept() else "")
+
+
+def compiling_paused() -> AbstractContextManager[None]:
+    """Return a block in which nothing is compiled ahead: where a vehicle flies, processors are for that alone."""
+    worker: Worker | None = click.get_current_context().meta.get(__name__)
+    return nullcontext() if worker is None else worker.paused()
 
 
 def warm_up(safety_file: Path, processes: int) -> None:
@@ -81,6 +110,11 @@ def _all_ended(workers: list[Worker], seconds: float) -> bool:
     return True
 
 
+def _ready(stage: Stage) -> bool:
+    """Return whether all that a stage calls was compiled."""
+    return any(_ready_file(each).exists() for each in Stage if each >= stage)
+
+
 def _ready_file(stage: Stage) -> Path:
     from cfplan import machine_code
 
@@ -90,10 +124,9 @@ def _ready_file(stage: Stage) -> Path:
 def work(stage: Stage, safety_file: Path, first: str) -> None:
     """Compile the calls of a stage, leaving out what other processes are at; print how many are compiled of how many.
 
-    `first` is "last", or how far along the calls to begin, in [0, 1).
+    `first` is "last", or how far along the calls to begin, in [0, 1). Once the process that began this one has ended,
+    one such process at a time goes on, while others need no processor.
     """
-    import os
-
     from cfplan.machine_code import compile_call, delete_unused, is_compiled
 
     parent = os.getppid()
@@ -101,15 +134,30 @@ def work(stage: Stage, safety_file: Path, first: str) -> None:
     order = calls[::-1] if first == "last" else calls[int(float(first) * len(calls)) :] + calls
     while waiting := [call for call in order if not is_compiled(call)]:
         for call in waiting:
-            print(sum(map(is_compiled, calls)), len(calls), flush=True)
-            if os.getppid() != parent:
+            if not _may_go_on(parent):
                 return
-            if not is_compiled(call):
-                compile_call(call)
+            _print_unless_alone(sum(map(is_compiled, calls)), len(calls))
+            if not is_compiled(call) and compile_call(call) and not is_compiled(call):
+                return  # it could not be written
         time.sleep(0.1)
-    print(len(calls), len(calls), flush=True)
+    _print_unless_alone(len(calls), len(calls))
     _ready_file(stage).touch()
     delete_unused()
+
+
+def _may_go_on(parent: int) -> bool:
+    """Return False if the parent has ended and another process goes on already; step back once it has ended."""
+    from cfplan.machine_code import claim
+
+    if os.getppid() == parent:
+        return True
+    os.nice(LEAST_PRIORITY)
+    return claim("compiling in the background")
+
+
+def _print_unless_alone(done: int, total: int) -> None:
+    with suppress(BrokenPipeError):
+        print(done, total, flush=True)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from typing import Any
 
 from cfplan.errors import InputError
 from cfplan.geometry.path_file import load_path_file
+from cfplan.machine_code import compile_from_here
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import plan
@@ -18,6 +19,7 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.space import check_space
 
 PLAN_SUFFIX = ".parquet"
+LONG = 40.0  # m of path, from which on compiling takes less time than planning without
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,8 @@ def plan_flight(
         path_file = load_path_file(source)
         check_space(path_file.path, limits.space, waypoints=path_file.waypoints, where=str(source))
         results.append(f"{path_file.name}, {path_file.path.length:.1f} m, {len(path_file.waypoints)} waypoints")
+    if path_file.path.length > LONG:
+        compile_from_here()
     with step(on_step, "plan") as results:
         planned = plan(
             path_file.path,

@@ -13,6 +13,7 @@ from cfplan.errors import NotCertifiedError
 from cfplan.flight.pilot.mission import Mission, mission_of
 from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.stop_certificate import StopCertificate, certify_stops
+from cfplan.machine_code import compile_from_here
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
@@ -73,6 +74,7 @@ def prepare_mission(source: Path, limits: Limits, options: FlightOptions | None 
 
 def encode_flight(planned: PlannedFlight, on_step: OnStep = ignore_steps, *, stream_for: float = 0.0) -> EncodedFlight:
     """Encode a certified plan, and check the bytes against the trajectory. Raises NotCertifiedError."""
+    compile_from_here()  # without, rehearsing takes minutes
     plan = planned.plan
     with step(on_step, "certificate") as results:
         worst = plan.certificate.worst

@@ -3,10 +3,12 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from cfplan.cli import warm_up
 from cfplan.preparation.compiled_calls import Stage
 
 ROOT = Path(__file__).parent.parent.parent
@@ -35,6 +37,54 @@ def run(code, cache, *arguments):
     return [line.split()[1] for line in done.stderr.splitlines() if line.startswith("compiles ")], done
 
 
+PLAN = "from cfplan.cli import main; sys.argv = ['cfplan', 'plan', 'flights/circle.yaml']; main()"
+
+
+@pytest.mark.integration
+def test_a_first_plan_compiles_nothing(tmp_path):
+    (tmp_path / "file").write_text("")
+    compiled, done = run(PLAN, tmp_path / "file" / "below")  # cannot be written, so nothing is compiled behind it
+    assert compiled == []
+    assert "planning without machine code" in done.stdout
+    assert "Certificate: passed" in done.stdout
+
+
+@pytest.mark.slow
+def test_what_a_first_plan_needed_is_compiled_behind_it(tmp_path):
+    compiled, done = run(PLAN, tmp_path)
+    assert compiled == []
+    assert "planning without machine code, which is compiled meanwhile" in done.stdout
+    latest = time.monotonic() + 200.0
+    while not list(tmp_path.glob("ready-plan-*")):
+        assert time.monotonic() < latest
+        time.sleep(0.5)
+    compiled, done = run(PLAN, tmp_path)
+    assert compiled == []
+    assert "without machine code" not in done.stdout
+
+
+GOING_ON = """
+import os
+from cfplan.cli import warm_up
+print(warm_up._may_go_on(os.getppid()), warm_up._may_go_on(-1), os.nice(0) == warm_up.LEAST_PRIORITY, flush=True)
+sys.stdin.readline()
+"""
+
+
+def test_of_those_whose_command_has_ended_one_goes_on(tmp_path):
+    def begin():
+        return subprocess.Popen(
+            [sys.executable, "-c", "import sys\n" + GOING_ON], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env=os.environ | {"CFPLAN_CACHE": str(tmp_path)},
+        )  # fmt: skip
+
+    first = begin()
+    assert first.stdout.readline() == "True True True\n"
+    assert begin().communicate("\n", timeout=60)[0] == "True False True\n"
+    first.communicate("\n", timeout=60)
+    assert begin().communicate("\n", timeout=60)[0] == "True True True\n"
+
+
 @pytest.mark.integration
 def test_after_compiling_ahead_a_plan_compiles_nothing(tmp_path):
     work = "from cfplan.cli.warm_up import *; work(Stage.PLAN, Path('safety.yaml'), 'last')"
@@ -46,11 +96,17 @@ def test_after_compiling_ahead_a_plan_compiles_nothing(tmp_path):
     # An array assigned to a slice makes numba compile this, for seconds: write a loop.
     assert not [name for name in compiled if "raise_with_shape_context" in name]
 
-    plan = "from cfplan.cli import main; sys.argv = ['cfplan', 'plan', 'flights/circle.yaml']; main()"
-    compiled, done = run(plan, tmp_path)
+    compiled, done = run(PLAN, tmp_path)
     assert compiled == []
     assert "compiling" not in done.stderr  # there is nothing to wait for
     assert "Certificate: passed" in done.stdout
+
+
+def test_a_stage_is_ready_once_a_later_one_is(monkeypatch, tmp_path):
+    monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path))
+    assert not warm_up._ready(Stage.PLAN)
+    warm_up._ready_file(Stage.REHEARSAL).touch()
+    assert [warm_up._ready(stage) for stage in Stage] == [True, True, False]
 
 
 def test_stages_follow_one_another():
