@@ -90,4 +90,4 @@ def _where_slower(before: SpeedProfile, after: SpeedProfile) -> tuple[float, flo
     worst = int(np.argmax(change))
     if change[worst] <= NOTICEABLE:
         return 0.0, 0.0, 0.0
-    return float(np.mean(change > NOTICEABLE)), float(change[worst]), float(before.s[worst])
+    return np.count_nonzero(change > NOTICEABLE) / len(change), float(change[worst]), float(before.s[worst])

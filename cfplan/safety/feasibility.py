@@ -1,6 +1,7 @@
 """Feasibility before any search: whether hovering keeps the limits and what it spares; boundary states beyond them."""
 
 import math
+from functools import lru_cache
 
 from cfplan.geometry.path import Path
 from cfplan.safety.limits import PlanLimits
@@ -42,6 +43,7 @@ def spare_turning(airframe: Airframe, limits: PlanLimits) -> float:
     return 4 * airframe.arm * spare / max(airframe.inertia[:2])
 
 
+@lru_cache(maxsize=64)
 def infeasible_limit(airframe: Airframe, limits: PlanLimits) -> str:
     """Return which limit excludes every flight because it excludes hovering; empty where none does."""
     for name in PlanLimits.__slots__:

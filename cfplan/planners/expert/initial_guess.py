@@ -77,13 +77,16 @@ def _yaw(start: BoundaryState | None, end: BoundaryState | None, yaw: float, nod
 
 def lowered(coefficients: NDArray, share: float, held: tuple[bool, bool]) -> NDArray:
     """Return the coefficients with h less by that share; less so next to an end that is held by a boundary state."""
+    result = coefficients.copy()
+    if not any(held):
+        result[:, 0] *= 1.0 - share
+        return result
     less = np.full(len(coefficients), float(share))
     ramp = np.clip((np.arange(LOWERED_TO) - LOWERED_FROM + 1) / (LOWERED_TO - LOWERED_FROM + 1), 0.0, 1.0)
     for is_held, from_end in zip(held, (less, less[::-1]), strict=True):
         if is_held:
             count = min(len(less), LOWERED_TO)
             from_end[:count] *= ramp[:count]
-    result = coefficients.copy()
     result[:, 0] *= 1.0 - less
     return result
 

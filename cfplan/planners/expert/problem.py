@@ -130,14 +130,26 @@ def build_problem(
 def _point_data(segment: Segment, step: float) -> NDArray:
     """Return the point data, (POINT_DATA, P), in node units."""
     layout, yaw = segment.layout, segment.yaw
+    derivatives = segment.path.derivatives(layout.s * step)
     data = np.empty((point_constraints.POINT_DATA, len(layout.interval)))
-    powers = step ** np.arange(1, 5)
-    data[:12] = (segment.path.derivatives(layout.s * step)[1:] * powers[:, None, None]).reshape(12, -1)
-    data[12], data[13] = layout.place, layout.weight
-    k = layout.interval
-    data[14], dyaw, ddyaw = yaw_within(layout.place * step, yaw.yaw[k], yaw.dyaw[k], yaw.ddyaw[k])
-    data[15], data[16] = dyaw * step, ddyaw * step**2
+    _fill_point_data(data, derivatives, step, layout.interval, layout.place, layout.weight, yaw.yaw, yaw.dyaw, yaw.ddyaw)
     return data
+
+
+@njit
+def _fill_point_data(
+    data: NDArray, derivatives: NDArray, step: float, interval: NDArray, place: NDArray, weight: NDArray, yaw: NDArray,
+    dyaw: NDArray, ddyaw: NDArray,
+) -> None:  # fmt: skip
+    for order in range(1, 5):
+        for axis in range(3):
+            for p in range(len(interval)):
+                data[3 * (order - 1) + axis, p] = derivatives[order, axis, p] * step**order
+    for p in range(len(interval)):
+        k = interval[p]
+        turned = yaw_within(place[p] * step, yaw[k], dyaw[k], ddyaw[k])
+        data[12, p], data[13, p] = place[p], weight[p]
+        data[14, p], data[15, p], data[16, p] = turned[0], turned[1] * step, turned[2] * step**2
 
 
 def _limits_at_points(layout: Layout, ends: Ends, margin: NDArray) -> tuple[NDArray, NDArray]:

@@ -84,7 +84,8 @@ class _HeldAtPoints(NamedTuple):
 def _hold_at_points(segment: Segment, near: NDArray) -> _HeldAtPoints | str:
     """Solve the problem from the coefficients `near`, or return why not."""
     ends = segment.ends
-    interval = segment.path.end / segment.layout.shape.nodes * float(np.mean(1.0 / np.sqrt(segment.unit * near[:, 0])))
+    slowness = float((1.0 / np.sqrt(segment.unit * near[:, 0])).sum()) / len(near)
+    interval = segment.path.end / segment.layout.shape.nodes * slowness
     agrees = not ends.end and (ends.continues or not ends.start)  # with the boundary states
     problem = build_problem(segment, coefficients=lowered(near, SLOWER, ends.held) if agrees else None)
     attempt = solve(problem, problem.coefficients, refining_starts(interval))

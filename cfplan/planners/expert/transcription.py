@@ -50,15 +50,15 @@ class SplineProgram:
         self.bounds = self._bounds(problem)
 
     def _bounds(self, problem: Problem) -> NDArray:
-        it, yaw = self._variables, self._variables.sparsity.of_yaw
-        first_yaw = (-np.inf, np.inf) if problem.ends.start else problem.first_yaw
-        lower, upper = np.full(self._linear, -np.inf), np.full(self._linear, np.inf)
-        speeds = len(problem.highest)
-        upper[:speeds] = problem.highest
-        lower[speeds : speeds + it.positive] = FLOOR
-        if yaw:
-            lower[-1], upper[-1] = first_yaw
-        return bounds_of(np.append(problem.lower, lower), np.append(problem.upper, upper))
+        it, at_points = self._variables, problem.lower.size
+        lower, upper = np.full(at_points + self._linear, -np.inf), np.full(at_points + self._linear, np.inf)
+        lower[:at_points], upper[:at_points] = problem.lower.ravel(), problem.upper.ravel()
+        behind = at_points + len(problem.highest)
+        upper[at_points:behind] = problem.highest
+        lower[behind : behind + it.positive] = FLOOR
+        if it.sparsity.of_yaw and not problem.ends.start:
+            lower[-1], upper[-1] = problem.first_yaw
+        return bounds_of(lower, upper)
 
     def v_of(self, coefficients: NDArray) -> NDArray:
         """Return the variables of a table; the smallest counts where several have one value."""
