@@ -4,21 +4,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stepped_flight import fly_stepped
 
 from cfplan.errors import ExitCode
 from cfplan.flight.pilot.mission import mission_of
 from cfplan.flight.pilot.outcome import Rung
-from cfplan.flight.pilot.process import fly
 from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.telemetry import SetpointSent
 from cfplan.geometry.path_file import load_path_file
 from cfplan.planning.plan import plan
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dry_run import dry_run
-from cfplan.simulation.lab.lab import start_lab
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
-from cfplan.simulation.lab.room import RoomPoseSource, RoomSettings
-from cfplan.simulation.lab.sim_driver import SimDriver
+from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 
 REPOSITORY = Path(__file__).parents[2]
 FLIGHTS = sorted((REPOSITORY / "flights").glob("*.yaml"))
@@ -44,18 +43,11 @@ def test_a_path_file_certifies_and_flies_as_planned(file):
     assert dry_run(encoded, made.trajectory, limits.airframe, limits.flight).passed
 
     assert limits.airframe.motor_time_constant == 0.105
-    room = RoomSettings(position_noise=1e-3, attitude_noise=np.radians(0.2), latency=0.010)
-    sent: list[SetpointSent] = []
-    with start_lab(limits.airframe, room=room) as lab:
-        lab.disturb(RadioFault(RadioFaultKind.LOSS, size=0.05))
-        outcome = fly(
-            mission_of(encoded, limits),
-            uri=lab.uri,
-            drivers=[SimDriver],
-            pose_source=RoomPoseSource(lab.number),
-            on_telemetry=lambda message: sent.append(message) if isinstance(message, SetpointSent) else None,
-        )
-        truth = lab.truth()
+    cameras = ViconSettings(position_noise=1e-3, attitude_noise=np.radians(0.2), latency=0.010)
+    lab = SteppedLab(limits.airframe, cameras=cameras)
+    lab.disturb(RadioFault(RadioFaultKind.LOSS, size=0.05))
+    flight = fly_stepped(mission_of(encoded, limits), lab=lab)
+    outcome, truth, sent = flight.outcome, flight.truth, flight.of(SetpointSent)
 
     assert (outcome.exit_code, outcome.reason) == (ExitCode.OK, "landed")
     assert outcome.rung is Rung.NONE

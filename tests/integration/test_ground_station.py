@@ -8,7 +8,6 @@ import math
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk
 from mavsdk.plugins.action import Action, ActionError, ActionResult
 from mavsdk.plugins.telemetry import Telemetry as StationTelemetry
 from stepped_flight import Flight, at_setpoint, fly_stepped
+from waiting import PATIENCE, until
 
 from cfplan.errors import ExitCode
 from cfplan.flight.clock import BEGIN
@@ -31,7 +31,6 @@ from cfplan.recording.mavlink.frames import ned
 
 pytestmark = pytest.mark.integration
 SCRIPTS = Path(sys.executable).parent
-PATIENCE = 60.0  # s of the computer's time, spent only where something never comes
 
 
 class Station:
@@ -104,13 +103,6 @@ def fly_with(station: Station, mission: Mission, log: Path, react: Callable[[Tel
     return flight
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.01)
-    assert condition()
-
-
 def refused(action: Callable[[], object]) -> ActionResult:
     with pytest.raises(ActionError) as caught:
         action()
@@ -151,7 +143,7 @@ def watched_flight(station: Station, mission: Mission, log: Path) -> Watched:
         )
 
     def look(name: str) -> None:
-        wait_until(up_to_date)
+        assert until(up_to_date)
         watched.seen[name] = shown()
 
     def land() -> None:

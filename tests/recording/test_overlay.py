@@ -4,7 +4,6 @@ import dataclasses
 import io
 import json
 import socket
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
+from waiting import a_moment, until
 
 from cfplan.cli import cfplan
 from cfplan.errors import InputError
@@ -199,11 +199,9 @@ def test_every_view_of_an_overlay_renders_without_reports_and_is_not_blank(tmp_p
     viewer = ViewerClient.spawn(headless=True, port=port, hide_welcome_screen=True, executable_path=str(executable))
     try:
         viewer.open(str(tmp_path / "a.rrd"))
-        deadline = time.monotonic() + 30
-        while viewer.get_state().loading and time.monotonic() < deadline:
-            time.sleep(0.1)
+        assert until(lambda: not viewer.get_state().loading)
         viewer.set_time(layout.TIMELINE, duration=4.0)
-        time.sleep(1.0)
+        a_moment(1.0)
         views = viewer.get_state().views
         assert {view.name for view in views} == {"Trials", "Deviation, m", "Speed, m/s", "x, m", "y, m", "z, m"}
         for view in views:

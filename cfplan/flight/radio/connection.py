@@ -4,12 +4,12 @@ import contextlib
 import os
 import queue
 import threading
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from cfplan.errors import LinkError
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.radio.crazyradio import usb_hint
 from cfplan.flight.radio.link import Link
 from cfplan.flight.radio.radio_lock import lock_radio
@@ -28,6 +28,7 @@ def connect(
     drivers: Sequence[type] = (),
     *,
     waiting: Callable[[], None] = lambda: None,
+    clock: Clock = REAL_CLOCK,
 ) -> Link:
     """Connect, and end the state in which an earlier connection left the vehicle.
 
@@ -66,10 +67,10 @@ def connect(
 
     threading.Thread(target=open_link, daemon=True).start()
     try:
-        _wait(answered, failed, FIRST_ANSWER, waiting)
+        _wait(answered, failed, FIRST_ANSWER, waiting, clock)
         if not failed.is_set() and not answered.is_set():
             raise LinkError("nothing answers", where=uri, hint=_hint(uri, ""))
-        _wait(complete, failed, WHOLE_CONNECTION, waiting)
+        _wait(complete, failed, WHOLE_CONNECTION, waiting, clock)
         if failed.is_set():
             reason = reasons[0].splitlines()[0].removeprefix("Couldn't load link driver: ")
             raise LinkError(f"cannot connect: {reason}", where=uri, hint=_hint(uri, reason))
@@ -82,7 +83,7 @@ def connect(
         threading.Thread(target=crazyflie.close_link, daemon=True).start()
         raise
 
-    link = Link(crazyflie, uri, report, radio_lock=lock)
+    link = Link(crazyflie, uri, report, clock, radio_lock=lock)
     crazyflie.disconnected.callbacks.insert(0, link.note_loss)
     crazyflie.connection_lost.add_callback(link.note_loss)
     link.release_priority()
@@ -90,11 +91,13 @@ def connect(
     return link
 
 
-def _wait(done: threading.Event, failed: threading.Event, patience: float, waiting: Callable[[], None]) -> None:
-    end = time.monotonic() + patience
-    while not (done.is_set() or failed.is_set()) and time.monotonic() < end:
+def _wait(
+    done: threading.Event, failed: threading.Event, patience: float, waiting: Callable[[], None], clock: Clock
+) -> None:
+    end = clock.now() + patience
+    while not (done.is_set() or failed.is_set()) and clock.now() < end:
         waiting()
-        done.wait(0.02)
+        clock.wait(done, 0.02)
 
 
 def _hint(uri: str, reason: str) -> str:

@@ -2,9 +2,9 @@
 
 import multiprocessing
 import select
-import time
 
 import pytest
+from waiting import until
 
 from cfplan.flight.clock import REAL_CLOCK, SteppedClock
 from cfplan.flight.pilot.keys import Order
@@ -15,14 +15,6 @@ from cfplan.flight.telemetry import Event, Level
 
 def event(number: int) -> Event:
     return Event(float(number), Level.INFO, "x" * 100)
-
-
-def wait_for(condition, patience=60.0):
-    """Wait for what another thread does; the patience is spent only where it never does."""
-    end = time.monotonic() + patience
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.001)
-    assert condition()
 
 
 @pytest.fixture
@@ -81,7 +73,7 @@ def test_a_reader_that_is_stuck_costs_the_oldest_messages_and_no_time(pipe):
             report(event(0))
         return not select.select([], [writer], [], 0)[1]
 
-    wait_for(stuck)
+    assert until(stuck)
     before = report.dropped
     for number in range(1, 5001):
         report(event(number))
@@ -106,7 +98,7 @@ def test_the_gravest_order_stays(pipe):
     orders = OrderReceiver(reader)
     for order in (Order.LAND, Order.CUT, Order.LAND):
         writer.send(order)
-    wait_for(lambda: orders.worst is Order.CUT)
+    assert until(lambda: orders.worst is Order.CUT)
     assert not orders.gone
 
 
@@ -116,12 +108,12 @@ def test_a_connection_that_closes_here_while_it_is_read_is_no_traceback():
             raise TypeError("'NoneType' object cannot be interpreted as an integer")
 
     orders = OrderReceiver(ClosedWhileRead())
-    wait_for(lambda: orders.gone)
+    assert until(lambda: orders.gone)
 
 
 def test_a_main_process_that_ends_is_noticed(pipe):
     reader, writer = pipe
     orders = OrderReceiver(reader)
     writer.close()
-    wait_for(lambda: orders.gone)
+    assert until(lambda: orders.gone)
     assert orders.worst is None

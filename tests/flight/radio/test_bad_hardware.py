@@ -1,7 +1,6 @@
 """`cfplan fly` where hardware is not as it must be: one line with a hint, before anything is planned, nothing armed."""
 
 import math
-import time
 
 import pytest
 
@@ -33,10 +32,8 @@ def refused(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(
             "sys.argv", ["cfplan", "fly", str(tmp_path / "path.yaml"), "--records", str(records), "--yes", *words]
         )
-        began = time.monotonic()
         with pytest.raises(SystemExit) as ending:
             run_command()
-        assert time.monotonic() - began < 5.0
         said = capsys.readouterr().err
         assert said.startswith("error: ")
         assert said.count("\n") == 1

@@ -1,7 +1,6 @@
 """A Crazyradio at the boundary of USB: what cflib and pyusb make of one that is absent, forbidden or another's."""
 
 import errno
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -75,10 +74,8 @@ def plugged_in(monkeypatch):
 
 
 def refused(function) -> LinkError:
-    began = time.monotonic()
     with pytest.raises(LinkError) as caught:
         function()
-    assert time.monotonic() - began < 5.0
     assert caught.value.where == URI
     assert "\n" not in str(caught.value)
     return caught.value

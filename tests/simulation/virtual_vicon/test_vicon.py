@@ -3,7 +3,6 @@
 import contextlib
 import math
 import socket
-import time
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from stepped_vicon import SteppedFeed
+from waiting import until
 
 from cfplan.errors import InputError
 from cfplan.flight.clock import SteppedClock
@@ -25,7 +25,6 @@ from cfplan.simulation.virtual_vicon.vicon import VirtualVicon, serve
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 CLEAN = ViconSettings(position_noise=0.0, attitude_noise=0.0)
-PATIENCE = 60.0  # s of the computer's time, spent only where something never comes
 
 
 def stations(count=8, seed=3):
@@ -37,13 +36,16 @@ def stations(count=8, seed=3):
 
 def frames_of(uri, count):
     """So many frames in which something was seen."""
-    found, end = [], time.monotonic() + PATIENCE
+    found = []
+
+    def enough():
+        assert feed.failure() is None
+        found.extend(m for m in feed.messages() if isinstance(m, Frame) and m.bodies)
+        return len(found) >= count
+
     with Feed(parse_uri(uri, subject_needed=True)) as feed:
         feed.start()
-        while len(found) < count and time.monotonic() < end:
-            found += [m for m in feed.messages() if isinstance(m, Frame) and m.bodies]
-            assert feed.failure() is None
-            time.sleep(0.005)
+        assert until(enough)
     return found
 
 

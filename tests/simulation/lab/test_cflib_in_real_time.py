@@ -1,0 +1,175 @@
+"""Unmodified cflib flies the virtual Crazyflie in real time, and loses it."""
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+from cflib.crazyflie import Crazyflie
+from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
+from cflib.crtp.crtpstack import CRTPPort
+from cflib.positioning.motion_commander import MotionCommander
+from waiting import until
+
+from cfplan.simulation.lab.lab import start_lab
+from cfplan.simulation.lab.room import RoomPoseSource
+from cfplan.simulation.lab.sim_driver import register_sim_driver
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.vehicle.airframes import AIRFRAMES
+
+pytestmark = [pytest.mark.integration, pytest.mark.slow]
+AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
+
+
+@pytest.fixture(scope="module")
+def lab():
+    """One lab for all that leave it whole."""
+    register_sim_driver()
+    with start_lab(AIRFRAME, vehicle=VehicleSettings(position=(0.5, -0.3, 0.0))) as running:
+        yield running
+
+
+@pytest.fixture
+def doomed():
+    """A lab for those that do not."""
+    register_sim_driver()
+    with start_lab(AIRFRAME, number=5) as running:
+        yield running
+
+
+@pytest.fixture
+def link(lab):
+    with SyncCrazyflie(lab.uri, cf=Crazyflie()) as sync:
+        sync.wait_for_params()
+        yield sync.cf
+
+
+def read_back(cf, name, value):
+    """Set a parameter and wait for the vehicle to say that it has it."""
+    cf.param.set_value(name, value)
+    assert until(lambda: abs(float(cf.param.get_value(name)) - value) <= 1e-6 * max(1.0, abs(value)))
+
+
+class PoseFeed(threading.Thread):
+    """What a pilot does with poses, in short."""
+
+    def __init__(self, cf):
+        super().__init__(daemon=True)
+        self.cf, self.source, self.stop = cf, RoomPoseSource(), threading.Event()
+        self.source.open()
+        self.start_position = self.source.poses()[-1].position
+        self.latest = None
+
+    def run(self):
+        while not self.stop.wait(0.004):
+            for pose in self.source.poses():
+                self.latest = pose
+                self.cf.loc.send_extpose(pose.position, pose.quaternion)
+        self.source.close()
+
+
+def prepare(cf, feed):
+    cf.commander.send_notify_setpoint_stop()
+    for name, value in (
+        ("stabilizer.controller", 2),
+        ("stabilizer.estimator", 2),
+        ("ctrlMel.mass", AIRFRAME.mass),
+        ("locSrv.extPosStdDev", 0.003),
+        ("locSrv.extQuatStdDev", 0.01),
+        ("kalman.dragB_x", AIRFRAME.drag[0] / AIRFRAME.mass),
+        ("kalman.dragB_y", AIRFRAME.drag[0] / AIRFRAME.mass),
+    ):
+        read_back(cf, name, value)
+    feed.start()
+    for axis, value in zip("XYZ", feed.start_position, strict=True):
+        cf.param.set_value(f"kalman.initial{axis}", value)
+    cf.param.set_value("kalman.resetEstimation", 1)
+    time.sleep(0.7)
+
+
+def test_a_whole_flight_take_off_go_to_stream_hand_back_land(lab, link):
+    codes = []
+    link.add_port_callback(CRTPPort.SETPOINT_HL, lambda packet: codes.append(packet.data[3]))
+    feed = PoseFeed(link)
+    prepare(link, feed)
+    commander, planner = link.commander, link.high_level_commander
+
+    started = time.monotonic()
+    planner.takeoff(0.8, 1.5, yaw=None)
+    time.sleep(2.0)
+    planner.go_to(0.0, 0.0, 1.0, 0.0, 1.5)
+    time.sleep(2.0)
+    begun = time.monotonic()
+    radius, rate = 0.4, 1.5
+    for step in range(300):
+        time.sleep(max(0.0, begun + step * 0.01 - time.monotonic()))
+        angle = rate * max(0.0, (time.monotonic() - begun))
+        ramp = min(angle / 3.0, 1.0)
+        place = [radius * ramp * np.sin(angle), 0.0, 1.0]
+        commander.send_full_state_setpoint(place, [0, 0, 0], [0, 0, 0], [0, 0, 0, 1], 0, 0, 0)
+    x, y, z = feed.latest.position
+    planner.go_to(x, y, z, 0.0, 1.0)
+    commander.send_notify_setpoint_stop()
+    time.sleep(1.2)
+    planner.land(0.0, 1.5, yaw=None)
+    assert until(lambda: not link.supervisor.is_flying)
+
+    truth = lab.truth()
+    feed.stop.set()
+    feed.join()
+    assert codes == [0, 0, 0, 0]
+    begun_at = np.searchsorted(truth.time, started)
+    assert truth.position[-1, 2] == 0.0
+    assert truth.position[begun_at:, 2].max() == pytest.approx(1.0, abs=0.1)
+    assert np.abs(truth.position[begun_at:, 0]).max() < 0.8
+    assert truth.off_in_air[-1] == truth.off_in_air[begun_at]
+    assert not truth.locked
+    assert np.allclose(np.diff(truth.time[begun_at:]), 0.01, atol=1e-6)
+
+
+def test_motion_commander_flies_with_the_default_controller(lab, link):
+    """The firmware's PID and its velocity setpoints, as cflib's own examples use them."""
+    read_back(link, "stabilizer.controller", 1)
+    feed = PoseFeed(link)
+    read_back(link, "stabilizer.estimator", 2)
+    feed.start()
+    for axis, value in zip("XYZ", feed.start_position, strict=True):
+        link.param.set_value(f"kalman.initial{axis}", value)
+    link.param.set_value("kalman.resetEstimation", 1)
+    time.sleep(0.7)
+    with MotionCommander(link, default_height=0.5) as motion:
+        motion.forward(0.4)
+        motion.left(0.3)
+        time.sleep(0.3)
+        place = feed.latest.position
+    feed.stop.set()
+    feed.join()
+    x, y, _ = feed.start_position
+    assert place == pytest.approx((x + 0.4, y + 0.3, 0.5), abs=0.2)
+    assert until(lambda: lab.truth().position[-1, 2] == 0.0)
+
+
+def test_the_link_closes_at_once(lab):
+    for _ in range(2):
+        with SyncCrazyflie(lab.uri, cf=Crazyflie()) as sync:
+            sync.wait_for_params()
+            begun = time.monotonic()
+        assert time.monotonic() - begun < 0.5
+
+
+def test_a_lab_that_hangs_is_a_lost_connection(doomed):
+    lost = threading.Event()
+    cf = Crazyflie()
+    cf.connection_lost.add_callback(lambda uri, why: lost.set())
+    connected = threading.Event()
+    cf.connected.add_callback(lambda uri: connected.set())
+    cf.open_link(doomed.uri)
+    assert connected.wait(60)
+    os.kill(doomed.process_id, signal.SIGSTOP)
+    try:
+        assert lost.wait(5)
+    finally:
+        os.kill(doomed.process_id, signal.SIGCONT)
+        cf.close_link()
