@@ -132,7 +132,8 @@ def _point_data(segment: Segment, step: float) -> NDArray:
     layout, yaw = segment.layout, segment.yaw
     derivatives = segment.path.derivatives(layout.s * step)
     data = np.empty((point_constraints.POINT_DATA, len(layout.interval)))
-    _fill_point_data(data, derivatives, step, layout.interval, layout.place, layout.weight, yaw.yaw, yaw.dyaw, yaw.ddyaw)
+    yaws = yaw.yaw, yaw.dyaw, yaw.ddyaw
+    _fill_point_data(data, derivatives, step, layout.interval, layout.place, layout.weight, *yaws)
     return data
 
 
