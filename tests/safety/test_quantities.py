@@ -8,12 +8,19 @@ import numpy as np
 import pytest
 
 from cfplan.errors import NotCertifiedError
+from cfplan.flight.mocap.poses import Pose
+from cfplan.flight.pilot import abort_monitor
+from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints import stop_certificate
 from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.flight.telemetry import Estimate, VehicleStatus
 from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.yaw import YawMode
+from cfplan.planners.baselines import toppquad, toppquad_nlp
 from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.intersample import DensePath, violates_at_nodes
+from cfplan.planners.task import PlanningTask
 from cfplan.safety import quantities
 from cfplan.safety.certificate import certify, shares
 from cfplan.safety.feasibility import hover_violation, infeasible_limit, violated_limit
@@ -157,6 +164,45 @@ def test_stops_are_judged_by_the_table(quantity, trajectory):
         beyond = quantity.in_stop(safety) + quantity.side
         with pytest.raises(NotCertifiedError, match=quantity.noun):
             replace(found, worst=found.worst | {quantity.name: beyond}).require(safety)
+
+
+@each_quantity
+def test_toppquad_keeps_every_limit(quantity, trajectory):
+    task = PlanningTask(trajectory.path, AIRFRAME, LIMITS, 20)
+    tighter = quantity.allowed(LIMITS) + 0.1 * (quantity.unused(AIRFRAME) - quantity.allowed(LIMITS))
+    other = replace(task, limits=replace(LIMITS, **{quantity.limit: tighter}))
+    before, after = program_of(task), program_of(other)
+    assert any(not np.array_equal(each, after[name]) for name, each in before.items())
+
+
+def program_of(task):
+    """The numbers by which TOPPQuad's program knows the limits: bounds of variables and rows, and rows at a point."""
+    grid = np.linspace(0.0, task.path.end, task.nodes + 1)
+    at = np.random.default_rng(0).uniform(0.2, 0.8, toppquad_nlp.VARIABLES), np.ones(8)
+    rows = toppquad_nlp._node(task.airframe, task.limits.angular_acceleration)(*at)
+    return toppquad._bounds(task, grid, YawMode.FIXED) | {"rows": np.array(rows)}
+
+
+@each_quantity
+def test_what_has_a_ladder_ends_a_flight(quantity):
+    limits = load_limits(Path(__file__).parents[2] / "safety.yaml")
+    if not quantity.ladder:
+        return
+    beyond = getattr(limits.flight, quantity.ladder).land + 1e-3
+    moving = {name: (0.0, beyond if name == quantity.ladder else 0.0, 0.0) for name in abort_monitor.MEASURED}
+    monitor = abort_monitor.AbortMonitor(limits)
+    for now in (1.0, 1.0 + 2 * limits.flight.patience):
+        abort = monitor.gravest(still(now, limits, moving))
+    assert abort.rung is Rung.LAND
+    assert quantity.name in abort.text
+
+
+def still(now, limits, moving):
+    """What the pilot observes of a vehicle in hover that moves as told."""
+    pose = Pose(now, now, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))
+    estimate = Estimate(now, (0.0, 0.0, 1.0), moving["speed"], moving["acceleration"], (0.0, 0.0, 0.0, 1.0))
+    status = VehicleStatus(now, moving["angular_velocity"], (0, 0, 0, 0), 4.0, 0)
+    return abort_monitor.Observation(now, pose=pose, estimate=estimate, status=status)
 
 
 def test_stops_are_bound_in_all_quantities_but_two():

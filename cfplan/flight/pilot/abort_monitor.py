@@ -1,8 +1,9 @@
 """The abort monitor: every trigger of the abort ladder in one place, checked a hundred times a second."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from cfplan.errors import ExitCode
 from cfplan.flight.mocap.poses import Pose
@@ -11,11 +12,20 @@ from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.radio.supervisor_bits import FAULTS
 from cfplan.flight.telemetry import Estimate, Triple, VehicleStatus
 from cfplan.safety.limits import Ladder, Limits
+from cfplan.safety.quantities import ON_LADDER
 
 LATEST_SETPOINT = 0.25  # s that a setpoint may be late; the vehicle stops following after 0.5 s
 OLDEST_LOG = 0.5  # s without the vehicle's log
 LINK_GONE = 10.0  # s without a log, after which the link counts as lost; until then the vehicle may be hovering
 DISAGREEMENT_FACTOR = 5.0  # times preflight's limit that estimate and pose may be apart in the air
+# By what a quantity of the table with a ladder is measured.
+MEASURED: Mapping[str, Callable[[Estimate, VehicleStatus], Triple]] = MappingProxyType(
+    {
+        "speed": lambda estimate, _: estimate.velocity,
+        "acceleration": lambda estimate, _: estimate.acceleration,
+        "angular_velocity": lambda _, status: status.body_rate,
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,13 +140,10 @@ class AbortMonitor:
             apart = math.dist(observation.pose.position, observation.estimate.position)
             if apart > DISAGREEMENT_FACTOR * self._limits.pose.agreement:
                 yield safety_abort(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")
-        for name, ladder, vector, unit in (
-            ("speed", limits.speed, observation.estimate.velocity, "m/s"),
-            ("acceleration", limits.acceleration, observation.estimate.acceleration, "m/s²"),
-            ("body rate", limits.angular_velocity, observation.status.body_rate, "rad/s"),
-        ):
-            value = math.hypot(*vector)
-            yield self._lasting(name, observation.now, _rung(ladder, value, f"a {name} of {value:.1f} {unit}"))
+        for quantity in ON_LADDER:
+            value = math.hypot(*MEASURED[quantity.ladder](observation.estimate, observation.status))
+            measured = _rung(getattr(limits, quantity.ladder), value, f"{quantity.name} of {value:.1f} {quantity.unit}")
+            yield self._lasting(quantity.name, observation.now, measured)
 
     def _beyond_fence(self, position: Triple) -> float:
         """Return how far, m, a position is beyond the space less its margin; the floor does not count."""
