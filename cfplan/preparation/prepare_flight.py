@@ -40,7 +40,7 @@ class PreparedFlight:
 
     @property
     def plan(self) -> Plan:
-        """The plan, with its certificate."""
+        """Return the plan, with its certificate."""
         return self.planned.plan
 
 

@@ -50,7 +50,7 @@ class Plot:
 
     @property
     def title(self) -> str:
-        """What it shows, with the unit."""
+        """Return what it shows, with the unit."""
         return TITLES[self.name]
 
 

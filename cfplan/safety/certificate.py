@@ -159,7 +159,7 @@ def _plain(value: Any) -> Any:
 
 
 def _margin(bound: _Bound, peak: float, time: float, s: float, position: Sequence[float]) -> Margin:
-    """`peak` is the side times the measure."""
+    """Return the margin of a peak, which is the side times the measure."""
     quantity, limit, unused = bound
     worst = float(quantity.value(quantity.side * peak))
     room = limit - unused

@@ -144,7 +144,7 @@ Kind = TypeVar("Kind")
 
 
 def _made(kind: type[Kind], section: _Section, **others: Any) -> Kind:
-    """A dataclass from the section with the same keys; `others` replace what the file says differently."""
+    """Return a dataclass from the section with the same keys; `others` replace what the file says differently."""
     # fields() wants a class that mypy knows to be a dataclass, and no bound of a type variable says that
     names = {field.name for field in fields(kind)} - others.keys()  # type: ignore[arg-type]
     values = {name: getattr(section, name) for name in names}

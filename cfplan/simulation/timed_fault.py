@@ -25,5 +25,5 @@ class TimedFault:
 
     @property
     def strength(self) -> float:
-        """The size, or the usual one if none is given."""
+        """Return the size, or the usual one if none is given."""
         return self.usual.get(self.kind, 0.0) if self.size is None else self.size

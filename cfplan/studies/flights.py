@@ -98,7 +98,7 @@ class JudgedFlight:
 
     @property
     def off_plan(self) -> float:
-        """By how much the time from the first setpoint to the last differed from the plan, relative."""
+        """Return by how much the time from the first setpoint to the last differed from the plan, relative."""
         return abs(self.streamed / self.planned - 1)
 
 

@@ -66,7 +66,7 @@ class LongPlan:
 
     @property
     def certified(self) -> bool:
-        """Whether it is certified as planned or refined: not slowed as a whole."""
+        """Return whether it is certified as planned or refined: not slowed as a whole."""
         return not self.reason and self.speed_factor == 1.0
 
 

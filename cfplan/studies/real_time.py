@@ -60,7 +60,7 @@ class RealTimeFlight:
 
     @property
     def landed(self) -> bool:
-        """Whether it flew its plan to the end and landed."""
+        """Return whether it flew its plan to the end and landed."""
         return self.outcome is not None and self.outcome.exit_code is ExitCode.OK
 
     def time_to(self, index: int) -> float:

@@ -49,17 +49,17 @@ class PlannerTrial:
 
     @property
     def certified(self) -> bool:
-        """Whether there is a certified flight."""
+        """Return whether there is a certified flight."""
         return bool(np.isfinite(self.certified_time))
 
     @property
     def unslowed(self) -> bool:
-        """Whether the certificate passed as planned."""
+        """Return whether the certificate passed as planned."""
         return self.worst_share <= 1.0
 
     @property
     def whole_seconds(self) -> float:
-        """From the path to the certified trajectory."""
+        """Return the time, s, from the path to the certified trajectory."""
         return self.plan_seconds + self.repair_seconds
 
     @property

@@ -35,7 +35,7 @@ class Airframe:
 
     @property
     def command_per_thrust(self) -> float:
-        """16-bit units of each motor's command per N of collective thrust: what ctrlMel.massThrust should be."""
+        """Return 16-bit units of a motor's command per N of collective thrust: what ctrlMel.massThrust should be."""
         return 65535 / (4 * self.motor_thrust_max)
 
     @property

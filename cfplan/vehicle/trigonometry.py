@@ -36,7 +36,7 @@ def cosine(angle: float) -> float:
 
 @register_jitable(forceinline=True)
 def _wave(angle: float, quarters: float) -> float:
-    """sin(angle + quarters π/2)."""
+    """Return sin(angle + quarters π/2)."""
     turns = np.floor(angle * PER_QUARTER + 0.5)
     x = ((angle - turns * QUARTER[0]) - turns * QUARTER[1]) - turns * QUARTER[2]
     z = x * x

@@ -31,7 +31,7 @@ class FrameClock:
 
     @property
     def sure(self) -> bool:
-        """Whether delays are recognised."""
+        """Return whether delays are recognised."""
         return self._number is not None and self._proof is None
 
     def taken(self, received: float, number: int | None, rate: float, latency: float = math.nan) -> float:

@@ -100,7 +100,7 @@ class Feed:
 
     @property
     def child_id(self) -> int | None:
-        """The child's process id, None where there is none."""
+        """Return the child's process id, None where there is none."""
         return self._process.pid if self._process is not None else None
 
     def _spawn(self, again: str) -> None:

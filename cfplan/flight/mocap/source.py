@@ -63,17 +63,17 @@ class MocapSource:
 
     @property
     def counts(self) -> "Counter[Verdict]":
-        """How many poses had which verdict."""
+        """Return how many poses had which verdict."""
         return self._classifier.counts
 
     @property
     def sees_delays(self) -> bool:
-        """Whether delayed frames are recognised: some seconds after opening, if frames have numbers."""
+        """Return whether delayed frames are recognised: some seconds after opening, if frames have numbers."""
         return self._frame_clock.sure
 
     @property
     def child_id(self) -> int | None:
-        """The process in which the driver runs, None where there is none."""
+        """Return the process in which the driver runs, None where there is none."""
         return self._feed.child_id if self._feed is not None else None
 
     def open(self) -> None:

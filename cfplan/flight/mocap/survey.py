@@ -37,13 +37,13 @@ class BodyReport:
 
     @property
     def seen(self) -> float:
-        """Share of the frames in which the body was seen."""
+        """Return the share of the frames in which the body was seen."""
         total = sum(self.counts.values())
         return 1.0 - self.counts.get(Verdict.OCCLUDED, 0) / total if total else 0.0
 
     @property
     def remark(self) -> str:
-        """A warning about the body; "" if there is none."""
+        """Return a warning about the body; "" if there is none."""
         if self.segments and self.name not in self.segments:
             return f"its segment is named {self.segments[0]!r}: Vicon's own client (vicon-sdk://) will not see it"
         if self.counts.get(Verdict.GOOD, 0) == 0:
@@ -87,7 +87,7 @@ class Surveyor:
 
     @property
     def frames(self) -> int:
-        """How many frames came."""
+        """Return how many frames came."""
         return len(self._received)
 
     def add(self, frame: Frame) -> None:

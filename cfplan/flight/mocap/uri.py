@@ -34,7 +34,7 @@ class MocapUri:
 
     @property
     def address(self) -> str:
-        """The host, with its port if that is not the usual one."""
+        """Return the host, with its port if that is not the usual one."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return host if self.port == SYSTEMS[self.system] else f"{host}:{self.port}"
 

@@ -36,7 +36,7 @@ class Deadlines:
 
     @property
     def upcoming(self) -> float:
-        """The next deadline that is still to come, s."""
+        """Return the next deadline that is still to come, s."""
         passed = math.floor((self._now() - self._first) / self._period)
         return self._first + (max(self._count, passed) + 1) * self._period
 

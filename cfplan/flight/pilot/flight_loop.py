@@ -94,7 +94,7 @@ class FlightLoop:
 
     @property
     def link(self) -> Link:
-        """The link to the vehicle, after `connect`."""
+        """Return the link to the vehicle, after `connect`."""
         assert self._link is not None
         return self._link
 
@@ -232,7 +232,7 @@ class FlightLoop:
 
     @property
     def skipped(self) -> int:
-        """How many deadlines have passed altogether since `restart_deadlines`."""
+        """Return how many deadlines have passed altogether since `restart_deadlines`."""
         return self._deadlines.skipped
 
     def until(self, done: Callable[[], bool], patience: float) -> bool:

@@ -109,7 +109,7 @@ class Keyboard:
 
     @property
     def descriptor(self) -> int | None:
-        """A file descriptor to wait on for keys; None without a terminal, or once it has closed."""
+        """Return a file descriptor to wait on for keys; None without a terminal, or once it has closed."""
         return self._terminal[0] if self._terminal is not None else None
 
     def orders(self) -> list[Order]:

@@ -28,12 +28,12 @@ class Mission:
 
     @property
     def start(self) -> tuple[Triple, float]:
-        """Position, m, and yaw, rad, of the first setpoint as the vehicle decodes it."""
+        """Return the position, m, and yaw, rad, of the first setpoint as the vehicle decodes it."""
         return _place(self.payloads[:1])
 
     @property
     def end(self) -> tuple[Triple, float]:
-        """Position, m, and yaw, rad, of the last setpoint as the vehicle decodes it."""
+        """Return the position, m, and yaw, rad, of the last setpoint as the vehicle decodes it."""
         return _place(self.payloads[-1:])
 
     @property
@@ -49,7 +49,7 @@ class Mission:
 
     @property
     def take_off_height(self) -> float:
-        """Height of the hover after take-off, m above the origin."""
+        """Return the height of the hover after take-off, m above the origin."""
         return self.limits.ground.take_off_height
 
 

@@ -42,7 +42,7 @@ class Stream:
 
     @property
     def end(self) -> float:
-        """s, when the last setpoint is due."""
+        """Return when the last setpoint is due, s."""
         return self.start + self.last / self.rate
 
     def index(self, time: float) -> int:

@@ -71,7 +71,7 @@ class Link:
 
     @property
     def round_trip(self) -> float:
-        """Round trip, s: 95th percentile of the last echoes; 0 before the first."""
+        """Return the round trip, s: 95th percentile of the last echoes; 0 before the first."""
         return float(self._crazyflie.link_statistics.latency.latency) * _MILLI
 
     # Sent in flight: these never wait.

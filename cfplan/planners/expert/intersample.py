@@ -42,7 +42,7 @@ class Violation:
 
     @property
     def worst(self) -> float:
-        """The largest."""
+        """Return the largest."""
         return float(max(self.upper.max(), self.lower.max()))
 
 

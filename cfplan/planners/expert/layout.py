@@ -50,12 +50,12 @@ class Layout:
 
     @property
     def s(self) -> NDArray:
-        """(P,) from the first node on, in intervals."""
+        """Return where the points lie, (P,), in intervals from the first node."""
         return self.interval + self.place
 
     @property
     def speed_s(self) -> NDArray:
-        """Where the speed limit holds, in intervals."""
+        """Return where the speed limit holds, in intervals."""
         return self.speed_interval + self.speed_place
 
 

@@ -60,7 +60,7 @@ class Segment:
 
     @property
     def unit(self) -> float:
-        """h where x is 1."""
+        """Return h where x is 1."""
         return self.limits.speed**2
 
     def profile(self, coefficients: NDArray) -> SpeedProfile:

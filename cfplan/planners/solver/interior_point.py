@@ -59,11 +59,11 @@ class NonlinearProgram(Protocol):
 
     @property
     def bounds(self) -> NDArray:
-        """(5, m), see barrier."""
+        """Return the bounds, (5, m), see barrier."""
 
     @property
     def rows(self) -> int:
-        """g begins with this many rows of as many constraints each."""
+        """Return how many rows g begins with, of as many constraints each."""
 
     def evaluate(self, v: NDArray) -> Values:
         """Return f and g at v."""

@@ -45,7 +45,7 @@ class Place:
 
     @property
     def here(self) -> bool:
-        """Whether it is on this machine."""
+        """Return whether it is on this machine."""
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:

@@ -34,7 +34,7 @@ FULL_EFFICIENCY = np.ones(4)
 
 
 def pack_body(airframe: Airframe, *, floor: float = 0.0, step: float = TIME_STEP) -> NDArray:
-    """The airframe's parameters for `step_body`; `floor` is the height of the ground, -inf for none; `step` in s."""
+    """Return the parameters for `step_body`; `floor` is the height of the ground, -inf for none; `step` in s."""
     return np.array(
         [
             airframe.mass,
@@ -53,14 +53,14 @@ def pack_body(airframe: Airframe, *, floor: float = 0.0, step: float = TIME_STEP
 
 
 def hovering(airframe: Airframe, position: NDArray, yaw: float = 0.0) -> NDArray:
-    """(17,) the state of a vehicle that hovers."""
+    """Return the state, (17,), of a vehicle that hovers."""
     state = at_rest(position, yaw)
     state[MOTORS] = airframe.hover_thrust
     return state
 
 
 def at_rest(position: NDArray, yaw: float = 0.0) -> NDArray:
-    """(17,) the state of a vehicle that stands still, level, its motors off."""
+    """Return the state, (17,), of a vehicle that stands still, level, its motors off."""
     state = np.zeros(STATE_SIZE)
     state[POSITION] = position
     state[QUATERNION] = about_z(yaw)

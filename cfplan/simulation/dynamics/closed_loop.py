@@ -63,27 +63,27 @@ class ClosedLoop:
 
     @property
     def position(self) -> NDArray:
-        """(N, 3) m"""
+        """Return the position, (N, 3) m."""
         return self.states[:, POSITION]
 
     @property
     def velocity(self) -> NDArray:
-        """(N, 3) m/s"""
+        """Return the velocity, (N, 3) m/s."""
         return self.states[:, VELOCITY]
 
     @property
     def quaternion(self) -> NDArray:
-        """(N, 4) body→world, x y z w"""
+        """Return the attitude, (N, 4) body→world, x y z w."""
         return self.states[:, QUATERNION]
 
     @property
     def body_rate(self) -> NDArray:
-        """(N, 3) rad/s"""
+        """Return the body rates, (N, 3) rad/s."""
         return self.states[:, BODY_RATE]
 
     @property
     def motor_thrust(self) -> NDArray:
-        """(N, 4) N"""
+        """Return the motor thrusts, (N, 4) N."""
         return self.states[:, MOTORS]
 
 

@@ -61,12 +61,12 @@ class Radio:
 
     @property
     def full(self) -> bool:
-        """Whether the computer's queue is full."""
+        """Return whether the computer's queue is full."""
         return len(self._up) >= COMPUTER_QUEUE
 
     @property
     def busy(self) -> bool:
-        """Whether any packet is on its way."""
+        """Return whether any packet is on its way."""
         return bool(self._up or self._down or self._on_way_up or self._on_way_down)
 
     def send(self, packet: bytes) -> None:

@@ -59,7 +59,7 @@ class MotionCapture:
 
     @property
     def next_tick(self) -> int:
-        """The tick of 1 ms at which the cameras look next."""
+        """Return the tick of 1 ms at which the cameras look next."""
         return self._begin + round(self._number * 1000 / self._settings.rate)
 
     def look(self, time: float, truth: NDArray) -> None:
@@ -84,7 +84,7 @@ class MotionCapture:
 
     @property
     def next_due(self) -> float:
-        """When the next packet leaves, s; infinity if none waits."""
+        """Return when the next packet leaves, s; infinity if none waits."""
         return self._waiting[0][0] if self._waiting else np.inf
 
 

@@ -48,7 +48,7 @@ class SteppedLab:
 
     @property
     def now(self) -> float:
-        """The time, s."""
+        """Return the time, s."""
         return self.clock.now()
 
     def disturb(self, fault: Fault) -> None:

@@ -33,5 +33,5 @@ class Battery:
 
     @property
     def strength(self) -> float:
-        """The share of its largest thrust that a motor can give at this voltage."""
+        """Return the share of its largest thrust that a motor can give at this voltage."""
         return min(1.0, max(0.0, 1.0 - _LOSS * (_FULL_ABOVE - self.voltage)))

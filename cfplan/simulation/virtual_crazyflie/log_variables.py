@@ -96,7 +96,7 @@ def _attitude(belief: NDArray) -> dict[str, Getter]:
 
 
 def _accelerations(loop: Loop) -> dict[str, Getter]:
-    """Accelerations in world axes: stateEstimate in g without gravity, stateEstimateZ in mm/s² with it."""
+    """Return accelerations in world axes: stateEstimate in g without gravity, stateEstimateZ in mm/s² with it."""
 
     def world(axis: int, scale: float, gravity: float) -> float:
         return float(matrix_of(loop.belief[6:10])[axis] @ loop.acceleration - gravity) * scale

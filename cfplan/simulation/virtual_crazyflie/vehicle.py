@@ -213,7 +213,7 @@ class VirtualCrazyflie:
 
     @property
     def acceleration(self) -> NDArray:
-        """(3,) m/s², specific force in body axes: what the supervisor's low-pass filter leaves of the measurement."""
+        """Return specific force in body axes, (3,) m/s²: what the supervisor's low-pass filter leaves of it."""
         return self.stabilizer.loop.acceleration
 
     def _stabilize(self, ticks: int) -> None:

@@ -64,7 +64,7 @@ class Cameras:
 
     @property
     def next_look(self) -> float:
-        """When the cameras look next, s."""
+        """Return when the cameras look next, s."""
         return self._start + self._looks / self._settings.rate
 
     def inject(self, fault: ViconFault, now: float) -> None:

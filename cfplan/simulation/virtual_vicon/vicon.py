@@ -110,7 +110,7 @@ class Served:
 
     @property
     def uri(self) -> str:
-        """The URI of its vehicle."""
+        """Return the URI of its vehicle."""
         return self.uri_of(self.settings.subject)
 
     def uri_of(self, subject: str, system: str = "vicon") -> str:
