@@ -1,0 +1,126 @@
+"""The pilot's link by cflib itself, to a virtual Crazyflie in the same process: parameters, and setpoints of others."""
+
+import queue
+import struct
+import threading
+import time
+
+import pytest
+from cflib import crtp
+from cflib.crtp.crtpdriver import CRTPDriver
+from cflib.crtp.crtpstack import CRTPPacket
+from cflib.crtp.exceptions import WrongUriType
+
+from cfplan.errors import LinkError
+from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES
+from cfplan.flight.radio.connection import connect
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
+from cfplan.simulation.virtual_crazyflie.wire import Port, pack
+from cfplan.vehicle.airframes import AIRFRAMES
+
+_STEP = 10  # ms of the vehicle's time at each look for a packet
+NAMES = [rule.name for rule in PARAMETER_RULES]
+
+
+class DirectDriver(CRTPDriver):
+    """A driver without a medium; the vehicle's time goes on when cflib looks for packets."""
+
+    needs_resending = False
+    vehicle: VirtualCrazyflie
+    silent = False
+
+    def connect(self, uri, statistics, error):
+        if not uri.startswith("direct://"):
+            raise WrongUriType("not mine")
+        self._lock, self._came = threading.Lock(), queue.SimpleQueue()
+
+    def send_packet(self, packet):
+        with self._lock:
+            if not self.silent:
+                self.vehicle.receive(bytes((packet.header,)) + bytes(packet.data))
+            self._collect()
+
+    def receive_packet(self, wait=0):
+        with self._lock:
+            self.vehicle.advance(_STEP)
+            self._collect()
+        try:
+            datagram = self._came.get_nowait()
+        except queue.Empty:
+            time.sleep(0.001)
+            return None
+        return CRTPPacket(datagram[0], datagram[1:])
+
+    def _collect(self):
+        for datagram in self.vehicle.sent():
+            self._came.put(datagram)
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def direct(monkeypatch):
+    """Return what connects to a vehicle with these settings; the links close at the end."""
+    monkeypatch.setattr(crtp, "CLASSES", [])
+    links = []
+
+    def open_link(**settings):
+        driver = type("Driver", (DirectDriver,), {"vehicle": VirtualCrazyflie(AIRFRAME, VehicleSettings(**settings))})
+        links.append(connect("direct://0", lambda message: None, [driver]))
+        return links[-1], driver
+
+    yield open_link
+    for link in links:
+        link.close()
+
+
+AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
+
+
+def test_every_parameter_of_the_table_is_read(direct):
+    link, driver = direct(firmware="2026.08")
+    assert link.read_parameters(NAMES) == pytest.approx({name: driver.vehicle.parameters[name] for name in NAMES})
+
+
+def test_what_an_older_firmware_lacks_is_left_out(direct):
+    link, _ = direct(firmware="2025.09.1", protocol=10)
+    lacking = {"kalman.dragB_x", "kalman.dragB_y", "supervisor.crashDetectGs"}
+    assert set(NAMES) - set(link.read_parameters(NAMES)) == lacking
+    assert not link.has_log_variable("ctrltarget.mode_roll")
+
+
+def test_a_value_is_the_vehicles_of_now_not_that_of_connecting(direct):
+    link, driver = direct()
+    assert link.read_parameters(["colAv.enable"]) == {"colAv.enable": 0}
+    driver.vehicle.parameters["colAv.enable"] = 1
+    assert link.read_parameters(["colAv.enable"]) == {"colAv.enable": 1}
+
+
+def test_a_vehicle_that_falls_silent_is_an_error(direct):
+    link, driver = direct()
+    driver.silent = True
+    with pytest.raises(LinkError, match=r"no answer to reading colAv\.enable"):
+        link.read_parameters(["colAv.enable"], patience=0.1)
+
+
+def wait_until(condition):
+    for _ in range(500):
+        if condition():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+@pytest.mark.parametrize("firmware", ["2025.09.1", "2026.08"])
+def test_a_setpoint_of_another_client_is_seen_and_its_end_too(direct, firmware):
+    link, driver = direct(firmware=firmware, auto_arming=True)
+    link.start_logs()
+    assert wait_until(lambda: link.status is not None)
+    assert not link.has_setpoint
+    driver.vehicle.receive(pack(Port.SETPOINT, 0, struct.pack("<Bffff", 7, 0.5, 0.5, 0.4, 0.0)))
+    assert wait_until(lambda: link.has_setpoint)
+    link.release_priority()
+    assert wait_until(lambda: not link.has_setpoint)
+    link.stop_preflight_logs()
