@@ -51,12 +51,12 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         if last >= Stage.REHEARSAL:
             from cfplan.preparation.plan_flight import PlannedFlight
             from cfplan.preparation.prepare_flight import encode_flight, make_mission, rehearse
-            from cfplan.simulation.link_loss import swept_after_link_loss
+            from cfplan.simulation.link_loss import simulate_link_loss
 
             flight = PlannedFlight("small flight", planned, limits)
             encoded = encode_flight(flight)
             rehearse(flight, encoded)
-            swept_after_link_loss(encoded.payloads, limits, np.zeros(1))
+            simulate_link_loss(encoded.payloads[:2], limits)
             make_mission(encoded, limits)
         if last >= Stage.FLIGHT:
             from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie

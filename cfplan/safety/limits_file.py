@@ -43,6 +43,8 @@ _LEAST_PLANNED = {
 
 Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
 Encodable = Annotated[float, Field(gt=0.0, le=LARGEST_IN_PACKET)]
+_ALONE = LinkLossLimits()  # of files from before safety.yaml had them
+_MotorLag = Annotated[float, Field(ge=0.005, le=0.5)]
 Share = Annotated[float, Field(gt=0.0, lt=0.5)]
 Voltage = Annotated[float, Field(ge=2.5, le=4.35)]
 Coordinate = Annotated[float, Field(ge=-LARGEST_IN_PACKET, le=LARGEST_IN_PACKET)]
@@ -111,6 +113,8 @@ class _Pose(_Section):
 
 class _LinkLoss(_Section):
     outside: Literal["refuse", "warn"] = "refuse"
+    motor_lags: Annotated[tuple[_MotorLag, ...], Field(min_length=1, max_length=5)] = _ALONE.motor_lags
+    attitude_error_deg: Annotated[float, Field(ge=0.0, le=10.0)] = math.degrees(_ALONE.attitude_error)
 
 
 class _Firmware(_Section):
@@ -174,7 +178,11 @@ def load_limits(file: Path | str) -> Limits:
         pose=PoseLimits(**pose, yaw_agreement=yaw_agreement),
         firmware=_made(FirmwareSettings, content.firmware, oldest=tuple(map(int, content.firmware.oldest.split(".")))),
         ground=_made(GroundManoeuvres, content.ground),
-        link_loss=LinkLossLimits(only_warn=content.link_loss.outside == "warn"),
+        link_loss=LinkLossLimits(
+            only_warn=content.link_loss.outside == "warn",
+            motor_lags=content.link_loss.motor_lags,
+            attitude_error=math.radians(content.link_loss.attitude_error_deg),
+        ),
         lateness=content.lateness,
     )
     _check_vehicle_can(limits, places)

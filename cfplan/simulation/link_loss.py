@@ -1,22 +1,33 @@
 """Link loss: where the vehicle goes by itself when its pilot or its radio dies, by the firmware's own time-outs.
 
 It holds the last setpoint, then its supervisor levels it out at that height, then it stops the motors. While it levels
-out, the controller keeps the body rates of that last setpoint, so a vehicle that was about to turn never gets quite
-level and may speed up. Where it comes down depends on the moment, and is found by simulating it.
+out, the controller keeps the body rates of that last setpoint, which is why setpoints carry rates that brake (see
+flight/setpoints/rate_trade.py). Where it comes down depends on the moment, so every setpoint is made the last one: the
+flight before is simulated once, in steps of 1 ms, and branches off at each setpoint in steps of 4 ms, until the vehicle
+has settled in its level-out; from there on its attitude stands still, and only its place is followed.
+
+No poses come any more either. The vehicle then flies by its gyroscope, and an attitude that it has wrong by a little
+makes it drift, by as much wherever it is: that drift is added to each box that the vehicle sweeps.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.firmware import Timeouts, gains_for
 from cfplan.flight.setpoints.encoding import RATE
-from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, decode
 from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dynamics.body import (
+    AXIAL_DRAG,
+    DRAG,
     FULL_EFFICIENCY,
+    LAG,
+    MASS,
+    STATE_SIZE,
     STILL_AIR,
     THRUST_MAX,
     TIME_STEP,
@@ -32,15 +43,23 @@ from cfplan.simulation.dynamics.mellinger import (
     SETPOINT_SIZE,
     distribute_power,
     level_out,
-    step_mellinger,
+    step_controller,
 )
-from cfplan.vehicle.rotations import yaw_of
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.rotations import axes_of, yaw_of
 
 # s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
 LEVEL_AFTER, OFF_AFTER = Timeouts().level_out_at_latest, Timeouts().motors_off_at_latest
 OFF_BY_WATCHDOG = Timeouts().keep_alive  # if the emergency-stop watchdog is enabled
+WALLS = ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1))
+"""(axis, low or high side) of the walls and the ceiling; on the floor is where it ends."""
 _LONGEST = 4.0  # s that are simulated after the last setpoint, unless the vehicle lies on the floor before
-_MOMENTS = 48  # at which the link is lost
+_STEP = 0.004  # s, of the simulation after the last setpoint
+_SETTLED_AFTER = 0.5  # s of level-out, after which a vehicle that hardly turns has settled
+_SETTLED_RATE = 0.2  # rad/s, below which it hardly turns
+_COAST_STEP = 0.01  # s, of the place alone
+_MEMORY, _THRUSTS = STATE_SIZE, STATE_SIZE + MEMORY_SIZE  # where they lie in a snapshot, behind the state
+_SNAPSHOT = _THRUSTS + 4
 _STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)
 
 
@@ -57,16 +76,41 @@ class LinkLoss:
         return f"at the worst moment, {self.moment:.1f} s, it comes down {self.distance:.1f} m on, {walls}"
 
 
+@dataclass(frozen=True, slots=True)
+class LinkLossMoments:
+    """What the vehicle sweeps after each setpoint, were it the last one: the worst of all motor lags."""
+
+    time: NDArray  # (N,) s of each setpoint from the first
+    place: NDArray  # (N, 3) m, of each setpoint
+    low: NDArray  # (N, 3) m, the corners of the box that the vehicle sweeps from there to the floor
+    high: NDArray  # (N, 3) m
+    beyond: NDArray  # (N,) m beyond the walls or the ceiling; negative inside
+    wall: NDArray  # (N,) int, the wall that it comes nearest to or goes farthest beyond, as in WALLS
+    distance: NDArray  # (N,) m, horizontally from the setpoint to the far corner of the box
+
+    @property
+    def worst(self) -> LinkLoss:
+        """Return the setpoint after which the vehicle ends farthest out; what is not a number is farthest."""
+        at = int(np.argmax(np.where(np.isnan(self.beyond), np.inf, self.beyond)))
+        return LinkLoss(float(self.time[at]), float(self.distance[at]), float(self.beyond[at]))
+
+    def name_of_wall(self, number: int, limits: Limits) -> str:
+        """Return what people call the wall of a setpoint: "the wall x = 2.25 m"."""
+        axis, side = WALLS[self.wall[number]]
+        place = (limits.space.low, limits.space.high)[side][axis]
+        return f"the {'ceiling' if axis == 2 else 'wall'} {'xyz'[axis]} = {place:g} m"
+
+
 def simulate_link_loss(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLoss:
-    """Lose the link at moments all along a flight, (N, 29) uint8 at `rate`, Hz; return what ends farthest out."""
-    moments = np.linspace(0.0, (len(payloads) - 1) / rate, _MOMENTS)
-    places, swept = swept_after_link_loss(payloads, limits, moments, rate)
-    low, high = np.array(limits.space.low), np.array(limits.space.high)
-    low[2] = -np.inf  # it ends on the floor
-    beyond = np.maximum(low - swept[:, 0], swept[:, 1] - high).max(axis=1)
-    away = np.abs(swept[:, :, :2] - places[:, None, :2]).max(axis=1)
-    worst = int(np.argmax(beyond))
-    return LinkLoss(float(moments[worst]), float(np.hypot(*away[worst])), float(beyond[worst]))
+    """Lose the link at every setpoint of a flight, (N, 29) uint8 at `rate`, Hz; return what ends farthest out."""
+    return link_loss_at_every_setpoint(payloads, limits, rate).worst
+
+
+def link_loss_at_every_setpoint(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLossMoments:
+    """Lose the link after each setpoint of a flight that begins in hover, (N, 29) uint8 at `rate`, Hz."""
+    state = decode(payloads)
+    boxes = [_swept(state, limits, body, rate)[:2] for body in _bodies(limits)]
+    return _judge(np.arange(len(payloads)) / rate, state.position, boxes, limits)
 
 
 def swept_after_link_loss(
@@ -74,92 +118,255 @@ def swept_after_link_loss(
 ) -> tuple[NDArray, NDArray]:
     """Return the last setpoint's place, (K, 3) m, and the box swept after it, (K, 2, 3) m, for each moment, (K,) s.
 
-    Moments must rise. The vehicle's estimate is taken to be perfect, although no pose comes either.
+    A moment counts as that of the setpoint nearest to it. See link_loss_at_every_setpoint.
     """
-    state, airframe = decode(payloads), limits.airframe
-    rows = np.zeros((len(payloads), SETPOINT_SIZE))
-    rows[:, 0:16] = np.hstack([state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate])
-    arrivals = np.round(np.arange(len(payloads)) / (rate * TIME_STEP)).astype(np.int64)
-    steps = np.round(moments / TIME_STEP).astype(np.int64)
-    swept = np.empty((len(steps), 2, 3))
-    _run(
-        swept,
-        steps,
-        hovering(airframe, state.position[0], float(yaw_of(state.quaternion[0]))),
-        rows,
-        arrivals,
-        gains_for(airframe).pack(),
-        pack_body(airframe),
-        round(LEVEL_AFTER / TIME_STEP),
-        round((OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER) / TIME_STEP),
-        round(_LONGEST / TIME_STEP),
+    found = link_loss_at_every_setpoint(payloads, limits, rate)
+    rows = np.clip(np.round(np.asarray(moments) * rate).astype(int), 0, len(payloads) - 1)
+    return found.place[rows], np.stack([found.low[rows], found.high[rows]], axis=1)
+
+
+def link_loss_of_stops(
+    payloads: NDArray, stops: NDArray, limits: Limits, rate: float = RATE, *, every: int = 1, each: int = 1
+) -> LinkLossMoments:
+    """Lose the link within the stops (N, M, 29) from the setpoints (N, 29) of a flight: in every so many of them.
+
+    `each` says after which of a stop's setpoints; the last counts besides. Times are those of the setpoints.
+    """
+    state, begin = decode(payloads), np.arange(0, len(payloads), every)
+    within = np.unique(np.append(np.arange(0, stops.shape[1], each), stops.shape[1] - 1))
+    told = decode(stops[begin].reshape(-1, PAYLOAD_SIZE))
+    rows = _rows(told).reshape(len(begin), stops.shape[1], SETPOINT_SIZE)
+    boxes = []
+    for body in _bodies(limits):
+        snapshots = _swept(state, limits, body, rate, fork=False)[2][begin]
+        swept, aloft = np.empty((len(begin), stops.shape[1], 2, 3)), np.empty((len(begin), stops.shape[1]))
+        forks = np.zeros(stops.shape[1], dtype=np.bool_)
+        forks[within] = True
+        _fly_stops(swept, aloft, rows, snapshots, forks, _gains(limits), *body, *_steps(limits), _arrivals(rows, rate))
+        boxes.append((swept[:, within].reshape(-1, 2, 3), aloft[:, within].reshape(-1)))
+    times = begin[:, None] / rate + within / rate
+    places = rows[:, within, 0:3].reshape(-1, 3)
+    return _judge(times.reshape(-1), places, boxes, limits)
+
+
+def drift(aloft: NDArray, limits: Limits) -> NDArray:
+    """Return how far, m, a wrong attitude carries the vehicle in the times `aloft`, (N,) s, after the last setpoint.
+
+    Motion under the sideways thrust of the error, against drag, until the motors stop; coasting from there.
+    """
+    error, (drag, _) = limits.link_loss.attitude_error, limits.airframe.drag
+    push, damping = GRAVITY * math.tan(error), max(drag / limits.airframe.mass, 1e-6)
+    off = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER
+    driven, coasting = np.minimum(aloft, off), np.maximum(aloft - off, 0.0)
+    speed = push / damping * -np.expm1(-damping * driven)
+    return np.asarray((push * driven - speed) / damping + speed * -np.expm1(-damping * coasting) / damping)
+
+
+def _judge(time: NDArray, place: NDArray, boxes: list[tuple[NDArray, NDArray]], limits: Limits) -> LinkLossMoments:
+    """Return the worst of the boxes, (N, 2, 3) m, and times aloft, (N,) s, of each motor lag."""
+    lows, highs = [], []
+    for swept, aloft in boxes:
+        side = drift(aloft, limits)[:, None] * np.array([1.0, 1.0, 0.0])
+        lows.append(swept[:, 0] - side)
+        highs.append(swept[:, 1] + side)
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    space = np.array([limits.space.low, limits.space.high])
+    out = np.stack(
+        [(high[:, axis] - space[1, axis]) if side else (space[0, axis] - low[:, axis]) for axis, side in WALLS], axis=1
     )
-    last = np.maximum(np.searchsorted(arrivals, steps) - 1, 0)
-    return state.position[last], swept
+    away = np.maximum(place - low, high - place)[:, :2]
+    return LinkLossMoments(
+        time, place, low, high, out.max(axis=1), np.argmax(out, axis=1), np.hypot(away[:, 0], away[:, 1])
+    )
+
+
+def _bodies(limits: Limits) -> list[tuple[NDArray, NDArray]]:
+    """Return the parameters of the body, for each motor lag, for steps before and after the last setpoint."""
+    lags = {*limits.link_loss.motor_lags, limits.airframe.motor_time_constant}
+    airframes: list[Airframe] = [replace(limits.airframe, motor_time_constant=lag) for lag in sorted(lags)]
+    return [(pack_body(airframe), pack_body(airframe, step=_STEP)) for airframe in airframes]
+
+
+def _gains(limits: Limits) -> NDArray:
+    return gains_for(limits.airframe).pack()
+
+
+def _steps(limits: Limits) -> tuple[int, int]:
+    """Return after how many steps of a branch the vehicle levels out, and after how many its motors stop."""
+    off = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER
+    return round(LEVEL_AFTER / _STEP), round(off / _STEP)
+
+
+def _rows(state: FullStateSetpoints) -> NDArray:
+    rows = np.zeros((len(state.position), SETPOINT_SIZE))
+    rows[:, 0:16] = np.hstack([state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate])
+    return rows
+
+
+def _arrivals(rows: NDArray, rate: float) -> NDArray:
+    """Return at which step each setpoint of a stream arrives, and the step of one more."""
+    return np.round(np.arange(rows.shape[-2] + 1) / (rate * TIME_STEP)).astype(np.int64)
+
+
+def _swept(
+    state: FullStateSetpoints, limits: Limits, body: tuple[NDArray, NDArray], rate: float, *, fork: bool = True
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return boxes (N, 2, 3), times aloft (N,) s, and snapshots of vehicle and controller at each setpoint."""
+    count, rows = len(state.position), _rows(state)
+    swept, aloft, snapshots = np.empty((count, 2, 3)), np.empty(count), np.empty((count, _SNAPSHOT))
+    start = np.zeros(_SNAPSHOT)
+    start[:STATE_SIZE] = hovering(limits.airframe, state.position[0], float(yaw_of(state.quaternion[0])))
+    start[_THRUSTS:] = limits.airframe.hover_thrust
+    forks, arrivals = np.full(count, fork), _arrivals(rows, rate)
+    _fly(swept, aloft, snapshots, rows, start, forks, _gains(limits), *body, *_steps(limits), arrivals)
+    return swept, aloft, snapshots
 
 
 @njit
-def _control_and_move(
-    step: int,
-    state: NDArray,
-    memory: NDArray,
-    thrusts: NDArray,
+def _fly_stops(
+    swept: NDArray,
+    aloft: NDArray,
+    stops: NDArray,
+    starts: NDArray,
+    forks: NDArray,
+    gains: NDArray,
+    body: NDArray,
+    later_body: NDArray,
+    level_after: int,
+    off_after: int,
+    arrivals: NDArray,
+) -> None:
+    snapshots = np.empty((stops.shape[1], _SNAPSHOT))
+    for n in range(len(stops)):
+        _fly(
+            swept[n], aloft[n], snapshots, stops[n], starts[n], forks, gains, body, later_body, level_after, off_after,
+            arrivals,
+        )  # fmt: skip
+
+
+@njit
+def _fly(
+    swept: NDArray,
+    aloft: NDArray,
+    snapshots: NDArray,
+    setpoints: NDArray,
+    start: NDArray,
+    forks: NDArray,
+    gains: NDArray,
+    body: NDArray,
+    later_body: NDArray,
+    level_after: int,
+    off_after: int,
+    arrivals: NDArray,
+) -> None:
+    """Fly setpoints from a snapshot; branch off where `forks` says so, at the moment at which each arrives."""
+    now, branch = start.copy(), start.copy()
+    control, motors, mode = np.zeros(4), np.zeros(4), FULL_STATE.copy()
+    wind, efficiency = STILL_AIR.copy(), FULL_EFFICIENCY.copy()
+    for newest in range(len(setpoints)):
+        for k in range(_SNAPSHOT):
+            snapshots[newest, k] = now[k]
+        if forks[newest]:
+            for k in range(_SNAPSHOT):
+                branch[k] = now[k]
+            aloft[newest] = _go_on_alone(
+                swept[newest], branch, setpoints[newest].copy(), gains, later_body, level_after, off_after
+            )
+        for step in range(arrivals[newest], arrivals[newest + 1]):
+            if step % _STEPS_A_CONTROL == 0:
+                _control(now, control, motors, gains, setpoints[newest], mode, body, CONTROL_PERIOD)
+            step_body(now[:STATE_SIZE], now[_THRUSTS:], body, wind, efficiency)
+
+
+@njit
+def _control(
+    now: NDArray,
+    control: NDArray,
+    motors: NDArray,
     gains: NDArray,
     setpoint: NDArray,
     mode: NDArray,
     body: NDArray,
-    wind: NDArray,
-    efficiency: NDArray,
+    period: float,
 ) -> None:
-    if step % _STEPS_A_CONTROL == 0:
-        control, motors = np.zeros(4), np.zeros(4)
-        step_mellinger(control, memory, gains, setpoint, mode, state)
-        distribute_power(control, motors)
-        for k in range(4):
-            thrusts[k] = motors[k] * (body[THRUST_MAX] / FULL_COMMAND)
-    step_body(state, thrusts, body, wind, efficiency)
+    step_controller(control, now[_MEMORY:_THRUSTS], gains, setpoint, mode, now, period)
+    distribute_power(control, motors)
+    for k in range(4):
+        now[_THRUSTS + k] = motors[k] * (body[THRUST_MAX] / FULL_COMMAND)
 
 
 @njit
-def _run(
+def _go_on_alone(
     swept: NDArray,
-    moments: NDArray,
-    start: NDArray,
-    setpoints: NDArray,
-    arrivals: NDArray,
+    now: NDArray,
+    setpoint: NDArray,
     gains: NDArray,
     body: NDArray,
     level_after: int,
     off_after: int,
-    longest: int,
-) -> None:
-    state, memory, thrusts = start.copy(), np.zeros(MEMORY_SIZE), np.zeros(4)
-    flying, wind, efficiency = FULL_STATE.copy(), STILL_AIR.copy(), FULL_EFFICIENCY.copy()
-    newest, flown = 0, 0
-    for number in range(len(moments)):
-        for step in range(flown, moments[number]):
-            while newest + 1 < len(arrivals) and arrivals[newest + 1] <= step:
-                newest += 1
-            _control_and_move(step, state, memory, thrusts, gains, setpoints[newest], flying, body, wind, efficiency)
-        flown = moments[number]
-        alone, mode, last = state.copy(), flying.copy(), setpoints[newest].copy()
-        its_memory, its_thrusts = memory.copy(), thrusts.copy()
+) -> float:
+    """Fly on with the last setpoint, to the floor; write the box swept, and return how long that takes, s."""
+    control, motors, mode = np.zeros(4), np.zeros(4), FULL_STATE.copy()
+    wind, efficiency = STILL_AIR.copy(), FULL_EFFICIENCY.copy()
+    settled_after = level_after + round(_SETTLED_AFTER / _STEP)
+    for k in range(3):
+        swept[0, k], swept[1, k] = now[k], now[k]
+    for after in range(round(_LONGEST / _STEP)):
+        if after == level_after:
+            level_out(setpoint, mode)
+        turning = abs(now[10]) + abs(now[11]) + abs(now[12])
+        if settled_after <= after < off_after and turning < _SETTLED_RATE:
+            return after * _STEP + _coast(swept, now, setpoint, gains, body, (off_after - after) * _STEP)
+        if after < off_after:
+            _control(now, control, motors, gains, setpoint, mode, body, _STEP)
+        else:
+            for k in range(4):
+                now[_THRUSTS + k] = 0.0
+        step_body(now[:STATE_SIZE], now[_THRUSTS:], body, wind, efficiency)
+        _widen(swept, now)
+        if after > off_after and now[2] <= 0.0:
+            return after * _STEP
+    return _LONGEST
+
+
+@njit
+def _coast(swept: NDArray, now: NDArray, setpoint: NDArray, gains: NDArray, body: NDArray, powered: float) -> float:
+    """Follow the place of a vehicle whose attitude stands still, for `powered` s with motors and to the floor.
+
+    Semi-implicit midpoint: height control, motor lag and drag as in the whole simulation.
+    """
+    _, _, (zx, zy, zz) = axes_of(now[6], now[7], now[8], now[9])
+    mass, lag = body[MASS], max(body[LAG], _COAST_STEP)
+    thrust = now[13] + now[14] + now[15] + now[16]
+    integral, time = now[_MEMORY + 2], 0.0
+    while time < _LONGEST:
+        wanted = 0.0
+        if time < powered:
+            error = setpoint[2] - now[2]
+            integral += error * _COAST_STEP
+            wanted = (mass * GRAVITY + gains[6] * error + gains[7] * (setpoint[5] - now[5]) + gains[8] * integral) * zz
+            wanted = min(max(wanted, 0.0), 4.0 * body[THRUST_MAX])
+        before = thrust
+        thrust += (wanted - thrust) * _COAST_STEP / (lag + 0.5 * _COAST_STEP)
+        push = 0.5 * (before + thrust) / mass
         for k in range(3):
-            swept[number, 0, k], swept[number, 1, k] = alone[k], alone[k]
-        for after in range(longest):
-            if after == level_after:
-                level_out(last, mode)
-            if after < off_after:
-                now = flown + after
-                _control_and_move(now, alone, its_memory, its_thrusts, gains, last, mode, body, wind, efficiency)
-            else:
-                for k in range(4):
-                    its_thrusts[k] = 0.0
-                step_body(alone, its_thrusts, body, wind, efficiency)
-            for k in range(3):
-                if not swept[number, 0, k] <= alone[k]:  # so that what is no number is taken over
-                    swept[number, 0, k] = alone[k]
-                if not swept[number, 1, k] >= alone[k]:
-                    swept[number, 1, k] = alone[k]
-            if after > off_after and alone[2] <= 0.0:
-                break
+            lift = (zx, zy, zz)[k] * push - (GRAVITY if k == 2 else 0.0)
+            drag = (body[DRAG] if k < 2 else body[AXIAL_DRAG]) / mass
+            speed = now[3 + k]
+            now[3 + k] += _COAST_STEP * (lift - drag * speed) / (1.0 + 0.5 * drag * _COAST_STEP)
+            now[k] += _COAST_STEP * 0.5 * (speed + now[3 + k])
+        _widen(swept, now)
+        time += _COAST_STEP
+        if time > powered and now[2] <= 0.0:
+            break
+    return time
+
+
+@njit
+def _widen(swept: NDArray, now: NDArray) -> None:
+    """Make a box, (2, 3), hold a place; written so that what is no number is taken over."""
+    for k in range(3):
+        if not swept[0, k] <= now[k]:
+            swept[0, k] = now[k]
+        if not swept[1, k] >= now[k]:
+            swept[1, k] = now[k]

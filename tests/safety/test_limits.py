@@ -69,7 +69,10 @@ def test_a_vehicle_file_lies_beside_the_safety_file(tmp_path):
     assert load_limits(changed(tmp_path, {"vehicle": "mine.yaml"})).airframe.mass == 0.03
 
 
-OPTIONAL = {"stop_tilt_deg", "link_loss", "outside"}  # which older files lack
+NO_POSITIVE_NUMBER = {
+    "vehicle", "low", "high", "latency", "controller", "estimator", "watchdog", "outside", "attitude_error_deg",
+}  # fmt: skip
+OPTIONAL = {"stop_tilt_deg", "link_loss", "outside", "motor_lags", "attitude_error_deg"}  # which older files lack
 
 
 @pytest.mark.parametrize("place", [".".join(place) for place in keys() if place[-1] not in OPTIONAL])
@@ -89,7 +92,8 @@ def test_no_key_may_be_missing(tmp_path, place):
 NUMBERS = [
     ".".join(p)
     for p in keys()
-    if p[-1] not in ("vehicle", "low", "high", "latency", "controller", "estimator", "watchdog", "outside")
+    if p[-1]
+    not in ("vehicle", "low", "high", "latency", "controller", "estimator", "watchdog", "outside", "attitude_error_deg")
 ]
 
 
@@ -144,6 +148,10 @@ def test_unknown_keys_are_errors(tmp_path, place):
         ({"link_loss.outside": "ignore"}, r"link_loss.outside.*refuse.*warn"),
         ({"link_loss.outside": True}, r"link_loss.outside.*refuse.*warn"),
         ({"link_loss": "warn"}, "link_loss"),
+        ({"link_loss.motor_lags": []}, r"link_loss.motor_lags"),
+        ({"link_loss.motor_lags": [0.1, 0.9]}, r"link_loss.motor_lags"),
+        ({"link_loss.attitude_error_deg": 11}, r"link_loss.attitude_error_deg"),
+        ({"link_loss.attitude_error_deg": -1}, r"link_loss.attitude_error_deg"),
     ],
 )
 def test_limits_that_contradict_each_other_or_the_vehicle_are_refused(tmp_path, changes, message):

@@ -5,12 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from link_loss_oracle import fly_on
 
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.link_loss import simulate_link_loss, swept_after_link_loss
+from cfplan.simulation.link_loss import (
+    link_loss_at_every_setpoint,
+    link_loss_of_stops,
+    simulate_link_loss,
+    swept_after_link_loss,
+)
 from cfplan.studies.fault_scenarios import SCENARIOS
 from cfplan.studies.faults import fly_stepped
 
@@ -63,6 +69,67 @@ def test_roll_and_pitch_rates_in_the_last_packet_carry_it_away_and_the_watchdog_
     watching = replace(limits, firmware=replace(limits.firmware, watchdog=True))
     assert lost.distance > 4.0
     assert simulate_link_loss(encode(told)[:200], watching).distance < lost.distance / 2
+
+
+@pytest.mark.parametrize("lag", [0.07, 0.13])
+@pytest.mark.parametrize("rates", [(0.0, 0.0), (1.0, -2.5)], ids=["as sent", "with rates"])
+def test_it_sweeps_what_a_whole_simulation_sweeps(line, limits, rates, lag):
+    """4 ms steps and an attitude that stands still once settled, against steps of 1 ms to the floor."""
+    alone = replace(limits.link_loss, motor_lags=(lag,), attitude_error=0.0)
+    airframe = replace(limits.airframe, motor_time_constant=lag)
+    limits = replace(limits, airframe=airframe, link_loss=alone)
+    for last in (40, 171, 260, 390):
+        told = decode(line.payloads)
+        told.body_rate[last, :2] += rates
+        sent = encode(told)
+        found = link_loss_at_every_setpoint(sent, limits)
+        places = fly_on(sent, airframe, last, lag=lag)
+        far = np.ptp(places[:, :2], axis=0).max()
+        assert found.low[last, :2] == pytest.approx(places.min(axis=0)[:2], abs=0.01 + 0.02 * far)
+        assert found.high[last] == pytest.approx(places.max(axis=0), abs=0.01 + 0.02 * far)
+
+
+def test_the_worst_of_all_motor_lags_counts(line, limits):
+    def judged(*lags):
+        alone = replace(limits.link_loss, motor_lags=lags)
+        airframe = replace(limits.airframe, motor_time_constant=lags[0])
+        return link_loss_at_every_setpoint(line.payloads, replace(limits, airframe=airframe, link_loss=alone))
+
+    each, both = [judged(0.07), judged(0.13)], judged(0.07, 0.13)
+    np.testing.assert_array_equal(both.low, np.minimum(each[0].low, each[1].low))
+    np.testing.assert_array_equal(both.high, np.maximum(each[0].high, each[1].high))
+
+
+def test_an_attitude_that_is_wrong_drifts_to_all_sides(limits):
+    """Half a degree is 0.086 m/s² for two seconds, less the drag of what speed that makes."""
+    wrong = replace(limits, link_loss=replace(limits.link_loss, attitude_error=np.radians(0.5)))
+    right = replace(limits, link_loss=replace(limits.link_loss, attitude_error=0.0))
+    hover = straight(0.0)
+    with_error, without = (link_loss_at_every_setpoint(hover, each) for each in (wrong, right))
+    aside = without.low[0] - with_error.low[0]
+    assert aside == pytest.approx(with_error.high[0] - without.high[0])
+    assert aside[2] == 0.0
+    fall = np.sqrt(2 * 1.0 / 9.81)
+    undamped = 0.5 * 0.0856 * 2.04**2 + 0.0856 * 2.04 * fall
+    assert 0.7 * undamped < aside[0] < undamped
+
+
+def test_it_says_which_wall(limits):
+    found = link_loss_at_every_setpoint(straight(1.0, 2.0), limits)
+    assert found.name_of_wall(0, limits) == f"the wall x = {limits.space.low[0]:g} m"  # it begins 2 m to the left
+    assert found.worst.beyond == found.beyond.max()
+    assert found.worst.moment == found.time[np.argmax(found.beyond)]
+
+
+def test_stops_from_a_flight_are_harmless_too(line, limits):
+    flight = link_loss_at_every_setpoint(line.payloads, limits)
+    every = link_loss_of_stops(line.payloads, line.stops, limits, every=10, each=8)
+    assert len(every.time) == 11 * len(range(0, len(line.payloads), 10))
+    assert every.worst.beyond < 0.0
+    first = np.flatnonzero(np.isin(every.time, flight.time) & (np.arange(len(every.time)) % 11 == 0))
+    rows = np.round(every.time[first] * 100).astype(int)
+    # A stop begins as the flight goes on, but brakes harder within its first setpoints.
+    assert every.high[first] == pytest.approx(flight.high[rows], abs=0.25)
 
 
 def test_setpoints_as_they_are_sent_are_harmless_when_they_stop(line, limits):

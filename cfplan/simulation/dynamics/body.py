@@ -27,7 +27,7 @@ MOTORS = slice(13, 17)
 STATE_SIZE = 17
 
 # Where each parameter lies in the array that `pack_body` makes.
-MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, THRUST_MAX, _LAG, _DRAG, _AXIAL_DRAG, FLOOR, _REACTION, STEP = range(13)
+MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, THRUST_MAX, LAG, DRAG, AXIAL_DRAG, FLOOR, _REACTION, STEP = range(13)
 
 STILL_AIR = np.zeros(3)
 FULL_EFFICIENCY = np.ones(4)
@@ -75,7 +75,7 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
     `efficiency` (4,) is the share of its thrust that each motor gives, 1 without a fault.
     """
     step = body[STEP]
-    lag = min(1.0, step / max(body[_LAG], 1e-9))
+    lag = min(1.0, step / max(body[LAG], 1e-9))
     push_0, twist_0 = _spin_up(state, command, body, efficiency, lag, 0)
     push_1, twist_1 = _spin_up(state, command, body, efficiency, lag, 1)
     push_2, twist_2 = _spin_up(state, command, body, efficiency, lag, 2)
@@ -99,9 +99,9 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
     state[12] += step * (torque_z + (jx - jy) * wx * wy) / jz
 
     ax, ay, az = state[3] - wind[0], state[4] - wind[1], state[5] - wind[2]
-    force_x = -body[_DRAG] * (xx * ax + xy * ay + xz * az)
-    force_y = -body[_DRAG] * (yx * ax + yy * ay + yz * az)
-    force_z = thrust - body[_AXIAL_DRAG] * (zx * ax + zy * ay + zz * az)
+    force_x = -body[DRAG] * (xx * ax + xy * ay + xz * az)
+    force_y = -body[DRAG] * (yx * ax + yy * ay + yz * az)
+    force_z = thrust - body[AXIAL_DRAG] * (zx * ax + zy * ay + zz * az)
     state[3] += step * (xx * force_x + yx * force_y + zx * force_z) / body[MASS]
     state[4] += step * (xy * force_x + yy * force_y + zy * force_z) / body[MASS]
     state[5] += step * (xz * force_x + yz * force_y + zz * force_z) / body[MASS]

@@ -60,14 +60,28 @@ def step_mellinger(
     control: NDArray, memory: NDArray, gains: NDArray, setpoint: NDArray, mode: NDArray, state: NDArray
 ) -> None:
     """Step the controller by CONTROL_PERIOD: write `control` and update `memory`."""
-    pull_x = _pull(memory, gains, setpoint, state, 0)
-    pull_y = _pull(memory, gains, setpoint, state, 1)
-    pull_z = _pull(memory, gains, setpoint, state, 2)
+    step_controller(control, memory, gains, setpoint, mode, state, CONTROL_PERIOD)
+
+
+@njit
+def step_controller(
+    control: NDArray,
+    memory: NDArray,
+    gains: NDArray,
+    setpoint: NDArray,
+    mode: NDArray,
+    state: NDArray,
+    period: float,
+) -> None:
+    """Step the controller by `period`, s, which is CONTROL_PERIOD in the firmware."""
+    pull_x = _pull(memory, gains, setpoint, state, 0, period)
+    pull_y = _pull(memory, gains, setpoint, state, 1, period)
+    pull_z = _pull(memory, gains, setpoint, state, 2, period)
 
     turn = axes_of(state[6], state[7], state[8], state[9])
     yaw = 1.0, 0.0  # cosine and sine
     if mode[MODE_YAW] == VELOCITY_MODE:
-        ahead = np.arctan2(turn[0][1], turn[0][0]) + setpoint[15] * CONTROL_PERIOD
+        ahead = np.arctan2(turn[0][1], turn[0][0]) + setpoint[15] * period
         yaw = np.cos(ahead), np.sin(ahead)
     elif mode[MODE_YAW] == ABSOLUTE:
         yaw = np.cos(setpoint[18]), np.sin(setpoint[18])
@@ -98,12 +112,12 @@ def step_mellinger(
     tilt_z = _dot(desired[1], turn[0]) - _dot(turn[1], desired[0])
     rate_x, rate_y, rate_z = state[10], -state[11], state[12]
     wanted_x, wanted_y, wanted_z = setpoint[13], -setpoint[14], setpoint[15]
-    surge_x = ((wanted_x - memory[8]) - (rate_x - memory[6])) / CONTROL_PERIOD
-    surge_y = ((wanted_y - memory[9]) - (rate_y - memory[7])) / CONTROL_PERIOD
+    surge_x = ((wanted_x - memory[8]) - (rate_x - memory[6])) / period
+    surge_y = ((wanted_y - memory[9]) - (rate_y - memory[7])) / period
     memory[6], memory[7], memory[8], memory[9] = rate_x, rate_y, wanted_x, wanted_y
-    memory[3] = _clamp(memory[3] - tilt_x * CONTROL_PERIOD, gains[_I_RANGE_M_XY])
-    memory[4] = _clamp(memory[4] - tilt_y * CONTROL_PERIOD, gains[_I_RANGE_M_XY])
-    memory[5] = _clamp(memory[5] - tilt_z * CONTROL_PERIOD, gains[_I_RANGE_M_Z])
+    memory[3] = _clamp(memory[3] - tilt_x * period, gains[_I_RANGE_M_XY])
+    memory[4] = _clamp(memory[4] - tilt_y * period, gains[_I_RANGE_M_XY])
+    memory[5] = _clamp(memory[5] - tilt_z * period, gains[_I_RANGE_M_Z])
 
     roll = -gains[_KR_XY] * tilt_x + gains[_KW_XY] * (wanted_x - rate_x)
     roll += gains[_KI_M_XY] * memory[3] + gains[_KD_OMEGA] * surge_x
@@ -123,12 +137,12 @@ def step_mellinger(
 
 
 @register_jitable(forceinline=True)
-def _pull(memory: NDArray, gains: NDArray, setpoint: NDArray, state: NDArray, axis: int) -> float:
+def _pull(memory: NDArray, gains: NDArray, setpoint: NDArray, state: NDArray, axis: int, period: float) -> float:
     """Return the force that the error of position along an axis calls for, N; it updates its integral."""
     kp, kd = (gains[_KP_XY], gains[_KD_XY]) if axis < 2 else (gains[_KP_Z], gains[_KD_Z])
     ki, i_range = (gains[_KI_XY], gains[_I_RANGE_XY]) if axis < 2 else (gains[_KI_Z], gains[_I_RANGE_Z])
     error = setpoint[axis] - state[axis]
-    memory[axis] = _clamp(memory[axis] + error * CONTROL_PERIOD, i_range)
+    memory[axis] = _clamp(memory[axis] + error * period, i_range)
     return kp * error + kd * (setpoint[3 + axis] - state[3 + axis]) + ki * memory[axis]
 
 
