@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --editable
 
-.PHONY: install fly test slow lint clean
+.PHONY: install fly test slow fuzz lint clean
 
 install: $(VENV)/installed
 
@@ -26,6 +26,9 @@ test: $(VENV)/installed-tests
 
 slow: $(VENV)/installed-tests
 	$(BIN)/python -m pytest -m slow
+
+fuzz: $(VENV)/installed-tests
+	$(BIN)/python -m tests.fuzzing --inputs 100000
 
 lint: $(VENV)/installed-tests
 	$(BIN)/ruff check .

@@ -18,6 +18,11 @@ def _shortened(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
+def _without_middle(place: str) -> str:
+    """Return a place that a terminal shows whole, with its begin and its line."""
+    return place if len(place) <= _LONGEST else f"{place[: _LONGEST // 2]}…{place[-_LONGEST // 2 :]}"
+
+
 class ExitCode(IntEnum):
     """How a command ends."""
 
@@ -45,7 +50,7 @@ class CfplanError(Exception):
         super().__init__(what)
 
     def __str__(self) -> str:
-        place = f"{self.where}: " if self.where else ""
+        place = f"{_without_middle(self.where)}: " if self.where else ""
         remedy = f" (hint: {_shortened(self.hint)})" if self.hint else ""
         return printable(f"{place}{_shortened(self.what)}{remedy}")
 

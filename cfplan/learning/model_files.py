@@ -26,6 +26,7 @@ from cfplan.vehicle.airframe import Airframe
 WEIGHTS, CARD = "weights.safetensors", "card.json"
 FORMAT = 1
 LARGEST = 10_000  # layers, hidden numbers of each, and intervals of a window
+HEAVIEST = 1e6  # weight; trained ones are a few
 TIGHTEST = 0.5  # of a model's limit: for tighter ones repair would do more than the model
 _RETRAIN = "train it again with `cfplan train`"
 _RESTORE = "restore both files from where the model came, or train it again with `cfplan train`"
@@ -163,8 +164,8 @@ def load_model(folder: Path, airframe: Airframe | None = None) -> Model:
             where=where,
             hint=_RESTORE,
         )
-    if not all(values.dtype == np.float32 and np.isfinite(values).all() for values in weights.values()):
-        raise InputError("some weights are not finite 32-bit numbers", where=where, hint=_RESTORE)
+    if not all(values.dtype == np.float32 and (np.abs(values) < HEAVIEST).all() for values in weights.values()):
+        raise InputError(f"some weights are not finite 32-bit numbers below {HEAVIEST:g}", where=where, hint=_RESTORE)
     if airframe is not None and (other := other_vehicle(card, airframe)):
         raise InputError(
             f"a model for another vehicle: {other}",
