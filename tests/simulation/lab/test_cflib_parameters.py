@@ -13,12 +13,13 @@ from cflib.crtp.exceptions import WrongUriType
 
 from cfplan.errors import LinkError
 from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES
-from cfplan.flight.radio.connection import connect
+from cfplan.flight.radio import connection
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import Port, pack
 from cfplan.vehicle.airframes import AIRFRAMES
 
+_PATIENCE = 60.0  # s for what takes a moment on an idle computer
 _STEP = 10  # ms of the vehicle's time at each look for a packet
 NAMES = [rule.name for rule in PARAMETER_RULES]
 
@@ -60,62 +61,68 @@ class DirectDriver(CRTPDriver):
         pass
 
 
-@pytest.fixture
-def direct(monkeypatch):
-    """Return what connects to a vehicle with these settings; the links close at the end."""
-    monkeypatch.setattr(crtp, "CLASSES", [])
-    links = []
-
-    def open_link(**settings):
-        driver = type("Driver", (DirectDriver,), {"vehicle": VirtualCrazyflie(AIRFRAME, VehicleSettings(**settings))})
-        links.append(connect("direct://0", lambda message: None, [driver]))
-        return links[-1], driver
-
-    yield open_link
-    for link in links:
+def open_link(**settings):
+    """Connect to a vehicle with these settings; give the link and its driver."""
+    vehicle = VirtualCrazyflie(AIRFRAMES["crazyflie-2.1+"], VehicleSettings(**settings))
+    vehicle.advance(_STEP)  # compiles if need be, for which nothing waits
+    driver = type("Driver", (DirectDriver,), {"vehicle": vehicle})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(connection, "FIRST_ANSWER", _PATIENCE)
+        patch.setattr(crtp, "CLASSES", [driver])
+        link = connection.connect("direct://0", lambda message: None, [driver])
+        yield link, driver
+        driver.silent = False
         link.close()
 
 
-AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
+@pytest.fixture(scope="module")
+def newest():
+    yield from open_link(firmware="2026.08")
 
 
-def test_every_parameter_of_the_table_is_read(direct):
-    link, driver = direct(firmware="2026.08")
-    assert link.read_parameters(NAMES) == pytest.approx({name: driver.vehicle.parameters[name] for name in NAMES})
+@pytest.fixture(scope="module")
+def older():
+    yield from open_link(firmware="2025.09.1", protocol=10)
 
 
-def test_what_an_older_firmware_lacks_is_left_out(direct):
-    link, _ = direct(firmware="2025.09.1", protocol=10)
+def test_every_parameter_of_the_table_is_read(newest):
+    link, driver = newest
+    on_board = {name: driver.vehicle.parameters[name] for name in NAMES}
+    assert link.read_parameters(NAMES, _PATIENCE) == pytest.approx(on_board)
+
+
+def test_what_an_older_firmware_lacks_is_left_out(older):
+    link, _ = older
     lacking = {"kalman.dragB_x", "kalman.dragB_y", "supervisor.crashDetectGs"}
-    assert set(NAMES) - set(link.read_parameters(NAMES)) == lacking
+    assert set(NAMES) - set(link.read_parameters(NAMES, _PATIENCE)) == lacking
     assert not link.has_log_variable("ctrltarget.mode_roll")
 
 
-def test_a_value_is_the_vehicles_of_now_not_that_of_connecting(direct):
-    link, driver = direct()
-    assert link.read_parameters(["colAv.enable"]) == {"colAv.enable": 0}
+def test_a_value_is_the_vehicles_of_now_not_that_of_connecting(newest):
+    link, driver = newest
+    assert link.read_parameters(["colAv.enable"], _PATIENCE) == {"colAv.enable": 0}
     driver.vehicle.parameters["colAv.enable"] = 1
-    assert link.read_parameters(["colAv.enable"]) == {"colAv.enable": 1}
+    assert link.read_parameters(["colAv.enable"], _PATIENCE) == {"colAv.enable": 1}
 
 
-def test_a_vehicle_that_falls_silent_is_an_error(direct):
-    link, driver = direct()
+def test_a_vehicle_that_falls_silent_is_an_error(newest):
+    link, driver = newest
     driver.silent = True
     with pytest.raises(LinkError, match=r"no answer to reading colAv\.enable"):
         link.read_parameters(["colAv.enable"], patience=0.1)
+    driver.silent = False
 
 
 def wait_until(condition):
-    for _ in range(500):
-        if condition():
-            return True
+    end = time.monotonic() + _PATIENCE
+    while not condition() and time.monotonic() < end:
         time.sleep(0.01)
-    return False
+    return condition()
 
 
-@pytest.mark.parametrize("firmware", ["2025.09.1", "2026.08"])
-def test_a_setpoint_of_another_client_is_seen_and_its_end_too(direct, firmware):
-    link, driver = direct(firmware=firmware, auto_arming=True)
+@pytest.mark.parametrize("vehicle", ["newest", "older"])
+def test_a_setpoint_of_another_client_is_seen_and_its_end_too(request, vehicle):
+    link, driver = request.getfixturevalue(vehicle)
     link.start_logs()
     assert wait_until(lambda: link.status is not None)
     assert not link.has_setpoint
