@@ -19,8 +19,8 @@ PIPE_PATIENCE = 5.0  # s without a byte
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 
 
-def read_text(file: pathlib.Path) -> str:
-    """Read the text of a file of at most MAX_FILE_SIZE.
+def read_text(file: pathlib.Path, *, most: int = MAX_FILE_SIZE) -> str:
+    """Read the text of a file of at most `most` bytes.
 
     Raises:
         InputError: missing, not a file, not readable, too large, empty, not UTF-8 text.
@@ -28,7 +28,7 @@ def read_text(file: pathlib.Path) -> str:
     try:
         if file.is_dir():
             raise InputError("a folder, not a file", where=str(file), hint="name the file in it")
-        content = _content(file)
+        content = _content(file, most)
     except FileNotFoundError:
         raise InputError(
             "no such file",
@@ -38,8 +38,9 @@ def read_text(file: pathlib.Path) -> str:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"cannot be read: {reason}", where=str(file), hint="check its permissions") from None
-    if len(content) > MAX_FILE_SIZE:
-        raise InputError(f"larger than {MAX_FILE_SIZE // 1_000_000} MB", where=str(file), hint="give fewer points")
+    if len(content) > most:
+        size = f"{most // 1_000_000} MB" if most >= 1_000_000 else f"{most // 1000} kB"
+        raise InputError(f"larger than {size}", where=str(file), hint="give fewer points, or those of a path as a CSV")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -50,13 +51,13 @@ def read_text(file: pathlib.Path) -> str:
     return text
 
 
-def _content(file: pathlib.Path) -> bytes:
-    """Return at most MAX_FILE_SIZE + 1 bytes of a file, or of a pipe."""
+def _content(file: pathlib.Path, most: int) -> bytes:
+    """Return at most `most` + 1 bytes of a file, or of a pipe."""
     with open(os.open(file, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as stream:
         if stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
-            return io.BufferedReader(stream).read(MAX_FILE_SIZE + 1)
+            return io.BufferedReader(stream).read(most + 1)
         content = b""
-        while len(content) <= MAX_FILE_SIZE:
+        while len(content) <= most:
             if not select.select([stream], [], [], PIPE_PATIENCE)[0]:
                 raise InputError(
                     f"a pipe or device that gave nothing for {PIPE_PATIENCE:g} s",

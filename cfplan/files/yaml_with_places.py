@@ -22,6 +22,7 @@ from cfplan.files.text import read_text
 Model = TypeVar("Model", bound=BaseModel)
 Location = tuple[str | int, ...]
 
+MAX_SIZE = 200_000  # bytes, some 8,000 waypoints: YAML is read slowly, and people write a few kilobytes
 _MAX_DEPTH = 20  # of nested mappings and lists
 _TAGS = {
     f"tag:yaml.org,2002:{name}"
@@ -84,7 +85,7 @@ def read_yaml(file: pathlib.Path | str, model: type[Model]) -> Model:
 
 def read_yaml_with_places(file: pathlib.Path | str, model: type[Model]) -> tuple[Model, Places]:
     """Read a YAML file as a pydantic model, and the place of each value, for mistakes that a later check finds."""
-    text = read_text(pathlib.Path(file))
+    text = read_text(pathlib.Path(file), most=MAX_SIZE)
     places = Places(str(file), {}, {})
     root = _composed(text, places.file)
     data = _plain(root, (), places)

@@ -189,3 +189,11 @@ def test_any_punctuation_is_read_or_refused(read, text):
 @given(structures | keyed)
 def test_any_structure_is_read_or_refused(read, data):
     only_input_errors(read, yaml.safe_dump(data, allow_unicode=True))
+
+
+def test_a_file_that_would_take_long_to_read_is_refused_at_once(tmp_path):
+    file = tmp_path / "path.yaml"
+    file.write_text("waypoints: [" + "[0.123, 0.456, 0.789], " * 20_000 + "[0, 0, 1]]")
+    with pytest.raises(InputError, match="larger than 200 kB") as error:
+        read_yaml(file, Box)
+    assert "as a CSV" in error.value.hint

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import pyarrow as pa
@@ -65,6 +66,11 @@ def _plan_once() -> None:
         plan_flight(LINE, load_limits(SAFETY), FlightOptions(planner, nodes=30))
 
 
+def _is_planned(folder: Path) -> bool:
+    """Return whether an input that is read is planned with too, which takes longer: one in four, by its content."""
+    return crc32(b"".join(file.read_bytes() for file in sorted(folder.iterdir()))) % 4 == 0
+
+
 # Paths, points, polynomials
 
 
@@ -100,7 +106,7 @@ def _use_path(folder: Path) -> None:
     """Read a path file and plan along it."""
     read = load_path_file(folder / "path.yaml")
     read.path(np.linspace(0.0, read.path.end, 500), 4)
-    if read.path.length < _LONGEST_PLANNED and len(read.path.breaks) < 100:
+    if read.path.length < _LONGEST_PLANNED and len(read.path.breaks) < 100 and _is_planned(folder):
         plan_flight(folder / "path.yaml", load_limits(SAFETY), FlightOptions("convex"))
 
 
@@ -118,7 +124,7 @@ def _spoil_safety(sound: bytes, chance: Random, folder: Path) -> None:
 
 def _use_safety(folder: Path) -> None:
     limits = load_limits(folder / "safety.yaml")
-    for planner in ("convex", "expert"):
+    for planner in ("convex", "expert") if _is_planned(folder) else ():
         plan_flight(LINE, limits, FlightOptions(planner, nodes=30))
 
 
