@@ -155,6 +155,7 @@ def _observe(loop: FlightLoop, read: dict[str, float]) -> PreflightSnapshot:
 def _listen(loop: FlightLoop, duration: float) -> Traffic:
     """Return what is heard of other commanders in `duration`, s."""
     bits, setpoint = 0, False
+    loop.link.replies.clear()  # an answer to an earlier connection may have come late
 
     def look() -> bool:
         nonlocal bits, setpoint

@@ -5,17 +5,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cfplan.flight.firmware import GAIN_PARAMETERS
+from cfplan.flight.firmware import GAIN_PARAMETERS, NEWEST_KNOWN, Timeouts, version_of, version_text
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.preflight import PreflightSnapshot, run_checks
-from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, Action, Traffic
+from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, PARAMETER_RULES, Action, Traffic
 from cfplan.flight.radio.supervisor_bits import CAN_FLY, FLYING, HIGH_LEVEL_ACTIVE, LOCKED, TUMBLED
 from cfplan.flight.telemetry import Estimate, VehicleStatus
 from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.virtual_crazyflie.defaults import DEFAULTS
+from cfplan.simulation.virtual_crazyflie.supervisor import LEVEL_OUT_AFTER, PERIOD, SHUT_DOWN_AFTER
+from cfplan.vehicle.airframes import AIRFRAMES
 
 SHIPPED = load_limits(Path(__file__).parents[3] / "safety.yaml")
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -132,6 +135,7 @@ def test_a_vehicle_that_lacks_a_parameter_flies_only_where_the_table_says_so(gro
 
 
 @pytest.mark.parametrize("rule", PARAMETER_RULES, ids=lambda rule: rule.name)
+@settings(max_examples=25)
 @given(value=st.floats(width=32))
 def test_what_a_rule_accepts_is_what_its_intervals_hold(rule, value):
     held = any(low - 1e-6 * low <= value <= high + 1e-6 * high for low, high in rule.allowed(SHIPPED))
@@ -155,6 +159,35 @@ def test_what_is_set_is_one_value(mission):
         if rule.action is Action.SET:
             ((low, high),) = rule.allowed(mission.limits)
             assert low == high
+
+
+@pytest.mark.parametrize("airframe", AIRFRAMES.values(), ids=AIRFRAMES)
+def test_a_vehicle_as_it_comes_has_what_is_only_read(airframe):
+    limits = replace(SHIPPED, airframe=airframe)
+    for rule in PARAMETER_RULES:
+        if rule.action is Action.REFUSED:
+            assert rule.accepts(DEFAULTS.get(rule.name, 0.0), limits), rule.name
+    assert PARAMETER_GROUPS["settings on board"]
+    idle = next(rule for rule in PARAMETER_RULES if rule.name == "powerDist.idleThrust")
+    assert idle.accepts(7000.0, limits) or "brushless" not in airframe.name  # as brushless vehicles come
+
+
+def test_the_time_outs_are_those_that_the_virtual_supervisor_keeps():
+    times = Timeouts()
+    assert (1000 * times.level_out, 1000 * times.motors_off) == (LEVEL_OUT_AFTER, SHUT_DOWN_AFTER)
+    assert 1000 * times.period == PERIOD
+
+
+@given(st.text())
+def test_any_text_is_a_firmware_or_none(text):
+    version = version_of(text)
+    assert version == () or version_of(version_text(version)) == version
+
+
+def test_versions_are_read_as_bitcraze_writes_them():
+    assert version_of("2025.09.1 (abc)") == (2025, 9, 1)
+    assert version_text((2025, 9, 1)) == "2025.09.1"
+    assert version_of("2026.08 +12") == NEWEST_KNOWN
 
 
 def test_a_vehicle_near_the_wall_may_not_take_off(ground):
