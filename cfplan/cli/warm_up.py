@@ -29,7 +29,7 @@ class Worker:
         self._arguments = stage, safety_file, first
         self.process = subprocess.Popen(
             [sys.executable, "-m", "cfplan.cli.warm_up", stage.name, str(safety_file), first],
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
             start_new_session=True,
         )  # fmt: skip
         threading.Thread(target=self._listen, daemon=True).start()
@@ -124,8 +124,8 @@ def _ready_file(stage: Stage) -> Path:
 def work(stage: Stage, safety_file: Path, first: str) -> None:
     """Compile the calls of a stage, leaving out what other processes are at; print how many are compiled of how many.
 
-    `first` is "last", or how far along the calls to begin, in [0, 1). Once the process that began this one has ended,
-    one such process at a time goes on, while others need no processor.
+    `first` is "last", or how far along the calls to begin, in [0, 1). Of those whose command has ended, one at a time
+    goes on.
     """
     from cfplan.machine_code import compile_call, delete_unused, is_compiled
 
@@ -146,13 +146,17 @@ def work(stage: Stage, safety_file: Path, first: str) -> None:
 
 
 def _may_go_on(parent: int) -> bool:
-    """Return False if the parent has ended and another process goes on already; step back once it has ended."""
+    """Return False if the parent has ended and another such process goes on already."""
     from cfplan.machine_code import claim
 
-    if os.getppid() == parent:
-        return True
-    os.nice(LEAST_PRIORITY)
-    return claim("compiling in the background")
+    return os.getppid() == parent or claim("compiling in the background")
+
+
+def _step_back_once_alone() -> None:
+    """Wait until the process that holds our input has ended; compile from then on when nobody needs the processor."""
+    while os.read(0, 1):
+        pass
+    os.setpriority(os.PRIO_PROCESS, os.getpid(), LEAST_PRIORITY)
 
 
 def _print_unless_alone(done: int, total: int) -> None:
@@ -161,4 +165,5 @@ def _print_unless_alone(done: int, total: int) -> None:
 
 
 if __name__ == "__main__":
+    threading.Thread(target=_step_back_once_alone, daemon=True).start()
     work(Stage[sys.argv[1]], Path(sys.argv[2]), sys.argv[3])
