@@ -81,15 +81,19 @@ class SteppedLab:
             if tick % COMMANDER_PERIOD == 0:
                 self._note()
             boundary = tick + COMMANDER_PERIOD - tick % COMMANDER_PERIOD
-            step = 1 if self.radio.busy else max(min(target, boundary, self._next_look()) - tick, 1)
+            # At a boundary the vehicle may send logs, which leave within a millisecond, as a real one's do.
+            busy = self.radio.busy or tick % COMMANDER_PERIOD == 0
+            step = 1 if busy else max(min(target, boundary, self._next_sight()) - tick, 1)
             self.vehicle.advance(step)
             for packet in self.vehicle.sent():
                 self.radio.answer(packet)
         self.clock.reach(end)
         self._exchange()
 
-    def _next_look(self) -> int:
-        return int(np.ceil((self.cameras.next_look - self._origin) * 1000 - 1e-6))
+    def _next_sight(self) -> int:
+        """Return the tick at which the cameras look or a picture leaves next."""
+        then = min(self.cameras.next_look, self.cameras.next_due)
+        return int(np.ceil((then - self._origin) * 1000 - 1e-6))
 
     def _exchange(self) -> None:
         up, down = self.radio.step(self.now)

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
 from cfplan.flight.telemetry import Quaternion, Triple
@@ -28,7 +29,10 @@ class ViconSettings:
     rate: float = 100.0  # Hz
     position_noise: float = 0.001  # m, standard deviation of each axis
     attitude_noise: float = math.radians(0.2)  # rad, standard deviation about each axis
-    latency: float = 0.010  # s from the moment of a pose to its leaving; also what the server says about itself
+    latency: float = 0.010  # s from the moment of a pose to its leaving
+    announced_latency: float | None = None  # s, what the server says about itself; None: the truth
+    origin: Triple = (0.0, 0.0, 0.0)  # m, of the markers' body, from the vehicle's centre of mass in body axes
+    mounting: Triple = (0.0, 0.0, 0.0)  # rad, rotation vector that turns the vehicle's axes into the markers' body's
     y_up: bool = False
     spare: bool = False  # do not repeat what has not changed
     port: int = 0  # 0 takes a free one
@@ -37,8 +41,14 @@ class ViconSettings:
     seed: int = 7
 
     def __post_init__(self) -> None:
-        for name in ("rate", "position_noise", "attitude_noise", "latency"):
-            value = getattr(self, name)
+        announced = self.latency if self.announced_latency is None else self.announced_latency
+        for name, value in (
+            ("rate", self.rate),
+            ("position_noise", self.position_noise),
+            ("attitude_noise", self.attitude_noise),
+            ("latency", self.latency),
+            ("announced_latency", announced),
+        ):
             if not (math.isfinite(value) and value >= 0) or (name == "rate" and not 1 <= value <= 1000):
                 raise InputError(
                     f"{name} {value} of the virtual Vicon is out of range",
@@ -55,6 +65,7 @@ class Cameras:
     def __init__(self, settings: ViconSettings, start: float):
         self._settings, self._start = settings, start
         self._chance = np.random.default_rng(settings.seed)
+        self._mounting = Rotation.from_rotvec(settings.mounting) if any(settings.mounting) else None
         self._faults = Faults()
         for fault in settings.faults:
             self._faults.add(fault, start)
@@ -66,6 +77,11 @@ class Cameras:
     def next_look(self) -> float:
         """Return when the cameras look next, s."""
         return self._start + self._looks / self._settings.rate
+
+    @property
+    def next_due(self) -> float:
+        """When the next picture leaves, s; infinity if none waits."""
+        return self._waiting[0][0] if self._waiting else math.inf
 
     def inject(self, fault: ViconFault, now: float) -> None:
         """Let something go wrong; its start counts from now."""
@@ -83,7 +99,8 @@ class Cameras:
         if self._last is not None and faults.acting(FaultKind.REPEAT, time):
             self._queue(time, self._last)
             return
-        truth = {settings.subject: (position, quaternion), **{name: (place, _LEVEL) for name, place in settings.others}}
+        markers = self._markers(position, quaternion)
+        truth = {settings.subject: markers, **{name: (place, _LEVEL) for name, place in settings.others}}
         seen = faults.seen(time, {name: self._with_noise(*pose) for name, pose in truth.items()})
         self._queue(time, self._picture(seen, truth))
 
@@ -97,6 +114,15 @@ class Cameras:
         while self._waiting and self._waiting[0][0] <= now:
             found.append(self._waiting.popleft()[1])
         return found
+
+    def _markers(self, position: Triple, quaternion: Quaternion) -> Seen:
+        """Return the pose of the markers' body on a vehicle with this pose."""
+        if self._mounting is None and not any(self._settings.origin):
+            return position, quaternion
+        attitude = Rotation.from_quat(quaternion)
+        x, y, z = (np.array(position) + attitude.apply(self._settings.origin)).tolist()
+        qx, qy, qz, qw = (attitude * self._mounting if self._mounting is not None else attitude).as_quat().tolist()
+        return (x, y, z), (qx, qy, qz, qw)
 
     def _queue(self, time: float, picture: Picture) -> None:
         self._last = picture
@@ -115,7 +141,8 @@ class Cameras:
             for name in truth
         )
         number = settings.first_frame + self._looks - 1
-        return Picture(number, settings.rate, settings.latency, settings.y_up, bodies)
+        announced = settings.latency if settings.announced_latency is None else settings.announced_latency
+        return Picture(number, settings.rate, announced, settings.y_up, bodies)
 
     def _with_noise(self, position: Triple, quaternion: Quaternion) -> Seen:
         settings = self._settings
