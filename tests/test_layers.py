@@ -8,7 +8,7 @@ import pytest
 
 LAYERS = [
     "files", "geometry", "vehicle", "safety", "planners", "learning", "planning", "flight", "simulation",
-    "preparation", "recording", "studies", "cli",
+    "preparation", "recording", "identification", "studies", "cli",
 ]  # fmt: skip
 # Modules and rooms of a package, in order: each may import those before it. Modules not named stand together.
 MODULES = "its other modules"

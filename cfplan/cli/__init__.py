@@ -12,6 +12,7 @@ from cfplan.cli.check import check
 from cfplan.cli.dataset import dataset
 from cfplan.cli.doctor import doctor
 from cfplan.cli.fly import fly
+from cfplan.cli.identify import identify
 from cfplan.cli.mocap import mocap
 from cfplan.cli.output import print_error
 from cfplan.cli.plan import plan
@@ -39,7 +40,7 @@ def cfplan() -> None:
     """Plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
 
 
-for command in (plan, check, sim, fly, virtual, replay, report, mocap, dataset, train, bench, study, doctor):
+for command in (plan, check, sim, fly, virtual, replay, report, identify, mocap, dataset, train, bench, study, doctor):
     cfplan.add_command(command)
 
 

@@ -219,6 +219,24 @@ def link_loss(path_files: tuple[Path, ...], **given: Any) -> None:
     _measure(partial(link_losses, path_files, _safety_file), "simulating", given)
 
 
+@study.command(
+    name="identification",
+    epilog="Example: cfplan study identification flights/identify.yaml flights/figure8.yaml --vehicles 5",
+)
+@_path
+@click.argument("next_file", metavar="NEXT", type=click.Path(path_type=Path))
+@click.option("--vehicles", type=click.IntRange(1), default=30, show_default=True, help="Drawn by seeds.")
+@_seed(0, "Of the first vehicle.")
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@_output
+@options.as_json
+def identification_study(path_file: Path, next_file: Path, **given: Any) -> None:
+    """Identify drawn vehicles from one flight along PATH each, and fly NEXT with what was found."""
+    from cfplan.studies.identification import identification
+
+    _measure(partial(identification, path_file, next_file, _safety_file), "flying", given)
+
+
 @study.command(short_help="Write the tables of docs/ from results/.")
 @click.argument("folder", metavar="[REPOSITORY]", type=click.Path(path_type=Path), default=Path())
 def docs(folder: Path) -> None:

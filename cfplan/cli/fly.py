@@ -100,6 +100,8 @@ def _print_result(
         print_table("Flight", ["", "value"], _rows(prepared, outcome, summary))
         click.echo(f"record: {folder}")
         click.echo(f"replay: cfplan replay {shlex.quote(str(folder))}")
+        if summary["deviation_grows_with_speed"]:
+            click.echo("the deviation grows with speed: fly flights/identify.yaml, then `cfplan identify` its record")
     if outcome.exit_code is not ExitCode.OK:
         click.echo(f"{click.style('error:', fg='red')} {outcome.reason}", err=True)
 

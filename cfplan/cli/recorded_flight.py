@@ -15,6 +15,7 @@ from cfplan.flight.pilot.keys import Keyboard
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import Telemetry
+from cfplan.identification.advice import suggests_identification
 from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.prepare_flight import PreparedFlight
 from cfplan.recording.header import header_of_plan
@@ -44,7 +45,9 @@ def fly_and_record(
             raise
         for what, failure in failures:
             steps.failed(what, failure)
-        summary = {"uri": vehicle.uri, "outcome": outcome.to_dict(), **summarise(read_record(folder)).to_json()}
+        record = read_record(folder)
+        summary = {"uri": vehicle.uri, "outcome": outcome.to_dict(), **summarise(record).to_json()}
+        summary["deviation_grows_with_speed"] = suggests_identification(record)
         write_summary(folder, summary)
     return folder, outcome, summary
 

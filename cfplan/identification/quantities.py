@@ -1,0 +1,233 @@
+"""Quantities: the identified figures with their units and uncertainties, and what the records cannot tell."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from cfplan.identification.signals import FlightSignals
+from cfplan.identification.translation import (
+    AXIAL_DRAG,
+    BATTERY,
+    DRAG,
+    LINEAR,
+    ORIGIN,
+    THRUST,
+    FittedUnknowns,
+    FlightModel,
+    slow_voltage,
+)
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+
+# N, standard uncertainty: an accelerometer off by 0.3 m/s² steps the estimate at each pose by 3 mm/s, which the gain on
+# velocity, 0.4 N s/m, turns into thrust between the log's samples.
+_UNSEEN_THRUST = 1.2e-3
+_SOURCE = "identified from flights by cfplan identify; the rest: "
+# s: the quickest message of the log takes one, and its gyroscope's sample is as old; known to one.
+_LOG_DELAY, _LOG_DOUBT = 2e-3, 1e-3
+_TELLS_DRAG, _TELLS_LAG = 0.3, 0.02  # share of the value, s: larger uncertainties tell nothing
+_TELLS_BATTERY = 0.3  # V that the voltage must span
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifiedQuantity:
+    """One identified figure."""
+
+    name: str
+    value: float
+    deviation: float  # standard uncertainty; NaN where the records say nothing
+    unit: str
+    before: float  # what the airframe or safety.yaml said; NaN where nothing did
+    digits: int
+    untold: str = ""  # why the records cannot tell; empty where they can
+    remark: str = ""  # what else to know
+    scale: float = 1.0  # from SI to the unit
+
+    def row(self) -> list[str]:
+        """Return name, value with uncertainty, what was assumed before, and a remark, for people."""
+        doubt = f" ± {self.scale * self.deviation:.{self.digits}f}" if math.isfinite(self.deviation) else ""
+        before = f"{self.scale * self.before:.{self.digits}f}" if math.isfinite(self.before) else "–"
+        return [
+            self.name,
+            f"{self.scale * self.value:.{self.digits}f}{doubt} {self.unit}",
+            before,
+            self.untold or self.remark,
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it in SI units."""
+        numbers = {"value": self.value, "standard_uncertainty": self.deviation, "before": self.before}
+        known = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+        return {**known, "untold": self.untold, "remark": self.remark}
+
+
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """What the records say of one vehicle."""
+
+    airframe: Airframe  # with what was told; the rest as before
+    pose_latency: float  # s, from exposure to the pilot: `pose.latency` of safety.yaml
+    quantities: dict[str, IdentifiedQuantity]
+    notes: tuple[str, ...]  # what no record can tell, and what was held
+    misfit: float  # m rms, of predictions over a second
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything but the airframe, in SI units; what is not known is None."""
+        quantities = {name: quantity.to_dict() for name, quantity in self.quantities.items()}
+        return {"quantities": quantities, "notes": list(self.notes), "misfit": self.misfit}
+
+
+def assemble(
+    models: Sequence[FlightModel], solution: FittedUnknowns, *, mass: float | None, voltage: float
+) -> Identification:
+    """Return the figures of a fit, and the airframe with those that the records tell."""
+    before = models[0].signals.airframe
+    found = _dynamics(solution, before, mass) | _latencies(models, solution) | _geometry(models, solution)
+    found["thrust per volt"] = _battery(models, solution, voltage)
+
+    def told(name: str, otherwise: float) -> float:
+        return otherwise if found[name].untold else found[name].value
+
+    scale = found["thrust scale"].value
+    airframe = replace(
+        before,
+        name=f"{before.name.removesuffix(', identified')}, identified",
+        mass=found["mass"].value,
+        motor_thrust_min=before.motor_thrust_min * scale,
+        motor_thrust_max=before.motor_thrust_max * scale,
+        motor_time_constant=told("motor lag", before.motor_time_constant),
+        drag=(max(told("drag", before.drag[0]), 0.0), max(told("axial drag", before.drag[1]), 0.0)),
+        source=_SOURCE + before.source.removeprefix(_SOURCE),
+    )
+    return Identification(airframe, found["pose latency"].value, found, _notes(mass, before), solution.rms)
+
+
+def _dynamics(solution: FittedUnknowns, before: Airframe, mass: float | None) -> dict[str, IdentifiedQuantity]:
+    linear, covariance = solution.linear, solution.covariance
+    thrust = float(np.linalg.norm(linear[THRUST]))
+    direction = linear[THRUST] / thrust
+    doubt = math.sqrt(direction @ covariance[THRUST, THRUST] @ direction) / thrust
+    doubt = math.hypot(doubt, _UNSEEN_THRUST / (before.mass * GRAVITY))
+    weight = before.mass if mass is None else mass
+    ratio = thrust / (before.motor_thrust_max / before.mass)
+    scale = thrust * weight / before.motor_thrust_max
+    held = "held: flying tells only thrust over mass; weigh it and give --mass" if mass is None else ""
+    lag, lag_doubt = solution.lag, math.sqrt(covariance[LINEAR, LINEAR])
+    drags = {}
+    for name, place, old in (("drag", DRAG, before.drag[0]), ("axial drag", AXIAL_DRAG, before.drag[1])):
+        value, doubt_of_drag = weight * linear[place], weight * math.sqrt(covariance[place, place])
+        vague = doubt_of_drag > _TELLS_DRAG * max(abs(value), 0.2 * old) or value < 0.0
+        why = "too vague, kept as before: fly faster, or longer" if vague else ""
+        drags[name] = IdentifiedQuantity(name, float(value), doubt_of_drag, "mN s/m", old, 2, why, scale=1e3)
+    vague = "too vague, kept as before: climb and sink more sharply" if lag_doubt > _TELLS_LAG else ""
+    remark = "with the mass as it is" if held else ""
+    return {
+        "thrust over mass": IdentifiedQuantity("thrust over mass, of before", ratio, ratio * doubt, "", 1.0, 4),
+        "mass": IdentifiedQuantity("mass", weight, math.nan, "g", before.mass, 2, held, scale=1e3),
+        "thrust scale": IdentifiedQuantity("thrust scale", scale, scale * doubt, "", 1.0, 4, remark=remark),
+        "motor lag": IdentifiedQuantity(
+            "motor lag", lag, lag_doubt, "ms", before.motor_time_constant, 1, vague, scale=1e3
+        ),
+        **drags,
+    }
+
+
+def _latencies(models: Sequence[FlightModel], solution: FittedUnknowns) -> dict[str, IdentifiedQuantity]:
+    variances = np.diag(solution.covariance)[LINEAR + 1 :].reshape(-1, 3)
+    behind = np.array([model.signals.behind for model in models])
+    pose, pose_doubt = _mean(behind + solution.times[:, 0] + _LOG_DELAY, variances[:, 0])
+    link, link_doubt = _mean(solution.times[:, 1], variances[:, 1])
+    return {
+        "pose latency": IdentifiedQuantity(
+            "pose latency", pose, math.hypot(pose_doubt, _LOG_DOUBT), "ms", float(behind.mean()), 1, scale=1e3
+        ),
+        "link latency": IdentifiedQuantity(
+            "link latency, to the vehicle", link, link_doubt, "ms", math.nan, 1, scale=1e3
+        ),
+    }
+
+
+def _geometry(models: Sequence[FlightModel], solution: FittedUnknowns) -> dict[str, IdentifiedQuantity]:
+    """Return how the markers' body is turned and where its origin is, and where the centre of mass is."""
+    mountings = np.array([model.attitude.mounting for model in models])
+    doubts = np.array([model.attitude.mounting_deviation for model in models])
+    yaw, yaw_doubt = _mean(mountings[:, 2], doubts[:, 2] ** 2)
+    thrust = solution.linear[THRUST]
+    size = float(np.linalg.norm(thrust))
+    # The thrust axis in the markers' axes, turned about z into the vehicle's: n ≈ (−pitch, roll, 1).
+    direction = Rotation.from_rotvec([0.0, 0.0, yaw]).apply(thrust / size)
+    tilt_doubt = np.sqrt(np.diag(solution.covariance)[THRUST]) / size
+    found = {}
+    for name, value, doubt in (
+        ("roll", direction[1], float(tilt_doubt[1])),
+        ("pitch", -direction[0], float(tilt_doubt[0])),
+        ("yaw", yaw, yaw_doubt),
+    ):
+        found[f"mounting {name}"] = IdentifiedQuantity(
+            f"markers turned, {name}", float(value), doubt, "°", 0.0, 2, scale=math.degrees(1.0)
+        )
+    for axis, place in zip("xyz", range(ORIGIN.start, ORIGIN.stop), strict=True):
+        doubt = math.sqrt(solution.covariance[place, place])
+        found[f"origin {axis}"] = IdentifiedQuantity(
+            f"markers' origin, {axis} from centre of mass",
+            float(solution.linear[place]),
+            doubt,
+            "mm",
+            0.0,
+            1,
+            scale=1e3,
+        )
+    centre, spread = _centre_of_mass([model.signals for model in models])
+    for axis, value, doubt in zip("xy", centre, spread, strict=True):
+        found[f"centre of mass {axis}"] = IdentifiedQuantity(
+            f"centre of mass, {axis} from the motors' middle", float(value), float(doubt), "mm", 0.0, 2,
+            remark="or motors that differ as much", scale=1e3,
+        )  # fmt: skip
+    return found
+
+
+def _centre_of_mass(flights: Sequence[FlightSignals]) -> tuple[NDArray, NDArray]:
+    """Return where, (2,) m, the motors' thrusts balance on average, and how sure that is, from means of a second."""
+    means = []
+    for flight in flights:
+        arm = flight.airframe.arm
+        # Motors 1 front right, 2 back right, 3 back left, 4 front left.
+        lever = arm * np.column_stack([flight.command @ [1, -1, -1, 1], flight.command @ [-1, -1, 1, 1]])
+        inside = (flight.status_time > 0) & (flight.status_time < flight.duration)
+        second = np.floor(flight.status_time).astype(int)
+        for number in np.unique(second[inside]):
+            rows = inside & (second == number)
+            means.append(lever[rows].sum(axis=0) / max(flight.collective[rows].sum(), 1e-9))
+    values = np.array(means)
+    return values.mean(axis=0), values.std(axis=0, ddof=1) / math.sqrt(len(values))
+
+
+def _battery(models: Sequence[FlightModel], solution: FittedUnknowns, voltage: float) -> IdentifiedQuantity:
+    nominal = float(np.linalg.norm(solution.linear[THRUST]))
+    value = float(solution.linear[BATTERY]) / nominal
+    doubt = math.sqrt(solution.covariance[BATTERY, BATTERY]) / nominal
+    volts = np.concatenate([slow_voltage(model.signals) for model in models])
+    span = float(np.ptp(volts))
+    untold = f"the voltage spanned {span:.2f} V: fly full and nearly empty" if span < _TELLS_BATTERY else ""
+    return IdentifiedQuantity(f"thrust per volt, at {voltage:.2f} V", value, doubt, "%/V", 0.0, 1, untold, scale=100.0)
+
+
+def _notes(mass: float | None, before: Airframe) -> tuple[str, ...]:
+    always = ("not told by these records: inertia, yaw torque per thrust, rotor reaction; as in the airframe before",)
+    if mass is not None:
+        return (f"mass {1e3 * mass:.2f} g as given; thrust and drag follow from it", *always)
+    return (
+        f"mass held at {1e3 * before.mass:.2f} g: motion is the same if mass, thrust, drag and inertia all grow by one "
+        "factor, so a record tells only their ratios; flights need no more",
+        *always,
+    )
+
+
+def _mean(values: NDArray, variances: NDArray) -> tuple[float, float]:
+    """Return the mean weighted by certainty, and its standard uncertainty."""
+    weights = 1.0 / np.maximum(variances, 1e-18)
+    return float(values @ weights / weights.sum()), float(1.0 / math.sqrt(weights.sum()))
