@@ -223,7 +223,7 @@ def _write(file: Path, content: bytes) -> None:
 
 
 def _read(folder: Path, part: str, schema: pa.Schema) -> pa.Table:
-    files = sorted((folder / part).glob("*.parquet"))
+    files = sorted(file for file in (folder / part).glob("*.parquet") if file.is_file())
     if not files:
         raise InputError("no rows yet", where=str(folder), hint="give `cfplan dataset make` again to go on")
     tables = []

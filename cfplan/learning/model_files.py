@@ -108,12 +108,10 @@ def load_card(folder: Path) -> Card:
         InputError: no card, one that cannot be read, or of another format or version of the features.
     """
     file = folder / CARD
+    if not file.is_file():  # a pipe would be waited for
+        raise InputError(f"no model: {CARD} is missing", where=str(folder), hint="train one with `cfplan train`")
     try:
         text = json.loads(file.read_bytes())
-    except FileNotFoundError:
-        raise InputError(
-            f"no model: {CARD} is missing", where=str(folder), hint="train one with `cfplan train`"
-        ) from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"cannot be read: {error}", where=str(file), hint=_RESTORE) from None
     if not isinstance(text, dict) or text.get("format") != FORMAT:
@@ -145,6 +143,8 @@ def load_model(folder: Path, airframe: Airframe | None = None) -> Model:
 
     card = load_card(folder)
     where = str(folder / WEIGHTS)
+    if not (folder / WEIGHTS).is_file():
+        raise InputError("no such file", where=where, hint=_RESTORE)
     try:
         content = (folder / WEIGHTS).read_bytes()
     except OSError as error:

@@ -201,6 +201,8 @@ def _columns(topic: Any, payloads: list[bytes], file: Path) -> Any:
 
 
 def _summary(folder: Path) -> Mapping[str, Any]:
+    if not (folder / SUMMARY_FILE).is_file():
+        return {}
     try:
         summary = whole_characters(json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")))
     except (OSError, ValueError, RecursionError):

@@ -477,11 +477,15 @@ def _vehicle(_: Path) -> Any:
     return SimpleNamespace(link=None, driver=None, heard=[], tracebacks=None)
 
 
+_MOST_THREADS = 40  # cflib has one for each packet that it repeats until it is answered, and some never are
 _CONNECTED: Any = None  # the link that all inputs share: connecting takes longer than an input
 
 
 def _connected() -> Any:
     global _CONNECTED
+    if _CONNECTED is not None and threading.active_count() > _MOST_THREADS:
+        _CONNECTED.link._crazyflie.link = None  # which ends its threads
+        _CONNECTED = None
     if _CONNECTED is None or _CONNECTED.link.lost:
         logger = logging.getLogger("cflib")
         logger.propagate = False
