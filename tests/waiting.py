@@ -7,9 +7,9 @@ PATIENCE = 60.0  # s of the computer's time, spent only where something never ha
 _LOOK_PERIOD = 0.005  # s
 
 
-def until(condition: Callable[[], object]) -> bool:
+def until(condition: Callable[[], object], patience: float = PATIENCE) -> bool:
     """Wait for a condition; return whether it came."""
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + patience
     while not condition():
         if time.monotonic() > end:
             return False

@@ -3,10 +3,10 @@
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from waiting import until
 
 from cfplan.cli import warm_up
 from cfplan.preparation.compiled_calls import Stage
@@ -54,10 +54,7 @@ def test_what_a_first_plan_needed_is_compiled_behind_it(tmp_path):
     compiled, done = run(PLAN, tmp_path)
     assert compiled == []
     assert "planning without machine code, which is compiled meanwhile" in done.stdout
-    latest = time.monotonic() + 200.0
-    while not list(tmp_path.glob("ready-plan-*")):
-        assert time.monotonic() < latest
-        time.sleep(0.5)
+    assert until(lambda: list(tmp_path.glob("ready-plan-*")), 200.0)
     compiled, done = run(PLAN, tmp_path)
     assert compiled == []
     assert "without machine code" not in done.stdout

@@ -3,13 +3,13 @@
 import queue
 import struct
 import threading
-import time
 
 import pytest
 from cflib import crtp
 from cflib.crtp.crtpdriver import CRTPDriver
 from cflib.crtp.crtpstack import CRTPPacket
 from cflib.crtp.exceptions import WrongUriType
+from waiting import PATIENCE, a_moment, until
 
 from cfplan.errors import LinkError
 from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES
@@ -19,7 +19,6 @@ from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import Port, pack
 from cfplan.vehicle.airframes import AIRFRAMES
 
-_PATIENCE = 60.0  # s for what takes a moment on an idle computer
 _STEP = 10  # ms of the vehicle's time at each look for a packet
 NAMES = [rule.name for rule in PARAMETER_RULES]
 
@@ -49,7 +48,7 @@ class DirectDriver(CRTPDriver):
         try:
             datagram = self._came.get_nowait()
         except queue.Empty:
-            time.sleep(0.001)
+            a_moment(0.001)
             return None
         return CRTPPacket(datagram[0], datagram[1:])
 
@@ -67,7 +66,7 @@ def open_link(**settings):
     vehicle.advance(_STEP)  # compiles if need be, for which nothing waits
     driver = type("Driver", (DirectDriver,), {"vehicle": vehicle})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(connection, "FIRST_ANSWER", _PATIENCE)
+        patch.setattr(connection, "FIRST_ANSWER", PATIENCE)
         patch.setattr(crtp, "CLASSES", [driver])
         link = connection.connect("direct://0", lambda message: None, [driver])
         yield link, driver
@@ -88,21 +87,21 @@ def older():
 def test_every_parameter_of_the_table_is_read(newest):
     link, driver = newest
     on_board = {name: driver.vehicle.parameters[name] for name in NAMES}
-    assert link.read_parameters(NAMES, _PATIENCE) == pytest.approx(on_board)
+    assert link.read_parameters(NAMES, PATIENCE) == pytest.approx(on_board)
 
 
 def test_what_an_older_firmware_lacks_is_left_out(older):
     link, _ = older
     lacking = {"kalman.dragB_x", "kalman.dragB_y", "supervisor.crashDetectGs"}
-    assert set(NAMES) - set(link.read_parameters(NAMES, _PATIENCE)) == lacking
+    assert set(NAMES) - set(link.read_parameters(NAMES, PATIENCE)) == lacking
     assert not link.has_log_variable("ctrltarget.mode_roll")
 
 
 def test_a_value_is_the_vehicles_of_now_not_that_of_connecting(newest):
     link, driver = newest
-    assert link.read_parameters(["colAv.enable"], _PATIENCE) == {"colAv.enable": 0}
+    assert link.read_parameters(["colAv.enable"], PATIENCE) == {"colAv.enable": 0}
     driver.vehicle.parameters["colAv.enable"] = 1
-    assert link.read_parameters(["colAv.enable"], _PATIENCE) == {"colAv.enable": 1}
+    assert link.read_parameters(["colAv.enable"], PATIENCE) == {"colAv.enable": 1}
 
 
 def test_a_vehicle_that_falls_silent_is_an_error(newest):
@@ -113,21 +112,14 @@ def test_a_vehicle_that_falls_silent_is_an_error(newest):
     driver.silent = False
 
 
-def wait_until(condition):
-    end = time.monotonic() + _PATIENCE
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.01)
-    return condition()
-
-
 @pytest.mark.parametrize("vehicle", ["newest", "older"])
 def test_a_setpoint_of_another_client_is_seen_and_its_end_too(request, vehicle):
     link, driver = request.getfixturevalue(vehicle)
     link.start_logs()
-    assert wait_until(lambda: link.status is not None)
+    assert until(lambda: link.status is not None)
     assert not link.has_setpoint
     driver.vehicle.receive(pack(Port.SETPOINT, 0, struct.pack("<Bffff", 7, 0.5, 0.5, 0.4, 0.0)))
-    assert wait_until(lambda: link.has_setpoint)
+    assert until(lambda: link.has_setpoint)
     link.release_priority()
-    assert wait_until(lambda: not link.has_setpoint)
+    assert until(lambda: not link.has_setpoint)
     link.stop_preflight_logs()
