@@ -118,8 +118,13 @@ def test_a_setpoint_of_another_client_is_seen_and_its_end_too(request, vehicle):
     link.start_logs()
     assert until(lambda: link.status is not None)
     assert not link.has_setpoint
-    driver.vehicle.receive(pack(Port.SETPOINT, 0, struct.pack("<Bffff", 7, 0.5, 0.5, 0.4, 0.0)))
-    assert until(lambda: link.has_setpoint)
+    setpoint = pack(Port.SETPOINT, 0, struct.pack("<Bffff", 7, 0.5, 0.5, 0.4, 0.0))
+
+    def seen():
+        driver.vehicle.receive(setpoint)  # again, as it lasts for a moment only
+        return link.has_setpoint
+
+    assert until(seen)
     link.release_priority()
     assert until(lambda: not link.has_setpoint)
     link.stop_preflight_logs()
