@@ -1,0 +1,187 @@
+"""Glitch margin: what a gap in setpoints, in poses, or in both does to the flight, beginning at any setpoint.
+
+The flight is simulated once, as in the dry run, and branches off at each setpoint. Through the gap the vehicle keeps
+its last setpoint; without poses it flies on by gyroscope and accelerometer, and what its attitude is wrong by makes its
+estimate drift. Then everything comes again: setpoints as far on as the clock is, and poses. The vehicle is lost where
+it then strays so far that the pilot would cut its motors, or leans so far that it turns over.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.flight.firmware import gains_for
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.packets import decode
+from cfplan.machine_code import njit
+from cfplan.safety.limits import Limits
+from cfplan.simulation.dynamics.body import (
+    FULL_EFFICIENCY,
+    STATE_SIZE,
+    STILL_AIR,
+    THRUST_MAX,
+    TIME_STEP,
+    hovering,
+    pack_body,
+    step_body,
+)
+from cfplan.simulation.dynamics.mellinger import (
+    CONTROL_PERIOD,
+    FULL_COMMAND,
+    FULL_STATE,
+    MEMORY_SIZE,
+    SETPOINT_SIZE,
+    distribute_power,
+    step_controller,
+)
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import yaw_of
+
+GAP = 0.2  # s without setpoints, without poses
+AFTERWARDS = 1.0  # s that are simulated after the gap
+TURNED_OVER = math.radians(80.0)  # of tilt
+KINDS = ("setpoints", "poses", "setpoints and poses")
+_STEP = CONTROL_PERIOD  # s, of the simulation from the gap on: motors saturate, which 4 ms show too mildly
+_MEMORY, _THRUSTS = STATE_SIZE, STATE_SIZE + MEMORY_SIZE  # where they lie behind the state
+_SIZE = _THRUSTS + 4
+_STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)
+
+
+@dataclass(frozen=True, slots=True)
+class GlitchMoments:
+    """What a gap of GAP s that begins at each setpoint does, for each of KINDS."""
+
+    time: NDArray  # (N,) s of each setpoint from the first
+    deviation: NDArray  # (3, N) m, worst from the setpoints that are due, from the gap on
+    tilt: NDArray  # (3, N) rad, worst from the gap on
+    lost: NDArray  # (3, N) bool, whether the vehicle is lost
+
+    @property
+    def worst(self) -> tuple[str, int]:
+        """Return the kind of gap and the setpoint after which the vehicle strays farthest."""
+        kind, number = np.unravel_index(np.argmax(np.nan_to_num(self.deviation, nan=np.inf)), self.deviation.shape)
+        return KINDS[int(kind)], int(number)
+
+    def __str__(self) -> str:
+        kind, number = self.worst
+        row = KINDS.index(kind)
+        return (
+            f"a gap of {GAP:g} s in {kind} at {self.time[number]:.2f} s takes the vehicle "
+            f"{self.deviation[row, number]:.2f} m off, at a tilt of {np.degrees(self.tilt[row, number]):.0f}°"
+            f"{'; it is lost' if self.lost.any() else ''}"
+        )
+
+
+def glitch_at_every_setpoint(
+    payloads: NDArray, limits: Limits, rate: float = RATE, *, gap: float = GAP
+) -> GlitchMoments:
+    """Let a gap, s, begin at each setpoint of a flight that begins in hover, (N, 29) uint8 at `rate`, Hz."""
+    state, airframe = decode(payloads), limits.airframe
+    rows = np.zeros((len(payloads), SETPOINT_SIZE))
+    rows[:, 0:16] = np.hstack([state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate])
+    arrivals = np.round(np.arange(len(payloads) + 1) / (rate * TIME_STEP)).astype(np.int64)
+    start = np.zeros(_SIZE)
+    start[:STATE_SIZE] = hovering(airframe, state.position[0], float(yaw_of(state.quaternion[0])))
+    start[_THRUSTS:] = airframe.hover_thrust
+    deviation, tilt = np.empty((3, len(payloads))), np.empty((3, len(payloads)))
+    _fly(
+        deviation, tilt, rows, arrivals, start, gains_for(airframe).pack(), pack_body(airframe, floor=-np.inf),
+        pack_body(airframe, floor=-np.inf, step=_STEP), round(gap / _STEP), round((gap + AFTERWARDS) / _STEP), rate,
+        GRAVITY * math.tan(limits.link_loss.attitude_error),
+    )  # fmt: skip
+    kept = (deviation < limits.flight.deviation.cut) & (tilt < TURNED_OVER)
+    return GlitchMoments(np.arange(len(payloads)) / rate, deviation, tilt, ~kept)
+
+
+@njit
+def _fly(
+    deviation: NDArray,
+    tilt: NDArray,
+    setpoints: NDArray,
+    arrivals: NDArray,
+    start: NDArray,
+    gains: NDArray,
+    body: NDArray,
+    later_body: NDArray,
+    gap: int,
+    steps: int,
+    rate: float,
+    push: float,
+) -> None:
+    """Fly the setpoints, and branch off at each, for each kind of gap."""
+    now, branch, believed = start.copy(), start.copy(), np.empty(STATE_SIZE)
+    control, motors = np.zeros(4), np.zeros(4)
+    for newest in range(len(setpoints)):
+        for kind in range(3):
+            for k in range(_SIZE):
+                branch[k] = now[k]
+            deviation[kind, newest], tilt[kind, newest] = _fly_gap(
+                branch, believed, newest, setpoints, kind != 1, kind != 0, gains, later_body, gap, steps, rate, push
+            )
+        for step in range(arrivals[newest], arrivals[newest + 1]):
+            if step % _STEPS_A_CONTROL == 0:
+                _control(now, now, control, motors, gains, setpoints[newest], body, CONTROL_PERIOD)
+            step_body(now[:STATE_SIZE], now[_THRUSTS:], body, STILL_AIR, FULL_EFFICIENCY)
+
+
+@njit
+def _fly_gap(
+    now: NDArray,
+    believed: NDArray,
+    newest: int,
+    setpoints: NDArray,
+    no_setpoints: bool,
+    no_poses: bool,
+    gains: NDArray,
+    body: NDArray,
+    gap: int,
+    steps: int,
+    rate: float,
+    push: float,
+) -> tuple[float, float]:
+    """Fly on through a gap; return the worst deviation, m, and tilt, rad, from there on."""
+    control, motors = np.zeros(4), np.zeros(4)
+    farthest, least_lift = 0.0, 1.0
+    speed = math.sqrt(now[3] ** 2 + now[4] ** 2)
+    ahead_x, ahead_y = (now[3] / speed, now[4] / speed) if speed > 0.0 else (1.0, 0.0)
+    for step in range(steps):
+        due = min(newest + int(step * _STEP * rate + 1e-9), len(setpoints) - 1)
+        told = newest if no_setpoints and step < gap else due
+        for k in range(STATE_SIZE):
+            believed[k] = now[k]
+        if no_poses and step < gap:
+            time = step * _STEP  # the estimate falls behind the motion, by what its wrong attitude makes it miss
+            believed[0] -= 0.5 * push * time * time * ahead_x
+            believed[1] -= 0.5 * push * time * time * ahead_y
+            believed[3] -= push * time * ahead_x
+            believed[4] -= push * time * ahead_y
+        _control(now, believed, control, motors, gains, setpoints[told], body, _STEP)
+        step_body(now[:STATE_SIZE], now[_THRUSTS:], body, STILL_AIR, FULL_EFFICIENCY)
+        away = 0.0
+        for k in range(3):
+            away += (now[k] - setpoints[due, k]) ** 2
+        if not away <= farthest:
+            farthest = away
+        lift = 1.0 - 2.0 * (now[6] * now[6] + now[7] * now[7])
+        if not lift >= least_lift:
+            least_lift = lift
+    return math.sqrt(farthest), math.acos(min(max(least_lift, -1.0), 1.0))
+
+
+@njit
+def _control(
+    now: NDArray,
+    believed: NDArray,
+    control: NDArray,
+    motors: NDArray,
+    gains: NDArray,
+    setpoint: NDArray,
+    body: NDArray,
+    period: float,
+) -> None:
+    step_controller(control, now[_MEMORY:_THRUSTS], gains, setpoint, FULL_STATE, believed, period)
+    distribute_power(control, motors)
+    for k in range(4):
+        now[_THRUSTS + k] = motors[k] * (body[THRUST_MAX] / FULL_COMMAND)

@@ -1,0 +1,82 @@
+"""A gap in setpoints, poses or both: against the dry run's own loop, and in limit cases."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.flight.setpoints.packets import decode, encode
+from cfplan.preparation.prepare_flight import prepare_mission
+from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.dynamics.body import hovering
+from cfplan.simulation.dynamics.closed_loop import fly_setpoints
+from cfplan.simulation.glitches import AFTERWARDS, GAP, KINDS, glitch_at_every_setpoint
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def limits():
+    return load_limits(REPOSITORY / "safety.yaml")
+
+
+@pytest.fixture(scope="module")
+def line(limits):
+    return prepare_mission(REPOSITORY / "flights" / "line.yaml", limits).payloads
+
+
+@pytest.fixture(scope="module")
+def found(line, limits):
+    return glitch_at_every_setpoint(line, limits)
+
+
+@pytest.mark.parametrize("number", [0, 57, 120, 301])
+def test_a_gap_in_setpoints_does_what_the_dry_run_says_of_a_flight_with_that_gap(found, line, limits, number):
+    rows = np.arange(len(line))
+    held = np.where((rows > number) & (rows < number + round(100 * GAP)), number, rows)
+    start = hovering(limits.airframe, decode(line).position[0])
+    end = number / 100 + GAP + AFTERWARDS
+    flown = fly_setpoints(decode(line[held]), rows / 100, limits.airframe, start, duration=end, floor=-np.inf)
+    since = np.arange(10 * number, round(1000 * end))
+    due = decode(line).position[np.minimum(since // 10, len(line) - 1)]
+    off = np.linalg.norm(flown.position[since] - due, axis=1).max()
+    x, y = flown.quaternion[since, 0], flown.quaternion[since, 1]
+    assert found.deviation[0, number] == pytest.approx(off, rel=0.03, abs=0.005)
+    assert found.tilt[0, number] == pytest.approx(np.arccos(1 - 2 * (x * x + y * y)).max(), abs=np.radians(2.0))
+
+
+def test_a_flight_without_a_gap_stays_on_its_setpoints(line, limits):
+    without = glitch_at_every_setpoint(line, limits, gap=0.0)
+    assert without.deviation.max() < 0.03
+    assert not without.lost.any()
+
+
+def test_the_longer_the_gap_the_farther_off(line, limits, found):
+    longer = glitch_at_every_setpoint(line, limits, gap=0.3)
+    assert longer.deviation[0].max() > 1.5 * found.deviation[0].max()
+    assert found.deviation.shape == found.tilt.shape == found.lost.shape == (len(KINDS), len(line))
+
+
+def test_without_poses_a_wrong_attitude_carries_the_vehicle_off(line, limits):
+    def poses_missing(degrees):
+        wrong = replace(limits, link_loss=replace(limits.link_loss, attitude_error=np.radians(degrees)))
+        return glitch_at_every_setpoint(line, wrong).deviation[1]
+
+    right, wrong = poses_missing(0.0), poses_missing(3.0)
+    assert right.max() < 0.03
+    assert 0.005 < (wrong - right).max() < 0.1  # 0.5 m/s² for 0.2 s is 1 cm, and 10 cm/s to be taken back
+
+
+def test_a_vehicle_that_turns_over_is_lost(line, limits):
+    told = decode(line)
+    told.body_rate[:, 0] += 9.0
+    tumbling = glitch_at_every_setpoint(encode(told)[:120], limits)
+    assert tumbling.lost.any()
+    assert "it is lost" in str(tumbling)
+
+
+def test_line_takes_a_gap(found):
+    assert not found.lost.any()
+    kind, number = found.worst
+    assert f"{found.deviation[KINDS.index(kind), number]:.2f} m off" in str(found)
