@@ -3,6 +3,7 @@
 import os
 import platform
 import sys
+from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import click
 from cfplan import __version__
 from cfplan.cli import options
 from cfplan.cli.output import print_json, print_table
+from cfplan.cli.vehicle import SIMULATED
 from cfplan.errors import CfplanError
 
 NEEDED = ("numpy", "scipy", "numba", "casadi", "cflib", "pydantic", "mcap", "pyarrow", "rerun-sdk")
@@ -25,8 +27,9 @@ OPTIONAL = {
 @click.command(short_help="Versions, packages, machine code, radio.", epilog="Example: cfplan doctor --json")
 @click.option("--warm-up", "warm", is_flag=True, help="Compile everything that flights need, on all processors, first.")
 @click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="safety.yaml; else the nearest above.")
+@click.option("--uri", help="A vehicle: what preflight would say of its firmware and settings. Nothing is changed.")
 @options.as_json
-def doctor(warm: bool, safety_file: Path | None, as_json: bool) -> int:
+def doctor(warm: bool, safety_file: Path | None, uri: str | None, as_json: bool) -> int:
     """Show versions, packages, compiled functions and the radio, and what is missing."""
     if warm:
         from cfplan.cli.warm_up import warm_up
@@ -39,8 +42,9 @@ def doctor(warm: bool, safety_file: Path | None, as_json: bool) -> int:
         _machine_code(),
         _priority(),
         _radio(),
+        *(_vehicle(uri, safety_file) if uri else ()),
     ]
-    missing = [check for check in checks if check["verdict"] == "missing"]
+    missing = [check for check in checks if check["verdict"] in ("missing", "refused")]
     if as_json:
         print_json({"cfplan": __version__, "checks": checks, "ok": not missing})
     else:
@@ -106,3 +110,34 @@ def _radio() -> dict[str, str]:
         return _check("radio", f"{len(find_radios())} Crazyradio")
     except CfplanError as error:
         return _check("radio", error.what, "optional", f"{error.hint}; sim:// flies without")
+
+
+def _vehicle(uri: str, safety_file: Path | None) -> list[dict[str, str]]:
+    """Return what preflight would say of a vehicle's firmware and settings. Raises LinkError, InputError."""
+    from cfplan.flight.pilot.vehicle_survey import survey_vehicle
+    from cfplan.flight.radio.connection import connect
+    from cfplan.flight.radio.uri import check_vehicle_uri
+    from cfplan.safety.limits_file import load_limits
+
+    check_vehicle_uri(uri)
+    limits = load_limits(options.find_safety_file(safety_file, Path.cwd()))
+    with ExitStack() as opened:
+        drivers: list[type] = []
+        if uri.startswith(SIMULATED):
+            from cfplan.simulation.lab.lab import launch_lab
+            from cfplan.simulation.lab.sim_driver import SimDriver
+
+            opened.enter_context(launch_lab(limits.airframe, number=int(uri.removeprefix(SIMULATED)))).wait()
+            drivers = [SimDriver]
+        link = connect(uri, lambda message: None, drivers)
+        opened.callback(link.close)
+        found = survey_vehicle(link, limits)
+    return [
+        _check(
+            check.name,
+            f"{check.value}; {check.threshold}" if check.passed else f"{check.value}, must be {check.threshold}",
+            "ok" if check.passed else "refused",
+            check.hint,
+        )
+        for check in found
+    ]

@@ -11,10 +11,11 @@ from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Check
-from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, Traffic
+from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, ParameterRule, Traffic
 from cfplan.flight.radio.supervisor_bits import FAULTS, FLYING
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Estimate, VehicleStatus
+from cfplan.safety.limits import Limits
 from cfplan.vehicle.rotations import yaw_of
 
 OLDEST_PROTOCOL = 8  # the first with go-to as it is sent here
@@ -58,10 +59,13 @@ def check_protocol(snapshot: PreflightSnapshot) -> Check:
 
 
 def check_firmware(snapshot: PreflightSnapshot) -> Check:
-    oldest = snapshot.mission.limits.firmware.oldest
-    found = version_of(snapshot.firmware)
+    return firmware_check(snapshot.firmware, snapshot.mission.limits)
+
+
+def firmware_check(firmware: str, limits: Limits) -> Check:
+    oldest, found = limits.firmware.oldest, version_of(firmware)
     return Check(
-        "firmware", snapshot.firmware or "unknown", "≥ " + version_text(oldest), bool(found) and found >= oldest,
+        "firmware", firmware or "unknown", "≥ " + version_text(oldest), bool(found) and found >= oldest,
         "update the vehicle's firmware: older filters go wrong with yaw beyond 90°",
     )  # fmt: skip
 
@@ -98,8 +102,12 @@ def check_endurance(snapshot: PreflightSnapshot) -> Check:
 
 
 def check_timeouts(snapshot: PreflightSnapshot) -> Check:
-    """The certificate of link loss rests on the supervisor's time-outs, which the vehicle does not tell."""
-    version, assumed = version_of(snapshot.firmware), Timeouts()
+    return timeouts_check(snapshot.firmware)
+
+
+def timeouts_check(firmware: str) -> Check:
+    """Compare the supervisor's time-outs, which no vehicle tells, with those that link loss is certified with."""
+    version, assumed = version_of(firmware), Timeouts()
     try:
         found = timeouts_of(version)
     except ValueError:
@@ -115,21 +123,21 @@ def check_timeouts(snapshot: PreflightSnapshot) -> Check:
 
 def check_parameters(snapshot: PreflightSnapshot) -> tuple[Check, ...]:
     """A line for each group of the table whose parameters are all right, and for each parameter that is wrong."""
-    limits = snapshot.mission.limits
     found: list[Check] = []
     for group, rules in PARAMETER_GROUPS.items():
-        wrong = [rule for rule in rules if not rule.accepts(snapshot.parameters.get(rule.name), limits)]
-        if not wrong:
-            found.append(Check(group, f"{len(rules)} in order", "as docs/preflight.md lists them", True))
-        for rule in wrong:
-            value = snapshot.parameters.get(rule.name)
-            found.append(
-                Check(
-                    rule.name, "missing" if value is None else f"{value:g}", rule.threshold(limits), False,
-                    f"{rule.hint}. {rule.reason}",
-                )
-            )  # fmt: skip
+        checks = [check_rule(rule, snapshot.parameters.get(rule.name), snapshot.mission.limits) for rule in rules]
+        wrong = [check for check in checks if not check.passed]
+        found += wrong or [Check(group, f"{len(rules)} in order", "as docs/preflight.md lists them", True)]
     return tuple(found)
+
+
+def check_rule(rule: ParameterRule, value: float | None, limits: Limits) -> Check:
+    """Check one parameter; None if the vehicle lacks it."""
+    passed = rule.accepts(value, limits)
+    return Check(
+        rule.name, "missing" if value is None else f"{value:g}", rule.threshold(limits), passed,
+        "" if passed else f"{rule.hint}. {rule.reason}",
+    )  # fmt: skip
 
 
 def check_commanders(snapshot: PreflightSnapshot) -> Check:

@@ -69,9 +69,16 @@ class ParameterRule:
 
     def threshold(self, limits: Limits) -> str:
         """Return what is allowed, in figures and in words."""
-        figures = " or ".join(dict.fromkeys(_figures(interval) for interval in self.allowed(limits)[-2:]))
+        intervals = self.allowed(limits)
+        figures = " or ".join(
+            _figures(each) for each in intervals if not any(_within(each, wide) for wide in intervals)
+        )
         words = self.wanted.replace("`", "")
         return f"{figures} ({words})" if any(map(str.isalpha, words)) else figures
+
+
+def _within(interval: Interval, wide: Interval) -> bool:
+    return interval != wide and wide[0] <= interval[0] and interval[1] <= wide[1]
 
 
 def _figures(interval: Interval) -> str:
