@@ -237,6 +237,20 @@ def identification_study(path_file: Path, next_file: Path, **given: Any) -> None
     _measure(partial(identification, path_file, next_file, _safety_file), "flying", given)
 
 
+@study.command(epilog="Example: cfplan study giving-way flights/*.yaml -o results/giving-way.json")
+@_paths
+@click.option("--random", "paths", type=click.IntRange(0), default=200, show_default=True, help="Random paths besides.")
+@_seed(0, "Of the first random path.")
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@_output
+@options.as_json
+def giving_way(path_files: tuple[Path, ...], **given: Any) -> None:
+    """Simulate link loss at every setpoint along each PATH and random ones, before and after plans give way."""
+    from cfplan.studies.giving_way import giving_way
+
+    _measure(partial(giving_way, path_files, _safety_file(path_files[0])), "simulating", given)
+
+
 @study.command(short_help="Write the tables of docs/ from results/.")
 @click.argument("folder", metavar="[REPOSITORY]", type=click.Path(path_type=Path), default=Path())
 def docs(folder: Path) -> None:

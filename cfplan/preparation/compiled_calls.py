@@ -38,9 +38,11 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         import numpy as np
 
         from cfplan.errors import CfplanError
+        from cfplan.flight.setpoints.encoding import encode_trajectory
         from cfplan.geometry.min_snap import min_snap
         from cfplan.planning.plan import plan
         from cfplan.safety.limits_file import load_limits
+        from cfplan.simulation.link_loss import simulate_link_loss
 
         limits = load_limits(safety_file)
         middle = (np.array(limits.space.low) + limits.space.high) / 2
@@ -48,15 +50,14 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         with suppress(CfplanError):  # there may be no model for this vehicle
             plan(path, limits.airframe, limits, planner="learned", nodes=NODES)
         planned = plan(path, limits.airframe, limits, planner="expert", nodes=NODES)  # exceeds limits between nodes
+        simulate_link_loss(encode_trajectory(planned.trajectory).payloads[:2], limits)
         if last >= Stage.REHEARSAL:
             from cfplan.preparation.plan_flight import PlannedFlight
             from cfplan.preparation.prepare_flight import encode_flight, make_mission, rehearse
-            from cfplan.simulation.link_loss import simulate_link_loss
 
             flight = PlannedFlight("small flight", planned, limits)
             encoded = encode_flight(flight)
             rehearse(flight, encoded)
-            simulate_link_loss(encoded.payloads[:2], limits)
             make_mission(encoded, limits)
         if last >= Stage.FLIGHT:
             from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie

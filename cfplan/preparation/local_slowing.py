@@ -16,14 +16,17 @@ from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan_result import LocalSlowing, Plan
 from cfplan.planning.repair import repair, slow
 from cfplan.safety.speed_caps import SpeedCaps
+from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 
-ROUNDS = 10  # of lowering caps, at most
-HALVINGS, CHEAP = 2, 0.005  # tries to win time back, where a plan loses more than this share of it
-LEAST_SHARE = 0.5  # of its speed, to which a place is slowed in one round
+ROUNDS = 12  # of lowering caps, at most
+TRIALS, CHEAP = 4, 0.005  # to win time back, where a plan loses more than this share of it
+PLACES = 4  # of caps in an interval
+LEAST_SHARE, MOST_SHARE = 0.5, 0.98  # of its speed, to which a place is slowed in a round
 POWER = 1.5  # of speed, with which the way that is left grows: some of it is v t, some v² / a
-BEFORE, AFTER = 0.02, 0.08  # s of flight about a setpoint, along which the speed decides how it ends
-LEAST_SPEED = 0.05  # m/s; where all about a setpoint is slower than this, slowness does not help
+ABOUT = 0.05  # s of flight before and after a setpoint at fault, along which a first round slows; later ones slow more
+LEAST_SPEED = 0.05  # m/s, of caps
+LEADING_UP = 0.4  # s about a setpoint that decide how it ends: caps that are the least there leave nothing to do
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,20 +65,20 @@ def slow_locally(plan: Plan, assess: Assess) -> tuple[Plan, Sequence[Assessment]
     if _passed(assessed):
         return plan, assessed
     slowed, reasons = plan, dict[str, None]()
-    caps = np.full(len(plan.profile.s), plan.limits.plan.speed)  # m/s, at the nodes
-    for _ in range(ROUNDS):
+    places = _places(plan.profile)
+    caps = SpeedCaps.of(places, np.full(len(places), plan.limits.plan.speed))
+    for done in range(ROUNDS):
         for each in assessed:
             reasons |= {f"{each.what} near {each.near(at)}": None for at in _worst_of_arcs(each)}
-        lower = [one for each in assessed if (one := _lowered(slowed.trajectory, each, caps)) is not None]
+        lower = [one for each in assessed if (one := _lowered(slowed.trajectory, each, caps, done)) is not None]
         if len(lower) < len(assessed):
             break
-        lowest = np.min(lower, axis=0)
-        failed = np.where(lowest < caps, np.minimum(caps, _speed_at_nodes(slowed.trajectory)), caps)
-        caps = lowest
+        lowest = np.min([each.speed for each in lower], axis=0)
+        caps = SpeedCaps.of(places, lowest)
         slowed = _replanned(plan, slowed, caps, tuple(reasons))
         assessed = assess(slowed.trajectory)
         if _passed(assessed):
-            return _faster(plan, assess, (slowed, assessed), caps, failed)
+            return _faster(plan, assess, (slowed, assessed), caps)
     worst = max((each for each in assessed if not each.passed), key=lambda each: each.excess[each.worst])
     at = worst.worst
     x, y, z = slowed.trajectory.at(worst.time[at]).position
@@ -87,20 +90,28 @@ def slow_locally(plan: Plan, assess: Assess) -> tuple[Plan, Sequence[Assessment]
 
 
 def _faster(
-    plan: Plan, assess: Assess, passed: tuple[Plan, Sequence[Assessment]], caps: NDArray, failed: NDArray
+    plan: Plan, assess: Assess, passed: tuple[Plan, Sequence[Assessment]], caps: SpeedCaps
 ) -> tuple[Plan, Sequence[Assessment]]:
-    """Return a plan between the one that passed under these caps and the speeds that failed, where that passes too."""
-    for _ in range(HALVINGS):
+    """Return a faster plan that passes too: caps are raised half the way where that brings no setpoint to fault."""
+    places = np.array(caps.s)
+    highest = np.minimum(_speed_at(plan.trajectory, places), plan.limits.plan.speed)
+    raised = highest > caps.speed
+    for _ in range(TRIALS):
         slowed = passed[0]
-        if slowed.slowing is None or slowed.time_lost <= CHEAP:
+        if slowed.slowing is None or slowed.time_lost <= CHEAP or not raised.any():
             break
-        between = np.sqrt(caps * np.maximum(failed, caps))
-        trial = _replanned(plan, slowed, between, slowed.slowing.reasons)
-        assessed = assess(trial.trajectory)
-        if _passed(assessed):
-            passed, caps = (trial, assessed), between
+        between = np.sqrt(np.array(caps.speed) * np.maximum(highest, caps.speed))
+        trial = SpeedCaps.of(places, np.where(raised, between, caps.speed))
+        faster = _replanned(plan, plan, trial, slowed.slowing.reasons)  # from a slow one nothing would be gained
+        assessed = assess(faster.trajectory)
+        if not _passed(assessed):
+            for each in assessed:
+                for first, last in zip(*_about(faster.trajectory, each, places, LEADING_UP), strict=True):
+                    raised[first : last + 1] = False
+        elif faster.trajectory.duration < slowed.trajectory.duration:
+            passed, caps = (faster, assessed), trial
         else:
-            failed = between
+            break
     return passed
 
 
@@ -116,34 +127,45 @@ def _worst_of_arcs(assessment: Assessment) -> list[int]:
     return sorted(worst, key=lambda at: -assessment.excess[at])
 
 
-def _lowered(trajectory: Trajectory, assessment: Assessment, caps: NDArray) -> NDArray | None:
-    """Return lower caps at the profile's nodes, (N+1,) m/s, that should do; None where they are the least already."""
-    profile, speed = trajectory.profile, _speed_at_nodes(trajectory)
+def _lowered(trajectory: Trajectory, assessment: Assessment, caps: SpeedCaps, done: int) -> SpeedCaps | None:
+    """Return lower caps, that should do after `done` rounds that did not; None where they are the least already."""
+    s = np.array(caps.s)
+    speed, before = _speed_at(trajectory, s), np.array(caps.speed)
     at_fault = np.flatnonzero(~(assessment.excess <= 0.0))
     excess, reach = np.nan_to_num(assessment.excess[at_fault], nan=np.inf), assessment.reach[at_fault]
-    share = np.maximum(np.maximum(1.0 - excess / reach, 0.0) ** (1.0 / POWER), LEAST_SHARE)
-    time = assessment.time[at_fault]
-    first = profile.interval(trajectory.s_at(time - BEFORE))
-    last = profile.interval(trajectory.s_at(time + AFTER)) + 1
-    lowered = caps.copy()
-    for begin, end, factor in zip(first, last, share, strict=True):
-        about = slice(begin, end + 1)
-        if (caps[about] <= LEAST_SPEED).all():
-            return None
-        lowered[about] = np.minimum(lowered[about], np.maximum(factor * speed[about], LEAST_SPEED))
-    return lowered
+    share = np.minimum(np.maximum(1.0 - excess / reach, 0.0) ** (1.0 / POWER), MOST_SHARE) ** (1 + 0.5 * done)
+    first, last = _about(trajectory, assessment, s, (1 + 0.5 * done) * ABOUT)
+    factor = np.ones(len(s))
+    for begin, end, one in zip(first, last, np.maximum(share, LEAST_SHARE), strict=True):
+        factor[begin : end + 1] = np.minimum(factor[begin : end + 1], one)
+    lower = np.where(factor < 1.0, np.maximum(factor * speed, LEAST_SPEED), np.inf)
+    leading_up = _about(trajectory, assessment, s, LEADING_UP)
+    if any((before[begin : end + 1] <= LEAST_SPEED).all() for begin, end in zip(*leading_up, strict=True)):
+        return None
+    return SpeedCaps.of(s, np.minimum(before, lower))
 
 
-def _speed_at_nodes(trajectory: Trajectory) -> NDArray:
-    """Return (N+1,) m/s."""
-    profile = trajectory.profile
-    return np.asarray(np.sqrt(profile.h) * np.linalg.norm(trajectory.path(profile.s, 1), axis=1))
+def _about(trajectory: Trajectory, assessment: Assessment, s: NDArray, about: float) -> tuple[NDArray, NDArray]:
+    """Return the first and the last of the places s, (K,), within `about` s of each setpoint at fault."""
+    time = assessment.time[~(assessment.excess <= 0.0)]
+    first = np.searchsorted(s, trajectory.s_at(time - about), side="right") - 1
+    return first, np.minimum(np.searchsorted(s, trajectory.s_at(time + about)), len(s) - 1)
 
 
-def _replanned(plan: Plan, nearest: Plan, caps_at_nodes: NDArray, reasons: tuple[str, ...]) -> Plan:
-    """Return the plan under caps at its nodes, (N+1,) m/s, refined from the nearest one; its speed factor is kept."""
+def _places(profile: SpeedProfile) -> NDArray:
+    """Return (K,) s, PLACES in each interval of the profile, and its end."""
+    between = np.arange(PLACES) / PLACES
+    return np.append((profile.s[:-1, None] + np.diff(profile.s)[:, None] * between).reshape(-1), profile.s[-1])
+
+
+def _speed_at(trajectory: Trajectory, s: NDArray) -> NDArray:
+    """Return (K,) m/s."""
+    return np.asarray(np.sqrt(trajectory.profile.at(s).h) * np.linalg.norm(trajectory.path(s, 1), axis=1))
+
+
+def _replanned(plan: Plan, nearest: Plan, caps: SpeedCaps, reasons: tuple[str, ...]) -> Plan:
+    """Return the plan under these caps, refined from the nearest one; its speed factor is kept."""
     factor, limits, profile = plan.speed_factor, plan.limits, nearest.profile.slowed(1.0 / plan.speed_factor)
-    caps = SpeedCaps.of(profile.s, caps_at_nodes)
     task = PlanningTask(
         plan.path, plan.airframe, limits.plan, nodes=len(profile.s) - 1, speed_caps=caps.scaled(1.0 / factor)
     )

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from cfplan.errors import InputError
+from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.geometry.path_file import load_path_file
 from cfplan.machine_code import compile_from_here
 from cfplan.planners.baselines.convex import lower_bound
@@ -13,10 +14,13 @@ from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO
+from cfplan.preparation.link_loss_assessment import MARGIN, assess_link_loss
+from cfplan.preparation.local_slowing import Assessment, slow_locally
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import check_space
+from cfplan.vehicle.trajectory import Trajectory
 
 PLAN_SUFFIX = ".parquet"
 LONG = 40.0  # m of path, from which on compiling takes less time than planning without
@@ -56,6 +60,8 @@ class PlannedFlight:
             "slowed": plan.repair_speed_factor,
             "speed_share": plan.speed_factor,
             "notes": list(plan.notes),
+            "time_lost": plan.time_lost,
+            "slower_for": list(plan.slowing.reasons) if plan.slowing else [],
             "certificate": plan.certificate.to_dict(),
         }
 
@@ -67,7 +73,7 @@ def plan_flight(
 
     Raises:
         InputError: a file or an option is wrong.
-        InfeasibleError: the path leaves the space, or no profile keeps the limits.
+        InfeasibleError: the path leaves the space, no profile keeps the limits, or link loss takes the vehicle outside.
     """
     if source.suffix == PLAN_SUFFIX:
         return _read_plan(source, limits, on_step)
@@ -95,7 +101,32 @@ def plan_flight(
         bound = planned.lower_bound or lower_bound(PlanningTask(planned.path, planned.airframe, limits.plan))
         more = planned.trajectory.duration / bound - 1
         results.append(f"no flight takes less than {bound:.2f} s; this one takes {more:.1%} more")
-    return PlannedFlight(path_file.name, planned, limits, bound)
+    return PlannedFlight(path_file.name, give_way(planned, on_step), limits, bound)
+
+
+def give_way(planned: Plan, on_step: OnStep = ignore_steps) -> Plan:
+    """Return the plan, slower in places if link loss would take the vehicle outside the walls from there.
+
+    Where safety.yaml says only to warn of that, nothing is slowed.
+
+    Raises:
+        InfeasibleError: from some place the vehicle would leave the walls however slowly it flies there.
+    """
+    limits = planned.limits
+    if limits.link_loss.only_warn:
+        return planned
+    compile_from_here()  # without, simulating takes minutes
+
+    def assess(trajectory: Trajectory) -> list[Assessment]:
+        return [assess_link_loss(encode_trajectory(trajectory), limits)]
+
+    with step(on_step, "slowing") as results:
+        slowed, (link_loss,) = slow_locally(planned, assess)
+        inside = MARGIN - link_loss.excess[link_loss.worst]
+        results.append(f"at least {inside:.2f} m inside the walls after link loss at any setpoint")
+        if slowed.slowing:
+            results.append(slowed.describe_slowing())
+    return slowed
 
 
 def _read_plan(file: Path, limits: Limits, on_step: OnStep) -> PlannedFlight:
@@ -108,6 +139,9 @@ def _read_plan(file: Path, limits: Limits, on_step: OnStep) -> PlannedFlight:
                 where=str(file),
                 hint="plan the path again for this vehicle",
             )
-        certificate = certify(plan.trajectory, limits.plan, limits.space)
+        caps = plan.slowing.caps if plan.slowing else None
+        certificate = certify(plan.trajectory, limits.plan, limits.space, caps)
         results.append(f"{plan.trajectory.duration:.2f} s, {plan.planner}, read from {file}")
+        if plan.slowing:
+            results.append(plan.describe_slowing())
     return PlannedFlight(file.stem, replace(plan, limits=limits, certificate=certificate), limits)

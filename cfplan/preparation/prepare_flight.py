@@ -15,16 +15,12 @@ from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, check_bytes, e
 from cfplan.flight.setpoints.stop_certificate import StopCertificate, certify_stops
 from cfplan.machine_code import compile_from_here
 from cfplan.planning.plan_result import Plan
+from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import DryRun, dry_run
 from cfplan.simulation.link_loss import LinkLoss, simulate_link_loss
-
-OUTSIDE_HINT = (
-    "keep the path farther from the walls or fly it slower; in a room with nets, write `outside: warn` under "
-    "`link_loss` in safety.yaml"
-)
 
 
 @dataclass(frozen=True, slots=True)

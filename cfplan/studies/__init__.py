@@ -1,8 +1,9 @@
 """Measurements: each study returns a `StudyResult` with tables, which is written to results/ and shown in docs/results.
 
 Studies: bench, feasibility, scaling, learned, long_paths; flights, lateness, faults, random_faults, link_losses,
-identification. They stand on result, provenance, machine and docs_tables (what a study returns, and where it goes), trials (one planner on
-one path), real_time and sleeper (flights in the virtual lab), fault_scenarios (the faults).
+giving_way, identification. They stand on result, provenance, machine and docs_tables (what a study returns, and where it
+goes), trials (one planner on one path), real_time and sleeper (flights in the virtual lab), fault_scenarios (the
+faults).
 """
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "faults",
     "feasibility",
     "flights",
+    "giving_way",
     "identification",
     "lateness",
     "learned",

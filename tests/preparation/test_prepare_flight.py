@@ -38,7 +38,7 @@ def steps():
 
 def test_every_step_is_reported_once_in_the_order_of_the_data(limits, steps):
     prepared = prepare_flight(LINE, limits, on_step=steps)
-    order = ["path", "plan", "bound", *AFTER_PLANNING]
+    order = ["path", "plan", "bound", "slowing", *AFTER_PLANNING]
     assert steps.names(StepState.BEGUN) == steps.names(*ENDED_WELL) == order
     assert all(result for _, state, result in steps.noted if state in ENDED_WELL)
     assert prepared.plan.certificate.passed
