@@ -1,8 +1,8 @@
 """Measurements: each study returns a `StudyResult` with tables, which is written to results/ and shown in docs/results.
 
 Studies: bench, feasibility, scaling, learned, long_paths; flights, lateness, faults, random_faults, link_losses,
-giving_way, identification. They stand on result, provenance, machine and docs_tables (what a study returns, and where it
-goes), trials (one planner on one path), real_time and sleeper (flights in the virtual lab), fault_scenarios (the
+giving_way, identification. They stand on result, provenance, machine and docs_tables (what a study returns, and where
+it goes), trials (one planner on one path), real_time and sleeper (flights in the virtual lab), fault_scenarios (the
 faults).
 """
 
