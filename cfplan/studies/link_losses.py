@@ -6,17 +6,29 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
+from cfplan.flight.setpoints.encoding import EncodedFlight, command_quaternion, motion_at
+from cfplan.flight.setpoints.packets import encode
 from cfplan.preparation.plan_flight import FlightOptions, plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.link_loss import simulate_link_loss
+from cfplan.simulation.link_loss import link_loss_at_every_setpoint, simulate_link_loss
 from cfplan.studies.result import Column, StudyResult, Table, collect
+from cfplan.vehicle.trajectory import Trajectory
 
 SPEEDS = (1.0, 0.6, 0.3)  # factors on the speed that the limits allow
 COLUMNS = (
     Column("path", "path"),
     Column("speed_factor", "speed", "", "g", meaning="factor on the speed that the limits allow, as by `--speed`"),
     Column("moment", "worst moment", "s", ".1f", meaning="to lose the link, from the first setpoint"),
+    Column(
+        "rates_beyond",
+        "beyond the walls, rates sent as rates",
+        "m",
+        ".1f",
+        meaning="from the worst moment of the same plan, had its setpoints the planned body rates in them",
+    ),
     Column("distance", "comes down", "m", ".1f", meaning="horizontally from the last setpoint, from the worst moment"),
     Column("beyond", "beyond the walls", "m", ".1f", meaning="negative inside"),
     Column("watchdog_distance", "with watchdog: comes down", "m", ".1f"),
@@ -31,7 +43,7 @@ def link_losses(
     speeds: Sequence[float] = SPEEDS,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StudyResult:
-    """Lose the link at moments all along each path at each speed. An interrupt keeps what is done by then.
+    """Lose the link at every setpoint of each path at each speed. An interrupt keeps what is done by then.
 
     Raises what planning and encoding raise.
     """
@@ -49,7 +61,9 @@ def link_losses(
 
 def _row(path_file: Path, safety_file: Path, speed: float) -> dict[str, Any]:
     limits = load_limits(safety_file)
-    encoded = encode_flight(plan_flight(path_file, limits, FlightOptions(speed_factor=speed)))
+    planned = plan_flight(path_file, limits, FlightOptions(speed_factor=speed))
+    encoded = encode_flight(planned)
+    as_rates = link_loss_at_every_setpoint(_with_rates(encoded, planned.plan.trajectory), limits)
     without, with_watchdog = (
         simulate_link_loss(encoded.payloads, replace(limits, firmware=replace(limits.firmware, watchdog=watchdog)))
         for watchdog in (False, True)
@@ -58,8 +72,15 @@ def _row(path_file: Path, safety_file: Path, speed: float) -> dict[str, Any]:
         "path": path_file.stem,
         "speed_factor": speed,
         "moment": without.moment,
+        "rates_beyond": as_rates.worst.beyond,
         "distance": without.distance,
         "beyond": without.beyond,
         "watchdog_distance": with_watchdog.distance,
         "watchdog_beyond": with_watchdog.beyond,
     }
+
+
+def _with_rates(encoded: EncodedFlight, trajectory: Trajectory) -> NDArray:
+    """Return the payloads of a flight with its planned attitudes and body rates, none of them traded."""
+    motion = motion_at(trajectory, encoded.times + encoded.lead)
+    return encode(replace(motion, quaternion=command_quaternion(motion.quaternion)))

@@ -18,8 +18,14 @@ def line():
 
 def test_a_slower_flight_comes_down_nearer(line):
     fast, slow = line.table("link-loss").rows
-    assert slow["distance"] < 0.2 * fast["distance"]
-    assert slow["beyond"] < 0 < fast["beyond"]
+    assert slow["distance"] < 0.7 * fast["distance"]
+    assert slow["beyond"] < fast["beyond"] < 0
+
+
+def test_with_rates_in_its_setpoints_it_would_go_far_beyond_the_walls(line):
+    fast, slow = line.table("link-loss").rows
+    assert fast["rates_beyond"] > 3.0
+    assert slow["rates_beyond"] < 1.0
 
 
 def test_with_the_watchdog_it_comes_down_nearer(line):
