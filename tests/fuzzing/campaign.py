@@ -2,6 +2,7 @@
 
 import json
 import mmap
+import os
 import re
 import signal
 import subprocess
@@ -15,7 +16,8 @@ from tests.fuzzing.files import REPOSITORY, emptied
 from tests.fuzzing.readers import READERS
 from tests.fuzzing.worker import PROGRESS
 
-LONGEST = 10.0  # s for one input
+LONGEST = 10.0  # s for one input: of the processor, as others may have it meanwhile
+_SLEEPY = 60.0  # s for one that needs no processor
 _START = 180.0  # s for the first, before which sound inputs are made and code is compiled
 _FRAME = re.compile(r'File "[^"]*/(cfplan/[^"]+)", line (\d+)')
 
@@ -70,7 +72,7 @@ def _reader(name: str, count: int, seed: int, folder: Path) -> Outcome:
 
 def _stretch(outcome: Outcome, seed: int, begin: int, end: int, folder: Path) -> int:
     """Let a process use inputs; return the number of the first that it did not use."""
-    (folder / "progress").write_bytes(PROGRESS.pack(-1, time.monotonic(), 0, 0, 0.0, 0.0, 0))
+    (folder / "progress").write_bytes(PROGRESS.pack(-1, time.monotonic(), 0.0, 0, 0, 0.0, 0.0, 0))
     command = [
         sys.executable,
         "-m",
@@ -86,13 +88,15 @@ def _stretch(outcome: Outcome, seed: int, begin: int, end: int, folder: Path) ->
         process = subprocess.Popen(command, cwd=REPOSITORY, stdout=output, stderr=output)
         hung = False
         while process.poll() is None and not hung:
-            number, since, *_ = PROGRESS.unpack_from(shared)
-            hung = time.monotonic() - since > (LONGEST if number >= 0 else _START)
+            number, since, used, *_ = PROGRESS.unpack_from(shared)
+            waited = time.monotonic() - since
+            hung = waited > (_SLEEPY if number >= 0 else _START)
+            hung = hung or (number >= 0 and waited > LONGEST and _processor_time(process.pid) - used > LONGEST)
             time.sleep(0.05)
         if hung:
             process.send_signal(signal.SIGKILL)
         process.wait()
-        number, _, inputs, refused, seconds, longest, memory = PROGRESS.unpack_from(shared)
+        number, _, _, inputs, refused, seconds, longest, memory = PROGRESS.unpack_from(shared)
     outcome.inputs, outcome.refused = outcome.inputs + inputs, outcome.refused + refused
     outcome.seconds, outcome.longest = outcome.seconds + seconds, max(outcome.longest, longest)
     outcome.memory = max(outcome.memory, memory)
@@ -102,6 +106,17 @@ def _stretch(outcome: Outcome, seed: int, begin: int, end: int, folder: Path) ->
     if number < 0:
         outcome.findings.append((begin, f"the fuzzing itself failed: {last}"))
         return end
-    outcome.findings.append((number, f"hung for {LONGEST:g} s" if hung else f"died by {-process.returncode}: {last}"))
+    outcome.findings.append(
+        (number, f"took more than {LONGEST:g} s" if hung else f"died by {-process.returncode}: {last}")
+    )
     outcome.inputs += 1
     return number + 1
+
+
+def _processor_time(process: int) -> float:
+    """Return the time, s, that a process has had of the processor; 0 where it has ended."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

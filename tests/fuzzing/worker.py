@@ -26,9 +26,10 @@ MOST_MEMORY = 1_000_000  # kB, more than before the input
 # bytes of address space: an input that takes more than is allowed is found, and the machine is not filled
 _HEADROOM = 6 << 30
 _LONGEST_MESSAGE = 2000  # characters
-# The input under way (-1 before the first, -1 - N at the end before N) and when it began, s; inputs read and refused,
-# their time and the longest of it, s, and the most memory that one took, kB.
-PROGRESS = struct.Struct("<qdqqddq")
+# The input under way (-1 before the first, -1 - N at the end before N); when it began, s, by the clock and by the
+# processor's time of this process; inputs read and refused, their time and the longest of it, s, and the most memory
+# that one took, kB.
+PROGRESS = struct.Struct("<qddqqddq")
 
 
 class Watch:
@@ -85,7 +86,7 @@ class Watch:
 
     def _note(self, number: int) -> None:
         totals: tuple[Any, ...] = (self._count, self._refused, self._seconds, self._longest, self._memory)
-        PROGRESS.pack_into(self._shared, 0, number, time.monotonic(), *totals)
+        PROGRESS.pack_into(self._shared, 0, number, time.monotonic(), time.process_time(), *totals)
 
 
 def _flaw(error: CfplanError) -> str:
