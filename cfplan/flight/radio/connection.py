@@ -38,8 +38,9 @@ def connect(
     from cflib import crtp
     from cflib.crazyflie import Crazyflie
     from cflib.crtp.radiodriver import set_retries_before_disconnect
+    from cflib.crtp.udpdriver import UdpDriver
 
-    if not crtp.CLASSES:
+    if UdpDriver not in crtp.CLASSES:  # one of cflib's own; there may be others' already
         crtp.init_drivers()
     for driver in reversed(drivers):
         if driver not in crtp.CLASSES:

@@ -3,8 +3,11 @@
 import threading
 
 import pytest
+from cflib import crtp
 from cflib.crtp.crtpdriver import CRTPDriver
 from cflib.crtp.exceptions import WrongUriType
+from cflib.crtp.radiodriver import RadioDriver
+from cflib.crtp.udpdriver import UdpDriver
 
 from cfplan.errors import LinkError
 from cfplan.flight.clock import SteppedClock
@@ -58,6 +61,14 @@ def test_a_radio_that_cannot_be_opened_says_what_to_do(reason, hint):
         connect("refused://0", lambda message: None, [Refused])
     assert hint in caught.value.hint
     assert "\n" not in str(caught.value)
+
+
+def test_cflibs_own_drivers_are_there_also_where_another_was_registered_before(monkeypatch):
+    monkeypatch.setattr(crtp, "CLASSES", [SilentDriver])
+    with pytest.raises(LinkError):
+        connect("broken://0", lambda message: None, [BrokenDriver])
+    assert {RadioDriver, UdpDriver, SilentDriver, BrokenDriver} <= set(crtp.CLASSES)
+    assert len(crtp.CLASSES) == len(set(crtp.CLASSES))
 
 
 def test_a_second_pilot_on_the_same_radio_is_refused_and_the_first_keeps_it(monkeypatch, tmp_path):
