@@ -42,6 +42,7 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         from cfplan.geometry.min_snap import min_snap
         from cfplan.planning.plan import plan
         from cfplan.safety.limits_file import load_limits
+        from cfplan.simulation.glitches import glitch_at_every_setpoint
         from cfplan.simulation.link_loss import simulate_link_loss
 
         limits = load_limits(safety_file)
@@ -50,7 +51,9 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         with suppress(CfplanError):  # there may be no model for this vehicle
             plan(path, limits.airframe, limits, planner="learned", nodes=NODES)
         planned = plan(path, limits.airframe, limits, planner="expert", nodes=NODES)  # exceeds limits between nodes
-        simulate_link_loss(encode_trajectory(planned.trajectory).payloads[:2], limits)
+        begin = encode_trajectory(planned.trajectory).payloads[:2]
+        simulate_link_loss(begin, limits)
+        glitch_at_every_setpoint(begin, limits)
         if last >= Stage.REHEARSAL:
             from cfplan.preparation.plan_flight import PlannedFlight
             from cfplan.preparation.prepare_flight import encode_flight, make_mission, rehearse

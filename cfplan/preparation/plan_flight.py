@@ -14,6 +14,7 @@ from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO
+from cfplan.preparation.glitch_assessment import assess_glitches
 from cfplan.preparation.link_loss_assessment import MARGIN, assess_link_loss
 from cfplan.preparation.local_slowing import Assessment, slow_locally
 from cfplan.preparation.steps import OnStep, ignore_steps, step
@@ -44,6 +45,11 @@ class PlannedFlight:
     plan: Plan
     limits: Limits
     lower_bound: float | None = None  # s, which no flight along the path can beat; None for a plan that was read
+
+    @property
+    def was_read(self) -> bool:
+        """Return whether the plan is a file's, of which nothing but its limits was checked yet."""
+        return self.lower_bound is None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures of the plan and its certificate, for JSON."""
@@ -105,25 +111,28 @@ def plan_flight(
 
 
 def give_way(planned: Plan, on_step: OnStep = ignore_steps) -> Plan:
-    """Return the plan, slower in places if link loss would take the vehicle outside the walls from there.
+    """Return the plan, slower in places if link loss would take the vehicle outside the walls from there, or a gap in
+    setpoints or poses would lose it.
 
-    Where safety.yaml says only to warn of that, nothing is slowed.
+    Where safety.yaml says only to warn of link loss, nothing is slowed for that.
 
     Raises:
-        InfeasibleError: from some place the vehicle would leave the walls however slowly it flies there.
+        InfeasibleError: at some place the vehicle would end so however slowly it flies there.
     """
     limits = planned.limits
-    if limits.link_loss.only_warn:
-        return planned
     compile_from_here()  # without, simulating takes minutes
 
     def assess(trajectory: Trajectory) -> list[Assessment]:
-        return [assess_link_loss(encode_trajectory(trajectory), limits)]
+        encoded = encode_trajectory(trajectory)
+        link_loss = [] if limits.link_loss.only_warn else [assess_link_loss(encoded, limits)]
+        return [*link_loss, assess_glitches(encoded, limits)]
 
     with step(on_step, "slowing") as results:
-        slowed, (link_loss,) = slow_locally(planned, assess)
-        inside = MARGIN - link_loss.excess[link_loss.worst]
-        results.append(f"at least {inside:.2f} m inside the walls after link loss at any setpoint")
+        slowed, (*link_loss, glitches) = slow_locally(planned, assess)
+        for each in link_loss:
+            inside = MARGIN - each.excess[each.worst]
+            results.append(f"at least {inside:.2f} m inside the walls after link loss at any setpoint")
+        results.append(f"a gap {glitches.describe(glitches.worst)} at most")
         if slowed.slowing:
             results.append(slowed.describe_slowing())
     return slowed

@@ -15,6 +15,7 @@ from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, check_bytes, e
 from cfplan.flight.setpoints.stop_certificate import StopCertificate, certify_stops
 from cfplan.machine_code import compile_from_here
 from cfplan.planning.plan_result import Plan
+from cfplan.preparation.glitch_assessment import assess_glitches
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
@@ -55,6 +56,8 @@ def prepare_flight(
     encoded = encode_flight(planned, on_step, stream_for=options.stream_for)
     rehearsed = rehearse(planned, encoded, on_step)
     lost = find_link_loss(encoded, limits, on_step)
+    if planned.was_read:  # else planning made sure of it, by the same bytes
+        require_glitch_margin(encoded, limits, on_step)
     mission, stops = make_mission(encoded, limits, on_step)
     return PreparedFlight(planned, encoded, rehearsed, lost, stops, mission)
 
@@ -112,6 +115,17 @@ def find_link_loss(encoded: EncodedFlight, limits: Limits, on_step: OnStep = ign
         if lost.beyond > 0 and not limits.link_loss.only_warn:
             raise NotCertifiedError(str(lost), where="link loss", hint=OUTSIDE_HINT)
     return lost
+
+
+def require_glitch_margin(encoded: EncodedFlight, limits: Limits, on_step: OnStep = ignore_steps) -> None:
+    """Simulate a gap in setpoints, poses or both at every setpoint. Raises NotCertifiedError if one nearly loses the
+    vehicle.
+    """
+    with step(on_step, "glitches") as results:
+        assessed = assess_glitches(encoded, limits)
+        results.append(f"a gap {assessed.describe(assessed.worst)} at most")
+        if not assessed.passed:
+            raise NotCertifiedError(f"a gap {assessed.describe(assessed.worst)}", where="glitches", hint=assessed.hint)
 
 
 def make_mission(

@@ -1,0 +1,28 @@
+"""Glitch margin as an assessment: how near a gap in setpoints or poses, beginning at any setpoint, comes to a loss."""
+
+import numpy as np
+
+from cfplan.flight.setpoints.encoding import EncodedFlight
+from cfplan.preparation.local_slowing import Assessment
+from cfplan.safety.limits import Limits
+from cfplan.simulation.glitches import GAP, KINDS, TURNED_OVER, glitch_at_every_setpoint
+
+KEPT = 0.9  # share of what is lost, that planning stays within
+_HINT = "make the path gentler there, or plan with a lower speed or acceleration"
+
+
+def assess_glitches(encoded: EncodedFlight, limits: Limits) -> Assessment:
+    """Simulate a gap at each setpoint; at fault is what nearly loses the vehicle, by its deviation or its tilt."""
+    moments, cut = glitch_at_every_setpoint(encoded.payloads, limits), limits.flight.deviation.cut
+    shares = np.fmax(moments.deviation / cut, moments.tilt / TURNED_OVER)  # (3, N) of what is lost
+    shares[moments.lost & ~(shares >= 1.0)] = np.inf
+    kind, share = np.argmax(shares, axis=0), shares.max(axis=0)
+
+    def describe(at: int) -> str:
+        off, tilt = moments.deviation[kind[at], at], np.degrees(moments.tilt[kind[at], at])
+        return f"of {GAP:g} s in {KINDS[kind[at]]} takes the vehicle {off:.2f} m off, at a tilt of {tilt:.0f}°"
+
+    def near(at: int) -> str:
+        return "({:.2f}, {:.2f}, {:.2f}) m".format(*encoded.decoded.position[at])
+
+    return Assessment("a gap", encoded.times, share - KEPT, share, describe, near, _HINT)

@@ -1,0 +1,55 @@
+"""Plans keep a margin for gaps in setpoints and poses; a file whose plan does not is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.errors import NotCertifiedError
+from cfplan.flight.setpoints.encoding import encode_trajectory
+from cfplan.preparation.glitch_assessment import KEPT, assess_glitches
+from cfplan.preparation.local_slowing import slow_locally
+from cfplan.preparation.plan_flight import plan_flight
+from cfplan.preparation.prepare_flight import require_glitch_margin
+from cfplan.simulation.glitches import TURNED_OVER, glitch_at_every_setpoint
+
+LOOP = Path(__file__).parents[2] / "flights" / "loop3d.yaml"
+
+
+@pytest.fixture(scope="module")
+def loop(limits):
+    return plan_flight(LOOP, limits).plan
+
+
+def cut_at(limits, deviation):
+    """The limits with a vehicle that counts as lost from a smaller deviation on."""
+    return replace(limits, flight=replace(limits.flight, deviation=replace(limits.flight.deviation, cut=deviation)))
+
+
+def test_the_loop_is_flown_through_gaps_with_a_margin(loop, limits):
+    encoded = encode_trajectory(loop.trajectory)
+    moments, assessed = glitch_at_every_setpoint(encoded.payloads, limits), assess_glitches(encoded, limits)
+    assert assessed.passed
+    assert not moments.lost.any()
+    assert assessed.excess.max() + KEPT == pytest.approx(
+        max(moments.deviation.max() / limits.flight.deviation.cut, moments.tilt.max() / TURNED_OVER)
+    )
+    assert len(assessed.excess) == len(encoded.times)
+    assert f"{np.degrees(moments.tilt.max()):.0f}°" in assessed.describe(assessed.worst)
+
+
+def test_a_plan_is_slowed_where_a_gap_nearly_loses_the_vehicle(loop, limits):
+    strict = cut_at(limits, 0.37)
+    assert not assess_glitches(encode_trajectory(loop.trajectory), strict).passed
+    slowed, _ = slow_locally(loop, lambda trajectory: [assess_glitches(encode_trajectory(trajectory), strict)])
+    assert assess_glitches(encode_trajectory(slowed.trajectory), strict).passed
+    assert 0.0 < slowed.time_lost < 0.03
+    assert slowed.slowing.reasons[0].startswith("a gap near (")
+
+
+def test_the_bytes_of_a_plan_without_that_margin_are_refused(loop, limits):
+    encoded = encode_trajectory(loop.trajectory)
+    require_glitch_margin(encoded, limits)
+    with pytest.raises(NotCertifiedError, match=r"a gap of 0\.2 s in setpoints takes the vehicle 0\.\d+ m off"):
+        require_glitch_margin(encoded, cut_at(limits, 0.35))
