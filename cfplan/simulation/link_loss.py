@@ -17,8 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.firmware import Timeouts, gains_for
-from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.encoding import RATE, encode_motion
+from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, decode
+from cfplan.flight.setpoints.rate_trade import ahead
+from cfplan.flight.telemetry import Triple
 from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dynamics.body import (
@@ -147,6 +150,17 @@ def link_loss_of_stops(
     times = begin[:, None] / rate + within / rate
     places = rows[:, within, 0:3].reshape(-1, 3)
     return _judge(times.reshape(-1), places, boxes, limits)
+
+
+def link_loss_of_transfer(
+    begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float, limits: Limits, rate: float = RATE
+) -> LinkLossMoments:
+    """Lose the link at every setpoint from hover to hover, as the pilot flies to take-off height and to the start.
+
+    Places in m, yaw in rad, `duration` in s; the first and the last setpoint are those of a hover.
+    """
+    motion = hover_to_hover(begin, yaw, end, end_yaw, duration, rate)
+    return link_loss_at_every_setpoint(encode_motion(motion, ahead(motion.acceleration, rate)), limits, rate)
 
 
 def drift(aloft: NDArray, limits: Limits) -> NDArray:

@@ -14,6 +14,7 @@ from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.link_loss import (
     link_loss_at_every_setpoint,
     link_loss_of_stops,
+    link_loss_of_transfer,
     simulate_link_loss,
     swept_after_link_loss,
 )
@@ -130,6 +131,22 @@ def test_stops_from_a_flight_are_harmless_too(line, limits):
     rows = np.round(every.time[first] * 100).astype(int)
     # A stop begins as the flight goes on, but brakes harder within its first setpoints.
     assert every.high[first] == pytest.approx(flight.high[rows], abs=0.25)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_take_off_and_the_way_to_the_start_are_harmless_from_corner_to_corner(limits, yaw):
+    space, height = limits.space, limits.ground.take_off_height
+    x, y = np.add(space.low, space.margin)[:2].tolist()
+    far_x, far_y = np.subtract(space.high, space.margin)[:2].tolist()
+    corners = (x, y, height), (far_x, far_y, space.high[2] - space.margin)
+    across = np.linalg.norm(np.subtract(*corners)) / limits.ground.go_to_speed
+    for begin, end, duration in (
+        ((x, y, 0.0), corners[0], height / limits.ground.take_off_speed),
+        (*corners, across),
+        (*corners[::-1], across),
+    ):
+        found = link_loss_of_transfer(begin, 0.0, end, yaw, max(float(duration), 1.5), limits)
+        assert found.worst.beyond < 0.0, (begin, end, found.worst)
 
 
 def test_setpoints_as_they_are_sent_are_harmless_when_they_stop(line, limits):
