@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from cfplan.errors import InputError
 from cfplan.identification.signals import FlightSignals
 from cfplan.machine_code import njit
 from cfplan.vehicle.rotations import product
@@ -22,6 +23,8 @@ from cfplan.vehicle.rotations import product
 STEP = 0.001  # s, of the grid on which everything is integrated
 _MARGIN = 0.2  # s of the grid before and behind the flight
 _SPAN = 12  # poses over which turns are compared: 0.12 s at 100 Hz
+# rad rms over such a span, from which turns are told from noise; share of it by which poses may turn otherwise
+_TURNS, _UNLIKE = 0.02, 0.6
 _NOTHING_KNOWN, _REGULAR = 1e-6, 1e-9
 _SMOOTHING = 0.25  # s, by which the slow difference of poses and gyroscope is smoothed
 
@@ -43,7 +46,10 @@ def grid_of(signals: FlightSignals) -> NDArray:
 
 
 def fit_attitude(signals: FlightSignals) -> AttitudeFit:
-    """Fit the poses' shift in time, the mounting and the gyroscope's bias to the turns of the flight."""
+    """Fit the poses' shift in time, the mounting and the gyroscope's bias to the turns of the flight.
+
+    Raises InputError where the poses are those of another body.
+    """
     grid = grid_of(signals)
     turned = _integrate(_rates(signals)(grid[:-1] + STEP / 2))
     inside = (signals.pose_time > 0) & (signals.pose_time < signals.duration)
@@ -59,6 +65,12 @@ def fit_attitude(signals: FlightSignals) -> AttitudeFit:
 
     found = least_squares(residual, np.zeros(7), x_scale=[0.01] * 7, loss="soft_l1", f_scale=0.02)
     spread = found.fun @ found.fun / max(len(found.fun) - 7, 1)
+    turned_by = np.sqrt(np.mean((_at(grid, turned, begin).inv() * _at(grid, turned, end)).as_rotvec() ** 2))
+    if turned_by > _TURNS and np.sqrt(spread) > _UNLIKE * turned_by:
+        raise InputError(
+            "the poses do not turn as the vehicle's gyroscope says",
+            hint="is the body that was tracked the vehicle? `cfplan replay` shows both",
+        )
     deviation = np.sqrt(np.diag(inverse_information(found.jac.T @ found.jac)) * spread)
     return AttitudeFit(float(found.x[0]), float(deviation[0]), found.x[1:4], deviation[1:4], found.x[4:7])
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cfplan.errors import InputError
 from cfplan.identification.signals import FlightSignals
 from cfplan.identification.translation import (
     AXIAL_DRAG,
@@ -29,6 +30,8 @@ _UNSEEN_THRUST = 1.2e-3
 _SOURCE = "identified from flights by cfplan identify; the rest: "
 # s: the quickest message of the log takes one, and its gyroscope's sample is as old; known to one.
 _LOG_DELAY, _LOG_DOUBT = 2e-3, 1e-3
+_PLAUSIBLE = (0.5, 2.0)  # thrust over mass, of before: no vehicle that flew as believed is farther off
+_LARGE_MISFIT = 0.004  # m rms
 _TELLS_DRAG, _TELLS_LAG = 0.3, 0.02  # share of the value, s: larger uncertainties tell nothing
 _TELLS_BATTERY = 0.3  # V that the voltage must span
 
@@ -86,6 +89,12 @@ def assemble(
 ) -> Identification:
     """Return the figures of a fit, and the airframe with those that the records tell."""
     before = models[0].signals.airframe
+    ratio = float(np.linalg.norm(solution.linear[THRUST])) * before.mass / before.motor_thrust_max
+    if not _PLAUSIBLE[0] <= ratio <= _PLAUSIBLE[1]:
+        raise InputError(
+            f"the motion does not follow the motors: thrust over mass {ratio:.2f} times that of {before.name}",
+            hint="is the body that was tracked the vehicle, and upright? `cfplan replay` shows both",
+        )
     found = _dynamics(solution, before, mass) | _latencies(models, solution) | _geometry(models, solution)
     found["thrust per volt"] = _battery(models, solution, voltage)
 
@@ -103,7 +112,9 @@ def assemble(
         drag=(max(told("drag", before.drag[0]), 0.0), max(told("axial drag", before.drag[1]), 0.0)),
         source=_SOURCE + before.source.removeprefix(_SOURCE),
     )
-    return Identification(airframe, found["pose latency"].value, found, _notes(mass, before), solution.rms)
+    return Identification(
+        airframe, found["pose latency"].value, found, _notes(mass, before, solution.rms), solution.rms
+    )
 
 
 def _dynamics(solution: FittedUnknowns, before: Airframe, mass: float | None) -> dict[str, IdentifiedQuantity]:
@@ -216,8 +227,10 @@ def _battery(models: Sequence[FlightModel], solution: FittedUnknowns, voltage: f
     return IdentifiedQuantity(f"thrust per volt, at {voltage:.2f} V", value, doubt, "%/V", 0.0, 1, untold, scale=100.0)
 
 
-def _notes(mass: float | None, before: Airframe) -> tuple[str, ...]:
-    always = ("not told by these records: inertia, yaw torque per thrust, rotor reaction; as in the airframe before",)
+def _notes(mass: float | None, before: Airframe, misfit: float) -> tuple[str, ...]:
+    untold = "not told by these records: inertia, yaw torque per thrust, rotor reaction; as in the airframe before"
+    large = f"{1e3 * misfit:.1f} mm rms of motion are not explained: wind, a changed load or poses of bad quality?"
+    always = (untold, large) if misfit > _LARGE_MISFIT else (untold,)
     if mass is not None:
         return (f"mass {1e3 * mass:.2f} g as given; thrust and drag follow from it", *always)
     return (

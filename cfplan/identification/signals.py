@@ -15,6 +15,7 @@ SHORTEST = 5.0  # s of flight that say anything
 _BEGINS = (Phase.GO_TO_START, Phase.STREAM)
 _ENDS = (Phase.HAND_BACK, Phase.LAND, Phase.DISARM, Phase.CLOSED)
 _LARGEST_GAPS = {"poses": 0.1, "estimates": 0.1, "status": 0.2}  # s, median interval; sparser streams say too little
+_UNIT = 0.1  # by which the length of a quaternion may differ from 1
 _ON_TIME = 5  # percentile of the poses' arrivals: those that nothing delayed
 
 
@@ -105,6 +106,8 @@ def _rows(stream: object, begin: float, end: float, finite: tuple[str, ...]) -> 
     for name in finite:
         values = np.asarray(getattr(stream, name))
         keep &= np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+    if hasattr(stream, "quaternion"):
+        keep &= np.abs(np.linalg.norm(stream.quaternion, axis=1) - 1.0) < _UNIT
     order = np.flatnonzero(keep)[np.argsort(time[keep], kind="stable")]
     order = order[np.diff(time[order], prepend=-np.inf) > 0.0]
     names = stream.__slots__  # type: ignore[attr-defined]

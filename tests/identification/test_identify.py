@@ -131,6 +131,25 @@ def test_records_of_two_vehicles_are_refused(record):
         identify([record, other])
 
 
+def test_messages_that_are_broken_or_come_twice_change_nothing(record, drawn, found):
+    poses = record.poses
+    broken = poses.quaternion.copy(), poses.position.copy()
+    broken[0][500], broken[1][600] = 0.0, np.nan
+    order = np.r_[0:300, 250:300, 299:200:-1, 300 : len(poses.time)]
+    changed = rows(replace(poses, quaternion=broken[0], position=broken[1]), order)
+    again = identify([replace(record, poses=changed)], mass=drawn.airframe.mass)
+    assert again.airframe.motor_thrust_max == pytest.approx(found.airframe.motor_thrust_max, rel=0.002)
+    assert again.airframe.drag[0] == pytest.approx(found.airframe.drag[0], rel=0.03)
+
+
+def test_poses_of_another_body_are_refused(record):
+    chance = np.random.default_rng(5)
+    still = np.array([1.0, 0.0, 0.0]) + chance.normal(0.0, 0.001, record.poses.position.shape)
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(still), 1))
+    with pytest.raises(InputError, match="do not turn as"):
+        identify([replace(record, poses=replace(record.poses, position=still, quaternion=level))])
+
+
 @pytest.mark.parametrize("mass", [0.0, -1.0, float("nan"), float("inf"), 33.1])
 def test_an_absurd_mass_is_refused(record, mass):
     with pytest.raises(InputError, match="mass"):
