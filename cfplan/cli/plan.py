@@ -29,7 +29,7 @@ def plan(
         from cfplan.cli.certificate_table import print_certificate
         from cfplan.preparation.plan_flight import FlightOptions, plan_flight
 
-    planned = plan_flight(path_file, limits, FlightOptions(**planning), steps)
+    planned = plan_flight(path_file, limits, FlightOptions(**planning, only_shown=output is None), steps)
     if output is not None:
         from cfplan.planning.plan_file import save_plan
 

@@ -7,7 +7,7 @@ from typing import Any
 from cfplan.errors import InputError
 from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.geometry.path_file import load_path_file
-from cfplan.machine_code import compile_from_here
+from cfplan.machine_code import compile_from_here, interprets
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import plan
@@ -35,6 +35,7 @@ class FlightOptions:
     nodes: int | None = None  # grid intervals; None chooses them by the path's length
     speed_factor: float | None = None  # of the speed that the limits allow; None takes the path file's
     stream_for: float = 0.0  # s of setpoints at least; behind the end of the path they hover
+    only_shown: bool = False  # whether the plan will neither fly nor be kept, so that it need not wait for compiling
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,12 @@ def plan_flight(
         bound = planned.lower_bound or lower_bound(PlanningTask(planned.path, planned.airframe, limits.plan))
         more = planned.trajectory.duration / bound - 1
         results.append(f"no flight takes less than {bound:.2f} s; this one takes {more:.1%} more")
-    return PlannedFlight(path_file.name, give_way(planned, on_step), limits, bound)
+    if options.only_shown and interprets():  # simulating link loss takes minutes without machine code
+        with step(on_step, "slowing") as results:
+            results.warn("not looked at before machine code is compiled; plan again, or with -o, to see it")
+    else:
+        planned = give_way(planned, on_step)
+    return PlannedFlight(path_file.name, planned, limits, bound)
 
 
 def give_way(planned: Plan, on_step: OnStep = ignore_steps) -> Plan:
