@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.recording.record import Record
+from cfplan.recording.record import Record, meant_motion
 from cfplan.recording.summary import deviation
 
 FULL_COMMAND = 65535  # of a motor, 16 bits
@@ -58,6 +58,7 @@ def plots(record: Record) -> tuple[Plot, ...]:
     """Return all plots of a flight, in the order of TITLES."""
     setpoints, estimates, status = record.setpoints, record.estimates, record.status
     bounds, planned, motors = record.header.bounds, record.header.plan_limits, motor_thrust(record)
+    _, meant_acceleration, meant_rate = meant_motion(setpoints)
     off = deviation(record)
     aged, age = pose_age(record)
     return (
@@ -75,13 +76,13 @@ def plots(record: Record) -> tuple[Plot, ...]:
             (planned.motor_thrust_min, planned.motor_thrust_max),
         ),
         _norms("speed", estimates.time, estimates.velocity, setpoints.due, setpoints.velocity, bounds.speed),
-        _norms("body_rate", status.time, status.body_rate, setpoints.due, setpoints.body_rate, bounds.body_rate),
+        _norms("body_rate", status.time, status.body_rate, setpoints.due, meant_rate, bounds.body_rate),
         _norms(
             "acceleration",
             estimates.time,
             estimates.acceleration,
             setpoints.due,
-            setpoints.acceleration,
+            meant_acceleration,
             bounds.acceleration,
         ),
         Plot(

@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.flight.setpoints.encoding import controller_attitude
+from cfplan.flight.setpoints.rate_trade import motion_of_sent
 from cfplan.recording.header import RecordHeader
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import quaternions_of
 
 FLIGHT_FILE = "flight.mcap"
 SUMMARY_FILE = "summary.json"
@@ -27,6 +31,18 @@ class Setpoints:
     acceleration: NDArray  # (N, 3) m/s²
     quaternion: NDArray  # (N, 4) body→world, x y z w
     body_rate: NDArray  # (N, 3) rad/s
+
+
+def meant_motion(setpoints: Setpoints) -> tuple[NDArray, NDArray, NDArray]:
+    """Return attitudes (N, 4), accelerations (N, 3) and body rates (N, 3) that setpoints make the vehicle fly.
+
+    Packets carry others, as most of the roll and pitch rates is sent as attitude.
+    """
+    if not len(setpoints.due):
+        return setpoints.quaternion, setpoints.acceleration, setpoints.body_rate
+    force = setpoints.acceleration + np.array([0.0, 0.0, GRAVITY])
+    made = quaternions_of(controller_attitude(force, setpoints.quaternion))
+    return motion_of_sent(setpoints.due, setpoints.acceleration, made, setpoints.body_rate)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

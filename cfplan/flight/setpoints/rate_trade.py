@@ -33,6 +33,8 @@ BRAKING = 1.0  # 1/s, deceleration by level-out over the speed left
 BRAKE_RATE_MAX = 0.6  # rad/s; 4.9° of tilt, for 1.5 s
 TRADED_RATE_MAX = 4.5  # rad/s; what exceeds it is sent as a rate, as φ grows to 90° at 7 rad/s
 _QUANTUM = 1e-3  # rad/s, of rates in a packet
+_LONGEST_GAP = 0.05  # s between setpoints, after which they are read anew
+_ROWS_AHEAD = 2  # of 10 ms, that rates are sent ahead
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +107,49 @@ def ahead(acceleration: NDArray, rate: float) -> NDArray:
     """Return accelerations, (..., N, 3) at `rate`, Hz, as they are BRAKE_LEAD later; the last one holds."""
     place = np.minimum(np.arange(acceleration.shape[-2]) + round(BRAKE_LEAD * rate), acceleration.shape[-2] - 1)
     return acceleration[..., place, :]
+
+
+def motion_of_sent(
+    times: NDArray, acceleration: NDArray, attitude: NDArray, body_rate: NDArray, gains: AttitudeGains = FIRMWARE_GAINS
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the attitudes (N, 4), accelerations (N, 3) and body rates (N, 3) that setpoints sent at `times`, s, mean.
+
+    For people to see, of setpoints alone: the attitude turns at the rates that it is asked for, which soon forgets how
+    it began. `attitude`, (N, 4), is what the controller makes of each. Setpoints whose rates are not traded mean what
+    they say.
+    """
+    return _meant(
+        *(np.array(each, dtype=float) for each in (times, acceleration, attitude, body_rate)), gains.full_rate
+    )
+
+
+@njit(error_model="numpy")
+def _meant(
+    times: NDArray, acceleration: NDArray, attitude: NDArray, body_rate: NDArray, full_rate: float
+) -> tuple[NDArray, NDArray, NDArray]:
+    attitudes, accelerations, rates = attitude.copy(), acceleration.copy(), body_rate.copy()
+    now = (0.0, 0.0, 0.0, 1.0)
+    for n in range(len(times)):
+        step = times[n] - times[n - 1] if n > 0 else _LONGEST_GAP
+        if 0.0 < step < _LONGEST_GAP:
+            wx, wy, wz = rates[max(n - _ROWS_AHEAD, 0)]  # rates are sent ahead
+            size = math.sqrt(wx * wx + wy * wy + wz * wz)
+            share = math.sin(0.5 * size * step) / size if size > 0.0 else 0.0
+            now = product(now, (wx * share, wy * share, wz * share, math.cos(0.5 * size * step)))
+        else:
+            now = (attitude[n, 0], attitude[n, 1], attitude[n, 2], attitude[n, 3])
+        x, y, z, w = now
+        asked = product((-x, -y, -z, w), attitude[n])
+        sine = 2.0 * asked[3]  # of the turn from here to what is asked for, about x and y
+        rates[n, 0] += full_rate * sine * asked[0]
+        rates[n, 1] += full_rate * sine * asked[1]
+        fx, fy, fz = acceleration[n, 0], acceleration[n, 1], acceleration[n, 2] + GRAVITY
+        ax, ay, az = 2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)
+        thrust = fx * ax + fy * ay + fz * az
+        accelerations[n, 0], accelerations[n, 1], accelerations[n, 2] = thrust * ax, thrust * ay, thrust * az - GRAVITY
+        for k in range(4):
+            attitudes[n, k] = now[k]
+    return attitudes, accelerations, rates
 
 
 @njit(error_model="numpy")

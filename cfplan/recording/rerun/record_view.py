@@ -5,6 +5,7 @@ since the record's first message, on the one timeline `flight`.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from cfplan.recording.header import RecordHeader
 from cfplan.recording.plots import FLOWN as FLOWN_COLOUR
 from cfplan.recording.plots import LIMIT, Colour, Plot, finite_limits, motor_thrust, plots
 from cfplan.recording.plots import WANTED as WANTED_COLOUR
-from cfplan.recording.record import Record
+from cfplan.recording.record import Record, meant_motion
 from cfplan.recording.rerun import layout
 from cfplan.recording.rerun.picture import write_png
 from cfplan.recording.rerun.plan_view import log_plan
@@ -124,7 +125,8 @@ def log_styles(stream: rr.RecordingStream, shown: Sequence[Plot]) -> None:
 
 def log_columns(stream: rr.RecordingStream, record: Record, shown: Sequence[Plot], start: float) -> None:
     """Send all rows of a record, or of a part of one, and of its plots; `start`, s, is 0 on the timeline."""
-    poses, setpoints = record.poses, record.setpoints
+    poses = record.poses
+    setpoints = replace(record.setpoints, quaternion=meant_motion(record.setpoints)[0])  # not that of the packets
     for entity, tail, times, moving, colour, radius in (
         (layout.BODY, layout.TAIL, poses.time, poses, FLOWN_COLOUR, TAIL_RADIUS),
         (layout.GHOST, layout.WANTED_TAIL, setpoints.due, setpoints, WANTED_COLOUR, WANTED_RADIUS),

@@ -18,7 +18,7 @@ from cfplan.flight.setpoints.encoding import (
     motion_at,
 )
 from cfplan.flight.setpoints.packets import decode, encode
-from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, BRAKE_RATE_MAX, FIRMWARE_GAINS, AttitudeGains
+from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, BRAKE_RATE_MAX, FIRMWARE_GAINS, AttitudeGains, motion_of_sent
 from cfplan.geometry.min_snap import min_snap
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY
@@ -295,3 +295,16 @@ def test_a_path_out_of_the_packets_range_is_refused_with_the_setpoint():
 def test_sampling_that_makes_no_sense_is_refused(trajectory, bad):
     with pytest.raises(NotCertifiedError):
         encode_trajectory(trajectory, **bad)
+
+
+def test_of_the_packets_alone_people_see_the_motion_that_was_planned(encoded, trajectory):
+    sent, planned = encoded.decoded, trajectory.at(encoded.times)
+    made = Rotation.from_matrix(controller_attitude(sent.acceleration + np.array([0, 0, GRAVITY]), sent.quaternion))
+    attitude, acceleration, rate = motion_of_sent(encoded.times, sent.acceleration, made.as_quat(), sent.body_rate)
+    later = slice(50, None)  # it takes half a second to forget how it began
+    off = (Rotation.from_quat(attitude[later]).inv() * Rotation.from_quat(planned.quaternion[later])).magnitude()
+    assert np.degrees(off.max()) < 1.0
+    assert rate[later] == pytest.approx(trajectory.at(encoded.times + RATE_LEAD).body_rate[later], abs=0.12)
+    led = motion_at(trajectory, encoded.times).acceleration
+    assert acceleration[later] == pytest.approx(led[later], abs=0.15)
+    assert np.abs(sent.acceleration - led)[later].max() > 0.5
