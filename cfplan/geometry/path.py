@@ -55,8 +55,13 @@ class Path:
         tables = [table]
         for _ in range(MAX_ORDER):
             powers = np.arange(1, tables[-1].shape[1])
-            derivative = tables[-1][:, 1:] * powers[:, None]
+            with np.errstate(over="ignore"):
+                derivative = tables[-1][:, 1:] * powers[:, None]
             tables.append(derivative if len(powers) else np.zeros((len(table), 1, 3)))
+        if not all(np.isfinite(derivative).all() for derivative in tables[1:]):
+            raise InputError(
+                "coefficients of a path are too large to have derivatives", where="path", hint="give them in metres"
+            )
         for array in (breaks, origins, *tables):
             array.setflags(write=False)
         for name, value in (

@@ -162,3 +162,9 @@ def test_a_part_may_end_a_rounding_error_behind_the_path():
     part = path.part(0.4 * path.end, np.nextafter(path.end, np.inf))
     np.testing.assert_allclose(part(part.end), path(path.end), atol=1e-12)
     assert not part(part.end, 1).any()
+
+
+def test_coefficients_whose_derivatives_are_no_numbers_are_refused():
+    with pytest.raises(InputError, match="too large") as error:
+        Path(np.array([0.0, 1.0, 2.0]), np.full((2, 8, 3), 1e308))
+    assert error.value.hint
