@@ -139,7 +139,8 @@ def _log(parts: list[_Rows], reading: _Reading, file: Path) -> MocapLog:
         if origin is None:
             origin = float(frame[np.isfinite(frame)][0]) if np.isfinite(frame).any() else 0.0
         sub_frame = np.zeros(len(frame)) if section.sub_frame_column is None else np.nan_to_num(values[:, 1])
-        time = ((frame - origin) * (1 + sub_frame.max()) + sub_frame) / section.rate
+        with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers do not grow, or make times that none has
+            time = ((frame - origin) * (1 + sub_frame.max()) + sub_frame) / section.rate
         keep = ascending(time)
         if not keep.all():
             notes.append(f"{np.sum(~keep)} frames of section {section.name} left out, as their numbers do not grow")
