@@ -20,6 +20,8 @@ from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dry_run import dry_run
 from cfplan.studies.real_time import Conditions, RealTimeFlight, fly_in_real_time
 from cfplan.studies.result import Column, StudyResult, Table, detail_table
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import hopf_quaternion
 from cfplan.vehicle.trajectory import Trajectory
 
 PLAN_COLUMNS = (
@@ -182,9 +184,15 @@ def _rehearsed(name: str, planned: PlannedFlight, encoded: EncodedFlight) -> Reh
 
 
 def _without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFlight:
-    """Return the same flight with the acceleration of the motion alone."""
+    """Return the same flight with the acceleration of the motion alone, and the attitude that leans for just that."""
     times = encoded.times + encoded.lead
-    motion = replace(motion_at(trajectory, times), acceleration=trajectory.at(times).acceleration)
+    states = trajectory.at(times)
+    thrust = states.acceleration + np.array([0.0, 0.0, GRAVITY])
+    axis = (thrust / np.linalg.norm(thrust, axis=1)[:, None]).T
+    quaternion = np.stack(
+        hopf_quaternion((axis[0], axis[1], axis[2]), np.cos(states.yaw / 2), np.sin(states.yaw / 2)), 1
+    )
+    motion = replace(motion_at(trajectory, times), acceleration=states.acceleration, quaternion=quaternion)
     payloads = encode_motion(motion, trajectory.at(times + BRAKE_LEAD).acceleration, encoded.gains)
     return replace(encoded, payloads=payloads, decoded=decode(payloads))
 
