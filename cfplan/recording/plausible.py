@@ -8,6 +8,7 @@ from cfplan.errors import InputError
 LONGEST = 12 * 3600.0  # s, from the first time to the last; more cost memory and minutes wherever times are compared
 _LATEST = 1e11  # s; microseconds taken for seconds are later
 _FARTHEST = 1e4  # m, from the origin
+_LARGEST = 1e11  # of any number, in SI; squares of larger ones would not fit what draws them
 
 
 def check_times(time: NDArray, name: str, *, where: str) -> None:
@@ -39,4 +40,17 @@ def check_places(position: NDArray, name: str, *, where: str) -> None:
             f"position {int(wrong[0]) + 1} of {name} is ({x:g}, {y:g}, {z:g}) m",
             where=where,
             hint="the file is damaged, or its lengths are not in the unit that its format has",
+        )
+
+
+def check_values(values: NDArray, name: str, *, where: str) -> None:
+    """Raise InputError where a number, (N,) or (N, K), is larger than anything that is measured; NaN is not known."""
+    if values.dtype.kind != "f":
+        return
+    wrong = np.argwhere(np.abs(values) > _LARGEST)
+    if len(wrong):
+        raise InputError(
+            f"number {int(wrong[0, 0]) + 1} of {name} is {float(values[tuple(wrong[0])]):g}",
+            where=where,
+            hint="the file is damaged, or was changed since",
         )

@@ -5,6 +5,7 @@ import json
 import struct
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from cfplan.errors import InputError
 from cfplan.files.json_values import whole_characters
 from cfplan.recording.header import RecordHeader, header_from_json
-from cfplan.recording.plausible import check_places, check_times
+from cfplan.recording.plausible import check_places, check_times, check_values
 from cfplan.recording.record import FLIGHT_FILE, SUMMARY_FILE, Record
 from cfplan.recording.topics import FORMAT, METADATA, PROFILE, TOPICS, columns_from_json
 
@@ -89,10 +90,15 @@ def _check_plausible(record: Record, file: Path) -> None:
         check_times(stream.time, topic.name, where=str(file))
         if hasattr(stream, "position"):
             check_places(stream.position, topic.name, where=str(file))
+        for column in fields(stream):
+            check_values(getattr(stream, column.name), f"{topic.name} {column.name}", where=str(file))
     check_times(record.setpoints.due, "the setpoints' deadlines", where=str(file))
     check_times(record.poses.received, "the poses' arrivals", where=str(file))
     ends = [record.start, record.start + record.duration]
     check_times(np.r_[ends, record.setpoints.due, record.poses.received], "the record", where=str(file))
+    header = record.header
+    figures = [*astuple(header.bounds), header.travel_time, header.thrust_at_full_command]
+    check_values(np.array(figures), "the header", where=str(file))
     if not np.isfinite(record.header.fence).all():
         raise InputError("the header's fence is not finite", where=str(file), hint="the record was changed since")
     check_places(np.vstack([record.header.path, record.header.fence]), "the header", where=str(file))

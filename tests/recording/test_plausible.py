@@ -16,6 +16,7 @@ from cfplan.recording.importers.formats import read_log
 from cfplan.recording.overlay import Trial, trial_of_record
 from cfplan.recording.plausible import check_times
 from cfplan.recording.reader import read_record
+from cfplan.recording.report.charts import Curve, time_chart
 from cfplan.recording.report.report import read_flight
 from cfplan.recording.rerun.overlay_view import dashes, write_overlay
 from cfplan.recording.rerun.record_view import floor_lines, write_rrd
@@ -146,3 +147,21 @@ def test_what_is_drawn_is_bounded(tmp_path):
 
 def test_a_record_of_one_pose_is_a_trial(tmp_path):
     assert len(trial_of_record(read_record(record_of(tmp_path, pose(1.0))), "one").time) == 1
+
+
+@pytest.mark.parametrize("quaternion", [(1e300, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, -1e12)])
+def test_a_record_with_a_number_that_nothing_measures_is_refused(tmp_path, quaternion):
+    with pytest.raises(InputError, match="number 2 of /pose quaternion is") as error:
+        read_record(record_of(tmp_path, pose(1.0), PoseReceived(1.01, 1.01, (0.0, 0.0, 1.0), quaternion)))
+    assert error.value.hint
+
+
+@pytest.mark.parametrize("figure", ["travel_time", "thrust_at_full_command"])
+def test_a_header_with_a_number_that_nothing_measures_is_refused(tmp_path, figure):
+    with pytest.raises(InputError, match="of the header is 1e\\+300"):
+        read_record(record_of(tmp_path, pose(1.0), **{figure: 1e300}))
+
+
+def test_values_that_cannot_be_told_apart_make_a_chart():
+    time = np.array([0.0, 1.0])
+    assert "<svg" in time_chart("speed", [Curve("flown", time, np.array([0.0, 5e-324]), (0, 0, 0))])

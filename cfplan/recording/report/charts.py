@@ -18,6 +18,7 @@ WIDTH, HEIGHT = 560, 250  # of a chart, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 46, 34  # around what is drawn
 LIGHTEST = 0.55  # of a colour's luminance on white paper; lighter ones are darkened to it
 NARROWEST = 1.0  # m across a chart of places, or millimetres of noise would fill it
+_SMALLEST_SPAN = 1e-9  # of the values, or of 1: smaller ones cannot be told apart
 COLUMNS = 400  # pixels across a chart, within which points cannot be distinguished
 _LETTER = 6.2  # width of one, about
 _GRID, _TEXT, _BAND = "#e3e3e3", "#444", "#f3f6fb"
@@ -108,7 +109,8 @@ def _span(arrays: Sequence[NDArray]) -> tuple[float, float]:
     if len(values) == 0:
         return 0.0, 1.0
     low, high = float(values.min()), float(values.max())
-    return (low, high) if high > low else (low - 0.5, high + 0.5)
+    told_apart = high - low > _SMALLEST_SPAN * max(1.0, abs(low), abs(high))
+    return (low, high) if told_apart else (low - 0.5, high + 0.5)
 
 
 def _padded(low: float, high: float) -> tuple[float, float]:
