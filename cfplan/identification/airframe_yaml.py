@@ -42,8 +42,9 @@ def airframe_text(airframe: Airframe) -> str:
 
 
 def safety_lines(found: Identification, file: Path) -> str:
-    """Return the lines of safety.yaml that make flights use what was found."""
-    return f"vehicle: {file.name}\npose:\n  latency: {found.pose_latency:.4f}\n"
+    """Return the lines of safety.yaml that make flights use what was found; none for poses that are dated right."""
+    pose = f"pose:\n  latency: {found.pose_latency:.4f}\n" if found.poses_misdated else ""
+    return f"vehicle: {file.name}\n{pose}"
 
 
 def check_target(file: Path, *, overwrite: bool = False) -> None:

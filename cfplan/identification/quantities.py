@@ -31,6 +31,7 @@ _SOURCE = "identified from flights by cfplan identify; the rest: "
 # s: the quickest message of the log takes one, and its gyroscope's sample is as old; known to one.
 _LOG_DELAY, _LOG_DOUBT = 2e-3, 1e-3
 _PLAUSIBLE = (0.5, 2.0)  # thrust over mass, of before: no vehicle that flew as believed is farther off
+_BEYOND_DOUBT = 2.0  # standard uncertainties
 _LARGE_MISFIT = 0.004  # m rms
 _TELLS_DRAG, _TELLS_LAG = 0.3, 0.02  # share of the value, s: larger uncertainties tell nothing
 _TELLS_BATTERY = 0.3  # V that the voltage must span
@@ -74,6 +75,7 @@ class Identification:
 
     airframe: Airframe  # with what was told; the rest as before
     pose_latency: float  # s, from exposure to the pilot: `pose.latency` of safety.yaml
+    poses_misdated: bool  # whether poses are dated otherwise than they should be, beyond doubt
     quantities: dict[str, IdentifiedQuantity]
     notes: tuple[str, ...]  # what no record can tell, and what was held
     misfit: float  # m rms, of predictions over a second
@@ -112,9 +114,9 @@ def assemble(
         drag=(max(told("drag", before.drag[0]), 0.0), max(told("axial drag", before.drag[1]), 0.0)),
         source=_SOURCE + before.source.removeprefix(_SOURCE),
     )
-    return Identification(
-        airframe, found["pose latency"].value, found, _notes(mass, before, solution.rms), solution.rms
-    )
+    notes, latency = _notes(mass, before, solution.rms), found["pose latency"]
+    misdated = abs(latency.value - latency.before) > _BEYOND_DOUBT * latency.deviation
+    return Identification(airframe, latency.value, misdated, found, notes, solution.rms)
 
 
 def _dynamics(solution: FittedUnknowns, before: Airframe, mass: float | None) -> dict[str, IdentifiedQuantity]:

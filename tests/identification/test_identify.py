@@ -166,6 +166,7 @@ def test_the_airframe_file_is_read_back_as_written(found, tmp_path):
     assert again.inertia == pytest.approx(found.airframe.inertia, rel=1e-6)
     assert again.motor_thrust_max == pytest.approx(found.airframe.motor_thrust_max, rel=1e-6)
     assert f"latency: {found.pose_latency:.4f}" in safety_lines(found, file)
+    assert "latency" not in safety_lines(replace(found, poses_misdated=False), file)
 
 
 def test_tiny_numbers_of_an_airframe_are_numbers_in_yaml(tmp_path):
