@@ -18,6 +18,7 @@ import platform
 import re
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -354,19 +355,20 @@ class _Interpreted:
 class _Noting(_Interpreted):
     """Stands for a compiled function where calls are noted: those from plain Python alone."""
 
-    depth = 0
+    within = threading.local()  # of another such call, in this thread
 
     def __call__(self, *arguments: Any) -> Any:
-        if _Noting.depth == 0:
+        outermost = not getattr(self.within, "a_call", False)
+        if outermost:
             parameters = list(inspect.signature(self.function).parameters.values())
             types = [typeof(each, Purpose.argument) for each in arguments]
             types += [Omitted(each.default) for each in parameters[len(arguments) :]]
             _calls[Call(self.function.__module__, self.function.__qualname__, tuple(types))] = None
-        _Noting.depth += 1
+        self.within.a_call = True
         try:
             return self.function(*arguments)
         finally:
-            _Noting.depth -= 1
+            self.within.a_call = not outermost
 
 
 _stand_in: type[_Interpreted] | None = None  # what njit returns now, instead of compiled functions

@@ -1,5 +1,6 @@
 """From a path file or a plan file to a plan that is certified under today's limits."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -130,8 +131,9 @@ def give_way(planned: Plan, on_step: OnStep = ignore_steps) -> Plan:
 
     def assess(trajectory: Trajectory) -> list[Assessment]:
         encoded = encode_trajectory(trajectory)
-        link_loss = [] if limits.link_loss.only_warn else [assess_link_loss(encoded, limits)]
-        return [*link_loss, assess_glitches(encoded, limits)]
+        assessments = [assess_glitches] if limits.link_loss.only_warn else [assess_link_loss, assess_glitches]
+        with ThreadPoolExecutor() as pool:
+            return list(pool.map(lambda each: each(encoded, limits), assessments))
 
     with step(on_step, "slowing") as results:
         slowed, (*link_loss, glitches) = slow_locally(planned, assess)

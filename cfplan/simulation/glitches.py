@@ -95,7 +95,7 @@ def glitch_at_every_setpoint(
     return GlitchMoments(np.arange(len(payloads)) / rate, deviation, tilt, ~kept)
 
 
-@njit
+@njit(nogil=True)
 def _fly(
     deviation: NDArray,
     tilt: NDArray,
@@ -110,16 +110,18 @@ def _fly(
     rate: float,
     push: float,
 ) -> None:
-    """Fly the setpoints, and branch off at each, for each kind of gap."""
+    """Fly the setpoints, and branch off at each, for each kind of gap; without `push` an estimate misses nothing."""
     now, branch, believed = start.copy(), start.copy(), np.empty(STATE_SIZE)
     control, motors = np.zeros(4), np.zeros(4)
     for newest in range(len(setpoints)):
-        for kind in range(3):
+        for kind in range(3 if push != 0.0 else 2):
             for k in range(_SIZE):
                 branch[k] = now[k]
             deviation[kind, newest], tilt[kind, newest] = _fly_gap(
                 branch, believed, newest, setpoints, kind != 1, kind != 0, gains, later_body, gap, steps, rate, push
             )
+        if push == 0.0:
+            deviation[2, newest], tilt[2, newest] = deviation[0, newest], tilt[0, newest]
         for step in range(arrivals[newest], arrivals[newest + 1]):
             if step % _STEPS_A_CONTROL == 0:
                 _control(now, now, control, motors, gains, setpoints[newest], body, CONTROL_PERIOD)

@@ -11,6 +11,7 @@ makes it drift, by as much wherever it is: that drift is added to each box that 
 """
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -112,7 +113,8 @@ def simulate_link_loss(payloads: NDArray, limits: Limits, rate: float = RATE) ->
 def link_loss_at_every_setpoint(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLossMoments:
     """Lose the link after each setpoint of a flight that begins in hover, (N, 29) uint8 at `rate`, Hz."""
     state = decode(payloads)
-    boxes = [_swept(state, limits, body, rate)[:2] for body in _bodies(limits)]
+    with ThreadPoolExecutor() as pool:  # a motor lag each
+        boxes = [each[:2] for each in pool.map(lambda body: _swept(state, limits, body, rate), _bodies(limits))]
     return _judge(np.arange(len(payloads)) / rate, state.position, boxes, limits)
 
 
@@ -258,7 +260,7 @@ def _fly_stops(
         )  # fmt: skip
 
 
-@njit
+@njit(nogil=True)
 def _fly(
     swept: NDArray,
     aloft: NDArray,

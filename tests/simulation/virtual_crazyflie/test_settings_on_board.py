@@ -83,7 +83,7 @@ def test_a_vehicle_under_collision_avoidance_falls_behind_a_fast_stream(ready):
 
 @pytest.fixture
 def ready():
-    def make(colAv):  # noqa: N803: the firmware's name
+    def make(colAv):
         rig = Rig(VehicleSettings(stored={"colAv.enable": colAv}))
         rig.prepare()
         rig.take_off()
