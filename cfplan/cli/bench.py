@@ -1,5 +1,6 @@
 """`cfplan bench` and `cfplan study`: measured comparisons, each one command and one JSON file."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -188,18 +189,42 @@ def faults(path_file: Path, only: tuple[str, ...], **given: Any) -> None:
 
 @study.command(epilog="Example: cfplan study random-faults flights/*.yaml -o results/random-faults.json")
 @_paths
-@click.option("--flights", "count", type=click.IntRange(1), default=200, show_default=True)
+@click.option("--flights", "count", type=click.IntRange(1), default=10_000, show_default=True)
 @_seed(0, "Of the first flight.")
+@click.option(
+    "--random-paths", type=click.IntRange(0), default=0, show_default=True,
+    help="Small paths of two or three waypoints, beside those given.",
+)  # fmt: skip
+@click.option("--minutes", type=click.FloatRange(0, min_open=True), help="Begin no flight after them.  [default: all]")
+@click.option(
+    "--add", "earlier_files", type=click.Path(path_type=Path), multiple=True,
+    help="A result of other seeds, which the tables then count as well; may be given several times.",
+)  # fmt: skip
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
 @_output
 @options.as_json
-def random_faults(path_files: tuple[Path, ...], count: int, first_seed: int, **given: Any) -> None:
-    """Fly along each PATH in turn with random faults: kind, moment, length and size are drawn by seeds."""
-    from cfplan.studies.random_faults import random_flights
+def random_faults(**given: Any) -> None:
+    """Fly along each PATH in turn with one to three random faults, in two of five flights also a death, by seeds.
 
-    def run(**rest: Any) -> "StudyResult":
-        missions = {file.stem: _prepared_mission(file) for file in path_files}
-        return random_flights(missions, seeds=range(first_seed, first_seed + count), **rest)
+    What dies is the pilot or the radio. A flight of the tables is flown again by its seed, with the same paths.
+    """
+    _use_one_thread()
+    from cfplan.studies.random_faults import prepare_missions, random_flights
+    from cfplan.studies.result import read_result
+
+    def run(
+        path_files: tuple[Path, ...],
+        count: int,
+        first_seed: int,
+        random_paths: int,
+        earlier_files: tuple[Path, ...] = (),
+        minutes: float | None = None,
+        **rest: Any,
+    ) -> "StudyResult":
+        earlier = [read_result(file) for file in earlier_files]
+        missions = prepare_missions(path_files, _safety_file, random_paths)
+        seeds = range(first_seed, first_seed + count)
+        return random_flights(missions, seeds=seeds, minutes=minutes or math.inf, earlier=earlier, **rest)
 
     _measure(run, "flying", given)
 

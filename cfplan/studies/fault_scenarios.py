@@ -14,6 +14,7 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 
+FOR_GOOD = 60.0  # s, beyond the end of any flight of the table
 FULL_SPEED = 1.5  # s after the stream began: the path's cruise
 
 
@@ -27,9 +28,12 @@ class Scenario:
     phase: Phase = Phase.STREAM  # in which it begins
     moment: float = FULL_SPEED  # s after the phase began
     stall: float = 0.0  # s for which the pilot's computer stands still
+    stall_after: float = 0.0  # s from the moment
     order: Order | None = None  # of the operator
     main_killed: bool = False
+    main_killed_after: float = 0.0  # s from the moment
     pilot_killed: bool = False
+    pilot_killed_after: float = 0.0  # s from the moment
     disk_full: bool = False
     from_start: bool = False  # the faults are there before anything is connected
     vehicle: VehicleSettings = field(default_factory=lambda: VehicleSettings(auto_arming=False))
@@ -38,6 +42,12 @@ class Scenario:
     falls: bool = False
     """Motors stop in the air: the vehicle's supervisor stops them, or a take-off ends a hand above the floor."""
     grounded: bool = False  # it must never take off
+
+    @property
+    def leaves_alone(self) -> bool:
+        """Return whether nobody can end the flight: the pilot or the radio dies for good."""
+        dead = (fault.kind is RadioFaultKind.DEAD and fault.duration >= FOR_GOOD for fault in self.faults)
+        return self.pilot_killed or any(dead)
 
 
 def _poses(name: str, kind: FaultKind, rung: Rung, duration: float, size: float | None = None) -> Scenario:
@@ -57,31 +67,29 @@ def _odd(name: str, *, grounded: bool = False, **settings: Any) -> Scenario:
     return Scenario(name, Rung.NONE, vehicle=VehicleSettings(auto_arming=False, **settings), grounded=grounded)
 
 
-_REST = 60.0  # s, beyond the end of any flight of the table
-
 SCENARIOS: tuple[Scenario, ...] = (
     _poses("poses stop for 0.05 s", FaultKind.OCCLUDE, Rung.NONE, 0.05),
     _poses("poses stop for 0.1 s", FaultKind.OCCLUDE, Rung.NONE, 0.1),
     _poses("poses stop for 0.3 s", FaultKind.OCCLUDE, Rung.BRAKE, 0.3),
     _poses("poses stop for 1 s", FaultKind.OCCLUDE, Rung.LAND, 1.0),
     _poses("poses stop for 5 s", FaultKind.OCCLUDE, Rung.LAND, 5.0),
-    _poses("poses stop for good", FaultKind.STALL, Rung.LAND, _REST),
-    _poses("frozen pose for good", FaultKind.FREEZE, Rung.LAND, _REST),
+    _poses("poses stop for good", FaultKind.STALL, Rung.LAND, FOR_GOOD),
+    _poses("frozen pose for good", FaultKind.FREEZE, Rung.LAND, FOR_GOOD),
     _poses("frozen pose for 0.3 s", FaultKind.FREEZE, Rung.BRAKE, 0.3),
     _poses("same frame again for 1 s", FaultKind.REPEAT, Rung.LAND, 1.0),
     _poses("pose 5 cm off for 1 s", FaultKind.JUMP, Rung.NONE, 1.0, 0.05),
     _poses("pose 1 m off for 1 s", FaultKind.JUMP, Rung.LAND, 1.0, 1.0),
-    _poses("pose 1 m off for good", FaultKind.JUMP, Rung.LAND, _REST, 1.0),
+    _poses("pose 1 m off for good", FaultKind.JUMP, Rung.LAND, FOR_GOOD, 1.0),
     _poses("yaw turned by 180° for 1 s", FaultKind.FLIP, Rung.LAND, 1.0, pi),
-    _poses("yaw turned by 180° for good", FaultKind.FLIP, Rung.LAND, _REST, pi),
+    _poses("yaw turned by 180° for good", FaultKind.FLIP, Rung.LAND, FOR_GOOD, pi),
     _poses("NaN pose for 1 s", FaultKind.BREAK, Rung.LAND, 1.0),
     _poses("poses 200 ms late for 1 s", FaultKind.DELAY, Rung.BRAKE, 1.0, 0.2),
-    _poses("poses 200 ms late for good", FaultKind.DELAY, Rung.BRAKE, _REST, 0.2),
+    _poses("poses 200 ms late for good", FaultKind.DELAY, Rung.BRAKE, FOR_GOOD, 0.2),
     _poses("Vicon's connection reset, back after 0.5 s", FaultKind.CLOSE, Rung.LAND, 0.5),
-    _radio("radio loses 10 %", RadioFaultKind.LOSS, Rung.NONE, _REST, 0.1),
-    _radio("radio loses 30 %", RadioFaultKind.LOSS, Rung.NONE, _REST, 0.3),
-    _radio("radio loses 50 %", RadioFaultKind.LOSS, Rung.NONE, _REST, 0.5),
-    _radio("radio 30 ms slower", RadioFaultKind.DELAY, Rung.NONE, _REST, 0.03),
+    _radio("radio loses 10 %", RadioFaultKind.LOSS, Rung.NONE, FOR_GOOD, 0.1),
+    _radio("radio loses 30 %", RadioFaultKind.LOSS, Rung.NONE, FOR_GOOD, 0.3),
+    _radio("radio loses 50 %", RadioFaultKind.LOSS, Rung.NONE, FOR_GOOD, 0.5),
+    _radio("radio 30 ms slower", RadioFaultKind.DELAY, Rung.NONE, FOR_GOOD, 0.03),
     _radio("radio dead for 0.3 s", RadioFaultKind.DEAD, Rung.NONE, 0.3),
     _radio("radio dead for 1 s", RadioFaultKind.DEAD, Rung.LAND, 1.0),
     Scenario(
@@ -100,11 +108,11 @@ SCENARIOS: tuple[Scenario, ...] = (
     Scenario("stream stalled for 2.5 s", Rung.CUT, stall=2.5, falls=True),
     Scenario("main process killed", Rung.LAND, main_killed=True),
     Scenario("pilot killed", Rung.NONE, pilot_killed=True, falls=True),
-    _vehicle("battery sags to 3.1 V", VehicleFaultKind.BATTERY, Rung.LAND, _REST),
-    _vehicle("one motor at 70 %", VehicleFaultKind.MOTOR, Rung.NONE, _REST),
-    _vehicle("mass +20 %", VehicleFaultKind.MASS, Rung.NONE, _REST, from_start=True),
+    _vehicle("battery sags to 3.1 V", VehicleFaultKind.BATTERY, Rung.LAND, FOR_GOOD),
+    _vehicle("one motor at 70 %", VehicleFaultKind.MOTOR, Rung.NONE, FOR_GOOD),
+    _vehicle("mass +20 %", VehicleFaultKind.MASS, Rung.NONE, FOR_GOOD, from_start=True),
     _vehicle("gust of 1 m/s for 1 s", VehicleFaultKind.GUST, Rung.NONE, 1.0),
-    _vehicle("supervisor locks", VehicleFaultKind.LOCK, Rung.CUT, _REST, falls=True),
+    _vehicle("supervisor locks", VehicleFaultKind.LOCK, Rung.CUT, FOR_GOOD, falls=True),
     _vehicle("vehicle tumbles", VehicleFaultKind.TUMBLE, Rung.CUT, 0.3, falls=True),
     _odd("parameter refused", grounded=True, stubborn=("stabilizer.controller",)),
     _odd("parameters answered 0.5 s late", parameter_delay=0.5),
@@ -113,11 +121,11 @@ SCENARIOS: tuple[Scenario, ...] = (
     _odd("firmware of 2025.12", protocol=10, firmware="2025.12"),
     _odd("start place 0.5 m off", position=(0.35, -2.85, 0.0)),
     Scenario(
-        "two bodies swapped", Rung.NONE, (ViconFault(FaultKind.SWAP, 0.0, _REST),), from_start=True, grounded=True,
+        "two bodies swapped", Rung.NONE, (ViconFault(FaultKind.SWAP, 0.0, FOR_GOOD),), from_start=True, grounded=True,
         falls=True, cameras=ViconSettings(others=(("cf2", (0.5, 0.5, 0.0)),)),
     ),
     Scenario(
-        "two bodies swapped in the stream", Rung.LAND, (ViconFault(FaultKind.SWAP, 0.0, _REST),),
+        "two bodies swapped in the stream", Rung.LAND, (ViconFault(FaultKind.SWAP, 0.0, FOR_GOOD),),
         cameras=ViconSettings(others=(("cf2", (0.5, 0.5, 0.0)),)),
     ),
     Scenario(

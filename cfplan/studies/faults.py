@@ -25,6 +25,7 @@ from cfplan.recording.header import RecordHeader, header_under
 from cfplan.recording.reader import read_record
 from cfplan.recording.writer import RecordWriter, new_file
 from cfplan.simulation.lab.lab import Truth
+from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
 from cfplan.simulation.virtual_crazyflie.supervisor import State
@@ -55,6 +56,7 @@ COLUMNS = (
 _DOWN = 0.05  # m
 _SETTLING = 0.1  # s in which the supervisor notices that it was disarmed
 _AFTERWARDS = 6.0  # s after the pilot ended, in which the vehicle comes to rest
+_LONGEST = 100.0  # s; a vehicle that is left alone on the floor disarms 30 s after it was armed
 _ARMED = (State.ARMING, State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
 _RUNGS = {f"{rung.name.lower()}:": rung for rung in Rung}
 
@@ -102,6 +104,8 @@ class SteppedFlight:
     events: list[tuple[float, str]] = field(default_factory=list)
     sent: list[tuple[float, Triple]] = field(default_factory=list)  # s, m, each setpoint from the plan's first on
     landing: float = math.inf  # s, when the last phase of landing began
+    killed: bool = False  # the pilot, in flight or before
+    ended: bool = False  # the pilot, whatever it ended by
 
 
 def fault_table(
@@ -151,18 +155,30 @@ def fly_stepped(
 ) -> SteppedFlight:
     """Fly one in a stepped lab, by default a new one with that seed, until everything has come to rest."""
     lab = lab or _lab(scenario, mission, seed)
-    orders, flown = HeldOrders(), SteppedFlight(None, "", lab.truth(), math.nan)
+    orders, flown, begin = HeldOrders(), SteppedFlight(None, "", lab.truth(), math.nan), lab.now
 
     def strike() -> None:
         flown.struck = lab.now
         for fault in scenario.faults if not scenario.from_start else ():
             lab.disturb(fault)
-        lab.clock.stall(scenario.stall)
-        orders.worst, orders.gone = scenario.order, scenario.main_killed
+        orders.worst = scenario.order
+        if scenario.stall:
+            lab.clock.at(lab.now + scenario.stall_after, lambda: lab.clock.stall(scenario.stall))
+        if scenario.main_killed:
+            lab.clock.at(lab.now + scenario.main_killed_after, lambda: setattr(orders, "gone", True))
         if scenario.pilot_killed:
-            raise PilotKilled
+            lab.clock.at(lab.now + scenario.pilot_killed_after, kill)
+
+    def kill() -> None:
+        if flown.ended:
+            return
+        flown.killed = True
+        lab.disturb(RadioFault(RadioFaultKind.DEAD))  # what is left of the pilot's code cannot disarm any more
+        raise PilotKilled
 
     def hear(message: Telemetry) -> None:
+        if flown.killed:
+            return
         listen(message)
         if isinstance(message, Event):
             flown.events.append((message.time, message.text))
@@ -192,9 +208,13 @@ def fly_stepped(
         flown.reason = "the pilot was killed"
     except CfplanError as error:
         flown.reason = str(error)
+    flown.ended = True
     lab.clock.sleep(_SETTLING)
     flown.truth = lab.truth()
     if flown.truth.position[-1, 2] > _DOWN or flown.truth.motor[-1].any():
+        lab.clock.sleep(_AFTERWARDS)
+        flown.truth = lab.truth()
+    while scenario.leaves_alone and flown.truth.supervisor[-1] in _ARMED and lab.now < begin + _LONGEST:
         lab.clock.sleep(_AFTERWARDS)
         flown.truth = lab.truth()
     return flown
@@ -217,7 +237,7 @@ def judge(scenario: Scenario, flown: SteppedFlight, mission: Mission, readable: 
     return FaultFlight(
         name=scenario.name,
         expected="no take-off" if scenario.grounded else scenario.rung.name.lower(),
-        rung=rung.name.lower() if flew or scenario.pilot_killed else "no take-off",
+        rung=rung.name.lower() if flew or flown.killed else "no take-off",
         reaction=reaction,
         off_plan=_off_plan(flown, mission),
         off_setpoint=_off_setpoint(flown, mission),
@@ -237,6 +257,8 @@ def _rung_of(text: str) -> Rung | None:
 def _off_plan(flown: SteppedFlight, mission: Mission) -> float:
     outcome, truth = flown.outcome, flown.truth
     begin = flown.struck if not math.isnan(flown.struck) else outcome.first_setpoint if outcome is not None else 0.0
+    if outcome is None and (not flown.sent or begin < flown.sent[0][0]):
+        return 0.0
     if outcome is not None and (not outcome.first_setpoint or begin < outcome.first_setpoint):
         return 0.0
     planned = decode(mission.payloads).position

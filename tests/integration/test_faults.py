@@ -4,11 +4,15 @@ from pathlib import Path
 
 import pytest
 
+from cfplan.errors import InputError
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.telemetry import Phase
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
-from cfplan.studies.fault_scenarios import SCENARIOS
+from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
+from cfplan.studies.fault_scenarios import FOR_GOOD, SCENARIOS, Scenario
 from cfplan.studies.faults import fly_scenario, fly_stepped
-from cfplan.studies.random_faults import fly_random
+from cfplan.studies.random_faults import fly_random, prepare_missions, random_flights, random_scenario
 
 REPOSITORY = Path(__file__).parents[2]
 pytestmark = pytest.mark.integration
@@ -24,7 +28,7 @@ QUICK = (
     "two bodies swapped",
     "disk full",
 )
-SEEDS, PATHS = range(200), ("helix", "line", "loop3d", "random", "slalom")
+RANDOM_SEEDS = (0, 2, 7, 11)  # of thousands that `cfplan study random-faults` flies
 
 
 @pytest.fixture(scope="module")
@@ -67,21 +71,58 @@ def test_the_quick_rows_are_rows_of_the_table():
     assert set(QUICK) <= {row.name for row in SCENARIOS}
 
 
-def test_a_flight_in_the_stepped_lab_repeats_to_the_last_bit(line):
-    assert fly_random(11, {"line": line}) == fly_random(11, {"line": line})
+@pytest.fixture(scope="module")
+def missions():
+    return prepare_missions([REPOSITORY / "flights" / "line.yaml"], lambda _: REPOSITORY / "safety.yaml", 2)
 
 
-@pytest.mark.parametrize("seed", [8, 23])
-def test_a_random_fault_stays_inside_the_walls(seed, line):
-    _, flown = fly_random(seed, {"line": line})
+def test_a_flight_in_the_stepped_lab_repeats_to_the_last_bit(missions):
+    assert fly_random(11, missions) == fly_random(11, missions)
+
+
+@pytest.mark.parametrize("phase", [Phase.TAKE_OFF, Phase.GO_TO_START, Phase.STREAM, Phase.HOLD])
+@pytest.mark.parametrize("dies", ["pilot", "radio"])
+def test_a_vehicle_that_is_left_alone_while_setpoints_fly_it_comes_down_beneath_and_disarms(phase, dies, line):
+    radio = (RadioFault(RadioFaultKind.DEAD, 0.0, FOR_GOOD),) if dies == "radio" else ()
+    alone = Scenario(dies, Rung.NONE, radio, phase, 0.7, pilot_killed=dies == "pilot")
+    flown = fly_scenario(alone, line)
     assert flown.to_wall > 0.0
     assert flown.landed
+    assert flown.disarmed
+    assert flown.readable
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
-def test_no_random_fault_of_two_hundred_leaves_the_walls():
-    limits = load_limits(REPOSITORY / "safety.yaml")
-    missions = {name: prepare_mission(REPOSITORY / "flights" / f"{name}.yaml", limits) for name in PATHS}
-    outside = [flown.name for _, flown in (fly_random(seed, missions) for seed in SEEDS) if flown.to_wall <= 0.0]
-    assert not outside
+@pytest.mark.parametrize("seed", RANDOM_SEEDS)
+def test_random_faults_end_inside_the_walls_disarmed_with_a_record(seed, missions):
+    flown = fly_random(seed, missions)
+    assert flown.to_wall > 0.0
+    assert not flown.bad
+
+
+@pytest.mark.parametrize("moment", [0.1, 0.2, 0.4])
+def test_a_vehicle_left_alone_on_the_floor_disarms_too(moment, line):
+    flown = fly_scenario(Scenario("killed", Rung.NONE, phase=Phase.ARM, moment=moment, pilot_killed=True), line)
+    assert flown.to_wall > 1.0
+    assert flown.disarmed
+    assert flown.readable
+
+
+def test_faults_that_are_drawn_differ_and_death_is_among_them(line):
+    drawn = [random_scenario(seed, line) for seed in range(200)]
+    assert len({scenario.name for scenario in drawn}) > 190
+    assert {len(scenario.faults) for scenario in drawn} >= {0, 1, 2, 3}
+    assert 40 < sum(scenario.leaves_alone for scenario in drawn) < 120
+    assert {scenario.phase for scenario in drawn} >= {Phase.PREFLIGHT, Phase.TAKE_OFF, Phase.STREAM, Phase.LAND}
+
+
+def test_results_of_several_runs_make_one_and_no_flight_counts_twice(missions):
+    first = random_flights(missions, seeds=range(2))
+    both = random_flights(missions, seeds=range(2, 3), earlier=[first])
+    assert [row["seed"] for row in both.table("flights").rows] == [0, 1, 2]
+    assert both.table("all").rows[0]["flights"] == 3
+    with pytest.raises(InputError, match="count twice"):
+        random_flights(missions, seeds=range(1, 3), earlier=[first])
+
+
+def test_no_flight_begins_when_the_time_is_up(missions):
+    assert random_flights(missions, seeds=range(5), minutes=0.0).table("all").rows == ()
