@@ -79,10 +79,11 @@ def _spoil_mavlink(_: None, chance: Random, folder: Path) -> None:
         with contextlib.suppress(struct.error, OverflowError):  # a field that its type cannot hold
             link.send(made, force_mavlink1=chance.random() < 0.3 and kind < 256)
         content = b"".join(sink.packets)
-        found.append(spoil_bytes(content, chance) if chance.random() < 0.3 else content)
+        found.append((spoil_bytes(content, chance) if chance.random() < 0.3 else content)[:_LARGEST_DATAGRAM])
     _written(folder, found)
 
 
+_LARGEST_DATAGRAM = 65_000  # bytes
 _ASKED = (
     common.MAVLINK_MSG_ID_COMMAND_LONG,
     common.MAVLINK_MSG_ID_COMMAND_INT,

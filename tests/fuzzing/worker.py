@@ -86,7 +86,8 @@ class Watch:
 
     def _note(self, number: int) -> None:
         totals: tuple[Any, ...] = (self._count, self._refused, self._seconds, self._longest, self._memory)
-        PROGRESS.pack_into(self._shared, 0, number, time.monotonic(), time.process_time(), *totals)
+        # as a whole: pack_into() would write zeros first, and the process above would read a time of long ago
+        self._shared[:] = PROGRESS.pack(number, time.monotonic(), time.process_time(), *totals)
 
 
 def _flaw(error: CfplanError) -> str:
