@@ -275,7 +275,7 @@ def _bound(covariance: NDArray) -> None:
             covariance[column, row] = value
 
 
-@njit
+@njit(error_model="numpy")  # a pose turned by half a turn divides by zero: infinity, as on board
 def _fuse_pose(kalman: Filter, poses: NDArray, row: int) -> None:
     x, y, z, w = poses[row, 3], poses[row, 4], poses[row, 5], poses[row, 6]
     for axis in range(3):
@@ -294,7 +294,7 @@ def _fuse_pose(kalman: Filter, poses: NDArray, row: int) -> None:
         _fuse(kalman, 6 + axis, error[axis], poses[row, 8])
 
 
-@njit
+@njit(error_model="numpy")
 def _fuse(kalman: Filter, measured: int, error: float, deviation: float) -> None:
     """Fuse a direct measurement of one state: with c = P e and k = c / (eᵀc + σ²), P ← P − k cᵀ."""
     covariance = kalman.covariance

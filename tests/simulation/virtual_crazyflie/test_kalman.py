@@ -10,8 +10,10 @@ from cfplan.simulation.dynamics import kalman as estimator
 from cfplan.simulation.dynamics.kalman import Prior, estimate, new_filter, reset, step_filter
 from cfplan.simulation.lab.room import RoomSettings
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import Port
 from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.rotations import matrix_of
 
 NONE = np.zeros((0, 9))
@@ -190,3 +192,12 @@ def test_the_drag_parameters_take_away_the_error_of_velocity_at_speed(make_rig):
         without.set(f"kalman.dragB_{axis}", 0.0)
     assert abs(velocity_error(with_drag)) < 0.03
     assert velocity_error(without) > 0.05
+
+
+def test_a_pose_turned_by_half_a_turn_does_not_end_the_simulation():
+    """Half a turn divides by zero in the filter, and gives infinity there as it does on board."""
+    vehicle = VirtualCrazyflie(AIRFRAMES["crazyflie-2.1+"])
+    vehicle.use_kalman()
+    vehicle.receive(b"\x6d\x08" + struct.pack("<7f", 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    vehicle.advance(100)
+    assert vehicle.tick == 100
