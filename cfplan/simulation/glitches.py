@@ -17,36 +17,24 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
-from cfplan.simulation.dynamics.body import (
-    FULL_EFFICIENCY,
-    STATE_SIZE,
-    STILL_AIR,
-    THRUST_MAX,
-    TIME_STEP,
-    hovering,
-    pack_body,
-    step_body,
+from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STATE_SIZE, STILL_AIR, pack_body
+from cfplan.simulation.dynamics.branching import (
+    SNAPSHOT_SIZE,
+    STEPS_A_CONTROL,
+    arrival_steps,
+    hovering_snapshot,
+    setpoint_rows,
+    step_control,
+    step_vehicle,
 )
-from cfplan.simulation.dynamics.mellinger import (
-    CONTROL_PERIOD,
-    FULL_COMMAND,
-    FULL_STATE,
-    MEMORY_SIZE,
-    SETPOINT_SIZE,
-    distribute_power,
-    step_controller,
-)
+from cfplan.simulation.dynamics.mellinger import CONTROL_PERIOD, FULL_STATE
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import yaw_of
 
 GAP = 0.2  # s without setpoints, without poses
 AFTERWARDS = 1.0  # s that are simulated after the gap
 TURNED_OVER = math.radians(80.0)  # of tilt
 KINDS = ("setpoints", "poses", "setpoints and poses")
 _STEP = CONTROL_PERIOD  # s, of the simulation from the gap on: motors saturate, which 4 ms show too mildly
-_MEMORY, _THRUSTS = STATE_SIZE, STATE_SIZE + MEMORY_SIZE  # where they lie behind the state
-_SIZE = _THRUSTS + 4
-_STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,15 +67,10 @@ def glitch_at_every_setpoint(
 ) -> GlitchMoments:
     """Let a gap, s, begin at each setpoint of a flight that begins in hover, (N, 29) uint8 at `rate`, Hz."""
     state, airframe = decode(payloads), limits.airframe
-    rows = np.zeros((len(payloads), SETPOINT_SIZE))
-    rows[:, 0:16] = np.hstack([state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate])
-    arrivals = np.round(np.arange(len(payloads) + 1) / (rate * TIME_STEP)).astype(np.int64)
-    start = np.zeros(_SIZE)
-    start[:STATE_SIZE] = hovering(airframe, state.position[0], float(yaw_of(state.quaternion[0])))
-    start[_THRUSTS:] = airframe.hover_thrust
     deviation, tilt = np.empty((3, len(payloads))), np.empty((3, len(payloads)))
     _fly(
-        deviation, tilt, rows, arrivals, start, gains_for(airframe).pack(), pack_body(airframe, floor=-np.inf),
+        deviation, tilt, setpoint_rows(state), arrival_steps(len(payloads), rate), hovering_snapshot(airframe, state),
+        gains_for(airframe).pack(), pack_body(airframe, floor=-np.inf),
         pack_body(airframe, floor=-np.inf, step=_STEP), round(gap / _STEP), round((gap + AFTERWARDS) / _STEP), rate,
         GRAVITY * math.tan(limits.link_loss.attitude_error),
     )  # fmt: skip
@@ -115,20 +98,21 @@ def _fly(
     control, motors = np.zeros(4), np.zeros(4)
     for newest in range(len(setpoints)):
         for kind in range(3 if push != 0.0 else 2):
-            for k in range(_SIZE):
+            for k in range(SNAPSHOT_SIZE):
                 branch[k] = now[k]
             deviation[kind, newest], tilt[kind, newest] = _fly_gap(
-                branch, believed, newest, setpoints, kind != 1, kind != 0, gains, later_body, gap, steps, rate, push
-            )
+                branch, believed, newest, setpoints, kind != 1, kind != 0, gains, later_body, gap, steps, rate, push,
+                control, motors,
+            )  # fmt: skip
         if push == 0.0:
             deviation[2, newest], tilt[2, newest] = deviation[0, newest], tilt[0, newest]
         for step in range(arrivals[newest], arrivals[newest + 1]):
-            if step % _STEPS_A_CONTROL == 0:
-                _control(now, now, control, motors, gains, setpoints[newest], body, CONTROL_PERIOD)
-            step_body(now[:STATE_SIZE], now[_THRUSTS:], body, STILL_AIR, FULL_EFFICIENCY)
+            if step % STEPS_A_CONTROL == 0:
+                step_control(now, now, gains, setpoints[newest], FULL_STATE, body, CONTROL_PERIOD, control, motors)
+            step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
 
 
-@njit
+@njit(allocates=False)
 def _fly_gap(
     now: NDArray,
     believed: NDArray,
@@ -142,9 +126,13 @@ def _fly_gap(
     steps: int,
     rate: float,
     push: float,
+    control: NDArray,
+    motors: NDArray,
 ) -> tuple[float, float]:
-    """Fly on through a gap; return the worst deviation, m, and tilt, rad, from there on."""
-    control, motors = np.zeros(4), np.zeros(4)
+    """Fly on through a gap; return the worst deviation, m, and tilt, rad, from there on.
+
+    `now`, `believed`, `control` and `motors` are overwritten.
+    """
     farthest, least_lift = 0.0, 1.0
     speed = math.sqrt(now[3] ** 2 + now[4] ** 2)
     ahead_x, ahead_y = (now[3] / speed, now[4] / speed) if speed > 0.0 else (1.0, 0.0)
@@ -159,8 +147,8 @@ def _fly_gap(
             believed[1] -= 0.5 * push * time * time * ahead_y
             believed[3] -= push * time * ahead_x
             believed[4] -= push * time * ahead_y
-        _control(now, believed, control, motors, gains, setpoints[told], body, _STEP)
-        step_body(now[:STATE_SIZE], now[_THRUSTS:], body, STILL_AIR, FULL_EFFICIENCY)
+        step_control(now, believed, gains, setpoints[told], FULL_STATE, body, _STEP, control, motors)
+        step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
         away = 0.0
         for k in range(3):
             away += (now[k] - setpoints[due, k]) ** 2
@@ -170,20 +158,3 @@ def _fly_gap(
         if not lift >= least_lift:
             least_lift = lift
     return math.sqrt(farthest), math.acos(min(max(least_lift, -1.0), 1.0))
-
-
-@njit
-def _control(
-    now: NDArray,
-    believed: NDArray,
-    control: NDArray,
-    motors: NDArray,
-    gains: NDArray,
-    setpoint: NDArray,
-    body: NDArray,
-    period: float,
-) -> None:
-    step_controller(control, now[_MEMORY:_THRUSTS], gains, setpoint, FULL_STATE, believed, period)
-    distribute_power(control, motors)
-    for k in range(4):
-        now[_THRUSTS + k] = motors[k] * (body[THRUST_MAX] / FULL_COMMAND)

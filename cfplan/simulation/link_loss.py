@@ -31,26 +31,24 @@ from cfplan.simulation.dynamics.body import (
     FULL_EFFICIENCY,
     LAG,
     MASS,
-    STATE_SIZE,
     STILL_AIR,
     THRUST_MAX,
-    TIME_STEP,
-    hovering,
     pack_body,
-    step_body,
 )
-from cfplan.simulation.dynamics.mellinger import (
-    CONTROL_PERIOD,
-    FULL_COMMAND,
-    FULL_STATE,
-    MEMORY_SIZE,
-    SETPOINT_SIZE,
-    distribute_power,
-    level_out,
-    step_controller,
+from cfplan.simulation.dynamics.branching import (
+    MEMORY,
+    SNAPSHOT_SIZE,
+    STEPS_A_CONTROL,
+    THRUSTS,
+    arrival_steps,
+    hovering_snapshot,
+    setpoint_rows,
+    step_control,
+    step_vehicle,
 )
+from cfplan.simulation.dynamics.mellinger import CONTROL_PERIOD, FULL_STATE, SETPOINT_SIZE, level_out
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.rotations import axes_of, yaw_of
+from cfplan.vehicle.rotations import axes_of
 
 # s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
 LEVEL_AFTER, OFF_AFTER = Timeouts().level_out_at_latest, Timeouts().motors_off_at_latest
@@ -62,9 +60,6 @@ _STEP = 0.004  # s, of the simulation after the last setpoint
 _SETTLED_AFTER = 0.5  # s of level-out, after which a vehicle that hardly turns has settled
 _SETTLED_RATE = 0.2  # rad/s, below which it hardly turns
 _COAST_STEP = 0.01  # s, of the place alone
-_MEMORY, _THRUSTS = STATE_SIZE, STATE_SIZE + MEMORY_SIZE  # where they lie in a snapshot, behind the state
-_SNAPSHOT = _THRUSTS + 4
-_STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,14 +135,14 @@ def link_loss_of_stops(
     state, begin = decode(payloads), np.arange(0, len(payloads), every)
     within = np.unique(np.append(np.arange(0, stops.shape[1], each), stops.shape[1] - 1))
     told = decode(stops[begin].reshape(-1, PAYLOAD_SIZE))
-    rows = _rows(told).reshape(len(begin), stops.shape[1], SETPOINT_SIZE)
-    boxes = []
+    rows = setpoint_rows(told).reshape(len(begin), stops.shape[1], SETPOINT_SIZE)
+    arrivals, boxes = arrival_steps(stops.shape[1], rate), []
     for body in _bodies(limits):
         snapshots = _swept(state, limits, body, rate, fork=False)[2][begin]
         swept, aloft = np.empty((len(begin), stops.shape[1], 2, 3)), np.empty((len(begin), stops.shape[1]))
         forks = np.zeros(stops.shape[1], dtype=np.bool_)
         forks[within] = True
-        _fly_stops(swept, aloft, rows, snapshots, forks, _gains(limits), *body, *_steps(limits), _arrivals(rows, rate))
+        _fly_stops(swept, aloft, rows, snapshots, forks, _gains(limits), *body, *_steps(limits), arrivals)
         boxes.append((swept[:, within].reshape(-1, 2, 3), aloft[:, within].reshape(-1)))
     times = begin[:, None] / rate + within / rate
     places = rows[:, within, 0:3].reshape(-1, 3)
@@ -213,27 +208,13 @@ def _steps(limits: Limits) -> tuple[int, int]:
     return round(LEVEL_AFTER / _STEP), round(off / _STEP)
 
 
-def _rows(state: FullStateSetpoints) -> NDArray:
-    rows = np.zeros((len(state.position), SETPOINT_SIZE))
-    rows[:, 0:16] = np.hstack([state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate])
-    return rows
-
-
-def _arrivals(rows: NDArray, rate: float) -> NDArray:
-    """Return at which step each setpoint of a stream arrives, and the step of one more."""
-    return np.round(np.arange(rows.shape[-2] + 1) / (rate * TIME_STEP)).astype(np.int64)
-
-
 def _swept(
     state: FullStateSetpoints, limits: Limits, body: tuple[NDArray, NDArray], rate: float, *, fork: bool = True
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return boxes (N, 2, 3), times aloft (N,) s, and snapshots of vehicle and controller at each setpoint."""
-    count, rows = len(state.position), _rows(state)
-    swept, aloft, snapshots = np.empty((count, 2, 3)), np.empty(count), np.empty((count, _SNAPSHOT))
-    start = np.zeros(_SNAPSHOT)
-    start[:STATE_SIZE] = hovering(limits.airframe, state.position[0], float(yaw_of(state.quaternion[0])))
-    start[_THRUSTS:] = limits.airframe.hover_thrust
-    forks, arrivals = np.full(count, fork), _arrivals(rows, rate)
+    count, rows = len(state.position), setpoint_rows(state)
+    swept, aloft, snapshots = np.empty((count, 2, 3)), np.empty(count), np.empty((count, SNAPSHOT_SIZE))
+    start, forks, arrivals = hovering_snapshot(limits.airframe, state), np.full(count, fork), arrival_steps(count, rate)
     _fly(swept, aloft, snapshots, rows, start, forks, _gains(limits), *body, *_steps(limits), arrivals)
     return swept, aloft, snapshots
 
@@ -252,7 +233,7 @@ def _fly_stops(
     off_after: int,
     arrivals: NDArray,
 ) -> None:
-    snapshots = np.empty((stops.shape[1], _SNAPSHOT))
+    snapshots = np.empty((stops.shape[1], SNAPSHOT_SIZE))
     for n in range(len(stops)):
         _fly(
             swept[n], aloft[n], snapshots, stops[n], starts[n], forks, gains, body, later_body, level_after, off_after,
@@ -276,54 +257,44 @@ def _fly(
     arrivals: NDArray,
 ) -> None:
     """Fly setpoints from a snapshot; branch off where `forks` says so, at the moment at which each arrives."""
-    now, branch = start.copy(), start.copy()
-    control, motors, mode = np.zeros(4), np.zeros(4), FULL_STATE.copy()
-    wind, efficiency = STILL_AIR.copy(), FULL_EFFICIENCY.copy()
+    now, branch, setpoint, control, motors = start.copy(), start.copy(), setpoints[0].copy(), np.zeros(4), np.zeros(4)
+    full_state, mode = FULL_STATE.copy(), FULL_STATE.copy()
     for newest in range(len(setpoints)):
-        for k in range(_SNAPSHOT):
+        for k in range(SNAPSHOT_SIZE):
             snapshots[newest, k] = now[k]
         if forks[newest]:
-            for k in range(_SNAPSHOT):
+            for k in range(SNAPSHOT_SIZE):
                 branch[k] = now[k]
+            for k in range(SETPOINT_SIZE):
+                setpoint[k] = setpoints[newest, k]
+            for k in range(len(mode)):
+                mode[k] = full_state[k]
             aloft[newest] = _go_on_alone(
-                swept[newest], branch, setpoints[newest].copy(), gains, later_body, level_after, off_after
+                swept[newest], branch, setpoint, mode, gains, later_body, level_after, off_after, control, motors
             )
         for step in range(arrivals[newest], arrivals[newest + 1]):
-            if step % _STEPS_A_CONTROL == 0:
-                _control(now, control, motors, gains, setpoints[newest], mode, body, CONTROL_PERIOD)
-            step_body(now[:STATE_SIZE], now[_THRUSTS:], body, wind, efficiency)
+            if step % STEPS_A_CONTROL == 0:
+                step_control(now, now, gains, setpoints[newest], full_state, body, CONTROL_PERIOD, control, motors)
+            step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
 
 
-@njit
-def _control(
-    now: NDArray,
-    control: NDArray,
-    motors: NDArray,
-    gains: NDArray,
-    setpoint: NDArray,
-    mode: NDArray,
-    body: NDArray,
-    period: float,
-) -> None:
-    step_controller(control, now[_MEMORY:_THRUSTS], gains, setpoint, mode, now, period)
-    distribute_power(control, motors)
-    for k in range(4):
-        now[_THRUSTS + k] = motors[k] * (body[THRUST_MAX] / FULL_COMMAND)
-
-
-@njit
+@njit(allocates=False)
 def _go_on_alone(
     swept: NDArray,
     now: NDArray,
     setpoint: NDArray,
+    mode: NDArray,
     gains: NDArray,
     body: NDArray,
     level_after: int,
     off_after: int,
+    control: NDArray,
+    motors: NDArray,
 ) -> float:
-    """Fly on with the last setpoint, to the floor; write the box swept, and return how long that takes, s."""
-    control, motors, mode = np.zeros(4), np.zeros(4), FULL_STATE.copy()
-    wind, efficiency = STILL_AIR.copy(), FULL_EFFICIENCY.copy()
+    """Fly on with the last setpoint, to the floor; write the box swept, and return how long that takes, s.
+
+    `now`, `setpoint`, `mode`, `control` and `motors` are overwritten.
+    """
     settled_after = level_after + round(_SETTLED_AFTER / _STEP)
     for k in range(3):
         swept[0, k], swept[1, k] = now[k], now[k]
@@ -334,18 +305,18 @@ def _go_on_alone(
         if settled_after <= after < off_after and turning < _SETTLED_RATE:
             return after * _STEP + _coast(swept, now, setpoint, gains, body, (off_after - after) * _STEP)
         if after < off_after:
-            _control(now, control, motors, gains, setpoint, mode, body, _STEP)
+            step_control(now, now, gains, setpoint, mode, body, _STEP, control, motors)
         else:
             for k in range(4):
-                now[_THRUSTS + k] = 0.0
-        step_body(now[:STATE_SIZE], now[_THRUSTS:], body, wind, efficiency)
+                now[THRUSTS + k] = 0.0
+        step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
         _widen(swept, now)
         if after > off_after and now[2] <= 0.0:
             return after * _STEP
     return _LONGEST
 
 
-@njit
+@njit(allocates=False)
 def _coast(swept: NDArray, now: NDArray, setpoint: NDArray, gains: NDArray, body: NDArray, powered: float) -> float:
     """Follow the place of a vehicle whose attitude stands still, for `powered` s with motors and to the floor.
 
@@ -354,7 +325,7 @@ def _coast(swept: NDArray, now: NDArray, setpoint: NDArray, gains: NDArray, body
     _, _, (zx, zy, zz) = axes_of(now[6], now[7], now[8], now[9])
     mass, lag = body[MASS], max(body[LAG], _COAST_STEP)
     thrust = now[13] + now[14] + now[15] + now[16]
-    integral, time = now[_MEMORY + 2], 0.0
+    integral, time = now[MEMORY + 2], 0.0
     while time < _LONGEST:
         wanted = 0.0
         if time < powered:
@@ -378,7 +349,7 @@ def _coast(swept: NDArray, now: NDArray, setpoint: NDArray, gains: NDArray, body
     return time
 
 
-@njit
+@njit(allocates=False)
 def _widen(swept: NDArray, now: NDArray) -> None:
     """Make a box, (2, 3), hold a place; written so that what is no number is taken over."""
     for k in range(3):

@@ -67,7 +67,7 @@ def at_rest(position: NDArray, yaw: float = 0.0) -> NDArray:
     return state
 
 
-@njit
+@njit(allocates=False)
 def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, efficiency: NDArray) -> None:
     """Advance `state` by one step, in place.
 
@@ -126,7 +126,7 @@ def _spin_up(
     return push, body[_THRUST_TO_TORQUE] * push + body[_REACTION] * change / body[STEP]
 
 
-@njit
+@njit(allocates=False)
 def _turn(state: NDArray, step: float) -> None:
     """Turn the attitude by the body rate over a step, s, exactly for a constant rate."""
     wx, wy, wz = state[10], state[11], state[12]
@@ -141,7 +141,7 @@ def _turn(state: NDArray, step: float) -> None:
         state[6 + axis] = turned[axis] / norm
 
 
-@njit
+@njit(allocates=False)
 def _rest(state: NDArray, floor: float) -> None:
     """Stand on the floor: still and level, yaw kept."""
     state[2] = floor

@@ -26,18 +26,15 @@ from cfplan.simulation.dynamics.body import (
     pack_body,
     step_body,
 )
+from cfplan.simulation.dynamics.branching import STEPS_A_CONTROL, setpoint_rows
 from cfplan.simulation.dynamics.mellinger import (
-    CONTROL_PERIOD,
     FULL_COMMAND,
     FULL_STATE,
     MEMORY_SIZE,
-    SETPOINT_SIZE,
     distribute_power,
     step_mellinger,
 )
 from cfplan.vehicle.airframe import Airframe
-
-_STEPS_A_CONTROL = round(CONTROL_PERIOD / TIME_STEP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,16 +105,6 @@ def fly_setpoints(
     """
     steps = round(duration / TIME_STEP)
     arrivals = np.round((np.asarray(times) + delay) / TIME_STEP).astype(np.int64)
-    rows = np.zeros((len(times), SETPOINT_SIZE))
-    rows[:, 0:16] = np.hstack(
-        [
-            setpoints.position,
-            setpoints.velocity,
-            setpoints.acceleration,
-            setpoints.quaternion,
-            setpoints.body_rate,
-        ]
-    )
     random = np.random.default_rng(estimate.seed)
     noise = np.repeat(random.normal(size=(steps // 10 + 1, 6)), 10, axis=0)
     noise *= np.repeat([estimate.position_noise, estimate.velocity_noise], 3)
@@ -127,7 +114,7 @@ def fly_setpoints(
     _run(
         states,
         commands,
-        rows,
+        setpoint_rows(setpoints),
         arrivals,
         (gains or gains_for(airframe)).pack(),
         pack_body(airframe, floor=floor),
@@ -164,7 +151,7 @@ def _run(
             states[step, k] = state[k]
         while newest + 1 < len(arrivals) and arrivals[newest + 1] <= step:
             newest += 1
-        if step % _STEPS_A_CONTROL == 0:
+        if step % STEPS_A_CONTROL == 0:
             for k in range(STATE_SIZE):
                 believed[k] = state[k]
             for k in range(6):

@@ -45,7 +45,7 @@ _MOMENT_LIMIT = 32000.0
 ) = range(19)  # as flight/firmware.py packs the gains  # fmt: skip
 
 
-@njit
+@njit(allocates=False)
 def level_out(setpoint: NDArray, mode: NDArray) -> None:
     """Apply the supervisor's override when setpoints stop coming, in place: level, no yaw rate, height kept."""
     mode[MODE_X] = mode[MODE_Y] = DISABLE
@@ -55,7 +55,7 @@ def level_out(setpoint: NDArray, mode: NDArray) -> None:
     setpoint[15] = 0.0
 
 
-@njit
+@njit(allocates=False)
 def step_mellinger(
     control: NDArray, memory: NDArray, gains: NDArray, setpoint: NDArray, mode: NDArray, state: NDArray
 ) -> None:
@@ -63,7 +63,7 @@ def step_mellinger(
     step_controller(control, memory, gains, setpoint, mode, state, CONTROL_PERIOD)
 
 
-@njit
+@njit(allocates=False)
 def step_controller(
     control: NDArray,
     memory: NDArray,
@@ -146,7 +146,7 @@ def _pull(memory: NDArray, gains: NDArray, setpoint: NDArray, state: NDArray, ax
     return kp * error + kd * (setpoint[3 + axis] - state[3 + axis]) + ki * memory[axis]
 
 
-@njit
+@njit(allocates=False)
 def distribute_power(control: NDArray, motors: NDArray) -> None:
     """Mix a control into motor commands (4,), in [0, FULL_COMMAND]: all are lowered by the excess of the largest."""
     half_roll, half_pitch = np.trunc(control[1] / 2), np.trunc(control[2] / 2)
