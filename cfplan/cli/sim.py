@@ -25,7 +25,7 @@ def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning:
     planned = plan_flight(path_or_plan, limits, FlightOptions(**planning), steps)
     encoded = encode_flight(planned, steps)
     rehearsed = rehearse(planned, encoded, steps)
-    find_link_loss(encoded, limits, steps)
+    find_link_loss(encoded, limits, steps, planned.link_loss)
     if as_json:
         print_json(planned.to_dict() | {"dry_run": rehearsed.summary()})
     else:

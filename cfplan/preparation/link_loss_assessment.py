@@ -3,7 +3,7 @@
 import numpy as np
 
 from cfplan.flight.setpoints.encoding import EncodedFlight
-from cfplan.preparation.local_slowing import Assessment
+from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss
 from cfplan.safety.limits import Limits
 from cfplan.simulation.link_loss import WALLS, drift, link_loss_at_every_setpoint
 
@@ -38,4 +38,5 @@ def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MAR
         describe=describe,
         near=lambda at: moments.name_of_wall(at, limits),
         hint=OUTSIDE_HINT,
+        simulated=SimulatedLinkLoss(encoded.payloads, moments),
     )

@@ -16,6 +16,7 @@ from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan_result import LocalSlowing, Plan
 from cfplan.planning.repair import repair, slow
 from cfplan.safety.speed_caps import SpeedCaps
+from cfplan.simulation.link_loss import LinkLossMoments
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -30,6 +31,14 @@ LEADING_UP = 0.4  # s about a setpoint that decide how it ends: caps that are th
 
 
 @dataclass(frozen=True, slots=True)
+class SimulatedLinkLoss:
+    """Link loss at every setpoint of a flight, for whoever has the same bytes."""
+
+    payloads: NDArray  # (N, 29) uint8, at RATE
+    moments: LinkLossMoments
+
+
+@dataclass(frozen=True, slots=True)
 class Assessment:
     """How each setpoint of a flight ends, were it the last one or followed by a gap."""
 
@@ -40,6 +49,7 @@ class Assessment:
     describe: Callable[[int], str]  # of a setpoint at fault: "ends 0.12 m beyond the wall x = 2.25 m"
     near: Callable[[int], str]  # of a setpoint at fault: "the wall x = 2.25 m"
     hint: str  # what to do where slowing does not help
+    simulated: SimulatedLinkLoss | None = None  # what an assessment of link loss was made from
 
     @property
     def worst(self) -> int:

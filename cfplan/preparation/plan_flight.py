@@ -17,7 +17,7 @@ from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO
 from cfplan.preparation.glitch_assessment import assess_glitches
 from cfplan.preparation.link_loss_assessment import MARGIN, assess_link_loss
-from cfplan.preparation.local_slowing import Assessment, slow_locally
+from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss, slow_locally
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits
@@ -47,6 +47,7 @@ class PlannedFlight:
     plan: Plan
     limits: Limits
     lower_bound: float | None = None  # s, which no flight along the path can beat; None for a plan that was read
+    link_loss: SimulatedLinkLoss | None = None  # of the plan's bytes, where planning looked at it
 
     @property
     def was_read(self) -> bool:
@@ -112,16 +113,16 @@ def plan_flight(
     if options.only_shown and interprets():  # simulating link loss takes minutes without machine code
         with step(on_step, "slowing") as results:
             results.warn("not looked at before machine code is compiled; plan again, or with -o, to see it")
-    else:
-        planned = give_way(planned, on_step)
-    return PlannedFlight(path_file.name, planned, limits, bound)
+        return PlannedFlight(path_file.name, planned, limits, bound)
+    planned, link_loss = give_way(planned, on_step)
+    return PlannedFlight(path_file.name, planned, limits, bound, link_loss)
 
 
-def give_way(planned: Plan, on_step: OnStep = ignore_steps) -> Plan:
+def give_way(planned: Plan, on_step: OnStep = ignore_steps) -> tuple[Plan, SimulatedLinkLoss | None]:
     """Return the plan, slower in places if link loss would take the vehicle outside the walls from there, or a gap in
-    setpoints or poses would lose it.
+    setpoints or poses would lose it; and what link loss does to it.
 
-    Where safety.yaml says only to warn of link loss, nothing is slowed for that.
+    Where safety.yaml says only to warn of link loss, nothing is slowed for that, and it is not looked at.
 
     Raises:
         InfeasibleError: at some place the vehicle would end so however slowly it flies there.
@@ -143,7 +144,7 @@ def give_way(planned: Plan, on_step: OnStep = ignore_steps) -> Plan:
         results.append(f"a gap {glitches.describe(glitches.worst)} at most")
         if slowed.slowing:
             results.append(slowed.describe_slowing())
-    return slowed
+    return slowed, link_loss[0].simulated if link_loss else None
 
 
 def _read_plan(file: Path, limits: Limits, on_step: OnStep) -> PlannedFlight:

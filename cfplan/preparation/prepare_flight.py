@@ -9,6 +9,8 @@ need a part of the way call the parts.
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.pilot.mission import Mission, mission_of
 from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, check_bytes, encode_trajectory
@@ -17,6 +19,7 @@ from cfplan.machine_code import compile_from_here
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.glitch_assessment import assess_glitches
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT
+from cfplan.preparation.local_slowing import SimulatedLinkLoss
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
@@ -55,7 +58,7 @@ def prepare_flight(
     planned = plan_flight(source, limits, options, on_step)
     encoded = encode_flight(planned, on_step, stream_for=options.stream_for)
     rehearsed = rehearse(planned, encoded, on_step)
-    lost = find_link_loss(encoded, limits, on_step)
+    lost = find_link_loss(encoded, limits, on_step, planned.link_loss)
     if planned.was_read:  # else planning made sure of it, by the same bytes
         require_glitch_margin(encoded, limits, on_step)
     mission, stops = make_mission(encoded, limits, on_step)
@@ -104,13 +107,22 @@ def rehearse(planned: PlannedFlight, encoded: EncodedFlight, on_step: OnStep = i
     return rehearsed
 
 
-def find_link_loss(encoded: EncodedFlight, limits: Limits, on_step: OnStep = ignore_steps) -> LinkLoss:
-    """Simulate that the pilot or the radio dies at moments all along the flight, and return the worst.
+def find_link_loss(
+    encoded: EncodedFlight,
+    limits: Limits,
+    on_step: OnStep = ignore_steps,
+    simulated: SimulatedLinkLoss | None = None,
+) -> LinkLoss:
+    """Simulate that the pilot or the radio dies at every setpoint of the flight, and return the worst.
 
-    Raises NotCertifiedError where the vehicle comes down outside the walls, unless safety.yaml says only to warn.
+    Where planning `simulated` that for the very same bytes, under these limits, its answer is taken. Raises
+    NotCertifiedError where the vehicle comes down outside the walls, unless safety.yaml says only to warn.
     """
     with step(on_step, "link loss") as results:
-        lost = simulate_link_loss(encoded.payloads, limits)
+        if simulated is not None and np.array_equal(simulated.payloads, encoded.payloads):
+            lost = simulated.moments.worst
+        else:
+            lost = simulate_link_loss(encoded.payloads, limits)
         (results.warn if lost.beyond > 0 else results.append)(str(lost))
         if lost.beyond > 0 and not limits.link_loss.only_warn:
             raise NotCertifiedError(str(lost), where="link loss", hint=OUTSIDE_HINT)

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.flight.firmware import gains_for
@@ -17,7 +18,7 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
-from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STATE_SIZE, STILL_AIR, pack_body
+from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STATE_SIZE, STILL_AIR, TIME_STEP, pack_body
 from cfplan.simulation.dynamics.branching import (
     SNAPSHOT_SIZE,
     STEPS_A_CONTROL,
@@ -93,23 +94,36 @@ def _fly(
     rate: float,
     push: float,
 ) -> None:
-    """Fly the setpoints, and branch off at each, for each kind of gap; without `push` an estimate misses nothing."""
+    """Fly the setpoints, and branch off at each, for each kind of gap.
+
+    Without `push` an estimate without poses misses nothing: such a gap leaves the flight as it is, and one in both is
+    one in setpoints.
+    """
     now, branch, believed = start.copy(), start.copy(), np.empty(STATE_SIZE)
     control, motors = np.zeros(4), np.zeros(4)
+    following = round(steps * _STEP / TIME_STEP)
+    away, lift = np.empty(arrivals[-1] + following), np.empty(arrivals[-1] + following)
     for newest in range(len(setpoints)):
-        for kind in range(3 if push != 0.0 else 2):
+        for kind in range(3 if push != 0.0 else 1):
             for k in range(SNAPSHOT_SIZE):
                 branch[k] = now[k]
             deviation[kind, newest], tilt[kind, newest] = _fly_gap(
                 branch, believed, newest, setpoints, kind != 1, kind != 0, gains, later_body, gap, steps, rate, push,
                 control, motors,
             )  # fmt: skip
-        if push == 0.0:
-            deviation[2, newest], tilt[2, newest] = deviation[0, newest], tilt[0, newest]
-        for step in range(arrivals[newest], arrivals[newest + 1]):
+        last = newest + 1 == len(setpoints)
+        for step in range(arrivals[newest], len(away) if last else arrivals[newest + 1]):
             if step % STEPS_A_CONTROL == 0:
                 step_control(now, now, gains, setpoints[newest], FULL_STATE, body, CONTROL_PERIOD, control, motors)
             step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
+            away[step], lift[step] = _away(now, setpoints[newest]), _lift(now)
+    if push == 0.0:
+        for newest in range(len(setpoints)):
+            farthest, least_lift = 0.0, 1.0
+            for step in range(arrivals[newest], arrivals[newest] + following):
+                farthest, least_lift = _most(farthest, away[step]), _least(least_lift, lift[step])
+            deviation[1, newest], tilt[1, newest] = math.sqrt(farthest), _tilt(least_lift)
+            deviation[2, newest], tilt[2, newest] = deviation[0, newest], tilt[0, newest]
 
 
 @njit(allocates=False)
@@ -149,12 +163,33 @@ def _fly_gap(
             believed[4] -= push * time * ahead_y
         step_control(now, believed, gains, setpoints[told], FULL_STATE, body, _STEP, control, motors)
         step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
-        away = 0.0
-        for k in range(3):
-            away += (now[k] - setpoints[due, k]) ** 2
-        if not away <= farthest:
-            farthest = away
-        lift = 1.0 - 2.0 * (now[6] * now[6] + now[7] * now[7])
-        if not lift >= least_lift:
-            least_lift = lift
-    return math.sqrt(farthest), math.acos(min(max(least_lift, -1.0), 1.0))
+        farthest, least_lift = _most(farthest, _away(now, setpoints[due])), _least(least_lift, _lift(now))
+    return math.sqrt(farthest), _tilt(least_lift)
+
+
+@register_jitable
+def _away(now: NDArray, setpoint: NDArray) -> float:
+    """Return the square of the distance from a setpoint, m²."""
+    return (now[0] - setpoint[0]) ** 2 + (now[1] - setpoint[1]) ** 2 + (now[2] - setpoint[2]) ** 2
+
+
+@register_jitable
+def _lift(now: NDArray) -> float:
+    """Return the cosine of the tilt."""
+    return 1.0 - 2.0 * (now[6] * now[6] + now[7] * now[7])
+
+
+@register_jitable
+def _tilt(lift: float) -> float:
+    return math.acos(min(max(lift, -1.0), 1.0))
+
+
+@register_jitable
+def _most(value: float, other: float) -> float:
+    """Return the larger; written so that what is no number is taken over."""
+    return value if other <= value else other
+
+
+@register_jitable
+def _least(value: float, other: float) -> float:
+    return value if other >= value else other

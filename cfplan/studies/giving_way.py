@@ -105,7 +105,7 @@ def _trial(
     refused, after = "", before
     slowed = planned
     try:
-        slowed = give_way(planned)
+        slowed, _ = give_way(planned)
         after = encode_trajectory(slowed.trajectory)
     except InfeasibleError as error:
         refused = str(error)

@@ -9,12 +9,14 @@ import pytest
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
 from cfplan.flight.setpoints.packets import decode
 from cfplan.planning.plan_file import save_plan
+from cfplan.preparation import glitch_assessment, link_loss_assessment
 from cfplan.preparation import plan_flight as planning
 from cfplan.preparation import prepare_flight as preparation
 from cfplan.preparation.plan_flight import FlightOptions, plan_flight
 from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, prepare_flight
 from cfplan.preparation.steps import StepState
-from cfplan.simulation.link_loss import LinkLoss
+from cfplan.simulation import link_loss
+from cfplan.simulation.link_loss import LinkLoss, simulate_link_loss
 
 REPOSITORY = Path(__file__).parents[2]
 LINE = REPOSITORY / "flights" / "line.yaml"
@@ -67,13 +69,42 @@ def test_where_safety_yaml_says_so_it_is_a_warning(limits, monkeypatch, steps, b
     assert steps.names(state) == ["link loss"]
 
 
-def test_nothing_is_simulated_twice(limits, monkeypatch):
-    called = []
-    for name in ("dry_run", "simulate_link_loss", "certify_stops", "check_bytes"):
-        function = getattr(preparation, name)
-        monkeypatch.setattr(preparation, name, lambda *a, _f=function, _n=name, **k: called.append(_n) or _f(*a, **k))
-    prepare_flight(LINE, limits)
-    assert called == ["check_bytes", "dry_run", "simulate_link_loss", "certify_stops"]
+@pytest.fixture
+def called(monkeypatch):
+    """Notes each call of what encodes, checks and simulates."""
+    noted = []
+    for module, name in (
+        (link_loss_assessment, "link_loss_at_every_setpoint"), (glitch_assessment, "glitch_at_every_setpoint"),
+        (link_loss, "link_loss_at_every_setpoint"), (preparation, "check_bytes"), (preparation, "dry_run"),
+        (preparation, "certify_stops"),
+    ):  # fmt: skip
+        function = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, _f=function, _n=name, **k: noted.append(_n) or _f(*a, **k))
+    return noted
+
+
+IN_PLANNING = ["glitch_at_every_setpoint", "link_loss_at_every_setpoint"]
+
+
+def test_nothing_is_simulated_twice(limits, called):
+    prepared = prepare_flight(LINE, limits)
+    assert sorted(called[:2]) == IN_PLANNING
+    assert called[2:] == ["check_bytes", "dry_run", "certify_stops"]
+    assert prepared.link_loss == simulate_link_loss(prepared.mission.payloads, limits)
+
+
+def test_link_loss_is_simulated_anew_for_other_bytes_than_those_of_planning(limits, called):
+    prepared = prepare_flight(LINE, limits, FlightOptions(stream_for=6.0))
+    assert called[2:] == ["check_bytes", "dry_run", "link_loss_at_every_setpoint", "certify_stops"]
+    assert prepared.link_loss == simulate_link_loss(prepared.mission.payloads, limits)
+
+
+def test_a_plan_file_is_looked_at_whole(limits, tmp_path, called):
+    save_plan(plan_flight(LINE, limits).plan, tmp_path / "plan.parquet")
+    called.clear()
+    prepare_flight(tmp_path / "plan.parquet", limits)
+    checked = ["check_bytes", "dry_run", "link_loss_at_every_setpoint", "glitch_at_every_setpoint", "certify_stops"]
+    assert called == checked
 
 
 def test_a_plan_file_gives_the_same_bytes_as_its_path_file(limits, tmp_path, steps):

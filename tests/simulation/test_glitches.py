@@ -46,6 +46,23 @@ def test_a_gap_in_setpoints_does_what_the_dry_run_says_of_a_flight_with_that_gap
     assert found.tilt[0, number] == pytest.approx(np.arccos(1 - 2 * (x * x + y * y)).max(), abs=np.radians(2.0))
 
 
+def test_without_poses_a_right_attitude_flies_on_as_the_dry_run_does(found, line, limits):
+    start = hovering(limits.airframe, decode(line).position[0])
+    seconds = GAP + AFTERWARDS
+    end = len(line) / 100 + seconds
+    flown = fly_setpoints(decode(line), np.arange(len(line)) / 100, limits.airframe, start, duration=end, floor=-np.inf)
+    since = np.arange(round(1000 * end))
+    off = np.linalg.norm(
+        flown.position[since + 1] - decode(line).position[np.minimum(since // 10, len(line) - 1)], axis=1
+    )
+    x, y = flown.quaternion[since + 1, 0], flown.quaternion[since + 1, 1]
+    tilt = np.arccos(1 - 2 * (x * x + y * y))
+    for number in range(len(line)):
+        some = slice(10 * number, 10 * number + round(1000 * seconds))
+        assert found.deviation[1, number] == pytest.approx(off[some].max(), rel=1e-9)
+        assert found.tilt[1, number] == pytest.approx(tilt[some].max(), rel=1e-6)
+
+
 def test_a_flight_without_a_gap_stays_on_its_setpoints(line, limits):
     without = glitch_at_every_setpoint(line, limits, gap=0.0)
     assert without.deviation.max() < 0.03
