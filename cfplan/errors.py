@@ -31,7 +31,7 @@ class ExitCode(IntEnum):
     INFEASIBLE = 3
     NOT_CERTIFIED = 4  # certificate or dry run failed
     PREFLIGHT = 5
-    ENDED_BY_PILOT = 6
+    ENDED_BY_OPERATOR = 6
     ENDED_BY_SAFETY = 7
     LINK_LOST = 8
 

@@ -31,7 +31,7 @@ Examples:
 
 \b
 Exit codes: 0 ok, 2 usage, 3 infeasible, 4 certificate or dry run failed, 5 preflight failed,
-6 ended by the pilot, 7 ended by a safety rule, 8 link lost."""
+6 ended by the operator, 7 ended by a safety rule, 8 link lost."""
 
 
 @click.group(epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})

@@ -1,8 +1,11 @@
-"""The flight on the terminal while it goes on: a line a phase, and a bar along the path."""
+"""The flight on the terminal while it goes on: a line a phase, a bar along the path, and the keys that end it."""
 
 import contextlib
 import math
+import sys
+from collections.abc import Iterable
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from cfplan.cli.output import Steps
 from cfplan.errors import printable
@@ -18,7 +21,12 @@ from cfplan.flight.telemetry import (
     VehicleStatus,
 )
 
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
 _REFRESH = 0.1  # s
+KEYS = "space lands · Esc cuts the motors · Ctrl-C lands, twice cuts"
+SIGNALS_ALONE = "Ctrl-C lands, twice cuts the motors"  # where standard input is no terminal
 
 
 class FlightProgress:
@@ -26,25 +34,34 @@ class FlightProgress:
 
     def __init__(self, *, duration: float, steps: Steps, clock: Clock = REAL_CLOCK):
         from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, Progress, TextColumn
+        from rich.text import Text
 
         self._quiet = steps.as_json
+        self._keys = KEYS if sys.stdin.isatty() else SIGNALS_ALONE
         console = Console(stderr=True, quiet=self._quiet)
-        self._bar = Progress(
+        keys = Text(f"  {self._keys}", style="bold")
+
+        class BarWithKeys(Progress):
+            def get_renderables(self) -> "Iterable[RenderableType]":
+                yield from super().get_renderables()
+                yield keys
+
+        self._bar = BarWithKeys(
             TextColumn("  {task.description:<12}"),
             BarColumn(),
             TextColumn("{task.fields[numbers]}"),
-            TimeRemainingColumn(compact=True),
             console=console,
             disable=self._quiet or not console.is_terminal,
             transient=True,
         )
-        self._task = self._bar.add_task("", total=duration, numbers="")
+        self._duration = duration
+        self._task = self._bar.add_task("", total=None, numbers="")
         self._console = console
         self._setpoint: SetpointSent | None = None
-        self._first_index_time = 0.0
+        self._first_index_time: float | None = None  # s, while the path is streamed
         self._pose: PoseReceived | None = None
-        self._battery = 0.0
+        self._battery: float | None = None  # V
         self.heard_vehicle = False
         self._shown = -math.inf  # s
         self._clock, self._began = clock, clock.now()
@@ -84,15 +101,23 @@ class FlightProgress:
 
     def _enter(self, message: PhaseEntered) -> None:
         elapsed = message.time - self._began
+        if message.phase is Phase.ARM and self._bar.disable:  # there is no bar, under which they stand else
+            self._bar.console.print(f"  {self._keys}", highlight=False)
         self._bar.console.print(f"  {elapsed:6.2f} s  {message.phase}", highlight=False)
-        self._bar.update(self._task, description=str(message.phase))
-        if message.phase is Phase.STREAM:
-            self._first_index_time = message.time
+        streaming = message.phase is Phase.STREAM
+        self._first_index_time = message.time if streaming else None
+        # without a total the bar only shows that something goes on
+        self._bar.reset(self._task, total=self._duration if streaming else None, description=str(message.phase))
 
     def _draw(self) -> None:
-        done = self._setpoint.time - self._first_index_time if self._setpoint is not None else 0.0
-        numbers = f"battery {self._battery:.2f} V"
+        numbers = []
+        done = 0.0
+        if self._first_index_time is not None and self._setpoint is not None:
+            done = min(max(self._setpoint.time - self._first_index_time, 0.0), self._duration)
+            numbers.append(f"{done:.1f} of {self._duration:.1f} s")
         if self._pose is not None:
-            x, y, z = self._pose.position
-            numbers = f"({x:+.2f}, {y:+.2f}, {z:.2f}) m  {numbers}"
-        self._bar.update(self._task, completed=done, numbers=numbers)
+            x, y, z = (round(value, 2) + 0.0 for value in self._pose.position)  # no -0.0
+            numbers.append(f"({x:.2f}, {y:.2f}, {z:.2f}) m")
+        if self._battery is not None:
+            numbers.append(f"{self._battery:.2f} V")
+        self._bar.update(self._task, completed=done, numbers="  ".join(numbers))

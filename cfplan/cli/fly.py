@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cfplan.cli import options
-from cfplan.cli.output import Steps, print_json, print_table
+from cfplan.cli.output import Steps, print_json, print_table, styled
 from cfplan.errors import ExitCode
 from cfplan.preparation.compiled_calls import Stage
 
 if TYPE_CHECKING:
-    from cfplan.flight.pilot.outcome import FlightOutcome
+    from cfplan.cli.recorded_flight import RecordedFlight
     from cfplan.preparation.prepare_flight import PreparedFlight
 
 
@@ -80,46 +80,42 @@ def fly(
         prepared = prepare_flight(path_or_plan, limits, FlightOptions(**planning), steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             click.echo("not flown", err=True)
-            return int(ExitCode.ENDED_BY_PILOT)
+            return int(ExitCode.ENDED_BY_OPERATOR)
         with compiling_paused():
-            folder, outcome, summary = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
-    _print_result(prepared, folder, outcome, summary, as_json)
-    return int(outcome.exit_code)
+            flown = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
+    _print_result(prepared, flown, as_json)
+    return int(flown.outcome.exit_code)
 
 
-def _print_result(
-    prepared: "PreparedFlight", folder: Path, outcome: "FlightOutcome", summary: dict[str, Any], as_json: bool
-) -> None:
+def _print_result(prepared: "PreparedFlight", flown: "RecordedFlight", as_json: bool) -> None:
+    outcome, summary, folder = flown.outcome, flown.summary, str(flown.record.folder)
     if as_json:
-        document = {"record": str(folder), "plan": prepared.planned.to_dict(), **summary}
+        document = {"record": folder, "plan": prepared.planned.to_dict(), **summary}
         print_json(document | {"dry_run_max_deviation": prepared.dry_run.deviation})
     else:
         if outcome.checks and outcome.exit_code == ExitCode.PREFLIGHT:
             columns = ["check", "value", "must be", "verdict", "hint"]
             print_table("Preflight", columns, outcome.check_rows())
-        print_table("Flight", ["", "value"], _rows(prepared, outcome, summary))
+        print_table("Flight", ["", "value"], _rows(prepared, flown))
         click.echo(f"record: {folder}")
-        click.echo(f"replay: cfplan replay {shlex.quote(str(folder))}")
+        click.echo(f"replay: cfplan replay {shlex.quote(folder)}")
+        click.echo(f"report: cfplan report {shlex.quote(folder)}")
         if summary["deviation_grows_with_speed"]:
             click.echo("the deviation grows with speed: fly flights/identify.yaml, then `cfplan identify` its record")
-    if outcome.exit_code is not ExitCode.OK:
-        click.echo(f"{click.style('error:', fg='red')} {outcome.reason}", err=True)
+    if outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:  # as asked: no error
+        click.echo(f"{styled('ended:', 'yellow')} {outcome.reason}", err=True)
+    elif outcome.exit_code is not ExitCode.OK:
+        click.echo(f"{styled('error:', 'red')} {outcome.reason}", err=True)
 
 
-def _rows(prepared: "PreparedFlight", outcome: "FlightOutcome", summary: dict[str, Any]) -> list[list[str]]:
-    settled, deviation, lateness = summary["outcome"]["settled_after"], outcome.deviation, outcome.lateness
+def _rows(prepared: "PreparedFlight", flown: "RecordedFlight") -> list[tuple[str, str]]:
+    """Return the verdicts of preflight and dry run, and what `cfplan report` says of the record too."""
+    from cfplan.recording.summary import summarise, summary_rows
+
+    outcome = flown.outcome
     return [
-        ["ended", outcome.reason],
-        ["preflight", f"{sum(check.passed for check in outcome.checks)} of {len(outcome.checks)} checks passed"],
-        ["travel time, planned", f"{prepared.plan.trajectory.duration:.2f} s"],
-        ["travel time, streamed", f"{outcome.flown:.2f} s"],
-        ["settled after", "–" if settled is None else f"{settled:.2f} s"],
-        ["deviation, dry run", f"{100 * prepared.dry_run.deviation:.1f} cm max"],
-        ["deviation, flown", f"{100 * deviation.max:.1f} cm max, {100 * deviation.rms:.1f} cm rms"],
-        ["lateness of setpoints", f"{1e3 * lateness.p99:.2f} ms p99, {1e3 * lateness.max:.2f} ms max"],
-        ["battery", f"{_volts(summary['battery_start'])} → {_volts(summary['battery_end'])} V"],
+        ("ended", outcome.reason),
+        ("preflight", f"{sum(check.passed for check in outcome.checks)} of {len(outcome.checks)} checks passed"),
+        ("deviation, dry run", f"{100 * prepared.dry_run.deviation:.1f} cm max"),
+        *summary_rows(summarise(flown.record), flown.record.header.plan_limits),
     ]
-
-
-def _volts(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"

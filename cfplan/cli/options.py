@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from cfplan.cli.output import VERBOSE, short_path
 from cfplan.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,6 +19,10 @@ SAFETY_FILE = "safety.yaml"
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 path_file = click.argument("path_file", metavar="PATH", type=click.Path(path_type=Path))
 path_or_plan = click.argument("path_or_plan", metavar="PATH_OR_PLAN", type=click.Path(path_type=Path))
+
+
+def _remember_verbose(context: click.Context, _: click.Parameter, verbose: bool) -> None:
+    context.meta[VERBOSE] = verbose
 
 
 def planning(command: Callable) -> Callable:
@@ -42,6 +47,14 @@ def planning(command: Callable) -> Callable:
                 "speed_factor",
                 type=click.FloatRange(0, 1, min_open=True),
                 help="Factor on the allowed speed; else the path file's, else 1.",
+            ),
+            click.option(
+                "-v",
+                "--verbose",
+                is_flag=True,
+                expose_value=False,
+                callback=_remember_verbose,
+                help="Say more of each step, as what every planner found.",
             ),
         )
     ):
@@ -81,6 +94,6 @@ def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compile_
 
         limits = load_limits(safety_file)
         plan = limits.plan
-        results.append(f"{limits.vehicle}, {plan.speed:g} m/s, {plan.acceleration:g} m/s² ({safety_file})")
+        results.append(f"{limits.vehicle}, {plan.speed:g} m/s, {plan.acceleration:g} m/s² ({short_path(safety_file)})")
         results += [compiling] if compiling else []
     return limits

@@ -1,9 +1,13 @@
 """Output of the commands: a line a step for people, one JSON document for scripts."""
 
 import json
+import os
+import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import click
@@ -13,8 +17,10 @@ from cfplan.files.json_values import json_value
 from cfplan.flight.clock import REAL_CLOCK, Clock, Repeated
 from cfplan.preparation.steps import StepResults, StepState, step
 
+VERBOSE = f"{__name__}.verbose"  # in click's context: --verbose was given
 _FIRST_NOTE, _TERMINAL_NOTES, _OTHER_NOTES = 1.0, 0.5, 4.0  # s until a wait is shown, and between later notes
 _MARKS = {StepState.FINISHED: ("✓", "green"), StepState.WARNED: ("!", "yellow"), StepState.FAILED: ("✗", "red")}
+_NARROWEST = 30  # characters for a step's result, below which it is not wrapped
 _FILE_WIDTH = 170  # characters, of tables that go to a file or a pipe
 
 
@@ -27,6 +33,8 @@ class Steps:
 
     def __init__(self, *, as_json: bool, clock: Clock = REAL_CLOCK):
         self.as_json, self._clock = as_json, clock
+        context = click.get_current_context(silent=True)
+        self.verbose = bool(context and context.meta.get(VERBOSE))  # whether details of steps are shown
         self.meanwhile: Callable[[], str] = str  # what else goes on, shown beside what is waited for
         self._begun = 0.0
         self._waiting: Repeated | None = None
@@ -35,6 +43,10 @@ class Steps:
         """Show how far a step is; an OnStep."""
         if self.as_json:
             return
+        if state is StepState.DETAIL:
+            if self.verbose:
+                click.echo(_line(" ", " " * 23, result))
+            return
         if state is StepState.BEGUN:
             self._begun = self._clock.now()
             note = _WaitingNote(name, self, self._clock)
@@ -42,9 +54,8 @@ class Steps:
             return
         self._end_waiting()
         sign, colour = _MARKS[state]
-        mark = click.style(sign, fg=colour)
         took = f"{(self._clock.now() - self._begun) * 1e3:.0f} ms"
-        click.echo(f"{mark} {name:<12} {took:>8}  {printable(result)}".rstrip())
+        click.echo(_line(styled(sign, colour), f"{name:<12} {took:>8}  ", result))
 
     def _end_waiting(self) -> None:
         if self._waiting is not None:
@@ -67,7 +78,7 @@ class Steps:
     def failed(self, name: str, text: str) -> None:
         """Show a step that ran to its end with the verdict no."""
         if not self.as_json:
-            click.echo(f"{click.style('✗', fg='red')} {name:<12} {printable(text)}")
+            click.echo(_line(styled("✗", "red"), f"{name:<12} ", text))
 
     def say(self, text: str = "") -> None:
         """Print a line that is no step."""
@@ -75,12 +86,21 @@ class Steps:
             click.echo(text)
 
 
+def _line(mark: str, head: str, result: str) -> str:
+    """Return a step's line; on a terminal that is too narrow it goes on under the result's beginning."""
+    text = printable(result)
+    room = shutil.get_terminal_size().columns - 2 - len(head)
+    if sys.stdout.isatty() and len(text) > room >= _NARROWEST:
+        text = textwrap.fill(text, room, break_on_hyphens=False).replace("\n", "\n" + " " * (2 + len(head)))
+    return f"{mark} {head}{text}".rstrip()
+
+
 class _WaitingNote:
     """Says again and again what is waited for."""
 
     def __init__(self, name: str, steps: Steps, clock: Clock):
         self._name, self._steps, self._clock = name, steps, clock
-        self._begun, self._on_terminal = clock.now(), sys.stdout.isatty()
+        self._begun, self._on_terminal = clock.now(), on_terminal()
         self._calls = 0
 
     def show(self) -> float | None:
@@ -112,25 +132,37 @@ def print_json(document: Any) -> None:
 
 def print_error(error: CfplanError, *, as_json: bool) -> None:
     """Print one line on standard error, and the same as JSON on standard output where that was asked for."""
-    click.echo(f"{click.style('error:', fg='red')} {error}", err=True)
+    click.echo(f"{styled('error:', 'red')} {error}", err=True)
     if as_json:
         code = int(error.exit_code)
         print_json({"error": error.what, "where": error.where, "hint": error.hint, "exit_code": code})
 
 
 def print_table(title: str, columns: list[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table: the first column to the left, numbers to the right."""
-    from rich import box
+    """Print a table: text to the left, numbers to the right, no wider than the terminal."""
     from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
-    table = Table(title=title, title_justify="left", header_style="bold", box=box.SIMPLE_HEAD)
-    for index, column in enumerate(columns):
-        table.add_column(column, justify="left" if index == 0 else "right")
-    for row in rows:
-        table.add_row(*(Text(printable(cell)) for cell in row))
-    console = Console()
+    from cfplan.cli.tables import print_fitting
+
+    console = Console(highlight=False)
     if not console.is_terminal:
         console.width = _FILE_WIDTH
-    console.print(table)
+    print_fitting(console, title, columns, [[printable(cell) for cell in row] for row in rows])
+
+
+def styled(text: str, colour: str) -> str:
+    """Return text in that colour; as it is where the environment has NO_COLOR (https://no-color.org)."""
+    return text if os.environ.get("NO_COLOR") else click.style(text, fg=colour)
+
+
+def on_terminal() -> bool:
+    """Return whether standard output is a terminal that can overwrite a line."""
+    return sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
+
+
+def short_path(file: Path) -> str:
+    """Return a path as it is shortest to read: from the working folder where it lies in it."""
+    try:
+        return str(file.resolve().relative_to(Path.cwd()))
+    except (ValueError, OSError):
+        return str(file)

@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from cfplan.cli.flight_progress import FlightProgress
 from cfplan.cli.output import Steps
@@ -20,14 +20,23 @@ from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.prepare_flight import PreparedFlight
 from cfplan.recording.header import header_of_plan
 from cfplan.recording.reader import read_record
+from cfplan.recording.record import Record
 from cfplan.recording.summary import summarise
 from cfplan.recording.writer import RecordWriter, new_record_folder, wall_time_at_zero, write_summary
 
 
+class RecordedFlight(NamedTuple):
+    """A flight that is over."""
+
+    outcome: FlightOutcome
+    record: Record
+    summary: dict[str, Any]  # as it stands in the record's folder
+
+
 def fly_and_record(
     prepared: PreparedFlight, source: Path, records: Path, vehicle: StartingVehicle, watched: Watched, steps: Steps
-) -> tuple[Path, FlightOutcome, dict[str, Any]]:
-    """Fly, and return the record's folder, the outcome and the summary. Without a flight no folder is left.
+) -> RecordedFlight:
+    """Fly, and return the outcome, the record and its summary. Without a flight no folder is left.
 
     Raises a CfplanError where the vehicle or its poses cannot be had.
     """
@@ -49,7 +58,7 @@ def fly_and_record(
         summary = {"uri": vehicle.uri, "outcome": outcome.to_dict(), **summarise(record).to_json()}
         summary["deviation_grows_with_speed"] = suggests_identification(record)
         write_summary(folder, summary)
-    return folder, outcome, summary
+    return RecordedFlight(outcome, record, summary)
 
 
 def _fly_into(

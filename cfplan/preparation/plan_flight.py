@@ -105,11 +105,14 @@ def plan_flight(
             speed_factor=path_file.speed if options.speed_factor is None else options.speed_factor,
         )
         results.append(f"{planned.trajectory.duration:.2f} s of flight by {planned.planner}")
-        results.extend(planned.notes)
+        if planned.speed_factor < 1.0:
+            results.append(f"at {planned.speed_factor:g} of full speed")
+        results.details += planned.notes
     with step(on_step, "bound") as results:
         bound = planned.lower_bound or lower_bound(PlanningTask(planned.path, planned.airframe, limits.plan))
-        more = planned.trajectory.duration / bound - 1
-        results.append(f"no flight takes less than {bound:.2f} s; this one takes {more:.1%} more")
+        more = planned.trajectory.duration * planned.speed_factor / bound - 1
+        whose = "this one takes" if planned.speed_factor == 1.0 else "at full speed this one would take"
+        results.append(f"no flight takes less than {bound:.2f} s; {whose} {100 * more:.1f} % more")
     if options.only_shown and interprets():  # simulating link loss takes minutes without machine code
         with step(on_step, "slowing") as results:
             results.warn("not looked at before machine code is compiled; plan again, or with -o, to see it")

@@ -14,6 +14,7 @@ class StepState(Enum):
     FINISHED = "finished"
     WARNED = "warned"  # finished, and a person should read the result
     FAILED = "failed"
+    DETAIL = "detail"  # told after the end: what only some readers want to know
 
 
 OnStep = Callable[[str, StepState, str], None]  # name of the step, how far it is, its result in one line
@@ -24,9 +25,12 @@ def ignore_steps(name: str, state: StepState, result: str) -> None:
 
 
 class StepResults(list[str]):
-    """What a step says at its end, and whether that is a warning."""
+    """What a step says at its end, whether that is a warning, and details that only some readers want."""
 
-    warning = False
+    def __init__(self) -> None:
+        super().__init__()
+        self.warning = False
+        self.details: list[str] = []
 
     def warn(self, result: str) -> None:
         """Append a result that a person should read."""
@@ -45,3 +49,5 @@ def step(on_step: OnStep, name: str) -> Iterator[StepResults]:
         on_step(name, StepState.FAILED, "")
         raise
     on_step(name, StepState.WARNED if results.warning else StepState.FINISHED, ", ".join(results))
+    for detail in results.details:
+        on_step(name, StepState.DETAIL, detail)

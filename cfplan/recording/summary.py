@@ -5,7 +5,6 @@ compared with the reference at the pose's own time (deviation in time) and with 
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import NamedTuple
@@ -16,9 +15,10 @@ from numpy.typing import NDArray
 from cfplan.flight.telemetry import Phase
 from cfplan.recording.path_distance import distance_to_path
 from cfplan.recording.record import Record, Setpoints
+from cfplan.safety.limits import PlanLimits
 
 UNKNOWN = "–"
-SETTLED = 0.05  # m from the end of the path: close enough to call the flight settled
+SETTLED = 0.03  # m from the end of the path: close enough to call the flight settled
 DROPOUT = 3.0  # usual intervals between poses: a longer gap is a dropout
 
 
@@ -28,7 +28,8 @@ class FlightSummary:
 
     travel_time_planned: float  # s
     travel_time_flown: float
-    """s, from the path's first setpoint until the vehicle stays at its end; NaN where the path was not finished."""
+    """s, planned, and by how much later than its setpoints the vehicle came within SETTLED of the path's end to stay;
+    NaN where the path was not finished."""
     settling: float  # s, from the end of the reference until the vehicle stays within SETTLED of the path's end
     max_deviation: float  # m, from the reference in time
     rms_deviation: float  # m
@@ -65,14 +66,14 @@ def summarise(record: Record) -> FlightSummary:
     """Return all numbers of one flight."""
     begin, end = reference_span(record)
     along = deviation(record, begin, end)
-    settled = settling(record)
+    arrived, sent = arrival(record)
     late = _finite(record.setpoints.time - record.setpoints.due)
     gaps = pose_gaps(record.poses.time)
     volts = _finite(record.status.battery_voltage)
     return FlightSummary(
         travel_time_planned=record.header.travel_time,
-        travel_time_flown=end - begin + settled,
-        settling=settled,
+        travel_time_flown=end - begin + arrived - sent,
+        settling=max(arrived - end, 0.0),
         max_deviation=_worst(along.in_time),
         rms_deviation=_rms(along.in_time),
         max_deviation_to_path=_worst(along.to_path),
@@ -142,17 +143,37 @@ def settling(record: Record) -> float:
 
     NaN where the path was not finished, where there is no pose, or where the vehicle was still outside at the last.
     """
-    _, end = reference_span(record)
+    return max(arrival(record)[0] - reference_span(record)[1], 0.0)
+
+
+def arrival(record: Record) -> tuple[float, float]:
+    """Return s, from when on the vehicle, and its setpoints, stay within SETTLED of the path's end.
+
+    NaN where the path was not finished, where there is no pose, or where the vehicle was still outside at the last.
+    """
+    begin, end = reference_span(record)
     held = record.phase_span(Phase.HOLD)
     if not finished(record) or held is None:
-        return math.nan
-    goal = record.setpoints.position[np.searchsorted(record.setpoints.due, _streamed(record)[-1])]
-    after = (record.poses.time >= end) & (record.poses.time <= max(held[1], end))
-    time, position = record.poses.time[after], record.poses.position[after]
-    outside = np.flatnonzero(~(np.linalg.norm(position - goal, axis=1) <= SETTLED))
+        return math.nan, math.nan
+    due = _streamed(record)
+    sent = (record.setpoints.due >= begin) & (record.setpoints.due <= due[-1])
+    goal = record.setpoints.position[np.searchsorted(record.setpoints.due, due[-1])]
+    seen = (record.poses.time >= begin) & (record.poses.time <= max(held[1], end))
+    vehicle = _from_then_near(record.poses.time[seen], record.poses.position[seen], goal)
+    return vehicle, _from_then_near(reference_times(record.setpoints)[sent], record.setpoints.position[sent], goal)
+
+
+def _from_then_near(time: NDArray, position: NDArray, goal: NDArray) -> float:
+    """Return s, from when on all positions are within SETTLED of the goal, straight between them; NaN if never."""
+    off = np.linalg.norm(position - goal, axis=1)
+    outside = np.flatnonzero(~(off <= SETTLED))
     if len(time) == 0 or (len(outside) and outside[-1] == len(time) - 1):
         return math.nan
-    return float(time[outside[-1] + 1] - end) if len(outside) else 0.0
+    if not len(outside):
+        return float(time[0])
+    last = outside[-1]
+    share = (off[last] - SETTLED) / (off[last] - off[last + 1]) if math.isfinite(off[last]) else 1.0
+    return float(time[last] + share * (time[last + 1] - time[last]))
 
 
 def finished(record: Record) -> bool:
@@ -176,18 +197,28 @@ def dropouts(gaps: NDArray) -> NDArray:
     return np.flatnonzero(gaps > DROPOUT * np.median(gaps)) if len(gaps) else np.empty(0, dtype=int)
 
 
-def summary_rows(summary: FlightSummary, shares: Mapping[str, float] | None = None) -> list[tuple[str, str]]:
-    """Return what each number is and its value as people read it; peaks with their share of the limit where given."""
+PLAN_LIMITS = {"peak_speed": "speed", "peak_acceleration": "acceleration", "peak_body_rate": "angular_velocity"}
+"""The limit of planned motion that each peak is compared with."""
+
+
+def shares(summary: FlightSummary, limits: PlanLimits) -> dict[str, float]:
+    """Return each peak's share of the plan's limit; NaN where the record holds no peak or no limit."""
+    return {peak: getattr(summary, peak) / getattr(limits, limit) for peak, limit in PLAN_LIMITS.items()}
+
+
+def summary_rows(summary: FlightSummary, limits: PlanLimits) -> list[tuple[str, str]]:
+    """Return what each number is and its value as people read it; peaks with their share of the plan's limit."""
+    of_limits = shares(summary, limits)
 
     def peak(name: str, unit: str) -> str:
-        share = (shares or {}).get(name, math.nan)
-        of_limit = f" ({100 * share:.0f} % of the limit)" if math.isfinite(share) else ""
+        share = of_limits[name]
+        of_limit = f" ({100 * share:.0f} % of the plan's limit)" if math.isfinite(share) else ""
         return _text(getattr(summary, name), unit, 2) + of_limit
 
     return [
         ("travel time, planned", _text(summary.travel_time_planned, "s", 2)),
         ("travel time, flown", _text(summary.travel_time_flown, "s", 2)),
-        ("settling", _text(summary.settling, "s", 2)),
+        ("settled after", _text(summary.settling, "s", 2)),
         ("deviation in time, max", _text(100 * summary.max_deviation, "cm", 1)),
         ("deviation in time, rms", _text(100 * summary.rms_deviation, "cm", 1)),
         ("deviation from the path, max", _text(100 * summary.max_deviation_to_path, "cm", 1)),
@@ -215,7 +246,7 @@ def summary_text(record: Record) -> str:
         "",
         "| | |",
         "|---|---|",
-        *(f"| {name} | {value} |" for name, value in summary_rows(summarise(record))),
+        *(f"| {name} | {value} |" for name, value in summary_rows(summarise(record), header.plan_limits)),
     ]
     return "\n".join(lines)
 

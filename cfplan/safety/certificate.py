@@ -58,6 +58,12 @@ class Margin:
         """Return whether the limit holds; False for NaN."""
         return bool(self.share <= 1.0)
 
+    def shown(self, value: float) -> str:
+        """Return a value in the unit of safety.yaml, where angles are in degrees."""
+        if self.unit == "rad":
+            return f"{math.degrees(value):.1f} °"
+        return f"{value:.{3 if self.unit == 'N' else 2}f} {self.unit}"
+
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
@@ -78,15 +84,15 @@ class Certificate:
         return max(self.margins, key=lambda margin: np.inf if np.isnan(margin.share) else margin.share)
 
     def rows(self) -> list[tuple[str, str, str, str, str, str]]:
-        """Return rows of a table: limit, worst value, allowed, share, time, place."""
+        """Return rows of a table: limit, worst value with its unit, allowed, share, time, place in m."""
         return [
             (
                 margin.name,
-                f"{margin.worst:.3f} {margin.unit}",
-                f"{margin.limit:.3f} {margin.unit}",
+                margin.shown(margin.worst),
+                margin.shown(margin.limit).split()[0],
                 f"{100 * margin.share:.1f} %",
-                f"{margin.time:.3f} s",
-                "({:.2f}, {:.2f}, {:.2f}) m".format(*margin.position),
+                f"{margin.time:.2f} s",
+                "{:.2f} {:.2f} {:.2f}".format(*margin.position),
             )
             for margin in self.margins
         ]

@@ -138,7 +138,7 @@ def fly_each(
                 lab = replace(conditions, seed=conditions.seed + number)
                 flight = fly_in_real_time(mission, lab, name=file.stem)
                 flights.append(_judged(file.stem, lab.seed, planned.plan.trajectory, flight))
-                if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT:
+                if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:
                     raise KeyboardInterrupt
         progress(total, total)
     except KeyboardInterrupt:

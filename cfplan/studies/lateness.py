@@ -154,7 +154,7 @@ def _streaming(priority: str, mission: Mission) -> list[WakeUps]:
     stolen = _stolen()
     with Sleeper(RATE, first=priority == FIRST) as sleeper:
         flight = fly_in_real_time(mission, Conditions(vicon=True), name="lateness", view=_view, on_stream=sleeper.watch)
-        if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT:
+        if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:
             raise KeyboardInterrupt  # who ends the flight ends the study
         if not flight.sent or flight.outcome is None:
             return [WakeUps("stream", priority, flight.reason, refusals=flight.refusals)]

@@ -46,7 +46,7 @@ def test_the_flight_lands_within_its_limits(flight):
     assert flight["plan"]["certificate"]["passed"]
     assert flight["outcome"]["reason"] == "landed"
     assert flight["outcome"]["rung"] == "none"
-    assert flight["outcome"]["deviation_max"] <= 0.08
+    assert flight["max_deviation"] <= 0.08
     assert all(check["passed"] for check in flight["outcome"]["preflight"])
 
 

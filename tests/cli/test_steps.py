@@ -1,8 +1,12 @@
 """A step is one line when it ends; a wait of more than a second says what it is and how long it has taken."""
 
-import pytest
+import io
 
-from cfplan.cli import output
+import click
+import pytest
+from rich.console import Console
+
+from cfplan.cli import output, tables
 from cfplan.cli.output import Steps
 from cfplan.errors import InputError
 from cfplan.flight.clock import SteppedClock
@@ -88,3 +92,55 @@ def test_json_is_alone_on_standard_output(capsys, clock):
     with Steps(as_json=True, clock=clock).step("plan"):
         clock.sleep(5.0)
     assert capsys.readouterr().out == ""
+
+
+def test_details_of_a_step_are_for_those_who_ask(capsys):
+    def print_steps():
+        with Steps(as_json=False).step("plan") as results:
+            results.append("3.87 s")
+            results.details.append("convex 4.09 s")
+        return capsys.readouterr().out
+
+    assert "convex" not in print_steps()
+    with click.Context(click.Command("fly")) as context:
+        context.meta[output.VERBOSE] = True
+        assert print_steps().splitlines()[1].strip() == "convex 4.09 s"
+
+
+def test_a_long_result_goes_on_under_its_beginning(capsys, monkeypatch):
+    monkeypatch.setattr(output.sys.stdout, "isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", "80")
+    with Steps(as_json=False).step("slowing") as results:
+        results.append("word " * 40)
+    lines = capsys.readouterr().out.splitlines()
+    assert all(len(click.unstyle(line)) <= 80 for line in lines)
+    assert len({len(line) - len(line.lstrip()) for line in lines[1:]}) == 1
+    assert lines[1].startswith(" " * 20)
+
+
+@pytest.mark.parametrize(("set_to", "coloured"), [(None, True), ("", True), ("1", False)])
+def test_no_color_is_obeyed(monkeypatch, set_to, coloured):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    if set_to is not None:
+        monkeypatch.setenv("NO_COLOR", set_to)
+    assert ("\x1b[" in output.styled("✓", "green")) is coloured
+
+
+WIDE = [["learned, refined", *(f"{number:.1f} ms" for number in range(15))], ["convex", *["–"] * 15]]
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows"),
+    [
+        (["planner", *(f"figure {number}" for number in range(15))], WIDE),
+        (["", "found", "verdict", "hint"], [["radio", "no Crazyradio is plugged in", "optional", "plug one in; " * 5]]),
+        (["limit", "worst", "allowed"], [["angular acceleration", "34.93 rad/s²", "35.00"]]),
+    ],
+)
+def test_tables_fit_80_columns_with_every_cell_whole(columns, rows):
+    console = Console(width=80, file=io.StringIO())
+    tables.print_fitting(console, "title", columns, rows)
+    lines = console.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    words = {word for line in lines for word in line.split()}
+    assert {word for text in (*columns, *(cell for row in rows for cell in row)) for word in text.split()} <= words

@@ -98,7 +98,7 @@ def test_an_outcome_can_be_passed_on(whole_flight):
 def test_ctrl_c_at_full_speed_brakes_on_the_path_and_lands(mission, lab):
     handler = signal.getsignal(signal.SIGINT)
     flight = fly_stepped(mission, at_setpoint(120, interrupt), lab=lab)
-    assert flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT
+    assert flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
     assert flight.outcome.rung is Rung.LAND
     end = flight.truth.position[-1]
     assert end[2] < 0.02
@@ -111,7 +111,7 @@ def test_ctrl_c_at_full_speed_brakes_on_the_path_and_lands(mission, lab):
 
 def test_a_second_ctrl_c_cuts_the_motors(mission, lab):
     flight = fly_stepped(mission, at_setpoint(120, lambda: (interrupt(), interrupt())), lab=lab)
-    assert flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT
+    assert flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
     assert flight.outcome.rung is Rung.CUT
     assert not flight.truth.motor[-1].any()
     assert lab.truth().locked

@@ -67,7 +67,7 @@ def test_a_flight_goes_by_the_clock_and_ends_landed(lab, fly_in, patient_mission
 def test_ctrl_c_at_full_speed_brakes_on_the_path_and_lands(lab, fly_in):
     off_before, handler = lab.truth().off_in_air[-1], signal.getsignal(signal.SIGINT)
     flight = fly_in(lab, at_setpoint(120, interrupt))
-    assert flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT
+    assert flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
     assert flight.outcome.rung is Rung.LAND
     end = flight.truth.position[-1]
     assert end[2] < 0.02
@@ -117,7 +117,7 @@ def test_when_the_main_process_is_killed_the_pilot_lands(lab, patient_mission, t
 def test_a_second_ctrl_c_cuts_the_motors(limits, fly_in):
     with start_lab(limits.airframe, number=1) as lab:
         flight = fly_in(lab, at_setpoint(120, lambda: (interrupt(), interrupt())))
-        assert flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT
+        assert flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
         assert flight.outcome.rung is Rung.CUT
         wait_until(lambda: not lab.truth().motor[-1].any(), 2.0)
         assert lab.truth().locked

@@ -187,7 +187,7 @@ def test_arming_and_taking_off_are_refused(landed):
 
 
 def test_the_ground_station_lands_the_vehicle_as_a_key_does(landed):
-    assert landed.outcome.exit_code is ExitCode.ENDED_BY_PILOT
+    assert landed.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
     assert landed.outcome.rung is Rung.LAND
     assert landed.outcome.reason == "the operator ended the flight"
 
@@ -210,7 +210,7 @@ def test_the_ground_station_stops_the_motors(mission, station, tmp_path, command
         assert getattr(station.action, command)() is ActionResult.SUCCESS
 
     flight = fly_with(station, mission, tmp_path / "flight.tlog", at_setpoint(80, stop))
-    assert flight.outcome.exit_code is ExitCode.ENDED_BY_PILOT, flight.outcome.reason
+    assert flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR, flight.outcome.reason
     assert flight.outcome.rung is Rung.CUT
     assert not flight.truth.motor[-1].any()
     assert flight.truth.locked

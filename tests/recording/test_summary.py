@@ -15,7 +15,7 @@ from cfplan.recording.path_distance import BLOCK, distance_to_path
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import Record
 from cfplan.recording.rerun.states import supervisor_states
-from cfplan.recording.summary import deviation, dropouts, pose_gaps, settling, summarise, summary_text
+from cfplan.recording.summary import SETTLED, deviation, dropouts, pose_gaps, settling, summarise, summary_text
 from cfplan.recording.writer import RecordWriter
 
 BEGIN, TRAVEL, HELD = 100.0, 4.0, 2.0  # s
@@ -86,18 +86,26 @@ def test_a_perfect_flight_takes_its_planned_time(flight):
     assert summary.travel_time_flown == pytest.approx(TRAVEL, abs=1e-9)
 
 
+@pytest.mark.parametrize("lag", [-0.02, 0.004, 0.05, 0.2])
+def test_the_time_flown_is_measured_by_the_poses(flight, lag):
+    summary = summarise(straight_flight(flight.header, lag=lag))
+    assert summary.travel_time_planned == TRAVEL
+    assert summary.travel_time_flown == pytest.approx(TRAVEL + lag, abs=1e-6)
+    assert summary.settling == pytest.approx(max(lag - SETTLED / SPEED, 0.0), abs=1e-6)
+
+
 def test_the_hover_streamed_behind_the_end_is_no_travel_time(flight):
     record = straight_flight(flight.header, hover=0.8, end_error=lambda t: np.where(t < 0.3, 0.08, 0.02))
     summary = summarise(record)
     assert summary.settling == pytest.approx(0.3, abs=0.006)
-    assert summary.travel_time_flown == pytest.approx(TRAVEL + 0.3, abs=0.006)
+    assert summary.travel_time_flown == pytest.approx(TRAVEL + 0.3 + SETTLED / SPEED, abs=0.006)
 
 
 @pytest.mark.parametrize("moment", [0.2, 0.75, 1.5])
 def test_settling_lasts_until_the_vehicle_stays_near_the_end(flight, moment):
     record = straight_flight(flight.header, end_error=lambda t: np.where(t < moment, 0.08, 0.02))
     assert settling(record) == pytest.approx(moment, abs=0.006)
-    assert summarise(record).travel_time_flown == pytest.approx(TRAVEL + moment, abs=0.006)
+    assert summarise(record).travel_time_flown == pytest.approx(TRAVEL + moment + SETTLED / SPEED, abs=0.006)
 
 
 def test_a_swing_back_outside_counts_as_not_yet_settled(flight):

@@ -155,7 +155,7 @@ def test_a_file_that_is_no_path_is_an_error_before_anything_flies(flown, tmp_pat
 
 def test_the_operators_stop_ends_the_study_and_keeps_what_was_flown(flown):
     ends, _ = flown
-    ends += [outcome(), outcome(ExitCode.ENDED_BY_PILOT), outcome()]
+    ends += [outcome(), outcome(ExitCode.ENDED_BY_OPERATOR), outcome()]
     result = study(repeats=3)
     assert result.interrupted
     assert [flight.landed for flight in flown_of(result)] == [True, False]

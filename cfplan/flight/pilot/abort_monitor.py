@@ -66,9 +66,9 @@ class AbortMonitor:
     def ordered(self, observation: Observation) -> Abort | None:
         """Return an abort for an operator command or the loss of the main process; also checked on the ground."""
         if observation.order is Order.CUT:
-            return Abort(Rung.CUT, ExitCode.ENDED_BY_PILOT, "the operator cut the motors")
+            return Abort(Rung.CUT, ExitCode.ENDED_BY_OPERATOR, "the operator cut the motors")
         if observation.order is Order.LAND:
-            return Abort(Rung.LAND, ExitCode.ENDED_BY_PILOT, "the operator ended the flight")
+            return Abort(Rung.LAND, ExitCode.ENDED_BY_OPERATOR, "the operator ended the flight")
         if observation.main_gone:
             return Abort(Rung.LAND, ExitCode.ENDED_BY_SAFETY, "the main process is gone")
         return None

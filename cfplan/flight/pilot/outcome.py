@@ -77,17 +77,11 @@ class FlightOutcome:
     telemetry_dropped: int = 0  # messages that found the main process too slow
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the outcome for JSON, as it stands in a record's summary."""
+        """Return how it ended, for JSON; a record's summary measures the flight itself by its streams."""
         return {
             "exit_code": int(self.exit_code),
             "reason": self.reason,
             "rung": self.rung.name.lower(),
-            "flown": self.flown,
-            "settled_after": self.settled_after if math.isfinite(self.settled_after) else None,
-            "lateness_p99": self.lateness.p99,
-            "lateness_max": self.lateness.max,
-            "deviation_max": self.deviation.max,
-            "deviation_rms": self.deviation.rms,
             "setpoints_skipped": self.lateness.skipped,
             "telemetry_dropped": self.telemetry_dropped,
             "preflight": [

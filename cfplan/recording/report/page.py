@@ -172,7 +172,7 @@ def _events(flight: ReportedFlight) -> str:
 def _certificate(flight: ReportedFlight) -> str:
     if flight.certificate is None:
         return ""
-    heads = ("limit", "worst", "allowed", "share", "at", "where")
+    heads = ("limit", "worst", "allowed", "share", "at", "where, m")
     head = "".join(f'<th class="n">{name}</th>' if index else f"<th>{name}</th>" for index, name in enumerate(heads))
     lines = [
         f'<tr class="{"" if margin.passed else "fail"}">'

@@ -10,7 +10,7 @@ from cfplan.errors import CfplanError
 from cfplan.planning.plan_file import load_plan
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE, Record
-from cfplan.recording.summary import UNKNOWN, FlightSummary, begun, summarise, summary_rows
+from cfplan.recording.summary import UNKNOWN, FlightSummary, begun, shares, summarise, summary_rows
 from cfplan.safety.certificate import Certificate
 
 
@@ -21,7 +21,7 @@ class ReportedFlight:
     name: str  # of its folder
     record: Record
     summary: FlightSummary
-    shares: Mapping[str, float]  # of the limit, of each peak; NaN where there is no such limit
+    shares: Mapping[str, float]  # of the plan's limit, of each peak; NaN where there is no such limit
     certificate: Certificate | None  # of its plan; None where the record has none that can be read
     provenance: tuple[tuple[str, str], ...]
     notes: tuple[str, ...]  # what is missing, one sentence each
@@ -30,7 +30,7 @@ class ReportedFlight:
 def read_flight(place: Path) -> ReportedFlight:
     """Read a record, with the plan that lies beside it. Raises InputError where it is no record."""
     record = read_record(place)
-    summary, header = summarise(record), record.header
+    summary = summarise(record)
     notes = ["The record ends early: what follows its last whole chunk is lost."] if record.truncated else []
     certificate, plan_rows = None, []
     plan_file = record.folder / PLAN_FILE
@@ -54,12 +54,7 @@ def read_flight(place: Path) -> ReportedFlight:
         name=record.folder.resolve().name,
         record=record,
         summary=summary,
-        shares={
-            "peak_speed": summary.peak_speed / header.bounds.speed,
-            "peak_acceleration": summary.peak_acceleration / header.bounds.acceleration,
-            "peak_body_rate": summary.peak_body_rate / header.bounds.body_rate,
-            "max_deviation": summary.max_deviation / header.bounds.deviation,
-        },
+        shares=shares(summary, record.header.plan_limits),
         certificate=certificate,
         provenance=(*_provenance(record), *plan_rows),
         notes=tuple(notes),
@@ -87,7 +82,7 @@ def outcome(flight: ReportedFlight) -> str:
 def rows(flight: ReportedFlight) -> list[tuple[str, str]]:
     """Return the summary table: what each number is, and its value as people read it."""
     return [
-        *summary_rows(flight.summary, flight.shares),
+        *summary_rows(flight.summary, flight.record.header.plan_limits),
         ("certificate", _verdict(flight.certificate)),
         ("ended", outcome(flight)),
     ]

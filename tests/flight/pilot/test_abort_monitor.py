@@ -121,7 +121,7 @@ def test_no_pose_at_all_lands(monitor):
 
 def test_the_operators_reason_is_told_before_others_of_its_rung(monitor):
     abort = monitor.gravest(observation(order=Order.LAND, main_gone=True, age=0.6))
-    assert abort.exit_code is ExitCode.ENDED_BY_PILOT
+    assert abort.exit_code is ExitCode.ENDED_BY_OPERATOR
 
 
 def test_the_gravest_reason_wins(monitor):

@@ -100,7 +100,7 @@ def lose_main(world):
     world.orders.gone = True
 
 
-SAFETY, PILOT = ExitCode.ENDED_BY_SAFETY, ExitCode.ENDED_BY_PILOT
+SAFETY, PILOT = ExitCode.ENDED_BY_SAFETY, ExitCode.ENDED_BY_OPERATOR
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_the_operator_can_land_at_any_time_in_the_air(world, fly, phase, after):
         after = 0.005  # before that it is still on the ground
     world.when(phase, after, lambda: land(world))
     outcome = fly()
-    assert outcome.exit_code is ExitCode.ENDED_BY_PILOT
+    assert outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
     assert world.position[2] < 0.05
     assert world.motors_off_in_the_air == 0.0
     assert not world.armed
@@ -179,7 +179,7 @@ def test_the_operator_can_land_at_any_time_in_the_air(world, fly, phase, after):
 def test_an_order_on_the_ground_ends_it_there(world, fly, phase):
     world.when(phase, 0.0, lambda: land(world))
     outcome = fly()
-    assert outcome.exit_code is ExitCode.ENDED_BY_PILOT
+    assert outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
     assert "take off" not in world.calls
     assert world.closed
 

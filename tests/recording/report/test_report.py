@@ -77,7 +77,7 @@ def test_the_table_says_what_the_summary_says(folder):
     assert shown.cell("deviation in time, max") == [f"{100 * summary.max_deviation:.1f} cm"]
     assert shown.cell("travel time, planned") == ["10.00 s"]
     assert shown.cell("peak speed") == [
-        f"{summary.peak_speed:.2f} m/s ({100 * summary.peak_speed / 2.5:.0f} % of the limit)"
+        f"{summary.peak_speed:.2f} m/s ({100 * summary.peak_speed / 2.0:.0f} % of the plan's limit)"
     ]
     assert shown.cell("pose dropouts") == ["1"]
     assert shown.open == []  # every tag is closed
@@ -202,7 +202,7 @@ def test_json_is_the_numbers_and_no_page(flight, tmp_path):
     first, second = json.loads(result.stdout)["flights"]
     assert first == second
     assert first["max_deviation"] == pytest.approx(summarise(flight.record).max_deviation)
-    assert first["shares"]["peak_speed"] == pytest.approx(first["peak_speed"] / 2.5)
+    assert first["shares"]["peak_speed"] == pytest.approx(first["peak_speed"] / 2.0)
     assert not (place / "report.html").exists()
 
 
