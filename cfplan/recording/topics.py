@@ -39,6 +39,7 @@ TOPICS = (
     Topic("/phase", telemetry.PhaseEntered, record.Phases, "phases"),
     Topic("/event", telemetry.Event, record.Events, "events"),
 )
+_NAMES = {topic.message: tuple(field.name for field in fields(topic.message)) for topic in TOPICS}
 
 
 def json_schema(message: type) -> dict[str, Any]:
@@ -64,9 +65,9 @@ def _schema(kind: Any) -> dict[str, Any]:
 
 def message_to_json(message: telemetry.Telemetry) -> bytes:
     """Return the message as JSON. Exact: a float reads back as the same float."""
-    values = {f.name: getattr(message, f.name) for f in fields(message)}
+    values = {name: getattr(message, name) for name in _NAMES[type(message)]}
     try:
-        return json.dumps(values, separators=(",", ":"), allow_nan=False, default=_from_numpy).encode()
+        return _to_json(values).encode()
     except ValueError:
         return json.dumps(json_value(values), separators=(",", ":"), allow_nan=False).encode()
 
@@ -75,6 +76,9 @@ def _from_numpy(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"a {type(value).__name__} does not belong into a message")
+
+
+_to_json = json.JSONEncoder(separators=(",", ":"), allow_nan=False, default=_from_numpy).encode
 
 
 def columns_from_json(topic: Topic, payloads: list[bytes]) -> Any:

@@ -13,7 +13,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import IO, Any, Protocol, cast
 
@@ -141,15 +140,15 @@ class RecordWriter:
     def _gather(self) -> None:
         """Add the waiting messages to the chunk."""
         while self._waiting:
-            self._try(partial(self._add, self._waiting.popleft()), "a message")
+            self._try(self._add, "a message", self._waiting.popleft())
 
     def _add(self, message: Telemetry) -> None:
         if self._sink.broken:
             return
-        log_time = self._nanoseconds(getattr(message, "received", message.time))
+        received = getattr(message, "received", message.time)
         self._mcap.add_message(
             channel_id=self._channels[type(message)],
-            log_time=log_time,
+            log_time=self._nanoseconds(received),
             publish_time=self._nanoseconds(message.time),
             data=message_to_json(message),
         )
@@ -162,10 +161,10 @@ class RecordWriter:
             self._mcap.finish()
             self._sink.flush()
 
-    def _try(self, action: Callable[[], None], what: str) -> None:
+    def _try(self, action: Callable[..., None], what: str, *arguments: Any) -> None:
         """Do it; warn of the first failure of all. None may reach the flight."""
         try:
-            action()
+            action(*arguments)
         except Exception as error:
             if not self.failure:
                 self.failure = f"{what} could not be written to {self.folder}: {error}"

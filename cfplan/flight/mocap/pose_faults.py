@@ -63,5 +63,6 @@ def is_frozen(pose: Placed, last: Placed) -> bool:
 
 def angle_between(first: Quaternion, second: Quaternion) -> float:
     """Return the angle, rad, between two attitudes; the sign of a quaternion means nothing."""
-    aligned = abs(math.fsum(p * q for p, q in zip(first, second, strict=True)))
+    (x, y, z, w), (a, b, c, d) = first, second
+    aligned = abs(math.fsum((x * a, y * b, z * c, w * d)))
     return 2.0 * math.acos(min(1.0, aligned))

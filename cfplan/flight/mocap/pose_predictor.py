@@ -32,12 +32,13 @@ class PosePredictor:
         count = len(self._poses)
         if count < _FEWEST:
             return 0.0, 0.0, 0.0
-        middle = sum(pose.time for pose in self._poses) / count
-        spread = sum((pose.time - middle) ** 2 for pose in self._poses)
-        x, y, z = (
-            sum((pose.time - middle) * pose.position[axis] for pose in self._poses) / spread for axis in range(3)
-        )
-        return x, y, z
+        middle = sum([pose.time for pose in self._poses]) / count
+        spread = x = y = z = 0.0
+        for pose in self._poses:
+            off, (px, py, pz) = pose.time - middle, pose.position
+            spread += off**2
+            x, y, z = x + off * px, y + off * py, z + off * pz
+        return x / spread, y / spread, z / spread
 
     def position(self, time: float) -> Triple:
         """Return the position, m, at a time, s, shortly after the last pose. Needs one pose."""

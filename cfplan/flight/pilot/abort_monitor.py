@@ -126,10 +126,10 @@ class AbortMonitor:
         limits = self._limits.flight
         if observation.pose is not None:
             beyond = self._beyond_fence(observation.pose.position)
-            yield _rung(limits.fence, beyond, f"{beyond:.2f} m beyond the fence")
+            yield _rung(limits.fence, beyond, "{:.2f} m beyond the fence")
             if observation.wanted is not None:
                 deviation = math.dist(observation.pose.position, observation.wanted)
-                yield _rung(limits.deviation, deviation, f"{deviation:.2f} m from the setpoint")
+                yield _rung(limits.deviation, deviation, "{:.2f} m from the setpoint")
         if observation.estimate is None or observation.status is None:
             return
         newest = self._limits.pose.age_warning
@@ -142,7 +142,8 @@ class AbortMonitor:
                 yield safety_abort(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")
         for quantity in ON_LADDER:
             value = math.hypot(*MEASURED[quantity.ladder](observation.estimate, observation.status))
-            measured = _rung(getattr(limits, quantity.ladder), value, f"{quantity.name} of {value:.1f} {quantity.unit}")
+            text = f"{quantity.name} of {{:.1f}} {quantity.unit}"
+            measured = _rung(getattr(limits, quantity.ladder), value, text)
             yield self._lasting(quantity.name, observation.now, measured)
 
     def _beyond_fence(self, position: Triple) -> float:
@@ -165,12 +166,15 @@ def safety_abort(rung: Rung, text: str) -> Abort:
     return Abort(rung, ExitCode.ENDED_BY_SAFETY, text)
 
 
+_NO_ABORT = safety_abort(Rung.NONE, "")
+
+
 def _rung(ladder: Ladder, value: float, text: str) -> Abort:
-    """Return the abort of a measured value; not a number means that the measurement cannot be trusted: land."""
-    if math.isnan(value):
-        return safety_abort(Rung.LAND, text)
-    if value > ladder.cut:
-        return safety_abort(Rung.CUT, text)
-    if value > ladder.land:
-        return safety_abort(Rung.LAND, text)
-    return safety_abort(Rung.BRAKE if value > ladder.brake else Rung.NONE, text)
+    """Return the abort of a measured value, and write the value into the text.
+
+    Not a number means that the measurement cannot be trusted: land.
+    """
+    if value <= ladder.brake:
+        return _NO_ABORT
+    rung = Rung.CUT if value > ladder.cut else Rung.LAND if value > ladder.land or math.isnan(value) else Rung.BRAKE
+    return safety_abort(rung, text.format(value))

@@ -7,9 +7,10 @@ cflib's own call truncates towards zero; here values are rounded, which halves t
 
 import math
 from dataclasses import dataclass
+from struct import Struct
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.machine_code import njit
@@ -28,6 +29,7 @@ _WIRE = np.dtype(
         ("body_rate", "<i2", 3),
     ]
 )
+_WIRE_OF_ONE = Struct("<B9hI3h")
 PAYLOAD_SIZE = _WIRE.itemsize
 _MAGNITUDES = 511  # nine bits for a component in [0, 1/√2]
 
@@ -72,6 +74,13 @@ def decode(payloads: NDArray) -> FullStateSetpoints:
     )
 
 
+def decode_one(payload: bytes) -> list[float]:
+    """Return the 16 numbers that the vehicle reads from one payload, in the order of FullStateSetpoints' fields."""
+    _, *milli, quaternion, roll, pitch, yaw = _WIRE_OF_ONE.unpack(payload)
+    turn = decompress_quaternion([quaternion])[0].tolist()
+    return [*(value / 1000.0 for value in milli), *turn, roll / 1000.0, pitch / 1000.0, yaw / 1000.0]
+
+
 def _milli(name: str, values: NDArray, first: int) -> NDArray:
     bad = ~(np.abs(values) <= LARGEST)
     if np.any(bad):
@@ -97,7 +106,7 @@ def compress_quaternion(quaternion: NDArray, first: int = 0) -> NDArray:
     return compressed
 
 
-def decompress_quaternion(compressed: NDArray) -> NDArray:
+def decompress_quaternion(compressed: ArrayLike) -> NDArray:
     """Decompress (N,) u32 to (N, 4) unit quaternions x y z w, the largest component positive."""
     return _decompressed(np.array(compressed, dtype=np.int64))
 

@@ -87,18 +87,22 @@ class Radio:
         """Return the packets that have reached the vehicle by now, and those that have reached the computer."""
         if not (self._up or self._down):
             self._next = max(self._next, now)
+            if not (self._on_way_up or self._on_way_down):
+                return [], []
         while self._next <= now and (self._up or self._down):
             self._transact(self._next)
             self._next += TRANSACTION
         return _arrived(self._on_way_up, now), _arrived(self._on_way_down, now)
 
     def _transact(self, time: float) -> None:
-        if self._acting(RadioFaultKind.DEAD, time) is not None:
-            return
-        loss, delay = self._acting(RadioFaultKind.LOSS, time), self._acting(RadioFaultKind.DELAY, time)
-        if loss is not None and self._chance.random() < loss.strength:
-            return
-        due = time + (delay.strength if delay is not None else 0.0)
+        due = time
+        if self._faults:
+            if self._acting(RadioFaultKind.DEAD, time) is not None:
+                return
+            loss, delay = self._acting(RadioFaultKind.LOSS, time), self._acting(RadioFaultKind.DELAY, time)
+            if loss is not None and self._chance.random() < loss.strength:
+                return
+            due += delay.strength if delay is not None else 0.0
         if self._up:
             self._on_way_up.append((due, self._up.popleft()))
         if self._down:

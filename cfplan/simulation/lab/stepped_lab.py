@@ -4,6 +4,7 @@ It has the same virtual Crazyflie, packets, pose classification and pilot as a l
 flight can be repeated to the last bit, and takes a fraction of its time.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -34,14 +35,15 @@ class SteppedLab:
         cameras: ViconSettings | None = None,
         seed: int = 0,
     ):
-        self.vehicle = VirtualCrazyflie(airframe, vehicle)
-        self.vehicle.advance(_WARM_UP)
-        self.vehicle.sent()
+        self._vehicle = VirtualCrazyflie(airframe, vehicle)
+        self._vehicle.advance(_WARM_UP)
+        self._vehicle.sent()
+        self._tick = self._vehicle.tick  # of now; the vehicle is advanced to it when something acts on it or sees it
         self.clock = SteppedClock(BEGIN, self._advance)
         self.radio = Radio(BEGIN, seed=11 + seed)
         self.cameras = Cameras(cameras or ViconSettings(seed=7 + seed), BEGIN)
         self.heard: Callable[[bytes], None] = lambda _: None
-        self._origin = BEGIN - self.vehicle.tick / 1000
+        self._origin = BEGIN - self._tick / 1000
         self._pictures: list[tuple[float, Picture]] = []
         self._connected_from = BEGIN
         self._rows: list[np.ndarray] = []
@@ -50,6 +52,14 @@ class SteppedLab:
     def now(self) -> float:
         """Return the time, s."""
         return self.clock.now()
+
+    @property
+    def vehicle(self) -> VirtualCrazyflie:
+        """Return the vehicle as it is now."""
+        behind = self._tick - self._vehicle.tick
+        if behind > 0:
+            self._vehicle.advance(behind)
+        return self._vehicle
 
     def disturb(self, fault: Fault) -> None:
         """Let something go wrong; its start counts from now."""
@@ -71,48 +81,53 @@ class SteppedLab:
         return Truth.of(rows, self.vehicle.supervisor.ever_locked)
 
     def _advance(self, end: float) -> None:
-        """Advance the vehicle by milliseconds, from one event to the next."""
+        """Advance the lab by milliseconds, from one event to the next."""
         target = int((end - self._origin) * 1000 + 1e-6)
-        while self.vehicle.tick < target:
-            tick = self.vehicle.tick
+        while (tick := self._tick) < target:
             self.clock.reach(self._origin + tick / 1000)
-            self._exchange()
-            self._look()
-            if tick % COMMANDER_PERIOD == 0:
+            now, passed = self.clock.now(), tick % COMMANDER_PERIOD
+            self._exchange(now)
+            self._look(now)
+            if not passed:
                 self._note()
-            boundary = tick + COMMANDER_PERIOD - tick % COMMANDER_PERIOD
+                self.vehicle.command()
+                self._answer()
             # At a boundary the vehicle may send logs, which leave within a millisecond, as a real one's do.
-            busy = self.radio.busy or tick % COMMANDER_PERIOD == 0
-            step = 1 if busy else max(min(target, boundary, self._next_sight()) - tick, 1)
-            self.vehicle.advance(step)
-            for packet in self.vehicle.sent():
-                self.radio.answer(packet)
+            if not passed or self.radio.busy:
+                self._tick += 1
+            else:
+                self._tick = max(min(target, tick + COMMANDER_PERIOD - passed, self._next_sight()), tick + 1)
         self.clock.reach(end)
-        self._exchange()
+        self._exchange(self.clock.now())
 
     def _next_sight(self) -> int:
         """Return the tick at which the cameras look or a picture leaves next."""
         then = min(self.cameras.next_look, self.cameras.next_due)
-        return int(np.ceil((then - self._origin) * 1000 - 1e-6))
+        return math.ceil((then - self._origin) * 1000 - 1e-6)
 
-    def _exchange(self) -> None:
-        up, down = self.radio.step(self.now)
+    def _exchange(self, now: float) -> None:
+        up, down = self.radio.step(now)
         for packet in up:
             self.vehicle.receive(packet)
-        for packet in self.vehicle.sent():
-            self.radio.answer(packet)
+        if up:
+            self._answer()
         for packet in down:
             self.heard(packet)
 
-    def _look(self) -> None:
-        if self.now >= self.cameras.next_look - 1e-6:
+    def _answer(self) -> None:
+        for packet in self._vehicle.sent():
+            self.radio.answer(packet)
+
+    def _look(self, now: float) -> None:
+        cameras = self.cameras
+        if now >= cameras.next_look - 1e-6:
             truth = self.vehicle.stabilizer.loop.truth.tolist()
-            self.cameras.look(self.now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]))
-        due = self.cameras.due(self.now)
-        if self.cameras.cut_off(self.now):
-            self._connected_from = self.now + _RECONNECTS_AFTER
-        elif self.now >= self._connected_from:
-            self._pictures += [(self.now, picture) for picture in due]
+            cameras.look(now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]))
+        due = cameras.due(now) if cameras.next_due <= now else ()
+        if cameras.cut_off(now):
+            self._connected_from = now + _RECONNECTS_AFTER
+        elif due and now >= self._connected_from:
+            self._pictures += [(now, picture) for picture in due]
 
     def _note(self) -> None:
         row, loop = np.empty(ROW_SIZE), self.vehicle.stabilizer.loop

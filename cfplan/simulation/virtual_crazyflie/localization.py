@@ -24,6 +24,11 @@ class Localization:
         self.kept_alive = False
         self._waiting: list[tuple[float, ...]] = []
 
+    @property
+    def waits(self) -> bool:
+        """Return whether a measurement has come since the last call of `take`."""
+        return bool(self._waiting)
+
     def take(self, position_deviation: float, attitude_deviation: float) -> NDArray:
         """Return the measurements (n, 9) since the last call, for the filter."""
         rows = [(*row, position_deviation, attitude_deviation) for row in self._waiting]

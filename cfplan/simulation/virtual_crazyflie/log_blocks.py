@@ -3,8 +3,9 @@
 import errno
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from math import copysign, inf, isfinite
-from struct import calcsize, unpack_from
+from functools import partial
+from math import copysign, inf
+from struct import Struct, calcsize, unpack_from
 from struct import pack as bytes_of
 
 from cfplan.simulation.virtual_crazyflie.catalogue import LOG_VARIABLES
@@ -15,6 +16,7 @@ _TYPES = {
 }  # fmt: skip
 _FORMATS = dict(_TYPES.values()) | {8: "e"}
 _FLOATING = "fe"
+_HEAD = "BHB"  # number of the block; stamp, 24 bits
 _TYPE_MASK = 0x0F
 _TOC, _SETTINGS, DATA_CHANNEL = range(3)
 _CREATE, _APPEND, _DELETE, _START, _STOP, _RESET, _CREATE_2, _APPEND_2, _START_2 = range(9)
@@ -39,14 +41,15 @@ def log_toc(without: Collection[str] = ()) -> Toc:
 
 @dataclass(slots=True)
 class _Block:
-    formats: list[str] = field(default_factory=list)
-    getters: list[Getter] = field(default_factory=list)
+    layout: Struct = field(default_factory=lambda: Struct("<" + _HEAD))
+    getters: list[Getter] = field(default_factory=list)  # of numbers that the layout takes, but for large floats
     period: int = 0  # ms; 0 while it is stopped
     due: int = 0  # tick of the next packet
 
     @property
     def size(self) -> int:
-        return sum(calcsize("<" + layout) for layout in self.formats)
+        """Return the bytes of its variables."""
+        return self.layout.size - calcsize("<" + _HEAD)
 
 
 def _nothing() -> float:
@@ -114,14 +117,17 @@ class LogBlocks:
                 return errno.E2BIG
             if sum(len(each.getters) for each in self._blocks.values()) >= MOST_VARIABLES:
                 return errno.ENOMEM
-            block.formats.append(layout)
-            block.getters.append(self._getters[number])
+            getter, layout = self._getters[number], layout if layout in _FLOATING else layout.upper()
+            block.layout = Struct(block.layout.format + layout)
+            largest = (1 << 8 * calcsize("<" + layout)) - 1
+            block.getters.append(getter if layout in _FLOATING else partial(_bits, getter, largest))
         return 0
 
     def due(self, tick: int) -> list[bytes]:
         """Return the payloads, on DATA_CHANNEL, of the blocks that are due."""
-        ready = [(number, block) for number, block in self._blocks.items() if self._is_due(block, tick)]
-        return [self._sample(number, block, tick) for number, block in ready]
+        return [
+            self._sample(number, block, tick) for number, block in self._blocks.items() if self._is_due(block, tick)
+        ]
 
     @staticmethod
     def _is_due(block: _Block, tick: int) -> bool:
@@ -132,16 +138,26 @@ class LogBlocks:
 
     @staticmethod
     def _sample(number: int, block: _Block, tick: int) -> bytes:
-        head = bytes_of("<BI", number, tick)[:4]
-        return head + b"".join(_encode(layout, get()) for layout, get in zip(block.formats, block.getters, strict=True))
-
-
-def _encode(layout: str, value: float) -> bytes:
-    """Return a value as bytes; a value out of range becomes infinite, or is cut to the type's bits, as in C."""
-    if layout in _FLOATING:
+        head, values = (number, tick & 0xFFFF, tick >> 16 & 0xFF), [get() for get in block.getters]
         try:
-            return bytes_of("<" + layout, value)
+            return block.layout.pack(*head, *values)
         except OverflowError:
-            return bytes_of("<" + layout, copysign(inf, value))
-    size = calcsize("<" + layout)
-    return ((int(value) if isfinite(value) else 0) & ((1 << 8 * size) - 1)).to_bytes(size, "little")
+            layouts = block.layout.format[1 + len(_HEAD) :]
+            return block.layout.pack(*head, *map(_in_range, layouts, values))
+
+
+def _bits(getter: Getter, largest: int) -> int:
+    """Return a value as an integer, cut to the bits of the largest one, as in C; 0 where it is not finite."""
+    try:
+        return int(getter()) & largest
+    except (ValueError, OverflowError):
+        return 0
+
+
+def _in_range(layout: str, value: float) -> float:
+    """Return a value, infinite where its type is too small for it, as in C."""
+    try:
+        bytes_of("<" + layout, value)
+    except OverflowError:
+        return copysign(inf, value)
+    return value

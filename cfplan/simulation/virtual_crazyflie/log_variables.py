@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.packets import compress_quaternion
+from cfplan.machine_code import njit
 from cfplan.simulation.dynamics.kalman import Filter
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.localization import Localization
@@ -23,7 +24,7 @@ _BATTERY_LEVELS = (3.5, 4.18)  # V at 0 and 100 %
 
 
 def _element(array: NDArray, place: int, scale: float = 1.0) -> Getter:
-    return lambda: float(array[place]) * scale
+    return lambda: array.item(place) * scale
 
 
 def euler(quaternion: NDArray) -> tuple[float, float, float]:
@@ -99,13 +100,20 @@ def _accelerations(loop: Loop) -> dict[str, Getter]:
     """Return accelerations in world axes: stateEstimate in g without gravity, stateEstimateZ in mm/s² with it."""
 
     def world(axis: int, scale: float, gravity: float) -> float:
-        return float(matrix_of(loop.belief[6:10])[axis] @ loop.acceleration - gravity) * scale
+        return (_in_world(loop.belief, loop.acceleration, axis) - gravity) * scale
 
     found: dict[str, Getter] = {}
     for place, axis in enumerate(_AXES):
         found[f"stateEstimate.a{axis}"] = partial(world, place, 1 / GRAVITY, GRAVITY if axis == "z" else 0.0)
         found[f"stateEstimateZ.a{axis}"] = partial(world, place, 1000.0, 0.0)
     return found
+
+
+@njit
+def _in_world(belief: NDArray, vector: NDArray, axis: int) -> float:
+    """Return how much of a vector (3,) in body axes lies along an axis of the world."""
+    turn = matrix_of(belief[6:10])
+    return turn[axis, 0] * vector[0] + turn[axis, 1] * vector[1] + turn[axis, 2] * vector[2]
 
 
 def _targets(setpoint: Callable[[], Setpoint]) -> dict[str, Getter]:

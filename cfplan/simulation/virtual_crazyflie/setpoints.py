@@ -7,7 +7,7 @@ from struct import calcsize, unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, decode
+from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, decode_one
 from cfplan.simulation.dynamics.mellinger import (
     ABSOLUTE,
     DISABLE,
@@ -60,10 +60,10 @@ def decode_setpoint(payload: bytes) -> Setpoint:
 
     Raises FirmwareAssert on a wrong length.
     """
-    setpoint = Setpoint()
     kind, content = payload[0], payload[1:]
     if kind == FULL_STATE_TYPE:
         return _full_state(payload)
+    setpoint = Setpoint()
     if kind == _STOP or kind not in _LAYOUTS:
         return setpoint
     if len(content) != calcsize(_LAYOUTS[kind]):
@@ -100,16 +100,8 @@ def decode_setpoint(payload: bytes) -> Setpoint:
 def _full_state(payload: bytes) -> Setpoint:
     if len(payload) != PAYLOAD_SIZE:
         raise FirmwareAssert(f"full state with {len(payload)} bytes")
-    state = decode(np.frombuffer(payload, dtype=np.uint8))
     setpoint = Setpoint(mode=FULL_STATE.copy())
-    for place, value in (
-        (POSITION, state.position),
-        (VELOCITY, state.velocity),
-        (ACCELERATION, state.acceleration),
-        (QUATERNION, state.quaternion),
-        (BODY_RATE, state.body_rate),
-    ):
-        setpoint.values[place] = value[0]
+    setpoint.values[POSITION.start : BODY_RATE.stop] = decode_one(payload)
     return setpoint
 
 

@@ -28,8 +28,9 @@ class State(IntEnum):
     CRASHED = 11
 
 
-_MAY_FLY = frozenset({State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED})
-_STAYS_ARMED = _MAY_FLY | {State.ARMING}
+# Tuples: an enum's hash runs as Python, and these are asked for a thousand times a second.
+_MAY_FLY = (State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
+_STAYS_ARMED = (*_MAY_FLY, State.ARMING)
 
 PERIOD = 40  # ms
 LEVEL_OUT_AFTER, SHUT_DOWN_AFTER = 500, 2000  # ms without a setpoint
@@ -139,7 +140,7 @@ class Supervisor:
             self._enter(state, tick)
 
     def _conditions(self, tick: int, setpoint_tick: int, acceleration: NDArray, motors: NDArray) -> _Conditions:
-        if np.any(motors > self.settings.idle_thrust):
+        if any(motor > self.settings.idle_thrust for motor in motors.tolist()):
             self._thrust_tick = tick
         age = tick - setpoint_tick
         starved = self._keep_alive is not None and tick >= self._keep_alive + _KEEP_ALIVE_WITHIN
@@ -158,7 +159,7 @@ class Supervisor:
         limit = self.settings.crash_detection
         if limit > 0 and abs(np.sqrt(acceleration @ acceleration) - 1.0) > limit:
             return True
-        if np.all(np.abs(acceleration) < _WEIGHTLESS):
+        if all(abs(along) < _WEIGHTLESS for along in acceleration.tolist()):
             self._tilted_since = None
         if acceleration[2] >= _TILTED:
             self._tilted_since = None
@@ -239,16 +240,15 @@ class Supervisor:
 
     def info(self, *, planner_active: bool, planner_finished: bool) -> int:
         """Return the bits of supervisor.info."""
-        bits = (
-            self.state is State.CHECKS_PASSED,
-            self.armed,
-            self.auto_arming,
-            self.can_fly,
-            self.is_flying,
-            self.tumbled,
-            self.locked,
-            self.crashed,
-            planner_active,
-            planner_finished,
+        return (
+            (self.state is State.CHECKS_PASSED)
+            | self.armed << 1
+            | self.auto_arming << 2
+            | self.can_fly << 3
+            | self.is_flying << 4
+            | bool(self.tumbled) << 5
+            | self.locked << 6
+            | self.crashed << 7
+            | planner_active << 8
+            | planner_finished << 9
         )
-        return sum(1 << place for place, bit in enumerate(bits) if bit)

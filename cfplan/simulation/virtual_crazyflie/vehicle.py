@@ -48,6 +48,7 @@ _ARM, _RECOVER, _EMERGENCY_STOP, _KEEP_ALIVE, _BITFIELD = 1, 2, 3, 4, 12
 _RESPONSE = 0x80
 _LEGACY_ARM, _LEGACY_RECOVER = 1, 2  # platform commands
 _NO_POSES = np.zeros((0, 9))
+_MOTORS_OFF = Setpoint()
 
 _SUPERVISOR_SINCE = 12  # protocol with which the port came
 _RESIDUAL_CORRECT_SINCE = (2025, 9, 1)  # firmware
@@ -59,6 +60,7 @@ class VirtualCrazyflie:
     def __init__(self, airframe: Airframe, settings: VehicleSettings | None = None):
         self.settings = settings or VehicleSettings()
         self.tick = 0
+        self._commanded = -1  # the last tick at which the slower loops ran
         self._version = tuple(int(part) for part in re.findall(r"\d+", self.settings.firmware))
         without = lacking(self._version)
         self.parameters = Parameters(DEFAULTS, without=without, stubborn=self.settings.stubborn)
@@ -122,8 +124,7 @@ class VirtualCrazyflie:
         """Advance by `ticks` milliseconds."""
         end = self.tick + ticks
         while self.tick < end:
-            if self.tick % COMMANDER_PERIOD == 0:
-                self._command()
+            self.command()
             step = min(end - self.tick, COMMANDER_PERIOD - self.tick % COMMANDER_PERIOD)
             self._stabilize(step)
             self.tick += step
@@ -172,8 +173,14 @@ class VirtualCrazyflie:
     def _send(self, port: Port, channel: int, payload: bytes) -> None:
         self._out.append(pack(port, channel, payload))
 
-    def _command(self) -> None:
-        """Run the slower loops: planner and log blocks at 100 Hz, supervisor at 25 Hz."""
+    def command(self) -> None:
+        """Run the slower loops if they are due now: planner and log blocks at 100 Hz, supervisor at 25 Hz.
+
+        `advance` does so too; each runs once.
+        """
+        if self.tick % COMMANDER_PERIOD or self.tick == self._commanded:
+            return
+        self._commanded = self.tick
         self._apply_faults()
         loop = self.stabilizer.loop
         can_fly = self.supervisor.can_fly
@@ -218,20 +225,26 @@ class VirtualCrazyflie:
 
     def _stabilize(self, ticks: int) -> None:
         supervisor = self.supervisor
-        asked = self.commander.setpoint if supervisor.motors_allowed else Setpoint()
-        self.setpoint = self._avoidance.rewrite(asked, self.stabilizer.loop.belief[0:3])
-        poses = self.localization.take(self.parameters["locSrv.extPosStdDev"], self.parameters["locSrv.extQuatStdDev"])
-        if len(poses) and self._version < _RESIDUAL_CORRECT_SINCE:
-            _reproduce_residual_error(poses, self.stabilizer.loop.belief[6:10])
+        allowed = supervisor.motors_allowed
+        self.setpoint = self.commander.setpoint if allowed else _MOTORS_OFF
+        if self._avoidance.enable:
+            self.setpoint = self._avoidance.rewrite(self.setpoint, self.stabilizer.loop.belief[0:3])
         self.stabilizer.run(
             self.tick,
             ticks,
             self.setpoint,
-            poses if self.parameters["stabilizer.estimator"] == KALMAN else _NO_POSES,
-            allowed=supervisor.motors_allowed,
+            self._poses() if self.localization.waits else _NO_POSES,
+            allowed=allowed,
             level=supervisor.levels_out,
             flying=supervisor.is_flying,
         )
+
+    def _poses(self) -> NDArray:
+        """Return the measurements (n, 9) that have come, for the filter."""
+        poses = self.localization.take(self.parameters["locSrv.extPosStdDev"], self.parameters["locSrv.extQuatStdDev"])
+        if self._version < _RESIDUAL_CORRECT_SINCE:
+            _reproduce_residual_error(poses, self.stabilizer.loop.belief[6:10])
+        return poses if self.parameters["stabilizer.estimator"] == KALMAN else _NO_POSES
 
     def _where(self) -> Goal:
         belief = self.stabilizer.loop.belief

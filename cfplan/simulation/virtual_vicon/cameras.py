@@ -70,13 +70,9 @@ class Cameras:
         for fault in settings.faults:
             self._faults.add(fault, start)
         self._looks = 0
+        self.next_look = start  # s, when the cameras look next
         self._last: Picture | None = None
         self._waiting: deque[tuple[float, Picture]] = deque()
-
-    @property
-    def next_look(self) -> float:
-        """Return when the cameras look next, s."""
-        return self._start + self._looks / self._settings.rate
 
     @property
     def next_due(self) -> float:
@@ -96,6 +92,7 @@ class Cameras:
         settings, faults = self._settings, self._faults
         # Frames that the owner had no time to take are counted, and missing.
         self._looks = max(self._looks, round((time - self._start) * settings.rate)) + 1
+        self.next_look = self._start + self._looks / settings.rate
         if self._last is not None and faults.acting(FaultKind.REPEAT, time):
             self._queue(time, self._last)
             return
@@ -148,8 +145,9 @@ class Cameras:
         settings = self._settings
         if not (settings.position_noise or settings.attitude_noise):
             return position, quaternion
-        off = self._chance.normal(0, settings.position_noise, 3)
-        a, b, c = self._chance.normal(0, settings.attitude_noise / 2, 3)
+        drawn = self._chance.standard_normal(6).tolist()
+        east, north, up = (settings.position_noise * share for share in drawn[:3])
+        a, b, c = (settings.attitude_noise / 2 * share for share in drawn[3:])
         (px, py, pz), (x, y, z, w) = position, quaternion
         turned = (
             x + w * a + y * c - z * b,
@@ -158,5 +156,5 @@ class Cameras:
             w - x * a - y * b - z * c,
         )
         norm = math.hypot(*turned)
-        qx, qy, qz, qw = (float(value / norm) for value in turned)
-        return (px + float(off[0]), py + float(off[1]), pz + float(off[2])), (qx, qy, qz, qw)
+        qx, qy, qz, qw = (value / norm for value in turned)
+        return (px + east, py + north, pz + up), (qx, qy, qz, qw)

@@ -60,6 +60,9 @@ class Faults:
 
     def seen(self, time: float, truth: Mapping[str, Seen]) -> dict[str, Seen]:
         """Return the bodies as the cameras see them, from where they are; hidden ones are left out."""
+        if not self._all:
+            self._held |= truth
+            return dict(truth)
         names = list(truth)
         if len(names) > 1 and self.acting(FaultKind.SWAP, time):
             truth = dict(truth) | {names[0]: truth[names[1]], names[1]: truth[names[0]]}
