@@ -194,7 +194,13 @@ class _Compiling(event.Listener):
             gc.enable()
 
 
-event.register("numba:compile", _Compiling())
+_listener = _Compiling()
+event.register("numba:compile", _listener)
+
+
+def compiles() -> bool:
+    """Return whether this process is compiling right now."""
+    return _listener.depth > 0
 
 
 class _Kept(_Cache):

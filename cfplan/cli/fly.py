@@ -68,6 +68,7 @@ def fly(
     steps, watched = Steps(as_json=as_json), Watched(live, mavlink)
     check_uris(uri, mocap_uri)
     check_watchers(watched)
+    options.check_records_folder(records)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.FLIGHT)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # starts while the flight is prepared

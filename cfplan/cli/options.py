@@ -1,5 +1,8 @@
 """Arguments and options that several commands share."""
 
+import errno
+import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,8 +83,30 @@ def find_safety_file(given: Path | None, path_file: Path) -> Path:
     )
 
 
+def check_records_folder(root: Path) -> None:
+    """Raise InputError where no record could be written under `root`, which need not exist yet."""
+    there = root.absolute()
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    try:
+        if not there.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        raise InputError(
+            f"records cannot be written there ({error.strerror or error})",
+            where=str(root),
+            hint="name a folder that can be written with --records",
+        ) from error
+
+
 def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compile_to: "Stage | None" = None) -> "Limits":
-    """Find and read safety.yaml, once a command, as its first step; begin to compile what the command will need."""
+    """Find and read safety.yaml, once a command, as its first step; begin to compile what the command will need.
+
+    Raises InputError where that is wrong, or where there is no path file to begin with.
+    """
+    if not path_file.exists():
+        raise InputError("no such file", where=str(path_file), hint="check the name; it is relative to this folder")
     with steps.step("limits") as results:
         safety_file = find_safety_file(given, path_file)
         compiling = ""

@@ -95,6 +95,12 @@ def _line(mark: str, head: str, result: str) -> str:
     return f"{mark} {head}{text}".rstrip()
 
 
+def _compiling_here() -> str:
+    """Say that this process compiles, if it does; whether it can is known without loading what compiles."""
+    machine_code = sys.modules.get("cfplan.machine_code")
+    return "compiling, once for this machine" if machine_code is not None and machine_code.compiles() else ""
+
+
 class _WaitingNote:
     """Says again and again what is waited for."""
 
@@ -109,7 +115,7 @@ class _WaitingNote:
         if self._calls == 1:
             return _FIRST_NOTE
         text = f"… {self._name}, {self._clock.now() - self._begun:.0f} s"
-        if meanwhile := self._steps.meanwhile():
+        if meanwhile := self._steps.meanwhile() or _compiling_here():
             text += f" ({meanwhile})"
         try:
             click.echo(f"\r\033[K{text}" if self._on_terminal else text, nl=not self._on_terminal)

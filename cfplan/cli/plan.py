@@ -23,6 +23,8 @@ def plan(
     path_file: Path, safety_file: Path | None, output: Path | None, force: bool, as_json: bool, **planning: Any
 ) -> None:
     """Plan the fastest flight along PATH within every limit, and print its certificate."""
+    if output is not None:
+        _check_output(output, force)
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_file, steps, compile_to=Stage.PLAN)
     with steps.waiting("loading planners"):
@@ -34,11 +36,25 @@ def plan(
         from cfplan.planning.plan_file import save_plan
 
         with steps.step("save") as results:
-            if output.exists() and not force:
-                raise InputError("there is a file already", where=str(output), hint="give --force to overwrite it")
             save_plan(planned.plan, output, {"name": planned.name, "path file": str(path_file)})
             results.append(str(output))
     if as_json:
         print_json(planned.to_dict() | ({"file": str(output)} if output else {}))
     else:
         print_certificate(planned.plan.certificate)
+
+
+def _check_output(output: Path, force: bool) -> None:
+    """Raise InputError, before anything is planned, where the plan could not be written or not be read again."""
+    from cfplan.preparation.plan_flight import PLAN_SUFFIX
+
+    if output.suffix != PLAN_SUFFIX:
+        raise InputError(
+            f"plans are written as Parquet, not as {output.suffix or 'a file without suffix'}",
+            where=str(output),
+            hint=f"name it {output.with_suffix(PLAN_SUFFIX).name}",
+        )
+    if output.exists() and not force:
+        raise InputError("there is a file already", where=str(output), hint="give --force to overwrite it")
+    if not output.absolute().parent.is_dir():
+        raise InputError("no such folder", where=str(output.parent), hint="make it first")

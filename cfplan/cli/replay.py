@@ -18,15 +18,25 @@ if TYPE_CHECKING:
 
 EPILOG = """\b
 Examples:
-  cfplan replay records/2026-11-21_101500-figure-eight --save flight.rrd
-  cfplan replay vicon.csv --subject cf1 --plan flights/figure8.yaml
-  cfplan replay records/toppquad records/learned
-  cfplan replay records/learned --png flight.png --at 12"""
+  cfplan replay records                                              list the flights
+  cfplan replay records/20261122-094221-figure8                      look at one
+  cfplan replay records/20261122-094221-figure8 --save flight.rrd    for later: rerun flight.rrd
+  cfplan replay records/20261122-094221-figure8 records/20261122-101500-figure8
+  cfplan replay vicon.csv --subject cf1 --plan records/20261122-094221-figure8
+  cfplan replay vicon.csv --subject cf1 --plan flights/figure8.yaml"""
 
 
 @click.command(short_help="Look at flights and logs in rerun.", epilog=EPILOG)
 @click.argument("flights", metavar="FLIGHT...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--plan", "plan_file", type=click.Path(path_type=Path), help="Lay the flights over this path or plan.")
+@click.option(
+    "--plan",
+    "plan_file",
+    type=click.Path(path_type=Path),
+    help="Lay the flights over this plan: a record's, a plan file, or of a path file what `cfplan fly` would plan.",
+)
+@click.option(
+    "--safety", "safety_file", type=click.Path(path_type=Path), help="Limits for planning it; found as by `cfplan fly`."
+)
 @click.option("--subject", "names", multiple=True, help="Show this subject of a mocap log only; may be repeated.")
 @click.option(
     "--angles",
@@ -41,6 +51,7 @@ Examples:
 def replay(
     flights: tuple[Path, ...],
     plan_file: Path | None,
+    safety_file: Path | None,
     names: tuple[str, ...],
     angles: str | None,
     save: Path | None,
@@ -52,10 +63,14 @@ def replay(
     """Replay a FLIGHT in rerun, or several as trials in one view.
 
     Each is a record (its folder, or its flight.mcap) or a log of motion capture: Vicon CSV, a Crazyflie's microSD log,
-    crazyswarm2 CSV, a ROS bag, or a MAVLink .tlog.
+    crazyswarm2 CSV, a ROS bag, or a MAVLink .tlog. The flights in a folder of records are listed.
     """
+    from cfplan.cli.flights_list import flights_in, print_flights
     from cfplan.recording.reader import is_record
 
+    if len(flights) == 1 and (records := flights_in(flights[0])):
+        print_flights(records, as_json=as_json)
+        return
     if moment is not None and (png is None or not abs(moment) < 1e6):
         raise InputError("--at says when a picture is taken, in s", hint="add --png flight.png")
     steps = Steps(as_json=as_json)
@@ -63,7 +78,12 @@ def replay(
     if len(flights) == 1 and plan_file is None and is_record(flights[0]):
         document = _replay_record(flights[0], files, steps)
     else:
-        document = _replay_trials(flights, plan_file, names, angles, files, steps)
+        reference = None
+        if plan_file is not None:
+            from cfplan.cli.reference_plan import reference_plan
+
+            reference = reference_plan(plan_file, safety_file, steps)
+        document = _replay_trials(flights, reference, names, angles, files, steps)
     if as_json:
         print_json({**document, "rrd": str(save) if save else None, "png": str(png) if png else None})
 
@@ -116,7 +136,7 @@ def _replay_record(place: Path, files: Files, steps: Steps) -> dict[str, Any]:
 
 def _replay_trials(
     flights: tuple[Path, ...],
-    plan_file: Path | None,
+    reference: "Reference | None",
     names: tuple[str, ...],
     angles: str | None,
     files: Files,
@@ -124,7 +144,6 @@ def _replay_trials(
 ) -> dict[str, Any]:
     from cfplan.recording.rerun.overlay_view import picture_overlay, show_overlay, write_overlay
 
-    reference = _reference(plan_file, steps) if plan_file is not None else None
     trials: list[Trial] = []
     told: list[dict[str, Any]] = []
     for place in flights:
@@ -133,22 +152,6 @@ def _replay_trials(
             told.append({"file": str(place), "name": trial.name, **said})
     files.make(steps, partial(write_overlay, trials), partial(picture_overlay, trials), partial(show_overlay, trials))
     return {"trials": told}
-
-
-def _reference(plan_file: Path, steps: Steps) -> "Reference":
-    from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, plan_flight
-    from cfplan.recording.overlay import reference_of
-
-    if plan_file.suffix == PLAN_SUFFIX:  # as it was planned, under the limits of that day
-        from cfplan.planning.plan_file import load_plan
-
-        with steps.step("plan") as results:
-            trajectory = load_plan(plan_file).trajectory
-            results.append(f"{trajectory.duration:.2f} s, read from {plan_file}")
-        return reference_of(trajectory, plan_file.stem)
-    limits = options.read_limits(None, plan_file, steps)
-    planned = plan_flight(plan_file, limits, FlightOptions("expert"), steps)
-    return reference_of(planned.plan.trajectory, planned.name)
 
 
 def _trials(

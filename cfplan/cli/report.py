@@ -12,9 +12,9 @@ from cfplan.cli.output import Steps, print_json
     short_help="A page with a flight's figures.",
     epilog="""\b
 Examples:
-  cfplan report records/2026-11-21_101500-figure-eight
-  cfplan report records/toppquad records/learned -o comparison.html
-  cfplan report records/learned --json""",
+  cfplan report records/20261122-094221-figure8
+  cfplan report records/20261122-094221-figure8 records/20261122-101500-figure8 -o comparison.html
+  cfplan report records/20261122-094221-figure8 --json""",
 )
 @click.argument("records", metavar="RECORD...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(

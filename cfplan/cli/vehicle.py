@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from cfplan.simulation.lab.lab import StartingLab
 
 SIMULATED = "sim://"
+VIRTUAL_SUBJECT = "cf1"  # the only body that it sees
 VIRTUAL_VICON = "lab"  # as the computer in a URI of motion capture
 
 
@@ -28,6 +29,12 @@ def check_uris(uri: str, mocap_uri: str | None) -> None:
         mocap = parse_uri(mocap_uri, subject_needed=True)
         if mocap.host == VIRTUAL_VICON and not mocap.system.startswith("vicon") and uri.startswith(SIMULATED):
             raise InputError("the lab has a virtual Vicon only", where=mocap_uri, hint="use vicon:// or vicon-sdk://")
+        if mocap.host == VIRTUAL_VICON and uri.startswith(SIMULATED) and mocap.subject != VIRTUAL_SUBJECT:
+            raise InputError(
+                f"the virtual Vicon sees {VIRTUAL_SUBJECT!r} alone, not {mocap.subject!r}",
+                where=mocap_uri,
+                hint=f"use {mocap.system}://{VIRTUAL_VICON}/{VIRTUAL_SUBJECT}",
+            )
     elif not uri.startswith(SIMULATED):
         raise InputError("this vehicle needs a source of poses", where=uri, hint=f"name it with --mocap, as {EXAMPLE}")
 

@@ -23,6 +23,7 @@ Model = TypeVar("Model", bound=BaseModel)
 Location = tuple[str | int, ...]
 
 MAX_SIZE = 200_000  # bytes, some 8,000 waypoints: YAML is read slowly, and people write a few kilobytes
+HINT = "; hint: "  # between a model's own message and its hint, in the text of a ValueError
 _MAX_DEPTH = 20  # of nested mappings and lists
 _TAGS = {
     f"tag:yaml.org,2002:{name}"
@@ -227,9 +228,9 @@ def _named(details: Any, model: type[BaseModel], places: Places) -> tuple[int, t
             f"the key {missing!r} is missing" + (f" in {name}" if name else ""),
             f"add `{missing}: …`" + (f"; {_known(owner)}" if owner else ""),
         )
-    message = _one_line(details["msg"].removeprefix("Value error, "))
+    message, _, hint = _one_line(details["msg"].removeprefix("Value error, ")).partition(HINT)
     if not message.startswith("Input "):
-        return 1, place, f"{name}: {message}" if name else message, _remedy(details["type"])
+        return 1, place, f"{name}: {message}" if name else message, hint or _remedy(details["type"])
     value = details["input"]
     shown = json.dumps(value, ensure_ascii=False) if isinstance(value, int | float | str | None) else ""
     unlike = f", not {shown}" if 0 < len(shown) <= 40 else ""

@@ -20,7 +20,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from cfplan.errors import InputError
 from cfplan.files.text import read_table
-from cfplan.files.yaml_with_places import Places, read_yaml_with_places
+from cfplan.files.yaml_with_places import HINT, Places, read_yaml_with_places
 from cfplan.geometry.min_snap import MIN_DENSE_SPACING, MIN_SPACING, check_points, min_snap, smooth_through
 from cfplan.geometry.path import Path, rotation_about_z
 from cfplan.geometry.polynomial_csv import read_polynomials
@@ -61,7 +61,18 @@ class _Place(BaseModel):
 
 
 def _short_yaw(value: Any) -> Any:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        raise ValueError(f"a mode is needed beside the angle{HINT}write `yaw: {{mode: fixed, angle_deg: {value:g}}}`")
     return {"mode": value} if isinstance(value, str) else value
+
+
+def _share(value: Any) -> Any:
+    if isinstance(value, str) or (isinstance(value, int | float) and value > 1):
+        raise ValueError(
+            f"a share of the speed that the limits allow, above 0 and at most 1, not a speed in m/s{HINT}"
+            "write 0.5 to fly half as fast; m/s stand in safety.yaml, `plan: speed`"
+        )
+    return value
 
 
 class _Content(BaseModel):
@@ -73,7 +84,7 @@ class _Content(BaseModel):
     polynomials: str | None = None
     yaw: Annotated[_Yaw, BeforeValidator(_short_yaw)] = _Yaw(mode=YawMode.FIXED)
     laps: int = Field(default=1, ge=1, le=1000)
-    speed: float = Field(default=1.0, gt=0.0, le=1.0)
+    speed: Annotated[float, Field(gt=0.0, le=1.0), BeforeValidator(_share)] = 1.0
     place: _Place = _Place()
 
 

@@ -123,7 +123,9 @@ def _find(place: Path) -> Path:
         file = place / FLIGHT_FILE
         if not file.is_file():
             raise InputError(
-                f"the folder holds no {FLIGHT_FILE}", where=str(place), hint="name the folder of one flight"
+                f"the folder holds no {FLIGHT_FILE}",
+                where=str(place),
+                hint="name the folder of one flight; `cfplan replay records` lists those in records/",
             )
         return file
     if place.is_fifo():

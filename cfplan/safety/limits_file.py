@@ -37,9 +37,10 @@ _LEAST_PLANNED = {
     "acceleration": 0.05,
     "angular_velocity": 0.05,
     "angular_acceleration": 0.05,
-    "tilt_deg": 0.5,
 }
 """What a limit of planned motion must allow at least: noise of the gyroscope and of poses would hide slower motion."""
+
+_QUARTER_TURN = math.pi / 2  # a limit of tilt below so many degrees is taken for radians
 
 Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
 Encodable = Annotated[float, Field(gt=0.0, le=LARGEST_IN_PACKET)]
@@ -212,6 +213,13 @@ def _plan_limits(plan: _Plan, airframe: Airframe) -> PlanLimits:
 
 def _check_order(content: _SafetyFile, places: Places) -> None:
     """Check the order of values within the file alone."""
+    for section, key in (("plan", "tilt_deg"), ("flight", "stop_tilt_deg")):
+        if (tilt := getattr(getattr(content, section), key)) < _QUARTER_TURN:
+            raise InputError(
+                f"{section}.{key} is {tilt:g}°: that hardly moves at all, and looks like radians",
+                where=places.where(section, key),
+                hint=f"write degrees: {tilt:g} rad is {math.degrees(tilt):.3g}; to fly slower, use --speed",
+            )
     for key, least in _LEAST_PLANNED.items():
         if getattr(content.plan, key) < least:
             raise InputError(

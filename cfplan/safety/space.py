@@ -10,6 +10,7 @@ from cfplan.geometry.path import Path
 
 _SAMPLES = 33  # of each piece of a path
 _AXES = ("x", "y", "z")
+_MILLIMETRES = 30.0  # larger coordinates of a path that lies in the space when divided by 1000 are in millimetres
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +34,15 @@ def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None,
         InfeasibleError: naming the first waypoint at fault, else the worst place, and by how much.
     """
     if waypoints is not None:
-        for number, point in enumerate(np.asarray(waypoints, dtype=float), start=1):
+        points = np.asarray(waypoints, dtype=float)
+        if np.abs(points).max(initial=0.0) > _MILLIMETRES and np.all(space.beyond(points / 1000.0) <= 0.0):
+            x, y, z = points[0]
+            raise InfeasibleError(
+                f"the waypoints are in millimetres: the first, ({x:g}, {y:g}, {z:g}), is to be in metres",
+                where=where,
+                hint=f"divide all coordinates by 1000: the first is then [{x / 1000:g}, {y / 1000:g}, {z / 1000:g}]",
+            )
+        for number, point in enumerate(points, start=1):
             if not np.all(space.beyond(point) <= 0.0):
                 _refuse(space, point, f"waypoint {number}", where)
     s = (path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)).reshape(-1)
@@ -50,13 +59,19 @@ def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None,
 def _refuse(space: Space, point: NDArray, what: str, where: str) -> None:
     beyond = space.beyond(point)
     axis = int(np.argmax(np.where(np.isfinite(beyond), beyond, np.inf)))
-    wall = space.low[axis] if point[axis] < (space.low[axis] + space.high[axis]) / 2 else space.high[axis]
+    low = bool(point[axis] < (space.low[axis] + space.high[axis]) / 2)
     x, y, z = point
     outside = beyond[axis] - space.margin
-    far = f"{outside:.3f} m outside the space" if outside > 0 else f"{-outside:.3f} m from the wall"
+    far = f"{outside:.3f} m beyond" if outside > 0 else f"{abs(outside):.3f} m from"
     raise InfeasibleError(
-        f"{what}, ({x:.3f}, {y:.3f}, {z:.3f}) m, is {far} {_AXES[axis]} = {wall:g} m, "
+        f"{what}, ({x:.3f}, {y:.3f}, {z:.3f}) m, is {far} {_side(space, axis, low)}, "
         f"{max(beyond[axis], 0.0):.3f} m too far with the margin of {space.margin:g} m",
         where=where,
         hint="move or place the path, or correct `space` in safety.yaml if the room is larger",
     )
+
+
+def _side(space: Space, axis: int, low: bool) -> str:
+    """Return what people call a side of the box."""
+    name = ("the floor" if low else "the ceiling") if axis == 2 else "the wall"
+    return f"{name} {_AXES[axis]} = {(space.low if low else space.high)[axis]:g} m"

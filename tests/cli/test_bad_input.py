@@ -22,6 +22,11 @@ BAD_PATHS = {
     "a path that leaves between its waypoints": (
         "waypoints: [[-2, 0, 1], [2.04, 3.7, 1], [2.04, -3.7, 1], [-2, 0, 1]]\n", 3, "path.yaml"),
     "no such file of points": ("points: nowhere.csv\n", 2, "nowhere.csv"),
+    "millimetres": ("waypoints: [[0, -1500, 1000], [300, 1500, 1000]]\n", 3, "[0, -1.5, 1]"),
+    "a path under the floor": ("waypoints: [[0, 0, 1], [1, 0, -0.1]]\n", 3, "0.100 m beyond the floor z = 0 m"),
+    "a yaw without its mode": (LINE + "yaw: 90\n", 2, "write `yaw: {mode: fixed, angle_deg: 90}`"),
+    "a speed that is no share": (LINE + "speed: 2\n", 2, "a share of the speed that the limits allow"),
+    "a speed in m/s": (LINE + "speed: 1.5 m/s\n", 2, "m/s stand in safety.yaml"),
     "a negative speed": (LINE + "speed: -0.5\n", 2, "path.yaml:2:"),
 }  # fmt: skip
 
@@ -29,6 +34,7 @@ BAD_SAFETY = {
     "a negative limit": (r"^  speed: 2.0", "  speed: -2.0", 2, "safety.yaml:7:"),
     "a zero limit": (r"^  acceleration: 5.0", "  acceleration: 0", 2, "safety.yaml:8:"),
     "an unknown key": (r"^  tilt_deg: 30", "  tilt: 30", 2, "safety.yaml:11:"),
+    "a tilt in radians": (r"^  tilt_deg: 30", "  tilt_deg: 0.52", 2, "0.52 rad is 29.8"),
     "an unknown vehicle": (r"^vehicle: \S+", "vehicle: crazyflie-9", 2, "safety.yaml:4:"),
     "limits under which it cannot hover": (r"^  motor_reserve: 0.2", "  motor_reserve: 0.45", 2, "safety.yaml:12:"),
     "a battery too small for the path": (r"^  endurance: 240", "  endurance: 9", 3, "endurance"),
@@ -119,3 +125,20 @@ def test_an_existing_plan_is_not_overwritten(cfplan, path_file, safety_file, tmp
     ended = cfplan("plan", path_file(LINE), "--safety", safety_file(), "-o", kept)
     assert_one_line(ended, 2, "plan.parquet", "--force")
     assert kept.read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["fly", "{path}", "--records", "/proc/records"], ["/proc/records", "--records"]),
+        (["fly", "{path}", "--mocap", "vicon://lab/cf2"], ["'cf2'", "vicon://lab/cf1"]),
+        (["plan", "{path}", "-o", "line.csv"], ["Parquet", "line.parquet"]),
+        (["plan", "{path}", "-o", "no/such/line.parquet"], ["no/such", "make it first"]),
+        (["fly", "no.yaml"], ["no.yaml", "no such file"]),
+    ],
+)
+def test_what_would_fail_at_the_end_is_refused_before_anything_is_planned(cfplan, path_file, safety_file, words, parts):
+    path = str(path_file(LINE))
+    ended = cfplan(*(word.format(path=path) for word in words), "--safety", safety_file())
+    assert_one_line(ended, 2, *parts)
+    assert ended.out == ""

@@ -116,7 +116,7 @@ def test_hundreds_of_points_keep_their_shape(load):
         ("waypoints: [[0,0,1],[1,0,1]]\nlaps: 2\n", ":2:7: 2 laps need a closed path, but the last point is 1.000 m"),
         ("waypoints: [[0,0,1],[1,0,1]]\nlaps: 0\n", ":2:7: laps should be greater than or equal to 1, not 0"),
         ("waypoints: [[0,0,1],[1,0,1]]\nspeed: 0\n", ":2:8: speed should be greater than 0, not 0"),
-        ("waypoints: [[0,0,1],[1,0,1]]\nspeed: 1.01\n", ":2:8: speed should be less than or equal to 1, not 1.01"),
+        ("waypoints: [[0,0,1],[1,0,1]]\nspeed: 1.01\n", ":2:8: speed: a share of the speed that the limits allow"),
         ("waypoints: [[0,0,1],[1,0,1]]\nyaw: left\n", ":2:6: yaw should be 'fixed', 'tangent' or 'free'"),
         ("waypoints: [[0,0,1],[1,0,1]]\nyaw: {mode: free, angle_deg: 9}\n", ":2:19: angle_deg is for mode fixed only"),
         ("waypoints: [[0,0,1],[1,0,1]]\nyaws: free\n", ":2:1: unknown key 'yaws' (hint: did you mean 'yaw'?"),

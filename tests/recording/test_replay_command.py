@@ -1,13 +1,24 @@
 """Words of `cfplan replay` and of the watchers of `cfplan fly` that cannot be followed: one line, nothing written."""
 
+import json
 import shutil
+from pathlib import Path
 
+import click
 import pytest
 from click.testing import CliRunner
 
 from cfplan.cli import cfplan
+from cfplan.cli.output import Steps
+from cfplan.cli.reference_plan import reference_plan
 from cfplan.errors import InputError
+from cfplan.planning.plan_file import save_plan
+from cfplan.preparation.plan_flight import plan_flight
 from cfplan.recording.rerun.record_view import write_rrd
+from cfplan.recording.writer import write_summary
+from cfplan.safety.limits_file import load_limits
+
+REPOSITORY = Path(__file__).parents[2]
 
 
 def refused(*words):
@@ -75,3 +86,41 @@ def test_a_flight_without_a_screen_or_a_place_for_mavlink_does_not_begin(monkeyp
         error = refused("fly", "line.yaml", "--mavlink", place, "--records", records)
         assert (error.where, "udp:127.0.0.1:14550" in error.hint) == (place, True)
     assert not records.exists()
+
+
+def test_a_folder_of_records_is_listed(flight, tmp_path):
+    for stamp in ("20240102-120000", "20240101-120000"):
+        shutil.copytree(flight.folder, tmp_path / f"{stamp}-figure8")
+    summary = {"uri": "sim://0", "outcome": {"reason": "landed"}, "travel_time_flown": 10.04, "max_deviation": 0.031}
+    write_summary(tmp_path / "20240102-120000-figure8", summary)
+    (tmp_path / "notes.txt").write_text("mine")
+    shown = CliRunner().invoke(cfplan, ["replay", str(tmp_path)])
+    assert shown.exit_code == 0
+    first, last = [line for line in shown.output.splitlines() if line.strip().startswith("2024")]
+    assert first.split()[0] == "20240101-120000-figure8"
+    assert last.split() == ["20240102-120000-figure8", "sim://0", "landed", "10.04", "s", "3.1", "cm"]
+    assert f"cfplan replay {tmp_path / '20240102-120000-figure8'}" in shown.output
+    listed = json.loads(CliRunner().invoke(cfplan, ["replay", str(tmp_path), "--json"]).stdout)["records"]
+    assert [entry.get("uri") for entry in listed] == [None, "sim://0"]
+
+
+def test_a_log_is_laid_over_the_plan_that_flew(flight, tmp_path):
+    """Of a record its own plan, of a path what `cfplan fly` would plan."""
+    limits = load_limits(REPOSITORY / "safety.yaml")
+    planned = plan_flight(REPOSITORY / "flights" / "line.yaml", limits)
+    save_plan(planned.plan, shutil.copytree(flight.folder, tmp_path / "flown") / "plan.parquet", {"name": "line"})
+    with click.Context(click.Command("replay")):
+        steps = Steps(as_json=True)
+        flown = reference_plan(tmp_path / "flown", None, steps)
+        again = reference_plan(REPOSITORY / "flights" / "line.yaml", REPOSITORY / "safety.yaml", steps)
+    assert flown.time[-1] == planned.plan.trajectory.duration
+    assert again.time[-1] == pytest.approx(planned.plan.trajectory.duration, abs=1e-6)
+
+
+def test_a_log_can_be_looked_at_in_a_room_too_small_for_its_path(tmp_path, capsys):
+    small = (REPOSITORY / "safety.yaml").read_text().replace("4.0, 0.0]", "1.0, 0.0]").replace("4.0, 2.0]", "1.0, 2.0]")
+    (tmp_path / "safety.yaml").write_text(small)
+    with click.Context(click.Command("replay")):
+        found = reference_plan(REPOSITORY / "flights" / "line.yaml", tmp_path / "safety.yaml", Steps(as_json=False))
+    assert found.position[:, 1].max() > 3.0
+    assert "not to be flown there" in capsys.readouterr().out

@@ -129,7 +129,7 @@ def test_unknown_keys_are_errors(tmp_path, place):
         ({"plan.acceleration": 0.001}, "noise would hide"),
         ({"plan.angular_velocity": 0.01}, "noise would hide"),
         ({"plan.angular_acceleration": 0.001}, "noise would hide"),
-        ({"plan.tilt_deg": 0.01}, "noise would hide"),
+        ({"plan.tilt_deg": 0.52}, "looks like radians"),
         ({"plan.speed": 3.5}, "not below flight.speed.brake"),
         ({"plan.acceleration": 10.0}, "not below flight.acceleration.brake"),
         ({"plan.angular_velocity": 12.0}, "not below flight.angular_velocity.brake"),

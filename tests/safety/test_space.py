@@ -20,10 +20,10 @@ def test_a_path_inside_is_fine():
 @pytest.mark.parametrize(
     ("point", "message"),
     [
-        ((2.3, 0, 1), r"waypoint 2, .* is 0\.300 m outside the space x = 2 m, 0\.500 m too far"),
+        ((2.3, 0, 1), r"waypoint 2, .* is 0\.300 m beyond the wall x = 2 m, 0\.500 m too far"),
         ((1.9, 0, 1), r"waypoint 2, .* is 0\.100 m from the wall x = 2 m, 0\.100 m too far"),
-        ((0, -3.5, 1), r"0\.500 m outside the space y = -3 m"),
-        ((0, 1, 0.05), r"0\.050 m from the wall z = 0 m, 0\.150 m too far"),
+        ((0, -3.5, 1), r"0\.500 m beyond the wall y = -3 m"),
+        ((0, 1, 0.05), r"0\.050 m from the floor z = 0 m, 0\.150 m too far"),
         ((0, 1, float("nan")), r"waypoint 2, \(0\.000, 1\.000, nan\)"),
     ],
 )

@@ -1,0 +1,53 @@
+"""The flights in a folder of records, as a list."""
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import click
+
+from cfplan.cli.output import print_json, print_table
+from cfplan.recording.record import FLIGHT_FILE, SUMMARY_FILE
+
+_UNKNOWN = "–"
+
+
+def flights_in(folder: Path) -> list[Path]:
+    """Return the records right in a folder, the latest last; none where it is no folder or a record itself."""
+    if not folder.is_dir() or (folder / FLIGHT_FILE).exists():
+        return []
+    return sorted(file.parent for file in folder.glob(f"*/{FLIGHT_FILE}"))
+
+
+def print_flights(records: list[Path], *, as_json: bool) -> None:
+    """Print a row for each flight, from its summary, and how to look at the last one."""
+    if as_json:
+        print_json({"records": [{"record": str(record), **_summary(record)} for record in records]})
+        return
+    print_table(f"{len(records)} flights", ["record", "on", "ended", "flown", "deviation"], list(map(_row, records)))
+    click.echo(f"replay the last: cfplan replay {shlex.quote(str(records[-1]))}")
+
+
+def _row(record: Path) -> list[str]:
+    summary = _summary(record)
+    ended = summary.get("outcome")
+    return [
+        record.name,
+        str(summary.get("uri", _UNKNOWN)),
+        str(ended.get("reason", _UNKNOWN)) if isinstance(ended, dict) else "no summary: the program ended in flight",
+        _number(summary.get("travel_time_flown"), 1, 2, "s"),
+        _number(summary.get("max_deviation"), 100, 1, "cm"),
+    ]
+
+
+def _summary(record: Path) -> dict[str, Any]:
+    try:
+        summary = json.loads((record / SUMMARY_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return summary if isinstance(summary, dict) else {}
+
+
+def _number(value: Any, scale: float, digits: int, unit: str) -> str:
+    return f"{scale * value:.{digits}f} {unit}" if isinstance(value, int | float) else _UNKNOWN

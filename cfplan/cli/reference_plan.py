@@ -1,0 +1,70 @@
+"""The plan that a log is laid over: as it was flown, or planned as `cfplan fly` would."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cfplan.cli import options
+from cfplan.errors import InfeasibleError
+
+if TYPE_CHECKING:
+    from cfplan.cli.output import Steps
+    from cfplan.planning.plan_result import Plan
+    from cfplan.recording.overlay import Reference
+    from cfplan.safety.limits import Limits
+
+FAR = 1e6  # m
+
+
+def reference_plan(source: Path, safety_file: Path | None, steps: "Steps") -> "Reference":
+    """Return the plan of a record or of a plan file as it was flown, else plan the path file as `cfplan fly` does.
+
+    Looking at a flight must not fail because of the room: a path that today's safety.yaml refuses is planned as if
+    there were no walls, and that is said.
+
+    Raises InputError where a file is wrong, InfeasibleError where no profile keeps the limits of motion.
+    """
+    from cfplan.preparation.compiled_calls import Stage
+    from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, plan_flight
+    from cfplan.recording.overlay import reference_of
+    from cfplan.recording.record import PLAN_FILE
+
+    file = source / PLAN_FILE if (source / PLAN_FILE).is_file() else source
+    if file.suffix == PLAN_SUFFIX:  # as it was planned, under the limits of that day
+        from cfplan.planning.plan_file import load_plan
+
+        with steps.step("plan") as results:
+            trajectory = load_plan(file).trajectory
+            results.append(f"{trajectory.duration:.2f} s, read from {file}")
+        return reference_of(trajectory, file.stem if file is source else source.resolve().name)
+    limits = options.read_limits(safety_file, source, steps, compile_to=Stage.PLAN)
+    try:
+        planned = plan_flight(source, limits, FlightOptions(), steps)
+    except InfeasibleError as error:
+        with steps.step("room") as results:
+            results.warn(f"not to be flown there: {error.what}")
+        plan = _without_walls(source, limits, steps)
+        return reference_of(plan.trajectory, source.stem)
+    return reference_of(planned.plan.trajectory, planned.name)
+
+
+def _without_walls(source: Path, limits: "Limits", steps: "Steps") -> "Plan":
+    """Plan a path file within the limits of motion alone. Raises InfeasibleError where no profile keeps them."""
+    from cfplan.geometry.path_file import load_path_file
+    from cfplan.planning.plan import plan
+
+    everywhere = replace(limits.space, low=(-FAR, -FAR, -FAR), high=(FAR, FAR, FAR))
+    for_ever = replace(limits.battery, endurance=math.inf)
+    with steps.step("plan") as results:
+        path_file = load_path_file(source)
+        planned = plan(
+            path_file.path,
+            limits.airframe,
+            replace(limits, space=everywhere, battery=for_ever),
+            yaw=path_file.yaw,
+            yaw_angle=path_file.yaw_angle,
+            speed_factor=path_file.speed,
+        )
+        results.append(f"{planned.trajectory.duration:.2f} s by {planned.planner}, as if there were no walls")
+    return planned
