@@ -19,6 +19,7 @@ from cfplan.geometry.rest import rest_path, with_rest_ends
 MIN_SPACING = 0.01  # m, two waypoints in a row that are closer are one point mistyped
 MIN_DENSE_SPACING = 0.001  # m, the same for lists of points
 MAX_COORDINATE = 1e5  # m from the origin along each axis: beyond this rounding costs millimetres
+REST = np.zeros((3, 3))  # γ', γ'', γ''' at an end that rests
 
 
 def _snap_energy() -> NDArray:
@@ -42,7 +43,7 @@ def min_snap(waypoints: ArrayLike, *, nominal_speed: float = 1.0) -> Path:
         InputError: fewer than two waypoints, two in a row closer than MIN_SPACING, numbers that are not finite.
     """
     points, times = _checked(waypoints, nominal_speed, MIN_SPACING)
-    return rest_path(times, _pieces(points, times, rest=True))
+    return rest_path(times, pieces_through(points, times, start=REST, rest_end=True))
 
 
 def smooth_through(points: ArrayLike) -> Path:
@@ -57,7 +58,7 @@ def smooth_through(points: ArrayLike) -> Path:
             where="points",
             hint="give more points, or lay a path of least snap through these",
         )
-    return with_rest_ends(times, _pieces(points, times, rest=False))
+    return with_rest_ends(times, pieces_through(points, times, start=None, rest_end=False))
 
 
 def check_points(points: NDArray, spacing: float = MIN_SPACING, where: Callable[[int], str] | None = None) -> None:
@@ -104,9 +105,13 @@ def _checked(waypoints: ArrayLike, nominal_speed: float, spacing: float) -> tupl
     return points, np.linalg.norm(np.diff(points, axis=0), axis=1) / nominal_speed
 
 
-def _pieces(points: NDArray, times: NDArray, rest: bool) -> NDArray:
-    """Return (K-1, 8, 3), the polynomial of each segment about its left end."""
-    derivatives = _waypoint_derivatives(points, times, rest)
+def pieces_through(points: NDArray, times: NDArray, start: NDArray | None, rest_end: bool) -> NDArray:
+    """Return (K-1, 8, 3), the polynomial of each segment about its left end, with the least snap.
+
+    Segment i goes from points[i] to points[i + 1], (K, 3) m, in times[i], s. `start`, (3, 3), is γ', γ'', γ''' at the
+    first point, None where they are free; the end rests or is free.
+    """
+    derivatives = _waypoint_derivatives(points, times, start, rest_end)
     powers = times[:, None] ** np.arange(4)
     left = np.concatenate([np.zeros((len(times), 1, 3)), derivatives[:-1]], axis=1)  # (K-1, 4, 3)
     right = np.concatenate([np.diff(points, axis=0)[:, None], derivatives[1:]], axis=1)
@@ -116,7 +121,7 @@ def _pieces(points: NDArray, times: NDArray, rest: bool) -> NDArray:
     return table
 
 
-def _waypoint_derivatives(points: NDArray, times: NDArray, rest: bool) -> NDArray:
+def _waypoint_derivatives(points: NDArray, times: NDArray, start: NDArray | None, rest_end: bool) -> NDArray:
     """Return (K, 3, 3), γ', γ'', γ''' at each waypoint with the least snap."""
     count = len(points)
     # In units of each segment's time T the energy is a constant matrix; T^-7 and powers of T scale it back.
@@ -132,8 +137,11 @@ def _waypoint_derivatives(points: NDArray, times: NDArray, rest: bool) -> NDArra
     force[:-1] -= energy[:, 1:4][:, :, [0, 4]] @ ends
     force[1:] -= energy[:, 5:8][:, :, [0, 4]] @ ends
 
-    first, last = (1, count - 1) if rest else (0, count)
+    first, last = 0 if start is None else 1, count - 1 if rest_end else count
     solution = np.zeros((count, 3, 3))
+    if start is not None:
+        solution[0] = start
+        force[1] -= beside[0].T @ start
     if last > first:
         solution[first:last] = _solve_block_tridiagonal(
             diagonal[first:last], beside[first : last - 1], force[first:last]

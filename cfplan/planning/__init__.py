@@ -1,3 +1,3 @@
 """From a path and limits to a certified plan: the choice of planner, repair, and plan files."""
 
-__all__ = ["plan", "plan_file", "plan_result", "planners", "repair"]
+__all__ = ["continuation", "plan", "plan_file", "plan_result", "planners", "repair"]

@@ -48,17 +48,11 @@ def plan(
     task = PlanningTask(path, airframe, limits.plan, yaw=yaw, yaw_angle=yaw_angle, start=start, end=end)
     best, bound, notes = choose(planner, task, nodes, limits.space)
     repaired = flown = best.repaired
-    if repaired.speed_factor < 1.0 and (start is not None or end is not None):
-        raise InfeasibleError(
-            f"the profile passes only at {repaired.speed_factor:.2%} of its speed, "
-            "which would break the boundary state",
-            hint="start slower, or leave the boundary free",
-        )
     if changed := repaired.describe():
         notes += (f"{best.planner}'s profile was {changed}",)
     if speed_factor < 1.0:
         flown = slow(task, repaired.trajectory.profile.slowed(speed_factor), limits.space)
-    _check_endurance(flown.trajectory.duration, limits)
+    check_endurance(flown.trajectory.duration, limits)
     return Plan(
         path=path,
         airframe=airframe,
@@ -99,7 +93,8 @@ def _check_arguments(planner: str, nodes: int | None, speed_factor: float, bound
         )
 
 
-def _check_endurance(duration: float, limits: Limits) -> None:
+def check_endurance(duration: float, limits: Limits) -> None:
+    """Refuse a flight that takes longer than the battery lasts. Raises InfeasibleError."""
     ground = limits.ground
     height = limits.space.high[2] - limits.space.low[2]
     around = height / ground.take_off_speed + height / ground.land_speed

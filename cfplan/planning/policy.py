@@ -1,9 +1,11 @@
 """The policy of planning as a table: which planners are asked, when, in which order and on which grids."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from types import MappingProxyType
 from typing import NamedTuple
+
+import numpy as np
 
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
 from cfplan.learning.model_files import find_model
@@ -15,6 +17,7 @@ from cfplan.planning.repair import Repaired, repair, slow
 from cfplan.safety.space import Space
 
 GOOD_SPEED_FACTOR = 0.97  # a profile that repair slows further than this is worth a try on the next grid
+SAME_STATE = 1e-6  # of h, yaw and their derivatives, or of one, within which a boundary state is met
 EXPERT_GAP = 0.1  # of the flight over the proven bound, above which the expert is asked too
 
 
@@ -159,7 +162,22 @@ def ask(planner: str, task: PlanningTask, space: Space) -> Found | str:
         repaired = (repair if PLANNERS[planner].refined else slow)(task, solution.profile, space)
     except (InfeasibleError, NotCertifiedError) as error:
         return f"{planner} with {nodes} nodes: {error}"
+    if missed := _missed_boundary(task, repaired):
+        return f"{planner} with {nodes} nodes: {missed}"
     return Found(repaired, planner, nodes, solution.joints if repaired.joints is None else repaired.joints)
+
+
+def _missed_boundary(task: PlanningTask, repaired: Repaired) -> str:
+    """Return why a repaired profile does not begin and end in the task's boundary states; empty where it does."""
+    for name, wanted, node in (("start", task.start, 0), ("end", task.end, -1)):
+        if wanted is None:
+            continue
+        reached = astuple(repaired.trajectory.profile.boundary(node))
+        if not np.allclose(reached, astuple(wanted), rtol=SAME_STATE, atol=SAME_STATE):
+            if repaired.speed_factor < 1.0:
+                return f"passes only at {repaired.speed_factor:.2%} of its speed, which would break the boundary state"
+            return f"the {name} is not in the boundary state"
+    return ""
 
 
 def _failure(planner: str, nodes: int, solution: Solution) -> str:

@@ -5,6 +5,7 @@ __all__ = [
     "airframes",
     "dense",
     "flatness",
+    "joint",
     "measures",
     "profile",
     "profile_spline",

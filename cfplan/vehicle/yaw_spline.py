@@ -20,6 +20,7 @@ from cfplan.machine_code import njit
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 
 SMOOTHING_LENGTH = 0.15  # s of nominal time, over which a sudden turn is spread
+SETTLING_LENGTH, TURN = 1.0, 0.3  # s of nominal time, at least, and rad a second of it, to turn from a boundary state
 SAMPLES = 16  # an interval, where the direction of flight is followed
 LEVEL = 0.1  # horizontal share of the direction of flight below which it says nothing about yaw
 KERNEL_WIDTH = 3.0  # nodes, standard deviation of the Gaussian that smooths given angles
@@ -56,6 +57,8 @@ class YawSpline:
         """Return one angle all along, which begins and ends with the yaw of boundary states where given."""
         if start is None and end is None:
             return cls(np.full(nodes + 1, angle), np.zeros(nodes + 1), np.zeros(nodes))
+        if start is not None and end is None:  # the turn of 2π that is nearest
+            angle += 2 * np.pi * np.round((start.yaw - angle) / (2 * np.pi))
         target = np.full(2 * nodes + 1, angle)
         return _fit(path, nodes, target, np.ones_like(target), start, end)
 
@@ -139,6 +142,14 @@ def _smooth(yaw: NDArray) -> NDArray:
     return out
 
 
+def _turn_from(start: BoundaryState, target: NDArray, spacing: float, end: float) -> NDArray:
+    """Return what to add to a target, one value each `spacing`, so that it turns gently from a boundary state's yaw."""
+    away, turning = start.yaw - target[0], start.dyaw - (target[1] - target[0]) / spacing
+    length = min(max(SETTLING_LENGTH, abs(away) / TURN), end)
+    x = np.minimum(np.arange(len(target)) * (spacing / length), 1.0)
+    return np.asarray((1 - x) ** 3 * ((1 + 3 * x + 6 * x**2) * away + x * (1 + 3 * x) * length * turning))
+
+
 def _fit(
     path: Path,
     nodes: int,
@@ -152,6 +163,8 @@ def _fit(
     from scipy.sparse.linalg import spsolve
 
     step = path.end / nodes
+    if start is not None:
+        target = target + _turn_from(start, target, step / 2, path.end)
     size = nodes + 2
     ones = np.ones(size)
     at_nodes = diags([ones[:-1] / 2, ones[:-1] / 2], [0, 1], shape=(nodes + 1, size))

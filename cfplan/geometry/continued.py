@@ -1,0 +1,119 @@
+"""Continued paths: curves that begin in motion, with given γ to γ'''', and end at rest.
+
+Where a path begins with the derivatives of another at some place, a speed profile continues across that joint by its
+boundary state alone: velocity, acceleration and jerk do not jump, and snap only by what h''' does. So both paths share
+the unit of s there.
+
+Pieces of degree 7 can begin with any γ', γ'', γ'''. What is missing of γ'''' is added as a polynomial of degree 9 that
+vanishes with four derivatives where it ends. Its own snap is as large whatever its length, and the curve moves less the
+shorter it is.
+"""
+
+import math
+from math import factorial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cfplan.errors import InputError
+from cfplan.geometry.min_snap import MIN_DENSE_SPACING, MIN_SPACING, check_points, pieces_through
+from cfplan.geometry.path import Path
+from cfplan.geometry.polynomials import hermite, padded, shifted
+from cfplan.geometry.rest import with_rest_end
+
+ORDERS = 5  # γ and four derivatives, that a path continues
+BLEND = 0.4  # s of nominal time, over which a given γ'''' fades; at most half of the first segment
+_HERMITE = hermite(ORDERS)
+_FACTORIALS = np.array([factorial(order) for order in range(ORDERS)], dtype=float)[:, None]
+
+
+def continued_min_snap(start: ArrayLike, waypoints: ArrayLike, times: ArrayLike | None = None) -> Path:
+    """Return the path of least snap that begins with γ to γ'''' as `start`, (5, 3), has them, and ends at rest.
+
+    It goes through the waypoints, (K, 3) m, K at least 1; `times`, (K,) s of nominal time, are those of the segments
+    that end in each. Where they are not given, each segment takes its straight length at 1 m/s. With the times that are
+    left of another path of least snap through the same waypoints, from a state of that path, it is the rest of it.
+
+    Raises:
+        InputError: two points in a row closer than MIN_SPACING, numbers that are not finite, times that are not
+            positive.
+    """
+    begin, points = _checked(start, waypoints, MIN_SPACING)
+    spans = _checked_times(points, times)
+    return _fitted(begin, spans, pieces_through(points, spans, start=begin[1:4], rest_end=True))
+
+
+def continued_through(start: ArrayLike, points: ArrayLike) -> Path:
+    """Return the path through dense points, (K, 3) m, K at least 4, that begins as `start`, (5, 3), says.
+
+    Its end is free, then brought to rest; see min_snap.smooth_through. Raises InputError.
+    """
+    begin, points = _checked(start, points, MIN_DENSE_SPACING)
+    if len(points) < 5:
+        raise InputError(
+            f"a smooth path with a free end needs at least four points ahead, not {len(points) - 1}",
+            where="points",
+            hint="give more points, or lay a path of least snap through these",
+        )
+    times = _checked_times(points, None)
+    spans, table = with_rest_end(times, pieces_through(points, times, start=begin[1:4], rest_end=False))
+    return _fitted(begin, spans, table)
+
+
+def _checked(start: ArrayLike, waypoints: ArrayLike, spacing: float) -> tuple[NDArray, NDArray]:
+    """Return the start, (5, 3), and the points, (K+1, 3), the first of which is the start's."""
+    begin, ahead = np.asarray(start, dtype=float), np.asarray(waypoints, dtype=float)
+    if begin.shape != (ORDERS, 3) or not np.isfinite(begin).all():
+        raise InputError(
+            f"a path continues from finite γ to γ'''', (5, 3), not from {begin.tolist()}",
+            where="start",
+            hint="take them from the path that is flown",
+        )
+    if ahead.ndim != 2 or ahead.shape[1] != 3 or not len(ahead):
+        raise InputError(
+            f"each waypoint must be x, y, z; the array has shape {ahead.shape}",
+            where="waypoints",
+            hint="give an array (K, 3) in metres, of one waypoint at least",
+        )
+    points = np.concatenate([begin[:1], ahead])
+    if len(ahead) > 1:
+        check_points(ahead, spacing)
+    if not math.dist(points[0], points[1]) >= spacing:
+        raise InputError(
+            f"the path begins {math.dist(points[0], points[1]):.4f} m from its first waypoint, less than {spacing} m",
+            where="waypoint 1",
+            hint="leave it out: it has been passed",
+        )
+    check_points(points[:2], spacing, lambda index: f"waypoint {index}" if index else "start")
+    return begin, points
+
+
+def _checked_times(points: NDArray, times: ArrayLike | None) -> NDArray:
+    """Return the nominal time of each segment, (K,) s."""
+    if times is None:
+        return np.asarray(np.linalg.norm(np.diff(points, axis=0), axis=1))
+    spans = np.asarray(times, dtype=float)
+    if spans.shape != (len(points) - 1,) or not (np.isfinite(spans).all() and (spans > 0.0).all()):
+        raise InputError(
+            f"{len(points) - 1} segments need as many positive times, not {spans.tolist()}",
+            where="times",
+            hint="leave them out to have them chosen",
+        )
+    return spans
+
+
+def _fitted(start: NDArray, spans: NDArray, table: NDArray) -> Path:
+    """Return the path of pieces, (M, D, 3) about their left ends, that begin with γ to γ'''; and now with γ'''' too."""
+    blend = min(BLEND, spans[0] / 2)
+    table = padded(table, max(2 * ORDERS, table.shape[1]))
+    table = np.concatenate([table[:1], shifted(table[:1], np.array([blend])), table[1:]])
+    spans = np.concatenate([[blend, spans[0] - blend], spans[1:]])
+
+    missing = np.zeros((2 * ORDERS, 3))
+    missing[4] = (start[4] - _FACTORIALS[4] * table[0, 4]) * blend**4
+    table[0, : 2 * ORDERS] += (_HERMITE @ missing) / blend ** np.arange(2 * ORDERS)[:, None]
+    table[0, :ORDERS] = start / _FACTORIALS  # to the last digit
+
+    table[-1] = shifted(table[-1:], spans[-1:])[0]
+    table[-1, 1:4] = 0.0
+    return Path(np.concatenate([[0.0], np.cumsum(spans)]), table)

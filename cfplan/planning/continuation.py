@@ -1,0 +1,198 @@
+"""Plans that continue a motion: the path may change while it is flown.
+
+A path laid from where the vehicle is, with the velocity that it has, may swing far out before its first waypoint, or
+turn too sharply for its speed. That depends on the nominal time that its first segment takes, and on the unit of s in
+which its start is given: that of the path left, which keeps the curve where waypoints stay, or time, which is gentle
+where the path left is about to stop. Several are tried, first the one that looks fastest by a cheap estimate.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cfplan.errors import CfplanError, InfeasibleError
+from cfplan.geometry.continued import continued_min_snap
+from cfplan.geometry.path import Path
+from cfplan.geometry.yaw import YawMode
+from cfplan.learning.features import REFERENCE, Bounds, bounds, node_features
+from cfplan.planners.solution import Solution, Status
+from cfplan.planners.task import PlanningTask
+from cfplan.planning.plan import check_endurance
+from cfplan.planning.plan_result import Plan
+from cfplan.planning.planners import default_nodes, find_planner
+from cfplan.safety.certificate import Certificate, certify
+from cfplan.safety.limits import Limits, PlanLimits
+from cfplan.safety.space import check_space
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.joint import Joint, joint_at
+from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.trajectory import Trajectory
+
+FIRST_TIMES = (0.7, 1.0, 1.5, 2.5)  # times the first segment's own, that are tried
+RATE = 1.25  # units of s a second, where they are those of time: about the speed in m/s
+TRIES = 4  # paths that are planned
+ROOM = 0.005  # share of each limit that plans leave to whoever continues them
+PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
+_NODES = 60  # where a path's time is estimated
+
+
+@dataclass(frozen=True, slots=True)
+class Continuation:
+    """A plan that begins in the state of a joint."""
+
+    plan: Plan
+    reached: tuple[float, ...]  # s on its path, of each waypoint
+
+
+def continue_plan(
+    trajectory: Trajectory,
+    leave: float,
+    waypoints: ArrayLike,
+    limits: Limits,
+    *,
+    times: ArrayLike | None = None,
+    yaw: YawMode = YawMode.FIXED,
+    yaw_angle: float = 0.0,
+) -> Continuation:
+    """Return a certified plan that leaves a trajectory at `leave`, s, and goes through waypoints, (K, 3) m, to rest.
+
+    `times`, (K,) s, are the nominal times of the segments that end in each, where waypoints of the path left stay: what
+    is left of it. In mode FIXED yaw turns to `yaw_angle`, rad, along the path.
+
+    Raises:
+        InputError: the waypoints are no waypoints, or the trajectory does not move then.
+        InfeasibleError: a waypoint lies outside the space, or none of the paths tried can be flown from this state.
+    """
+    begun = time.perf_counter()
+    joint = joint_at(trajectory, leave)
+    points = np.asarray(waypoints, dtype=float)
+    continued_min_snap(joint.derivatives, points)  # refuses what are no waypoints
+    _check_waypoints(points, limits)
+    bound = bounds(limits.airframe, limits.plan)
+    ways = sorted(_ways(joint, trajectory, points, times), key=lambda way: _least_time(way.path, bound))
+    failure, tries = "", 0
+    for way in ways:
+        try:
+            check_space(way.path, limits.space)
+            way.path.check()
+        except CfplanError as error:
+            failure = failure or error.what
+            continue
+        task = PlanningTask(
+            way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start
+        )
+        found = _solve(task, limits)
+        if not isinstance(found, str):
+            check_endurance(found.trajectory.duration, limits)
+            return Continuation(_plan(found, task, limits, time.perf_counter() - begun), way.reached)
+        failure, tries = found, tries + 1
+        if tries == TRIES:
+            break
+    speed = float(np.linalg.norm(trajectory.at(leave).velocity))
+    away = float(np.linalg.norm(points[0] - joint.derivatives[0]))
+    raise InfeasibleError(
+        f"from {speed:.2f} m/s no way leads through waypoint 1, {away:.2f} m away: {failure}",
+        where="waypoint 1",
+        hint="give a waypoint farther on and more ahead, or stop first",
+    )
+
+
+def _check_waypoints(points: NDArray, limits: Limits) -> None:
+    beyond = limits.space.beyond(points).max(axis=1)
+    if (beyond > 0.0).any():
+        at = int(np.argmax(beyond > 0.0))
+        x, y, z = points[at]
+        raise InfeasibleError(
+            f"waypoint {at + 1}, ({x:.3f}, {y:.3f}, {z:.3f}) m, is {beyond[at]:.3f} m too far out",
+            where=f"waypoint {at + 1}",
+            hint="keep waypoints inside the space less its margin",
+        )
+
+
+class _Way(NamedTuple):
+    """A path on which to go on, the boundary state at its start, and the s of each waypoint."""
+
+    path: Path
+    start: BoundaryState
+    reached: tuple[float, ...]
+
+
+def _ways(joint: Joint, trajectory: Trajectory, points: NDArray, times: ArrayLike | None) -> Iterator[_Way]:
+    """Yield the paths that are worth a try."""
+    straight = np.linalg.norm(np.diff(np.concatenate([joint.derivatives[:1], points]), axis=0), axis=1)
+    if times is not None:
+        yield _way(joint, points, np.asarray(times, dtype=float))
+    for begin in (joint, joint.timed(trajectory, RATE)):
+        for factor in FIRST_TIMES:
+            yield _way(begin, points, np.concatenate([[factor * straight[0]], straight[1:]]))
+
+
+def _way(joint: Joint, points: NDArray, times: NDArray) -> _Way:
+    path = continued_min_snap(joint.derivatives, points, times)
+    return _Way(path, joint.state, tuple(np.cumsum(times).tolist()))
+
+
+def _least_time(path: Path, bound: Bounds) -> float:
+    """Return about how long a path takes at least, s, by what its derivatives allow place by place."""
+    step = path.end / _NODES
+    return float(np.exp(-node_features(path, 0.0, step, _NODES + 1, bound)[:, REFERENCE]).sum())
+
+
+def with_room(limits: PlanLimits, airframe: Airframe, room: float = ROOM) -> PlanLimits:
+    """Return limits that leave a share `room` of each to whoever continues the plan.
+
+    A state just at a limit can hardly be continued: what follows is all but decided, and exceeds it by rounding.
+    """
+    hover, less = airframe.hover_thrust, 1.0 - room
+    return PlanLimits(
+        speed=less * limits.speed,
+        acceleration=less * limits.acceleration,
+        angular_velocity=less * limits.angular_velocity,
+        tilt=less * limits.tilt,
+        motor_thrust_min=hover - less * (hover - limits.motor_thrust_min),
+        motor_thrust_max=hover + less * (limits.motor_thrust_max - hover),
+        specific_thrust_min=GRAVITY - less * (GRAVITY - limits.specific_thrust_min),
+        angular_acceleration=less * limits.angular_acceleration,
+    )
+
+
+class _Found(NamedTuple):
+    trajectory: Trajectory
+    certificate: Certificate
+    joints: tuple[float, ...]
+
+
+def _solve(task: PlanningTask, limits: Limits) -> _Found | str:
+    """Return a certified trajectory, planned with room if the state at its start has that; or why there is none."""
+    solution = Solution(Status.BAD_BOUNDARY, None)
+    for allowed in (with_room(task.limits, task.airframe), task.limits):
+        if solution.status is Status.BAD_BOUNDARY:
+            solution = find_planner(PLANNER)(replace(task, limits=allowed))
+    if solution.profile is None:
+        return f"{solution.status} ({' '.join(solution.reason.split())})" if solution.reason else str(solution.status)
+    trajectory = Trajectory(task.path, solution.profile, task.airframe)
+    certificate = certify(trajectory, limits.plan, limits.space)
+    if not certificate.passed:
+        return f"the plan exceeds the limit on {certificate.worst.name} by {certificate.worst.share - 1.0:.2%}"
+    return _Found(trajectory, certificate, solution.joints)
+
+
+def _plan(found: _Found, task: PlanningTask, limits: Limits, seconds: float) -> Plan:
+    return Plan(
+        path=task.path,
+        airframe=task.airframe,
+        limits=limits,
+        trajectory=found.trajectory,
+        certificate=found.certificate,
+        planner=PLANNER,
+        nodes=task.nodes,
+        repair_speed_factor=1.0,
+        speed_factor=1.0,
+        seconds=seconds,
+        notes=(),
+        joints=found.joints,
+    )

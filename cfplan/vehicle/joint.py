@@ -1,0 +1,109 @@
+"""Joint: where another trajectory takes over from one that is flown, without a jump; and trajectories so joined.
+
+The one taking over begins with γ to γ'''' and the boundary state (h, h', h'', ψ, ψ') of the one left, in its unit of s.
+Position, velocity, acceleration, jerk, attitude and body rates are then continuous; only snap, and with it angular
+acceleration and motor thrust, may jump by what h''' and ψ'' jump, as at every grid point of a profile.
+"""
+
+from dataclasses import dataclass, fields
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cfplan.errors import InputError
+from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.trajectory import FullState, Trajectory
+
+_ORDERS = 5  # γ and four derivatives
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Joint:
+    """The state of a trajectory at a moment, from which another continues."""
+
+    time: float  # s, of the trajectory left
+    s: float  # likewise, where on its path
+    derivatives: NDArray  # (5, 3) γ to γ''''
+    state: BoundaryState
+
+    def timed(self, trajectory: Trajectory, rate: float) -> "Joint":
+        """Return the same state of the trajectory left in another unit of s: time, `rate` units a second.
+
+        Then h is the square of `rate` and stands still, and γ' to γ'''' are what the vehicle has of velocity to snap.
+        """
+        moving = trajectory.at(self.time)
+        derivatives = np.array([moving.position, moving.velocity, moving.acceleration, moving.jerk, moving.snap])
+        derivatives /= rate ** np.arange(_ORDERS)[:, None]
+        derivatives.setflags(write=False)
+        turning = self.state.dyaw * self.state.h**0.5
+        return Joint(self.time, self.s, derivatives, BoundaryState(rate**2, 0.0, 0.0, self.state.yaw, turning / rate))
+
+
+def joint_at(trajectory: Trajectory, time: float) -> Joint:
+    """Return the joint at a time, s, while the trajectory moves. Raises InputError at other times."""
+    if not 0.0 <= time <= trajectory.duration:
+        raise InputError(
+            f"the flight lasts from 0 to {trajectory.duration:.3f} s, so nothing moves at {time:.3f} s",
+            where="joint",
+            hint="plan from rest there",
+        )
+    s = float(trajectory.s_at(time))
+    sample = trajectory.profile.at(np.array([s]))
+    state = BoundaryState(*(float(each[0]) for each in (sample.h, sample.dh, sample.ddh, sample.yaw, sample.dyaw)))
+    derivatives = np.array([trajectory.path(s, order) for order in range(_ORDERS)])
+    derivatives.setflags(write=False)
+    return Joint(float(time), s, derivatives, state)
+
+
+@dataclass(frozen=True, slots=True)
+class JoinedTrajectory:
+    """Trajectories on one clock, each flown from its start until that of the next; the last one to its end."""
+
+    trajectories: tuple[Trajectory, ...]
+    starts: tuple[float, ...]  # s, on the common clock, ascending
+
+    def __post_init__(self) -> None:
+        if not self.starts or len(self.starts) != len(self.trajectories):
+            raise InputError(
+                f"{len(self.trajectories)} trajectories and {len(self.starts)} starts",
+                where="joined trajectory",
+                hint="give as many starts as trajectories, at least one",
+            )
+        if not all(before < after for before, after in pairwise(self.starts)):
+            raise InputError(
+                f"starts do not ascend: {self.starts}", where="joined trajectory", hint="give them in order"
+            )
+
+    @property
+    def duration(self) -> float:
+        """Return when the last trajectory ends, s."""
+        return self.starts[-1] + self.trajectories[-1].duration
+
+    def at(self, time: ArrayLike) -> FullState:
+        """Return the full state at each time, (N,) s; before the first start and after the end it hovers."""
+        times = np.atleast_1d(np.asarray(time, dtype=float))
+        leg = np.clip(np.searchsorted(self.starts, times, side="right") - 1, 0, len(self.starts) - 1)
+        flown = [np.flatnonzero(leg == each) for each in np.unique(leg)]
+        states = [self.trajectories[leg[rows[0]]].at(times[rows] - self.starts[leg[rows[0]]]) for rows in flown]
+        if len(states) == 1:
+            merged = {field.name: getattr(states[0], field.name) for field in fields(FullState)}
+        else:
+            order = np.argsort(np.concatenate(flown), kind="stable")
+            merged = {
+                field.name: np.concatenate([getattr(each, field.name) for each in states])[order]
+                for field in fields(FullState)
+            }
+        merged["time"] = times
+        state = FullState(**merged)
+        return state if np.ndim(time) else FullState(*(getattr(state, name)[0] for name in FullState.__slots__))
+
+    def since(self, time: float) -> "JoinedTrajectory":
+        """Return the same flight on a clock that is 0 at `time`, s, without what is flown before."""
+        first = max(int(np.searchsorted(self.starts, time, side="right")) - 1, 0)
+        return JoinedTrajectory(self.trajectories[first:], tuple(start - time for start in self.starts[first:]))
+
+    def continued(self, time: float, trajectory: Trajectory) -> "JoinedTrajectory":
+        """Return the flight that is this one until `time`, s, and then the trajectory."""
+        kept = int(np.searchsorted(self.starts, time, side="left"))
+        return JoinedTrajectory((*self.trajectories[:kept], trajectory), (*self.starts[:kept], time))

@@ -1,0 +1,99 @@
+"""Plans that continue a motion: without a jump, certified, and refused in words where none can be flown."""
+
+import numpy as np
+import pytest
+
+from cfplan.errors import InfeasibleError, InputError
+from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.yaw import YawMode
+from cfplan.planning.continuation import continue_plan
+from cfplan.planning.plan import plan
+from cfplan.safety.certificate import certify
+from cfplan.vehicle.joint import JoinedTrajectory
+
+WAYPOINTS = np.array([[-1.2, -2.0, 0.8], [1.0, -1.0, 1.2], [-0.8, 0.6, 0.9], [0.9, 2.0, 1.2], [-1.0, 2.6, 0.8]])
+CONTINUOUS = ("position", "velocity", "acceleration", "jerk", "quaternion", "body_rate", "yaw")
+
+
+@pytest.fixture(scope="module")
+def flown(limits):
+    """A plan through all waypoints but the last."""
+    return plan(min_snap(WAYPOINTS[:4]), limits.airframe, limits, planner="expert", yaw=YawMode.FREE)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.55, 0.75])
+@pytest.mark.parametrize("yaw", YawMode)
+def test_a_new_plan_goes_on_without_a_jump_and_is_certified(flown, limits, share, yaw):
+    leave = share * flown.trajectory.duration
+    waypoints = [[0.3, 1.2, 1.0], [-1.0, 2.4, 1.1]]
+    made = continue_plan(flown.trajectory, leave, waypoints, limits, yaw=yaw, yaw_angle=0.5)
+    before, after = flown.trajectory.at(leave), made.plan.trajectory.at(0.0)
+    for name in CONTINUOUS:
+        np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-6, err_msg=name)
+    assert certify(made.plan.trajectory, limits.plan, limits.space).passed
+    np.testing.assert_allclose(made.plan.path(made.reached), waypoints, atol=1e-9)
+    end = made.plan.trajectory.at(made.plan.trajectory.duration)
+    assert not end.velocity.any()
+    assert np.allclose(end.acceleration, 0.0, atol=1e-6)
+
+
+def test_more_waypoints_ahead_change_the_way_little_and_save_the_stop(flown, limits):
+    """Extended early by the waypoint left out, the flight takes about as long as one planned through all at once."""
+    leave = 0.3 * flown.trajectory.duration
+    s = float(flown.trajectory.s_at(leave))
+    ahead = int(np.searchsorted(flown.path.breaks, s))
+    times = np.diff([s, *flown.path.breaks[ahead:]])
+    times = np.append(times, np.linalg.norm(WAYPOINTS[4] - WAYPOINTS[3]))
+    made = continue_plan(flown.trajectory, leave, WAYPOINTS[ahead:], limits, times=times, yaw=YawMode.FREE)
+    at_once = plan(min_snap(WAYPOINTS), limits.airframe, limits, planner="expert", yaw=YawMode.FREE)
+    assert leave + made.plan.trajectory.duration < 1.03 * at_once.trajectory.duration
+
+
+def test_plans_can_be_continued_again_and_again(flown, limits):
+    """Twelve replans, 0.4 s apart, each through two new waypoints: one flight without a jump."""
+    random = np.random.default_rng(1)
+    joined, made = JoinedTrajectory((flown.trajectory,), (0.0,)), 0
+    clock = 0.0
+    for _ in range(12):
+        clock += 0.4
+        last, start = joined.trajectories[-1], joined.starts[-1]
+        waypoints = random.uniform([-1.2, -2.6, 0.7], [1.2, 2.6, 1.3], (2, 3))
+        try:
+            new = continue_plan(last, clock - start, waypoints, limits)
+        except InfeasibleError:
+            continue
+        joined, made = joined.continued(clock, new.plan.trajectory), made + 1
+    assert made >= 8
+    for start in joined.starts[1:]:
+        before, after = joined.at(np.array([start - 1e-7, start])).position, joined.at(start).position
+        np.testing.assert_allclose(before[0], after, atol=1e-6)
+    times = np.arange(0.0, joined.duration, 0.001)
+    states = joined.at(times)
+    assert np.linalg.norm(states.velocity, axis=1).max() <= limits.plan.speed + 1e-9
+    assert np.linalg.norm(states.acceleration, axis=1).max() <= limits.plan.acceleration + 1e-9
+    changes = np.abs(np.diff(states.acceleration, axis=0)).max()
+    assert changes < 0.2  # m/s² in a millisecond: no jump
+
+
+def test_a_waypoint_outside_is_refused_by_its_number(flown, limits):
+    with pytest.raises(InfeasibleError, match=r"waypoint 2, \(0.000, 0.000, 2.500\) m, is 0.700 m too far out"):
+        continue_plan(flown.trajectory, 1.0, [[0, 0, 1], [0, 0, 2.5]], limits)
+
+
+def test_a_waypoint_too_near_to_turn_to_is_refused_with_speed_and_distance(flown, limits):
+    leave = 0.5 * flown.trajectory.duration
+    state = flown.trajectory.at(leave)
+    behind = state.position - 0.05 * state.velocity / np.linalg.norm(state.velocity)
+    with pytest.raises(InfeasibleError, match=r"from \d\.\d\d m/s no way leads through waypoint 1, 0\.05 m away"):
+        continue_plan(flown.trajectory, leave, [behind], limits)
+
+
+@pytest.mark.parametrize("waypoints", [[], [[1, 2]], [[np.nan, 0, 1]], [[0.5, 0, 1], [0.5, 0, 1]]])
+def test_what_are_no_waypoints_is_refused(flown, limits, waypoints):
+    with pytest.raises(InputError):
+        continue_plan(flown.trajectory, 1.0, waypoints, limits)
+
+
+def test_after_its_end_a_plan_is_not_continued(flown, limits):
+    with pytest.raises(InputError, match="nothing moves"):
+        continue_plan(flown.trajectory, flown.trajectory.duration + 0.1, [[0, 0, 1]], limits)
