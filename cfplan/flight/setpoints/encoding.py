@@ -32,6 +32,7 @@ from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import INSTANT
 from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.measures import measures_of
 from cfplan.vehicle.rotations import heading_of, matrices_of, quaternions_of, rotations_of, write_quaternion
 from cfplan.vehicle.trajectory import Trajectory
@@ -75,7 +76,7 @@ class EncodedFlight:
 
 
 def encode_trajectory(
-    trajectory: Trajectory,
+    trajectory: Trajectory | JoinedTrajectory,
     *,
     rate: float = RATE,
     hold: float = HOLD,
@@ -110,7 +111,10 @@ def encode_trajectory(
 
 
 def motion_at(
-    trajectory: Trajectory, times: NDArray, rate_lead: float = RATE_LEAD, thrust_lead: float = THRUST_LEAD
+    trajectory: Trajectory | JoinedTrajectory,
+    times: NDArray,
+    rate_lead: float = RATE_LEAD,
+    thrust_lead: float = THRUST_LEAD,
 ) -> FullStateSetpoints:
     """Return the motion that setpoints are to make, at times (N,), s: the attitudes and rates to fly.
 
@@ -155,7 +159,7 @@ def controller_attitude(thrust: NDArray, quaternion: NDArray) -> NDArray:
     return _attitudes(np.array(thrust, dtype=float), np.array(quaternion, dtype=float))
 
 
-def check_bytes(encoded: EncodedFlight, trajectory: Trajectory, limits: PlanLimits) -> None:
+def check_bytes(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajectory, limits: PlanLimits) -> None:
     """Certify the bytes against the trajectory, which is evaluated afresh: nothing that encoding computed is used.
 
     Turned back by what the body rates leave to the attitude, what the controller makes of the decoded payloads lies
@@ -281,10 +285,10 @@ def _check_limits(
         )
 
 
-def _require_hover(last: FullStateSetpoints, trajectory: Trajectory, count: int) -> None:
+def _require_hover(last: FullStateSetpoints, trajectory: Trajectory | JoinedTrajectory, count: int) -> None:
     """Check that the last setpoint, with which the vehicle is left if nothing more comes, is a hover."""
     moves = [last.velocity, last.acceleration, last.body_rate]
-    end = trajectory.path(trajectory.path.end)
+    end = trajectory.at(trajectory.duration).position
     if np.any(moves) or np.any(np.abs(last.position[0] - end) > HALF_QUANTUM + _ROUNDING):
         raise NotCertifiedError(
             "the last setpoint is not a hover at the end of the path",

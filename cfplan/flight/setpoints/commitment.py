@@ -1,0 +1,213 @@
+"""Commitment: all that a pilot is bound to fly, which ends at rest inside the space; and how a new plan replaces it.
+
+Setpoints are numbered from the start of the stream. A proposal continues a commitment from a splice ahead of the clock:
+its first setpoint is the committed one with that number, and all after it replaces what was committed. Who proposes may
+be late, mistaken or broken, so the pilot verifies by itself, without trusting anybody, that
+
+- the bytes are those that were certified (checksum), and were made for just this commitment (order);
+- the splice is still ahead of the clock (time), and within what is committed;
+- position, velocity, acceleration, attitude and body rates there are the committed ones within a quantum (joint);
+- from setpoint to setpoint the vehicle moves as the velocities say, inside the space, and ends at rest;
+- from each setpoint there is a stop, which begins there and ends at rest inside the space.
+
+Where anything of that fails, the old commitment is flown to its end. A commitment is a value: splicing makes a new one.
+"""
+
+import zlib
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import NotCertifiedError
+from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, RATE
+from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode
+from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD
+from cfplan.safety.space import Space
+
+SPLICE_AHEAD = round(BRAKE_LEAD * RATE)  # setpoints from a splice to its joint: as far ahead a setpoint looks
+LEAST_AHEAD = 2  # setpoints from the clock to a splice, at least, in time for it
+KEPT_BEHIND = 100  # setpoints before a splice that are kept, for a vehicle that fell behind
+QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
+LARGEST_JERK = 400.0  # m/s³, beyond which velocities do not belong together: ten times what plans reach
+_ROUNDING = 1e-9
+
+
+class Fault(StrEnum):
+    """Why a proposal is refused."""
+
+    SHAPE = "the proposal is no setpoints with stops"
+    CHECKSUM = "the proposal is not what was certified: its checksum differs"
+    ORDER = "the proposal continues another commitment than the present one"
+    LATE = "the proposal came too late"
+    OUTSIDE = "the proposal begins where nothing is committed"
+    JOINT = "the proposal does not begin with the committed setpoint"
+    MOTION = "the proposed setpoints do not follow from one another"
+    SPACE = "the proposal leaves the space"
+    END = "the proposal does not end at rest"
+    STOPS = "the stops do not begin with their setpoints, or do not end at rest inside the space"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a proposal is not flown; the commitment stays what it is."""
+
+    fault: Fault
+    detail: str  # the numbers
+
+    def __str__(self) -> str:
+        return f"{self.fault}: {self.detail}" if self.detail else str(self.fault)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Commitment:
+    """Encoded setpoints that end at rest, with a stop from each.
+
+    Raises NotCertifiedError where the arrays are no setpoints with stops.
+    """
+
+    first: int  # number of the first setpoint that is kept
+    payloads: NDArray  # (N, 29) uint8
+    stops: NDArray  # (N, M, 29) uint8
+    splices: tuple[int, ...] = ()  # numbers of the setpoints from which plans made in the air are flown
+    checksum: int = -1  # of all that, computed where it is not given
+
+    def __post_init__(self) -> None:
+        if wrong := _wrong_shape(self.first, self.payloads, self.stops):
+            raise NotCertifiedError(wrong, where="commitment", hint="encode the plan and its stops anew")
+        for name in ("payloads", "stops"):
+            object.__setattr__(self, name, _frozen(getattr(self, name)))
+        object.__setattr__(self, "checksum", checksum_of(self.first, self.payloads, self.stops))
+
+    @property
+    def last(self) -> int:
+        """Return the number of the last setpoint, a hover."""
+        return self.first + len(self.payloads) - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Proposal:
+    """What may replace the rest of a commitment from setpoint `splice` on."""
+
+    follows: int  # checksum of the commitment that it continues
+    splice: int  # number of its first setpoint
+    payloads: NDArray  # (K, 29) uint8
+    stops: NDArray  # (K, M, 29) uint8
+    checksum: int  # of splice, payloads and stops
+
+
+def propose(commitment: Commitment, splice: int, payloads: NDArray, stops: NDArray) -> Proposal:
+    """Return the proposal of setpoints and stops that were certified to continue the commitment from `splice` on."""
+    return Proposal(commitment.checksum, splice, payloads, stops, checksum_of(splice, payloads, stops))
+
+
+def checksum_of(first: int, payloads: NDArray, stops: NDArray) -> int:
+    """Return a checksum of setpoints, their stops, and the number of the first of them."""
+    check = zlib.crc32(str((first, payloads.shape, stops.shape)).encode())
+    for array in (payloads, stops):
+        check = zlib.crc32(np.ascontiguousarray(array).data, check)
+    return check
+
+
+def splice(commitment: Commitment, proposal: Proposal, now: int, space: Space) -> Commitment | Refusal:
+    """Return what is committed with the proposal, or why it is refused; `now` is the number of the setpoint due.
+
+    Never raises, whatever the proposal holds.
+    """
+    if not isinstance(proposal, Proposal) or _wrong_shape(proposal.splice, proposal.payloads, proposal.stops):
+        return Refusal(Fault.SHAPE, "")
+    if proposal.stops.shape[1] != commitment.stops.shape[1]:
+        return Refusal(Fault.SHAPE, f"stops of {proposal.stops.shape[1]} setpoints")
+    if proposal.checksum != checksum_of(proposal.splice, proposal.payloads, proposal.stops):
+        return Refusal(Fault.CHECKSUM, "")
+    if proposal.follows != commitment.checksum:
+        return Refusal(Fault.ORDER, "")
+    if proposal.splice < now + LEAST_AHEAD:
+        return Refusal(Fault.LATE, f"for setpoint {proposal.splice}, with {now} due")
+    if not commitment.first <= proposal.splice <= commitment.last:
+        return Refusal(Fault.OUTSIDE, f"at setpoint {proposal.splice}, committed to {commitment.last}")
+    kept = proposal.splice - commitment.first
+    asked = decode(proposal.payloads)
+    if refusal := (
+        _differs(decode(commitment.payloads[kept : kept + 1]), asked, proposal.splice)
+        or _unfit(asked, proposal.payloads, proposal.splice, space)
+        or _unfit_stops(asked, proposal.stops, proposal.splice, space)
+    ):
+        return refusal
+    begin = max(kept - KEPT_BEHIND, 0)
+    first = commitment.first + begin
+    return Commitment(
+        first,
+        np.concatenate([commitment.payloads[begin:kept], proposal.payloads]),
+        np.concatenate([commitment.stops[begin:kept], proposal.stops]),
+        (*(one for one in commitment.splices if first <= one < proposal.splice), proposal.splice),
+    )
+
+
+def _frozen(array: NDArray) -> NDArray:
+    array = np.ascontiguousarray(array)
+    array = array.copy() if array.flags.writeable else array
+    array.setflags(write=False)
+    return array
+
+
+def _wrong_shape(first: int, payloads: NDArray, stops: NDArray) -> str:
+    """Return what is wrong with setpoints and stops, empty where nothing is."""
+    if not isinstance(first, int) or first < 0:
+        return f"the first setpoint has the number {first!r}"
+    for name, array, shape in (("setpoints", payloads, (PAYLOAD_SIZE,)), ("stops", stops, (-1, PAYLOAD_SIZE))):
+        if not isinstance(array, np.ndarray) or array.dtype != np.uint8 or array.ndim != len(shape) + 1:
+            return f"the {name} are no bytes"
+        if array.shape[-1] != PAYLOAD_SIZE or 0 in array.shape:
+            return f"{name} of shape {array.shape}"
+        if (array[..., 0] != FULL_STATE_TYPE).any():
+            return f"some of the {name} are no full states"
+    if len(payloads) != len(stops):
+        return f"{len(payloads)} setpoints and {len(stops)} stops"
+    return ""
+
+
+def _differs(committed: FullStateSetpoints, asked: FullStateSetpoints, number: int) -> Refusal | None:
+    for name in ("position", "velocity", "acceleration", "body_rate"):
+        off = float(np.abs(getattr(asked, name)[0] - getattr(committed, name)[0]).max())
+        if off > QUANTUM + _ROUNDING:
+            return Refusal(Fault.JOINT, f"{name.replace('_', ' ')} at setpoint {number} is off by {off:.3f}")
+    turned = 2.0 * np.arccos(min(abs(float(asked.quaternion[0] @ committed.quaternion[0])), 1.0))
+    if turned > 2.0 * ATTITUDE_QUANTUM:
+        return Refusal(Fault.JOINT, f"attitude at setpoint {number} is off by {np.degrees(turned):.2f}°")
+    return None
+
+
+def _unfit(asked: FullStateSetpoints, payloads: NDArray, first: int, space: Space) -> Refusal | None:
+    """Return why setpoints must not be flown: they jump, leave the space or do not end at rest."""
+    period = 1.0 / RATE
+    moved = np.diff(asked.position, axis=0) - 0.5 * period * (asked.velocity[1:] + asked.velocity[:-1])
+    # By the trapezoidal rule positions are off by the jerk times period³ / 12 and by what is rounded.
+    jump = np.abs(moved).max(axis=1, initial=0.0)
+    if (jump > LARGEST_JERK * period**3 / 12 + QUANTUM * (1.0 + period)).any():
+        at = int(np.argmax(jump))
+        return Refusal(Fault.MOTION, f"after setpoint {first + at} the position jumps by {jump[at]:.3f} m")
+    beyond = space.beyond(asked.position).max(axis=1)
+    if (beyond > QUANTUM).any():
+        at = int(np.argmax(beyond))
+        return Refusal(Fault.SPACE, f"setpoint {first + at} is {beyond[at]:.3f} m too far out")
+    end = FullStateSetpoints(*(getattr(asked, name)[-1:] for name in FullStateSetpoints.__slots__))
+    return None if _rests(end).all() else Refusal(Fault.END, f"setpoint {first + len(payloads) - 1} still moves")
+
+
+def _unfit_stops(asked: FullStateSetpoints, stops: NDArray, first: int, space: Space) -> Refusal | None:
+    begin, end = decode(stops[:, 0]), decode(stops[:, -1])
+    off = np.maximum(
+        np.abs(begin.position - asked.position).max(axis=1), np.abs(begin.velocity - asked.velocity).max(axis=1)
+    )
+    good = (off <= QUANTUM + _ROUNDING) & _rests(end) & (space.beyond(end.position).max(axis=1) <= QUANTUM)
+    if good.all():
+        return None
+    return Refusal(Fault.STOPS, f"the stop from setpoint {first + int(np.argmin(good))}")
+
+
+def _rests(setpoints: FullStateSetpoints) -> NDArray:
+    """Return (N,) whether each setpoint is a hover: nothing moves, and the thrust is upwards."""
+    moves = np.concatenate([setpoints.velocity, setpoints.body_rate], axis=1)
+    return np.asarray(~moves.any(axis=1) & ~setpoints.acceleration.any(axis=1))

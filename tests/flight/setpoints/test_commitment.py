@@ -1,0 +1,244 @@
+"""Commitments: new plans replace the rest from a splice on without a jump; all else is refused and changes nothing."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
+from cfplan.flight.setpoints.commitment import (
+    KEPT_BEHIND,
+    LEAST_AHEAD,
+    SPLICE_AHEAD,
+    Commitment,
+    Fault,
+    Proposal,
+    Refusal,
+    checksum_of,
+    propose,
+    splice,
+)
+from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.stop_certificate import certify_stops
+from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.geometry.min_snap import min_snap
+from cfplan.planning.continuation import continue_plan
+from cfplan.planning.plan import plan
+from cfplan.safety.limits_file import load_limits
+from cfplan.vehicle.joint import JoinedTrajectory
+
+WAYPOINTS = np.array([[-1.2, -2.0, 0.8], [1.0, -1.0, 1.2], [-0.8, 0.6, 0.9], [0.9, 2.0, 1.2]])
+LOW, HIGH = np.array([-1.3, -2.8, 0.7]), np.array([1.3, 2.8, 1.3])
+
+
+def encoded(flown: JoinedTrajectory, first: int):
+    return encode_trajectory(flown.since(first / RATE))
+
+
+def stops_of(payloads):
+    return encode_stops(payloads.motion, RATE, gains=payloads.gains)
+
+
+@pytest.fixture(scope="module")
+def limits():
+    """The limits of the project's own safety.yaml."""
+    return load_limits(Path(__file__).parents[3] / "safety.yaml")
+
+
+@pytest.fixture(scope="module")
+def flown(limits):
+    made = plan(min_snap(WAYPOINTS), limits.airframe, limits, planner="expert")
+    return JoinedTrajectory((made.trajectory,), (0.0,))
+
+
+@pytest.fixture(scope="module")
+def committed(flown):
+    setpoints = encoded(flown, 0)
+    return Commitment(0, setpoints.payloads, stops_of(setpoints))
+
+
+def continued(flown, number, waypoints, limits):
+    """The flight that leaves `flown` where setpoint `number` is spliced, and its setpoints from there on."""
+    joint = (number + SPLICE_AHEAD) / RATE
+    new = continue_plan(flown.trajectories[-1], joint - flown.starts[-1], waypoints, limits)
+    joined = flown.continued(joint, new.plan.trajectory)
+    return joined, encoded(joined, number)
+
+
+@pytest.fixture(scope="module")
+def spliced(flown, committed, limits):
+    """A flight and the proposal that makes it, with the splice at setpoint 120."""
+    joined, setpoints = continued(flown, 120, [[0.2, 1.0, 1.0], [-1.0, 2.4, 1.1]], limits)
+    return joined, propose(committed, 120, setpoints.payloads, stops_of(setpoints))
+
+
+def resummed(proposal: Proposal) -> Proposal:
+    return replace(proposal, checksum=checksum_of(proposal.splice, proposal.payloads, proposal.stops))
+
+
+def test_a_new_plan_replaces_the_rest_and_nothing_jumps(committed, spliced, limits):
+    joined, proposal = spliced
+    new = splice(committed, proposal, 100, limits.space)
+    assert isinstance(new, Commitment)
+    assert new.splices == (120,)
+    begin = 120 - KEPT_BEHIND
+    assert new.first == begin
+    np.testing.assert_array_equal(new.payloads[:KEPT_BEHIND], committed.payloads[begin:120])
+    # What is sent is the encoding of the joined trajectory, and at the splice it is what was committed, to the byte.
+    np.testing.assert_array_equal(proposal.payloads[0], committed.payloads[120])
+    state = decode(new.payloads)
+    assert np.linalg.norm(np.diff(state.velocity, axis=0), axis=1).max() < 1.2 * limits.plan.acceleration / RATE
+    np.testing.assert_allclose(state.position[-1], joined.at(joined.duration).position, atol=5.1e-4)
+
+
+def test_its_bytes_and_stops_pass_the_checks_of_every_plan(spliced, limits):
+    joined, _ = spliced
+    setpoints = encoded(joined, 120)
+    check_bytes(setpoints, joined.since(120 / RATE), limits.plan)
+    certify_stops(stops_of(setpoints), setpoints.motion, limits, RATE).require(limits)
+
+
+def test_splices_follow_one_another(flown, committed, spliced, limits):
+    joined, proposal = spliced
+    one = splice(committed, proposal, 100, limits.space)
+    further, setpoints = continued(joined, 150, [[-0.3, 1.4, 1.1], [1.0, 2.2, 0.9]], limits)
+    second = splice(one, propose(one, 150, setpoints.payloads, stops_of(setpoints)), 140, limits.space)
+    assert isinstance(second, Commitment)
+    assert second.splices == (120, 150)
+    assert second.last == 150 + len(setpoints.payloads) - 1
+    assert further.starts[1:] == (1.35, 1.65)
+
+
+def test_what_is_committed_cannot_be_changed(committed):
+    with pytest.raises(ValueError, match="read-only"):
+        committed.payloads[0] = 0
+    mine = committed.payloads.copy()
+    held = Commitment(0, mine, committed.stops)
+    mine[:] = 0
+    assert held.checksum == committed.checksum
+    np.testing.assert_array_equal(held.payloads, committed.payloads)
+
+
+@pytest.mark.parametrize(
+    ("payloads", "stops"),
+    [
+        (lambda p: p[:, :28], lambda s: s),
+        (lambda p: p[:-1], lambda s: s),
+        (lambda p: p[:0], lambda s: s[:0]),
+        (lambda p: p.astype(float), lambda s: s),
+        (lambda p: p * 0, lambda s: s),
+        (lambda p: p, lambda s: s[:, :, :3]),
+        (lambda p: p, lambda s: s * 0),
+    ],
+)
+def test_what_are_no_setpoints_is_no_commitment(committed, payloads, stops):
+    with pytest.raises(NotCertifiedError):
+        Commitment(0, payloads(committed.payloads), stops(committed.stops))
+
+
+def moved(array, row, column, by):
+    """The same bytes with one 16-bit number changed."""
+    changed = array.copy()
+    changed[row].view()[column : column + 2].view("<i2")[:] += by
+    return changed
+
+
+FAULTS = {
+    "late": (lambda p: p, 120 - LEAST_AHEAD + 1, Fault.LATE),
+    "long past": (lambda p: p, 10_000, Fault.LATE),
+    "for another commitment": (lambda p: replace(p, follows=p.follows ^ 1), 0, Fault.ORDER),
+    "a bit flipped": (lambda p: replace(p, payloads=moved(p.payloads, 50, 1, 1)), 0, Fault.CHECKSUM),
+    "another splice": (lambda p: replace(p, splice=121), 0, Fault.CHECKSUM),
+    "made for another setpoint": (lambda p: resummed(replace(p, splice=121)), 0, Fault.JOINT),
+    "beyond what is committed": (lambda p: resummed(replace(p, splice=100_000)), 0, Fault.OUTSIDE),
+    "begins two millimetres off": (lambda p: resummed(replace(p, payloads=moved(p.payloads, 0, 3, 2))), 0, Fault.JOINT),
+    "begins 2 mm/s off": (lambda p: resummed(replace(p, payloads=moved(p.payloads, 0, 7, 2))), 0, Fault.JOINT),
+    "begins with another attitude": (
+        lambda p: resummed(replace(p, payloads=moved(p.payloads, 0, 19, 40))), 0, Fault.JOINT,
+    ),
+    "jumps by 10 cm": (lambda p: resummed(replace(p, payloads=moved(p.payloads, 60, 1, 100))), 0, Fault.MOTION),
+    "ends in motion": (
+        lambda p: resummed(replace(p, payloads=p.payloads[:80], stops=p.stops[:80])), 0, Fault.END,
+    ),
+    "stops of other setpoints": (lambda p: resummed(replace(p, stops=np.roll(p.stops, 20, axis=0))), 0, Fault.STOPS),
+    "stops that do not stop": (
+        lambda p: resummed(replace(p, stops=np.repeat(p.stops[:, :1], p.stops.shape[1], axis=1))), 0, Fault.STOPS,
+    ),
+    "shorter stops": (lambda p: resummed(replace(p, stops=p.stops[:, 1:])), 0, Fault.SHAPE),
+    "fewer stops": (lambda p: replace(p, stops=p.stops[1:]), 0, Fault.SHAPE),
+    "no bytes": (lambda p: replace(p, payloads=p.payloads.astype(float)), 0, Fault.SHAPE),
+    "nothing": (lambda p: None, 0, Fault.SHAPE),
+    "text": (lambda p: "fly!", 0, Fault.SHAPE),
+    "a number that is none": (lambda p: replace(p, splice=float("nan")), 0, Fault.SHAPE),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_what_is_wrong_is_refused_in_words(committed, spliced, limits, case):
+    make, now, fault = FAULTS[case]
+    before = committed.payloads.copy(), committed.stops.copy(), committed.checksum
+    refused = splice(committed, make(spliced[1]), now, limits.space)
+    assert isinstance(refused, Refusal)
+    assert refused.fault is fault
+    assert str(refused).startswith(str(fault))
+    np.testing.assert_array_equal(committed.payloads, before[0])
+    np.testing.assert_array_equal(committed.stops, before[1])
+    assert checksum_of(committed.first, committed.payloads, committed.stops) == before[2]
+
+
+def test_a_proposal_that_leaves_the_space_is_refused(committed, spliced, limits):
+    smaller = replace(limits.space, high=(limits.space.high[0], 1.5, limits.space.high[2]))
+    refused = splice(committed, spliced[1], 0, smaller)
+    assert refused.fault is Fault.SPACE
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    number=st.integers(0, 600),
+    ahead=st.integers(-20, 60),
+    points=st.lists(
+        st.tuples(*(st.floats(float(a), float(b)) for a, b in zip(LOW, HIGH, strict=True))), min_size=1, max_size=3
+    ),
+)
+def test_random_splices_are_flown_without_a_jump_or_refused(flown, committed, limits, number, ahead, points):
+    """Whatever continues the flight: what is committed ends at rest inside the space and never jumps."""
+    try:
+        joined, setpoints = continued(flown, number, points, limits)
+    except (InfeasibleError, InputError):  # no such plan: nothing to propose
+        return
+    proposal = propose(committed, number, setpoints.payloads, stops_of(setpoints))
+    result = splice(committed, proposal, number - ahead, limits.space)
+    assert isinstance(result, Commitment) == (ahead >= LEAST_AHEAD)
+    if isinstance(result, Refusal):
+        assert result.fault is Fault.LATE
+        return
+    state = decode(result.payloads)
+    assert limits.space.beyond(state.position).max() <= 1e-3
+    assert not state.velocity[-1].any()
+    assert np.linalg.norm(np.diff(state.velocity, axis=0), axis=1).max() < 1.2 * limits.plan.acceleration / RATE
+    at = np.array([(result.first + row) / RATE for row in range(len(result.payloads))])
+    np.testing.assert_allclose(state.position, joined.at(at).position, atol=5.1e-4)
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=st.data())
+def test_a_broken_proposal_is_refused_whatever_is_broken(committed, spliced, limits, data):
+    """Bytes overwritten at random, with the checksum made good or not."""
+    _, proposal = spliced
+    which = data.draw(st.sampled_from(["payloads", "stops"]))
+    array = getattr(proposal, which).copy()
+    count = data.draw(st.integers(1, 400))
+    places = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1))).integers(0, array.size, count)
+    array.reshape(-1)[places] ^= data.draw(st.integers(1, 255))
+    broken = replace(proposal, **{which: array})
+    refused = splice(committed, broken, 100, limits.space)
+    assert isinstance(refused, Refusal)
+    made_good = splice(committed, resummed(broken), 100, limits.space)
+    if isinstance(made_good, Commitment):  # what the pilot can see of it is sound
+        state = decode(made_good.payloads)
+        assert limits.space.beyond(state.position).max() <= 1e-3
+        assert not state.velocity[-1].any()
