@@ -12,6 +12,7 @@ import gc
 import hashlib
 import importlib
 import inspect
+import io
 import os
 import pickle
 import platform
@@ -32,7 +33,11 @@ import numba
 import numpy as np
 from numba.core import event
 from numba.core.caching import _Cache
+from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult
+from numba.core.environment import Environment, _rebuild_env, lookup_environment
+from numba.core.registry import cpu_target
+from numba.core.runtime._nrt_python import c_helpers
 from numba.core.serialize import dumps
 from numba.core.types import Omitted
 from numba.core.typing.typeof import Purpose, typeof
@@ -203,6 +208,67 @@ def compiles() -> bool:
     return _listener.depth > 0
 
 
+class _Library(JITCodeLibrary):
+    """Machine code of one function. Where it was kept, its bitcode waits until a function that calls it is compiled.
+
+    numba's own parses it at once and lists its symbols, which takes as long as all the rest of loading.
+    """
+
+    _object: bytes | None = None
+    _bitcode: bytes | None = None
+    _module: Any = None
+
+    @property
+    def _shared_module(self) -> Any:
+        if self._module is None and self._bitcode is not None:
+            self._module = llvm.parse_bitcode(self._bitcode)
+        return self._module
+
+    @_shared_module.setter
+    def _shared_module(self, module: Any) -> None:
+        self._module = module
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: Any) -> "_Library":
+        name, _, (object_code, bitcode) = state
+        library = cls(codegen, name)
+        library._object, library._bitcode = object_code, bitcode
+        library.enable_object_caching()
+        library._set_compiled_object(object_code)
+        library._finalize_final_module()
+        return library
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Return the address of a function, 0 if it is not here."""
+        if self._object is None:
+            return int(super().get_pointer_to_function(name))
+        return int(self._codegen._engine.get_function_address(name)) if name.encode() in self._object else 0
+
+
+cpu_target.target_context.codegen()._library_class = _Library
+for _helper, _address in c_helpers.items():  # which numba does where it compiles, beside much else
+    llvm.add_symbol(_helper if _helper.startswith("_") else f"NRT_{_helper}", _address)
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads compiled functions without importing the parts of numba that their code comes from."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        found = super().find_class(module, name)
+        return _environment if found is _rebuild_env else found
+
+
+def _environment(module: str, constants: list[Any], name: str) -> Environment:
+    """Return the environment of a compiled function; its globals are for code that was not compiled."""
+    environment = lookup_environment(name)
+    if environment is None:
+        environment = Environment(vars(sys.modules[module]) if module in sys.modules else {"__name__": module})
+        environment.consts[:] = constants
+        environment.env_name = name
+        Environment._memo[name] = environment
+    return environment
+
+
 class _Kept(_Cache):
     """numba's cache of one function, with one file for each set of argument types."""
 
@@ -235,8 +301,7 @@ class _Kept(_Cache):
         data = _read(name)
         if data is None:
             return None
-        target_context.refresh()
-        written_for, payload = pickle.loads(data)
+        written_for, payload = _Unpickler(io.BytesIO(data)).load()
         return CompileResult._rebuild(target_context, *payload) if written_for == str(signature) else None
 
     def save_overload(self, sig: Any, data: Any) -> None:

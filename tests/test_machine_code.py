@@ -44,6 +44,59 @@ def test_a_function_is_compiled_once_for_each_kind_of_argument(cache):
     assert len(files(cache)) == 2
 
 
+KEPT_BEFORE = """
+import sys
+import numpy as np
+from cfplan.machine_code import njit
+from cfplan.vehicle.rotations import matrix_of
+
+@njit
+def squares(n):
+    found = np.zeros(n)
+    for k in range(n):
+        if k > 99:
+            raise ValueError("too many")
+        found[k] = k * k
+    return found
+
+@njit
+def total(n):
+    return squares(n).sum() + matrix_of(np.array([0.0, 0.0, 0.0, 1.0]))[2, 2]
+
+@njit
+def same_text(a, b):
+    return hash(a) == hash(b)
+"""
+USED = "assert list(squares(4)) == [0, 1, 4, 9], squares(4)"
+RAISED = """
+try:
+    squares(100 + 1)
+except ValueError as error:
+    assert str(error) == "too many"
+else:
+    raise SystemExit("nothing was raised")
+"""
+
+
+def test_what_other_processes_kept_is_used_and_called_by_what_is_compiled_later(cache, tmp_path):
+    (tmp_path / "kept.py").write_text(KEPT_BEFORE)
+
+    def run(*lines):
+        code = "\n".join(["from kept import *", *lines])
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=100,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join((str(PACKAGE.parent), str(tmp_path)))},
+        )  # fmt: skip
+        assert not done.stderr
+
+    loaded = "assert not any(each.stats.cache_misses for each in (squares, total, same_text))"
+    run(USED, 'assert same_text("a path", "a path") and not same_text("a path", "another")')
+    run(USED, RAISED, loaded, 'assert "numba.np.arrayobj" not in sys.modules')
+    run(USED, "assert total(4) == 15.0", "assert total.stats.cache_misses")  # calls code that was kept
+    run("assert total(4) == 15.0", USED, RAISED, loaded)
+    run('assert same_text("a path", "a path") and not same_text("a path", "another")', loaded)
+
+
 def test_where_nothing_can_be_written_functions_are_compiled_all_the_same(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "file" / "below"))
