@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import matrix_of, product
+from cfplan.vehicle.rotations import axes_of, matrix_of, product
 
 PREDICTION_PERIOD = 10  # ticks of 1 ms
 
@@ -82,7 +82,7 @@ def new_filter(prior: NDArray) -> Filter:
     return made
 
 
-@njit
+@njit(allocates=False)
 def reset(kalman: Filter, prior: NDArray) -> None:
     """Reset the filter: at rest at the prior's place, with a large variance."""
     for row in range(_SIZE):
@@ -129,26 +129,28 @@ def step_filter(
     return True
 
 
-@njit
+@njit(allocates=False)
 def estimate(kalman: Filter, out: NDArray) -> None:
     """Write position 0:3, velocity 3:6 in world axes and quaternion 6:10 to `out`."""
-    turn = matrix_of(kalman.quaternion)
+    q = kalman.quaternion
+    vx, vy, vz = kalman.state[3], kalman.state[4], kalman.state[5]
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes_of(q[0], q[1], q[2], q[3])
     for axis in range(3):
         out[axis] = kalman.state[axis]
-        out[3 + axis] = 0.0
-        for other in range(3):
-            out[3 + axis] += turn[axis, other] * kalman.state[3 + other]
+    out[3] = xx * vx + yx * vy + zx * vz
+    out[4] = xy * vx + yy * vy + zy * vz
+    out[5] = xz * vx + yz * vy + zz * vz
     for axis in range(4):
         out[6 + axis] = kalman.quaternion[axis]
 
 
-@njit
+@njit(allocates=False)
 def _clear(values: NDArray) -> None:
     for place in range(len(values)):
         values[place] = 0.0
 
 
-@njit
+@njit(allocates=False)
 def _within_bounds(kalman: Filter, prior: NDArray) -> bool:
     for axis in range(3):
         # Written so that NaN is out of bounds.
@@ -227,7 +229,7 @@ def _add_cross(step: NDArray, row: int, column: int, scale: float, x: float, y: 
     step[row + 2, column + 1] += scale * x
 
 
-@njit
+@njit(allocates=False)
 def _rotate_error(step: NDArray, x: float, y: float, z: float) -> None:
     """Write the block that turns the attitude error when the attitude turns by twice (x, y, z), to second order."""
     step[6, 6], step[6, 7], step[6, 8] = 1 - y * y / 2 - z * z / 2, z + x * y / 2, -y + x * z / 2
@@ -251,7 +253,7 @@ def _carry(covariance: NDArray, step: NDArray) -> None:
             covariance[row, column] = value
 
 
-@njit
+@njit(allocates=False)
 def _add_noise(kalman: Filter, prior: NDArray) -> None:
     for axis in range(3):
         acceleration = prior[_ACC_Z] if axis == 2 else prior[_ACC_XY]
@@ -262,7 +264,7 @@ def _add_noise(kalman: Filter, prior: NDArray) -> None:
     _bound(kalman.covariance)
 
 
-@njit
+@njit(allocates=False)
 def _bound(covariance: NDArray) -> None:
     for row in range(_SIZE):
         for column in range(row, _SIZE):
@@ -326,7 +328,7 @@ def _absorb_attitude_error(kalman: Filter) -> None:
     _bound(kalman.covariance)
 
 
-@njit
+@njit(allocates=False)
 def _turn_by(quaternion: NDArray, angle_x: float, angle_y: float, angle_z: float) -> None:
     """Turn an attitude by a rotation vector, rad, in body axes."""
     size = np.sqrt(angle_x**2 + angle_y**2 + angle_z**2) + 1e-9
@@ -338,7 +340,7 @@ def _turn_by(quaternion: NDArray, angle_x: float, angle_y: float, angle_z: float
     _normalise(quaternion)
 
 
-@njit
+@njit(allocates=False)
 def _normalise(quaternion: NDArray) -> None:
     size = 0.0
     for axis in range(4):

@@ -6,6 +6,7 @@ Nothing but the sensors and the recorder sees the true state; the controller fli
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
@@ -18,33 +19,33 @@ from cfplan.simulation.dynamics.body import (
     pack_body,
     step_body,
 )
-from cfplan.simulation.dynamics.kalman import Filter, estimate, new_filter, reset, step_filter
+from cfplan.simulation.dynamics.kalman import Filter, estimate, reset, step_filter
 from cfplan.simulation.dynamics.mellinger import (
     DISABLE,
     FULL_COMMAND,
-    MEMORY_SIZE,
     MODE_Z,
     distribute_power,
     level_out,
     step_mellinger,
 )
-from cfplan.simulation.virtual_crazyflie.pid import MEMORY_SIZE as PID_MEMORY_SIZE
 from cfplan.simulation.virtual_crazyflie.pid import OUTPUT_LIMIT, OVERHEAD, default_gains, default_limits, step_pid
 from cfplan.simulation.virtual_crazyflie.setpoints import THRUST, Setpoint
 from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.rotations import matrix_of
+from cfplan.vehicle.rotations import axes_of
 
 # Where each flag lies in the array that `run` fills.
 OFF_TICKS, OFF_IN_AIR_TICKS, RESETS = range(3)
 
-NO_MELLINGER = np.zeros(0)  # in place of its gains where the PID controller flies
 IN_AIR = 0.05  # m above the floor; a landing ends a little above it
 _NOISE_ROWS = 8191  # ms after which the sensors' noise repeats; a prime, so that it has no common period with anything
 
 
 class Loop(NamedTuple):
-    """Everything that the compiled loop reads and changes, in place."""
+    """Everything that the compiled loop reads and changes, in place: all but counts and noise are views of one array.
+
+    To take a call's arguments apart, array by array, would cost more than the arithmetic of a millisecond.
+    """
 
     truth: NDArray  # (17,) the body's state, see `body`
     kalman: Filter
@@ -60,34 +61,59 @@ class Loop(NamedTuple):
     efficiency: NDArray  # (4,) share of its thrust that each motor gives
     override: NDArray  # (5,) motorPowerSet: whether its commands count, 2 and 3 the first for all; 16-bit commands
     idle: NDArray  # (1,) 16-bit command that no motor falls below while it may turn
+    body: NDArray  # (13,) the body's parameters, see `body`
+    prior: NDArray  # (16,) the filter's parameters, see `kalman`
+    gains: NDArray  # (19,) of the Mellinger controller, see `mellinger`
+    pid_gains: NDArray  # (12, 5) see `pid`
+    pid_limits: NDArray  # (5,)
+
+
+_FLOATS = 318  # of all parts together
+
+
+@register_jitable
+def _parts(floats: NDArray, counts: NDArray, noise: NDArray) -> Loop:
+    """Return the parts of the array (318,) in their order."""
+    return Loop(
+        truth=floats[0:17],
+        kalman=Filter(floats[17:26], floats[26:30], floats[30:111].reshape(9, 9), floats[111:118], floats[118:122]),
+        belief=floats[122:135],
+        acceleration=floats[135:138],
+        memory=floats[138:148],
+        pid_memory=floats[148:184],
+        control=floats[184:188],
+        motors=floats[188:192],
+        counts=counts,
+        noise=noise,
+        wind=floats[192:195],
+        efficiency=floats[195:199],
+        override=floats[199:204],
+        idle=floats[204:205],
+        body=floats[205:218],
+        prior=floats[218:234],
+        gains=floats[234:253],
+        pid_gains=floats[253:313].reshape(12, 5),
+        pid_limits=floats[313:318],
+    )
 
 
 class Stabilizer:
-    """The vehicle below the commander. `prior` and `gains` are arrays that parameters may change in flight."""
+    """The vehicle below the commander. `prior` (16,) and `gains` (19,) are those of the filter and the controller."""
 
     def __init__(self, airframe: Airframe, settings: VehicleSettings, prior: NDArray, gains: NDArray):
         position = np.array(settings.position, dtype=float)
-        self.body = pack_body(airframe, floor=float(position[2]))
-        self.prior, self.gains = prior, gains
-        self.pid_gains, self.pid_limits = default_gains(), default_limits()
+        self._floats, self._counts = np.zeros(_FLOATS), np.zeros(3, dtype=np.int64)
+        self._noise = _sensor_noise(settings.sensors, settings.seed)
+        self.loop = loop = _parts(self._floats, self._counts, self._noise)
+        loop.truth[:] = at_rest(position, settings.yaw)
+        loop.acceleration[:] = 0.0, 0.0, GRAVITY
+        loop.wind[:], loop.efficiency[:] = STILL_AIR, FULL_EFFICIENCY
+        loop.body[:] = pack_body(airframe, floor=float(position[2]))
+        loop.prior[:], loop.gains[:] = prior, gains
+        loop.pid_gains[:], loop.pid_limits[:] = default_gains(), default_limits()
         self.mellinger = False  # which of the two controllers flies
-        self.loop = Loop(
-            truth=at_rest(position, settings.yaw),
-            kalman=new_filter(prior),
-            belief=np.zeros(13),
-            acceleration=np.array([0.0, 0.0, GRAVITY]),
-            memory=np.zeros(MEMORY_SIZE),
-            pid_memory=np.zeros(PID_MEMORY_SIZE),
-            control=np.zeros(4),
-            motors=np.zeros(4),
-            counts=np.zeros(3, dtype=np.int64),
-            noise=_sensor_noise(settings.sensors, settings.seed),
-            wind=STILL_AIR.copy(),
-            efficiency=FULL_EFFICIENCY.copy(),
-            override=np.zeros(5),
-            idle=np.zeros(1),
-        )
-        estimate(self.loop.kalman, self.loop.belief)
+        reset(loop.kalman, loop.prior)
+        estimate(loop.kalman, loop.belief)
         self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N
 
     def reset_controller(self) -> None:
@@ -97,11 +123,11 @@ class Stabilizer:
 
     def limit_speed(self, axis: int, most: float) -> None:
         """Set the PID controller's largest speed along an axis, m/s."""
-        self.pid_gains[axis, OUTPUT_LIMIT] = (max(most, 0.5) if axis == 2 else most) * OVERHEAD
+        self.loop.pid_gains[axis, OUTPUT_LIMIT] = (max(most, 0.5) if axis == 2 else most) * OVERHEAD
 
     def reset_estimator(self) -> None:
         """Reset the filter to the place that its parameters name."""
-        reset(self.loop.kalman, self.prior)
+        reset(self.loop.kalman, self.loop.prior)
 
     def run(
         self, tick: int, ticks: int, setpoint: Setpoint, poses: NDArray, *, allowed: bool, level: bool, flying: bool
@@ -112,8 +138,8 @@ class Stabilizer:
             values, mode = values.copy(), mode.copy()
             level_out(values, mode)
         _run(
-            self.loop, self.body, self.gains if self.mellinger else NO_MELLINGER, self.pid_gains, self.pid_limits,
-            self.prior, values, mode, setpoint.velocity_in_body, poses, tick, ticks, allowed, flying, self._per_command,
+            self._floats, self._counts, self._noise, self.mellinger, values, mode, setpoint.velocity_in_body, poses,
+            tick, ticks, allowed, flying, self._per_command,
             allowed and bool(mode[MODE_Z] != DISABLE or values[THRUST] > 0),
         )  # fmt: skip
 
@@ -130,12 +156,10 @@ def _sensor_noise(sensors: Sensors, seed: int) -> NDArray:
 
 @njit
 def _run(
-    loop: Loop,
-    body: NDArray,
-    gains: NDArray,
-    pid_gains: NDArray,
-    pid_limits: NDArray,
-    prior: NDArray,
+    floats: NDArray,
+    counts: NDArray,
+    noise: NDArray,
+    mellinger: bool,
     setpoint: NDArray,
     mode: NDArray,
     velocity_in_body: bool,
@@ -147,7 +171,8 @@ def _run(
     per_command: float,
     asked: bool,
 ) -> None:
-    gyro, measured = np.empty(3), np.empty(3)
+    loop = _parts(floats, counts, noise)
+    gyro, measured, thrusts = np.empty(3), np.empty(3), np.empty(4)
     none = poses[:0]
     for now in range(tick, tick + ticks):
         row = now % len(loop.noise)
@@ -155,30 +180,29 @@ def _run(
             gyro[axis] = loop.truth[10 + axis] + loop.noise[row, axis]
             measured[axis] = loop.acceleration[axis] + loop.noise[row, 3 + axis]
             loop.belief[10 + axis] = gyro[axis]
-        if not step_filter(loop.kalman, prior, gyro, measured, poses if now == tick else none, now, flying):
+        if not step_filter(loop.kalman, loop.prior, gyro, measured, poses if now == tick else none, now, flying):
             loop.counts[RESETS] += 1
         estimate(loop.kalman, loop.belief)
 
         if now % 2 == 0:
-            if len(gains) > 0:
-                step_mellinger(loop.control, loop.memory, gains, setpoint, mode, loop.belief)
+            if mellinger:
+                step_mellinger(loop.control, loop.memory, loop.gains, setpoint, mode, loop.belief)
             else:
                 step_pid(
-                    loop.control, loop.pid_memory, pid_gains, pid_limits, setpoint, mode, velocity_in_body,
+                    loop.control, loop.pid_memory, loop.pid_gains, loop.pid_limits, setpoint, mode, velocity_in_body,
                     loop.belief, now,
                 )  # fmt: skip
             distribute_power(loop.control, loop.motors)
-        _drive(loop, body, allowed, per_command, asked)
+        _drive(loop, thrusts, allowed, per_command, asked)
 
 
-@njit
-def _drive(loop: Loop, body: NDArray, allowed: bool, per_command: float, asked: bool) -> None:
+@njit(allocates=False)
+def _drive(loop: Loop, thrusts: NDArray, allowed: bool, per_command: float, asked: bool) -> None:
     """Turn the motors, move the body, and note what its accelerometer measures.
 
     Motors count as off if nothing asks them to turn, not if the controller wants no thrust for a moment.
     """
     off = True
-    command = np.empty(4)
     for motor in range(4):
         if allowed and not loop.motors[motor] > loop.idle[0]:
             loop.motors[motor] = loop.idle[0]
@@ -187,15 +211,16 @@ def _drive(loop: Loop, body: NDArray, allowed: bool, per_command: float, asked: 
         if not (allowed and loop.motors[motor] > 0.0):  # NaN is off too, as its cast to an integer is
             loop.motors[motor] = 0.0
         off = off and loop.motors[motor] == 0.0
-        command[motor] = loop.motors[motor] * per_command
+        thrusts[motor] = loop.motors[motor] * per_command
     if off and not asked:
         loop.counts[OFF_TICKS] += 1
-        if loop.truth[2] > body[FLOOR] + IN_AIR:
+        if loop.truth[2] > loop.body[FLOOR] + IN_AIR:
             loop.counts[OFF_IN_AIR_TICKS] += 1
     vx, vy, vz = loop.truth[3], loop.truth[4], loop.truth[5]
-    step_body(loop.truth, command, body, loop.wind, loop.efficiency)
+    step_body(loop.truth, thrusts, loop.body, loop.wind, loop.efficiency)
     fx, fy = (loop.truth[3] - vx) / TIME_STEP, (loop.truth[4] - vy) / TIME_STEP
     fz = (loop.truth[5] - vz) / TIME_STEP + GRAVITY
-    turn = matrix_of(loop.truth[6:10])
-    for axis in range(3):
-        loop.acceleration[axis] = turn[0, axis] * fx + turn[1, axis] * fy + turn[2, axis] * fz
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes_of(loop.truth[6], loop.truth[7], loop.truth[8], loop.truth[9])
+    loop.acceleration[0] = xx * fx + xy * fy + xz * fz
+    loop.acceleration[1] = yx * fx + yy * fy + yz * fz
+    loop.acceleration[2] = zx * fx + zy * fy + zz * fz

@@ -192,7 +192,7 @@ class VirtualCrazyflie:
                 self.tick, self.commander.setpoint.tick if can_fly else 0, self.acceleration / GRAVITY, loop.motors
             )
         self.battery.drain(float(loop.truth[13:17].sum()), COMMANDER_PERIOD / 1000)
-        self.stabilizer.body[THRUST_MAX] = self.battery.strength * self._airframe.motor_thrust_max
+        self.stabilizer.loop.body[THRUST_MAX] = self.battery.strength * self._airframe.motor_thrust_max
         while self._answers and self._answers[0][0] <= self.tick:
             _, answer = self._answers.pop(0)
             self._send(Port.PARAMETERS, answer[0], answer[1:])
@@ -210,7 +210,7 @@ class VirtualCrazyflie:
         if VehicleFaultKind.TUMBLE in acting:
             loop.efficiency[2:4] = 0.0
         loop.wind[1] = acting.get(VehicleFaultKind.GUST, 0.0)
-        self.stabilizer.body[MASS] = mass * acting.get(VehicleFaultKind.MASS, 1.0)
+        self.stabilizer.loop.body[MASS] = mass * acting.get(VehicleFaultKind.MASS, 1.0)
         if VehicleFaultKind.BATTERY not in acting:
             self.battery.sag = 0.0
         elif self.battery.sag == 0.0:
@@ -321,14 +321,14 @@ class VirtualCrazyflie:
 
         watch = self.parameters.watch
         for place, name in enumerate(GAIN_PARAMETERS):
-            watch(name, fill(self.stabilizer.gains, place))
+            watch(name, fill(self.stabilizer.loop.gains, place))
         for place, name in enumerate(PRIOR_PARAMETERS):
-            watch(name, fill(self.stabilizer.prior, place))
+            watch(name, fill(self.stabilizer.loop.prior, place))
         for loop, names in enumerate(PID_GAIN_PARAMETERS):
             for place, name in enumerate(names):
-                watch(name, fill(self.stabilizer.pid_gains[loop], place))
+                watch(name, fill(self.stabilizer.loop.pid_gains[loop], place))
         for place, name in enumerate(PID_LIMIT_PARAMETERS):
-            watch(name, fill(self.stabilizer.pid_limits, place))
+            watch(name, fill(self.stabilizer.loop.pid_limits, place))
         for place, name in enumerate(PID_SPEED_PARAMETERS):
             watch(name, partial(self.stabilizer.limit_speed, place))
         supervised = self.supervisor.settings

@@ -146,7 +146,7 @@ def test_idle_thrust_turns_motors_only_where_arming_is_asked_for(auto_arming, id
 def test_stored_values_are_there_at_power_up_and_known_as_stored():
     rig = Rig(VehicleSettings(stored={"ctrlMel.kR_xy": 65000.0, "no.such": 1.0}))
     assert rig.vehicle.parameters["ctrlMel.kR_xy"] == 65000.0
-    assert 65000.0 in rig.vehicle.stabilizer.gains
+    assert 65000.0 in rig.vehicle.stabilizer.loop.gains
 
 
 def test_what_came_with_a_version_is_in_the_tables_of_the_newest():
