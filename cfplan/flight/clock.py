@@ -132,7 +132,8 @@ class SteppedClock:
 
     def reach(self, time: float) -> None:
         """Move on to `time`, s; a time that has passed changes nothing."""
-        self._now = max(time, self._now)
+        if time > self._now:
+            self._now = time
 
     def sleep(self, duration: float, /) -> None:
         """Let `duration`, s, pass, and more of it if the computer stands still."""

@@ -86,7 +86,8 @@ class Radio:
     def step(self, now: float) -> tuple[list[bytes], list[bytes]]:
         """Return the packets that have reached the vehicle by now, and those that have reached the computer."""
         if not (self._up or self._down):
-            self._next = max(self._next, now)
+            if now > self._next:
+                self._next = now
             if not (self._on_way_up or self._on_way_down):
                 return [], []
         while self._next <= now and (self._up or self._down):

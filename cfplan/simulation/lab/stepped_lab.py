@@ -120,6 +120,8 @@ class SteppedLab:
 
     def _look(self, now: float) -> None:
         cameras = self.cameras
+        if now < cameras.next_look - 1e-6 and now < cameras.next_due and not cameras.disturbed:
+            return
         if now >= cameras.next_look - 1e-6:
             truth = self.vehicle.stabilizer.loop.truth.tolist()
             cameras.look(now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]))

@@ -79,6 +79,11 @@ class Cameras:
         """When the next picture leaves, s; infinity if none waits."""
         return self._waiting[0][0] if self._waiting else math.inf
 
+    @property
+    def disturbed(self) -> bool:
+        """Return whether there ever was a fault, or one is to come."""
+        return bool(self._faults.all)
+
     def inject(self, fault: ViconFault, now: float) -> None:
         """Let something go wrong; its start counts from now."""
         self._faults.add(fault, now)

@@ -40,27 +40,27 @@ class Faults:
     """The faults of one server, applied to what the cameras see."""
 
     def __init__(self) -> None:
-        self._all: list[tuple[float, float, ViconFault]] = []
+        self.all: list[tuple[float, float, ViconFault]] = []  # each with when it begins and ends, s
         self._held: dict[str, Seen] = {}
 
     def add(self, fault: ViconFault, now: float) -> None:
         """Add a fault; its start counts from now."""
-        self._all.append((now + fault.start, now + fault.start + fault.duration, fault))
+        self.all.append((now + fault.start, now + fault.start + fault.duration, fault))
 
     def end(self, now: float) -> None:
         """Let all faults end, also those that have not begun."""
-        self._all = [(start, min(end, now), fault) for start, end, fault in self._all]
+        self.all = [(start, min(end, now), fault) for start, end, fault in self.all]
 
     def acting(self, kind: FaultKind, time: float, subject: str | None = None) -> ViconFault | None:
         """Return a fault of this kind that acts on this body at this time; None if there is none."""
-        for start, end, fault in self._all:
+        for start, end, fault in self.all:
             if fault.kind is kind and start <= time < end and fault.subject in (None, subject):
                 return fault
         return None
 
     def seen(self, time: float, truth: Mapping[str, Seen]) -> dict[str, Seen]:
         """Return the bodies as the cameras see them, from where they are; hidden ones are left out."""
-        if not self._all:
+        if not self.all:
             self._held |= truth
             return dict(truth)
         names = list(truth)
