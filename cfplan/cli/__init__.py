@@ -13,6 +13,7 @@ from cfplan.cli.dataset import dataset
 from cfplan.cli.doctor import doctor
 from cfplan.cli.fly import fly
 from cfplan.cli.identify import identify
+from cfplan.cli.init import init
 from cfplan.cli.mocap import mocap
 from cfplan.cli.output import print_error
 from cfplan.cli.plan import plan
@@ -25,6 +26,7 @@ from cfplan.errors import CfplanError
 
 EPILOG = """\b
 Examples:
+  cfplan init --room 4x6x2.5               write a safety.yaml and a first path for this room
   cfplan fly flights/figure8.yaml          fly the virtual Crazyflie
   cfplan check flights/circle.yaml         is the plan within every limit?
   cfplan replay records/<flight>           look at a flight in rerun
@@ -40,7 +42,10 @@ def cfplan() -> None:
     """Plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
 
 
-for command in (plan, check, sim, fly, virtual, replay, report, identify, mocap, dataset, train, bench, study, doctor):
+COMMANDS = (
+    init, plan, check, sim, fly, virtual, replay, report, identify, mocap, dataset, train, bench, study, doctor,
+)  # fmt: skip
+for command in COMMANDS:
     cfplan.add_command(command)
 
 
@@ -66,7 +71,7 @@ def run_command() -> None:
 def _exit_code() -> int:
     """Run a command and return the exit code; a user's mistake ends in one line, never in a traceback."""
     try:
-        result = cfplan.main(standalone_mode=False)
+        result = cfplan.main(prog_name="cfplan", standalone_mode=False)
     except click.exceptions.Exit as ending:
         return ending.exit_code
     except click.ClickException as error:

@@ -79,7 +79,7 @@ def find_safety_file(given: Path | None, path_file: Path) -> Path:
     raise InputError(
         f"no {SAFETY_FILE} in or above this folder, or above the path file",
         where=str(path_file),
-        hint="name one with --safety; cfplan's own repository has one to start from",
+        hint="`cfplan init` writes one; or name one with --safety",
     )
 
 

@@ -9,7 +9,7 @@ import json
 import math
 import pathlib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar, get_args
 
@@ -84,19 +84,34 @@ def read_yaml(file: pathlib.Path | str, model: type[Model]) -> Model:
     return read_yaml_with_places(file, model)[0]
 
 
-def read_yaml_with_places(file: pathlib.Path | str, model: type[Model]) -> tuple[Model, Places]:
-    """Read a YAML file as a pydantic model, and the place of each value, for mistakes that a later check finds."""
+def read_yaml_with_places(
+    file: pathlib.Path | str, model: type[Model], complete: Callable[[dict[str, Any]], dict[str, Any]] | None = None
+) -> tuple[Model, Places]:
+    """Read a YAML file as a pydantic model, and the place of each value, for mistakes that a later check finds.
+
+    `complete` adds what the file may leave out.
+    """
     text = read_text(pathlib.Path(file), most=MAX_SIZE)
     places = Places(str(file), {}, {})
     root = _composed(text, places.file)
     data = _plain(root, (), places)
     if not isinstance(data, dict):
         raise InputError("the file must be keys with values", where=places.where(), hint=_known(model))
+    if complete is not None:
+        data = complete(data)
     try:
         # By way of JSON: pydantic's strict mode then takes lists for tuples and words for enums, and nothing else
         return model.model_validate_json(json.dumps(data), strict=True), places
     except ValidationError as error:
         raise _input_error(error, model, places) from None
+
+
+def read_plain(file: pathlib.Path) -> dict[str, Any]:
+    """Read a YAML file of keys with values, of no certain form. Raises InputError."""
+    data = _plain(_composed(read_text(file, most=MAX_SIZE), str(file)), (), Places(str(file), {}, {}))
+    if not isinstance(data, dict):
+        raise InputError("the file must be keys with values", where=str(file), hint="write `key: value`")
+    return data
 
 
 class _Loader(yaml.SafeLoader):

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import fields
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -10,10 +11,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.files.yaml_with_places import Places, read_yaml_with_places
+from cfplan.files.yaml_with_places import Places, read_plain, read_yaml_with_places
 from cfplan.safety.feasibility import describe_hover, hover_violation
 from cfplan.safety.limits import (
-    STOP_TILT,
     BatteryLimits,
     FirmwareSettings,
     FlightLimits,
@@ -30,6 +30,7 @@ from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.airframes import load_airframe
 
+DEFAULTS = Path(__file__).with_name("defaults.yaml")  # a whole safety.yaml, with comments
 LARGEST_IN_PACKET = 32.767  # m, m/s, m/s², rad/s: what a setpoint's 16 bits of thousandths hold
 
 _LEAST_PLANNED = {
@@ -44,7 +45,6 @@ _QUARTER_TURN = math.pi / 2  # a limit of tilt below so many degrees is taken fo
 
 Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
 Encodable = Annotated[float, Field(gt=0.0, le=LARGEST_IN_PACKET)]
-_ALONE = LinkLossLimits()  # of files from before safety.yaml had them
 _MotorLag = Annotated[float, Field(ge=0.005, le=0.5)]
 Share = Annotated[float, Field(gt=0.0, lt=0.5)]
 Voltage = Annotated[float, Field(ge=2.5, le=4.35)]
@@ -79,7 +79,7 @@ class _Flight(_Section):
     acceleration: _Ladder
     angular_velocity: _Ladder
     patience: Annotated[float, Field(gt=0.0, le=1.0)]
-    stop_tilt_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = math.degrees(STOP_TILT)
+    stop_tilt_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
 
     @classmethod
     def ladders(cls) -> list[str]:
@@ -113,9 +113,9 @@ class _Pose(_Section):
 
 
 class _LinkLoss(_Section):
-    outside: Literal["refuse", "warn"] = "refuse"
-    motor_lags: Annotated[tuple[_MotorLag, ...], Field(min_length=1, max_length=5)] = _ALONE.motor_lags
-    attitude_error_deg: Annotated[float, Field(ge=0.0, le=10.0)] = math.degrees(_ALONE.attitude_error)
+    outside: Literal["refuse", "warn"]
+    motor_lags: Annotated[tuple[_MotorLag, ...], Field(min_length=1, max_length=5)]
+    attitude_error_deg: Annotated[float, Field(ge=0.0, le=10.0)]
 
 
 class _Firmware(_Section):
@@ -139,7 +139,7 @@ class _SafetyFile(_Section):
     space: _Space
     battery: _Battery
     pose: _Pose
-    link_loss: _LinkLoss = _LinkLoss()
+    link_loss: _LinkLoss
     firmware: _Firmware
     ground: _Ground
     lateness: Annotated[float, Field(gt=0.0, le=0.1)]
@@ -157,14 +157,38 @@ def _made(kind: type[Kind], section: _Section, **others: Any) -> Kind:
     return kind(**{**values, **ladders, **others})
 
 
+@lru_cache(maxsize=1)
+def _defaults() -> dict[str, Any]:
+    """Return what a safety.yaml may leave out; nobody but its lab knows the vehicle and the room."""
+    defaults = read_plain(DEFAULTS)
+    del defaults["vehicle"], defaults["space"]["low"], defaults["space"]["high"]
+    return defaults
+
+
+def _complete(content: dict[str, Any]) -> dict[str, Any]:
+    """Return the content with the default of each key that it leaves out, in sections too."""
+    added = _filled(content, _defaults())
+    if "space" not in content:
+        del added["space"]
+    return added
+
+
+def _filled(content: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
+    filled = {**defaults, **content}
+    for key, value in content.items():
+        if isinstance(value, dict) and isinstance(defaults.get(key), dict):
+            filled[key] = _filled(value, defaults[key])
+    return filled
+
+
 def load_limits(file: Path | str) -> Limits:
-    """Read safety.yaml, strictly validated, and find its vehicle.
+    """Read safety.yaml, strictly validated, and find its vehicle. What it leaves out is as in DEFAULTS.
 
     Raises:
         InputError: unknown keys, limits that are not positive, that contradict each other, that make hovering
             impossible or that allow more than the vehicle can do; with `file:line:column`.
     """
-    content, places = read_yaml_with_places(file, _SafetyFile)
+    content, places = read_yaml_with_places(file, _SafetyFile, _complete)
     _check_order(content, places)
     airframe = _vehicle(content.vehicle, Path(file).parent, places)
     pose = content.pose.model_dump()
@@ -241,7 +265,7 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
             raise InputError(
                 f"plan.{quantity.key} ({planned:g}) is not below flight.{quantity.ladder}.brake ({abort:g})",
                 where=places.where("plan", quantity.key),
-                hint="a flight as planned would be broken off; plan slower",
+                hint=f"a flight as planned would be broken off: plan slower, or allow more in flight.{quantity.ladder}",
             )
     for axis, (low, high) in enumerate(zip(content.space.low, content.space.high, strict=True)):
         if not high - low > 2 * content.space.margin:

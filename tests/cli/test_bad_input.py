@@ -31,12 +31,12 @@ BAD_PATHS = {
 }  # fmt: skip
 
 BAD_SAFETY = {
-    "a negative limit": (r"^  speed: 2.0", "  speed: -2.0", 2, "safety.yaml:7:"),
-    "a zero limit": (r"^  acceleration: 5.0", "  acceleration: 0", 2, "safety.yaml:8:"),
-    "an unknown key": (r"^  tilt_deg: 30", "  tilt: 30", 2, "safety.yaml:11:"),
+    "a negative limit": (r"^  speed: 2.0", "  speed: -2.0", 2, "safety.yaml:8:"),
+    "a zero limit": (r"^  acceleration: 5.0", "  acceleration: 0", 2, "safety.yaml:9:"),
+    "an unknown key": (r"^  tilt_deg: 30", "  tilt: 30", 2, "safety.yaml:12:"),
     "a tilt in radians": (r"^  tilt_deg: 30", "  tilt_deg: 0.52", 2, "0.52 rad is 29.8"),
-    "an unknown vehicle": (r"^vehicle: \S+", "vehicle: crazyflie-9", 2, "safety.yaml:4:"),
-    "limits under which it cannot hover": (r"^  motor_reserve: 0.2", "  motor_reserve: 0.45", 2, "safety.yaml:12:"),
+    "an unknown vehicle": (r"^vehicle: \S+", "vehicle: crazyflie-9", 2, "safety.yaml:5:"),
+    "limits under which it cannot hover": (r"^  motor_reserve: 0.2", "  motor_reserve: 0.45", 2, "safety.yaml:13:"),
     "a battery too small for the path": (r"^  endurance: 240", "  endurance: 9", 3, "endurance"),
 }
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cfplan.errors import CfplanError, InputError
 from cfplan.safety.limits import Ladder
-from cfplan.safety.limits_file import load_limits
+from cfplan.safety.limits_file import DEFAULTS, load_limits
 from cfplan.vehicle.airframes import AIRFRAMES
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"
@@ -72,11 +72,10 @@ def test_a_vehicle_file_lies_beside_the_safety_file(tmp_path):
 NO_POSITIVE_NUMBER = {
     "vehicle", "low", "high", "latency", "controller", "estimator", "watchdog", "outside", "attitude_error_deg",
 }  # fmt: skip
-OPTIONAL = {"stop_tilt_deg", "link_loss", "outside", "motor_lags", "attitude_error_deg"}  # which older files lack
+NEEDED = ("vehicle", "space", "space.low", "space.high")  # which nobody but the lab knows
 
 
-@pytest.mark.parametrize("place", [".".join(place) for place in keys() if place[-1] not in OPTIONAL])
-def test_no_key_may_be_missing(tmp_path, place):
+def without(tmp_path, place):
     content = copy.deepcopy(CONTENT)
     *above, key = place.split(".")
     section = content
@@ -85,8 +84,30 @@ def test_no_key_may_be_missing(tmp_path, place):
     del section[key]
     file = tmp_path / "safety.yaml"
     file.write_text(yaml.safe_dump(content))
-    with pytest.raises(InputError, match=f"{key}' is missing"):
-        load_limits(file)
+    return file
+
+
+@pytest.mark.parametrize("place", NEEDED)
+def test_vehicle_and_room_may_not_be_left_out(tmp_path, place):
+    with pytest.raises(InputError, match=f"{place.split('.')[-1]}' is missing"):
+        load_limits(without(tmp_path, place))
+
+
+@pytest.mark.parametrize("place", sorted({".".join(place[:n]) for place in keys() for n in (1, 2, 3)} - {*NEEDED}))
+def test_whatever_else_is_left_out_is_as_in_the_projects_file(tmp_path, place):
+    assert load_limits(without(tmp_path, place)) == load_limits(SAFETY)
+
+
+def test_two_lines_are_a_safety_file(tmp_path):
+    file = tmp_path / "safety.yaml"
+    file.write_text("vehicle: crazyflie-2.1+\nspace: {low: [-1, -1, 0], high: [1, 1, 2.2]}\nplan: {speed: 1.0}\n")
+    limits, whole = load_limits(file), load_limits(SAFETY)
+    assert (limits.space.high, limits.space.margin, limits.plan.speed) == ((1, 1, 2.2), whole.space.margin, 1.0)
+    assert limits.flight == whole.flight
+
+
+def test_the_defaults_are_the_projects_own_file():
+    assert DEFAULTS.read_text() == SAFETY.read_text()
 
 
 NUMBERS = [
