@@ -5,13 +5,12 @@ import numpy as np
 from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss
 from cfplan.safety.limits import Limits
-from cfplan.simulation.link_loss import WALLS, drift, link_loss_at_every_setpoint
+from cfplan.simulation.link_loss import WALLS, link_loss_at_every_setpoint
 
 MARGIN = 0.02  # m inside the walls that planning aims at: what the last refinement changes stays within
 OUTSIDE_HINT = (
     "keep the path farther from that wall; in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
 )
-FLIGHT_ALONE = 2.3  # s, about, from the last setpoint to the floor
 _LEAST_REACH = 1e-3  # m
 
 
@@ -20,7 +19,6 @@ def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MAR
     moments = link_loss_at_every_setpoint(encoded.payloads, limits)
     number, (axis, side) = np.arange(len(moments.time)), np.array(WALLS)[moments.wall].T
     reach = np.where(side[:, None], moments.high - moments.place, moments.place - moments.low)[number, axis]
-    reach -= drift(np.array([FLIGHT_ALONE]), limits)  # which is as far however slow the flight
 
     def describe(at: int) -> str:
         far = (

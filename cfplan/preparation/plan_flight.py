@@ -134,7 +134,7 @@ def give_way(planned: Plan, on_step: OnStep = ignore_steps) -> tuple[Plan, Simul
     compile_from_here()  # without, simulating takes minutes
 
     def assess(trajectory: Trajectory) -> list[Assessment]:
-        encoded = encode_trajectory(trajectory)
+        encoded = encode_trajectory(trajectory, space=limits.space)
         assessments = [assess_glitches] if limits.link_loss.only_warn else [assess_link_loss, assess_glitches]
         with ThreadPoolExecutor() as pool:
             return list(pool.map(lambda each: each(encoded, limits), assessments))

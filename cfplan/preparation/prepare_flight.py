@@ -88,7 +88,9 @@ def encode_flight(planned: PlannedFlight, on_step: OnStep = ignore_steps, *, str
                 hint="plan the path again under this safety.yaml",
             )
     with step(on_step, "bytes") as results:
-        encoded = encode_trajectory(plan.trajectory, hold=max(HOLD, stream_for - plan.trajectory.duration))
+        encoded = encode_trajectory(
+            plan.trajectory, hold=max(HOLD, stream_for - plan.trajectory.duration), space=planned.limits.space
+        )
         check_bytes(encoded, plan.trajectory, planned.limits.plan)
         results.append(f"{len(encoded.payloads)} setpoints")
     return encoded
@@ -146,7 +148,9 @@ def make_mission(
     """Encode a stop from every setpoint and certify them all. Raises NotCertifiedError."""
     with step(on_step, "stops") as results:
         mission = mission_of(encoded, limits)
-        stops = certify_stops(mission.stops, encoded.motion, limits, mission.rate)
+        stops = certify_stops(
+            mission.stops, encoded.motion, limits, mission.rate, gains=encoded.gains, space=encoded.space
+        )
         stops.require(limits)
         results.append(f"certified from each of {stops.count} setpoints, {stops.as_planned} within the plan's limits")
     return mission, stops

@@ -113,9 +113,16 @@ class _Pose(_Section):
 
 
 class _LinkLoss(_Section):
+<<<<<<< Updated upstream
     outside: Literal["refuse", "warn"]
     motor_lags: Annotated[tuple[_MotorLag, ...], Field(min_length=1, max_length=5)]
     attitude_error_deg: Annotated[float, Field(ge=0.0, le=10.0)]
+=======
+    outside: Literal["refuse", "warn"] = "refuse"
+    motor_lags: Annotated[tuple[_MotorLag, ...], Field(min_length=1, max_length=5)] = _ALONE.motor_lags
+    attitude_error_deg: Annotated[float, Field(ge=0.0, le=10.0)] = math.degrees(_ALONE.attitude_error)
+    vertical_acceleration_error: Annotated[float, Field(ge=0.0, le=2.0)] = _ALONE.vertical_acceleration_error
+>>>>>>> Stashed changes
 
 
 class _Firmware(_Section):
@@ -207,6 +214,7 @@ def load_limits(file: Path | str) -> Limits:
             only_warn=content.link_loss.outside == "warn",
             motor_lags=content.link_loss.motor_lags,
             attitude_error=math.radians(content.link_loss.attitude_error_deg),
+            vertical_acceleration_error=content.link_loss.vertical_acceleration_error,
         ),
         lateness=content.lateness,
     )

@@ -6,8 +6,11 @@ flight/setpoints/rate_trade.py). Where it comes down depends on the moment, so e
 flight before is simulated once, in steps of 1 ms, and branches off at each setpoint in steps of 4 ms, until the vehicle
 has settled in its level-out; from there on its attitude stands still, and only its place is followed.
 
-No poses come any more either. The vehicle then flies by its gyroscope, and an attitude that it has wrong by a little
-makes it drift, by as much wherever it is: that drift is added to each box that the vehicle sweeps.
+No poses come any more either. The vehicle then flies by gyroscope and accelerometer. An attitude that it has wrong by
+a little makes it drift to a side, by as much wherever it is, so each place widens the box that the vehicle sweeps by
+how far that drift has come until then. An accelerometer that says too little makes it believe that it sinks, and climb:
+it is simulated so. One that says too much makes it come down sooner, with less thrust to brake by, which takes it some
+millimetres farther to the sides; that is simulated as well where the vehicle comes near a wall.
 """
 
 import math
@@ -60,6 +63,8 @@ _STEP = 0.004  # s, of the simulation after the last setpoint
 _SETTLED_AFTER = 0.5  # s of level-out, after which a vehicle that hardly turns has settled
 _SETTLED_RATE = 0.2  # rad/s, below which it hardly turns
 _COAST_STEP = 0.01  # s, of the place alone
+_NEAR = 0.1  # m from a wall, within which it also matters that the accelerometer may say too much
+_PUSH, _DAMPING, _LIFT = range(3)  # as _wrong packs what the vehicle has wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,22 +112,20 @@ def simulate_link_loss(payloads: NDArray, limits: Limits, rate: float = RATE) ->
 
 def link_loss_at_every_setpoint(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLossMoments:
     """Lose the link after each setpoint of a flight that begins in hover, (N, 29) uint8 at `rate`, Hz."""
-    state = decode(payloads)
-    with ThreadPoolExecutor() as pool:  # a motor lag each
-        boxes = [each[:2] for each in pool.map(lambda body: _swept(state, limits, body, rate), _bodies(limits))]
-    return _judge(np.arange(len(payloads)) / rate, state.position, boxes, limits)
+    state, time, wrong = decode(payloads), np.arange(len(payloads)) / rate, _wrong(limits)
 
+    def swept(forks: NDArray, wrong: NDArray) -> list[NDArray]:
+        with ThreadPoolExecutor() as pool:  # a motor lag each
+            flown = pool.map(lambda body: _swept(state, limits, body, rate, forks, wrong), _bodies(limits))
+            return [boxes for boxes, _ in flown]
 
-def swept_after_link_loss(
-    payloads: NDArray, limits: Limits, moments: NDArray, rate: float = RATE
-) -> tuple[NDArray, NDArray]:
-    """Return the last setpoint's place, (K, 3) m, and the box swept after it, (K, 2, 3) m, for each moment, (K,) s.
-
-    A moment counts as that of the setpoint nearest to it. See link_loss_at_every_setpoint.
-    """
-    found = link_loss_at_every_setpoint(payloads, limits, rate)
-    rows = np.clip(np.round(np.asarray(moments) * rate).astype(int), 0, len(payloads) - 1)
-    return found.place[rows], np.stack([found.low[rows], found.high[rows]], axis=1)
+    boxes = swept(np.ones(len(payloads), dtype=np.bool_), wrong)
+    found = _judge(time, state.position, boxes, limits)
+    near = ~(found.beyond < -_NEAR)
+    if wrong[_LIFT] and near.any():
+        sinking = [np.where(near[:, None, None], box, boxes[0]) for box in swept(near, wrong * (1.0, 1.0, -1.0))]
+        found = _judge(time, state.position, boxes + sinking, limits)
+    return found
 
 
 def link_loss_of_stops(
@@ -138,12 +141,12 @@ def link_loss_of_stops(
     rows = setpoint_rows(told).reshape(len(begin), stops.shape[1], SETPOINT_SIZE)
     arrivals, boxes = arrival_steps(stops.shape[1], rate), []
     for body in _bodies(limits):
-        snapshots = _swept(state, limits, body, rate, fork=False)[2][begin]
-        swept, aloft = np.empty((len(begin), stops.shape[1], 2, 3)), np.empty((len(begin), stops.shape[1]))
+        snapshots = _swept(state, limits, body, rate, np.zeros(len(payloads), dtype=np.bool_), _wrong(limits))[1][begin]
+        swept = np.empty((len(begin), stops.shape[1], 2, 3))
         forks = np.zeros(stops.shape[1], dtype=np.bool_)
         forks[within] = True
-        _fly_stops(swept, aloft, rows, snapshots, forks, _gains(limits), *body, *_steps(limits), arrivals)
-        boxes.append((swept[:, within].reshape(-1, 2, 3), aloft[:, within].reshape(-1)))
+        _fly_stops(swept, rows, snapshots, forks, _gains(limits), *body, *_steps(limits), arrivals, _wrong(limits))
+        boxes.append(swept[:, within].reshape(-1, 2, 3))
     times = begin[:, None] / rate + within / rate
     places = rows[:, within, 0:3].reshape(-1, 3)
     return _judge(times.reshape(-1), places, boxes, limits)
@@ -157,30 +160,20 @@ def link_loss_of_transfer(
     Places in m, yaw in rad, `duration` in s; the first and the last setpoint are those of a hover.
     """
     motion = hover_to_hover(begin, yaw, end, end_yaw, duration, rate)
-    return link_loss_at_every_setpoint(encode_motion(motion, ahead(motion.acceleration, rate)), limits, rate)
+    payloads = encode_motion(motion, ahead(motion.acceleration, rate), space=limits.space)
+    return link_loss_at_every_setpoint(payloads, limits, rate)
 
 
-def drift(aloft: NDArray, limits: Limits) -> NDArray:
-    """Return how far, m, a wrong attitude carries the vehicle in the times `aloft`, (N,) s, after the last setpoint.
-
-    Motion under the sideways thrust of the error, against drag, until the motors stop; coasting from there.
-    """
-    error, (drag, _) = limits.link_loss.attitude_error, limits.airframe.drag
-    push, damping = GRAVITY * math.tan(error), max(drag / limits.airframe.mass, 1e-6)
-    off = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER
-    driven, coasting = np.minimum(aloft, off), np.maximum(aloft - off, 0.0)
-    speed = push / damping * -np.expm1(-damping * driven)
-    return np.asarray((push * driven - speed) / damping + speed * -np.expm1(-damping * coasting) / damping)
+def _wrong(limits: Limits) -> NDArray:
+    """Return what the vehicle has wrong: m/s² to a side, the damping of that motion by drag in 1/s, m/s² upwards."""
+    wrong, drag = limits.link_loss, limits.airframe.drag[0]
+    push = GRAVITY * math.tan(wrong.attitude_error)
+    return np.array([push, max(drag / limits.airframe.mass, 1e-6), wrong.vertical_acceleration_error])
 
 
-def _judge(time: NDArray, place: NDArray, boxes: list[tuple[NDArray, NDArray]], limits: Limits) -> LinkLossMoments:
-    """Return the worst of the boxes, (N, 2, 3) m, and times aloft, (N,) s, of each motor lag."""
-    lows, highs = [], []
-    for swept, aloft in boxes:
-        side = drift(aloft, limits)[:, None] * np.array([1.0, 1.0, 0.0])
-        lows.append(swept[:, 0] - side)
-        highs.append(swept[:, 1] + side)
-    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+def _judge(time: NDArray, place: NDArray, boxes: list[NDArray], limits: Limits) -> LinkLossMoments:
+    """Return the worst of the boxes, (N, 2, 3) m, of each motor lag."""
+    low, high = np.min([box[:, 0] for box in boxes], axis=0), np.max([box[:, 1] for box in boxes], axis=0)
     space = np.array([limits.space.low, limits.space.high])
     out = np.stack(
         [(high[:, axis] - space[1, axis]) if side else (space[0, axis] - low[:, axis]) for axis, side in WALLS], axis=1
@@ -209,20 +202,24 @@ def _steps(limits: Limits) -> tuple[int, int]:
 
 
 def _swept(
-    state: FullStateSetpoints, limits: Limits, body: tuple[NDArray, NDArray], rate: float, *, fork: bool = True
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Return boxes (N, 2, 3), times aloft (N,) s, and snapshots of vehicle and controller at each setpoint."""
+    state: FullStateSetpoints,
+    limits: Limits,
+    body: tuple[NDArray, NDArray],
+    rate: float,
+    forks: NDArray,
+    wrong: NDArray,
+) -> tuple[NDArray, NDArray]:
+    """Return boxes (N, 2, 3) where `forks`, (N,), and snapshots of vehicle and controller at each setpoint."""
     count, rows = len(state.position), setpoint_rows(state)
-    swept, aloft, snapshots = np.empty((count, 2, 3)), np.empty(count), np.empty((count, SNAPSHOT_SIZE))
-    start, forks, arrivals = hovering_snapshot(limits.airframe, state), np.full(count, fork), arrival_steps(count, rate)
-    _fly(swept, aloft, snapshots, rows, start, forks, _gains(limits), *body, *_steps(limits), arrivals)
-    return swept, aloft, snapshots
+    swept, snapshots = np.empty((count, 2, 3)), np.empty((count, SNAPSHOT_SIZE))
+    start, arrivals = hovering_snapshot(limits.airframe, state), arrival_steps(count, rate)
+    _fly(swept, snapshots, rows, start, forks, _gains(limits), *body, *_steps(limits), arrivals, wrong)
+    return swept, snapshots
 
 
 @njit
 def _fly_stops(
     swept: NDArray,
-    aloft: NDArray,
     stops: NDArray,
     starts: NDArray,
     forks: NDArray,
@@ -232,19 +229,19 @@ def _fly_stops(
     level_after: int,
     off_after: int,
     arrivals: NDArray,
+    wrong: NDArray,
 ) -> None:
     snapshots = np.empty((stops.shape[1], SNAPSHOT_SIZE))
     for n in range(len(stops)):
         _fly(
-            swept[n], aloft[n], snapshots, stops[n], starts[n], forks, gains, body, later_body, level_after, off_after,
-            arrivals,
+            swept[n], snapshots, stops[n], starts[n], forks, gains, body, later_body, level_after, off_after, arrivals,
+            wrong,
         )  # fmt: skip
 
 
 @njit(nogil=True)
 def _fly(
     swept: NDArray,
-    aloft: NDArray,
     snapshots: NDArray,
     setpoints: NDArray,
     start: NDArray,
@@ -255,10 +252,11 @@ def _fly(
     level_after: int,
     off_after: int,
     arrivals: NDArray,
+    wrong: NDArray,
 ) -> None:
     """Fly setpoints from a snapshot; branch off where `forks` says so, at the moment at which each arrives."""
     now, branch, setpoint, control, motors = start.copy(), start.copy(), setpoints[0].copy(), np.zeros(4), np.zeros(4)
-    full_state, mode = FULL_STATE.copy(), FULL_STATE.copy()
+    full_state, mode, astray = FULL_STATE.copy(), FULL_STATE.copy(), np.zeros(3)
     for newest in range(len(setpoints)):
         for k in range(SNAPSHOT_SIZE):
             snapshots[newest, k] = now[k]
@@ -269,9 +267,10 @@ def _fly(
                 setpoint[k] = setpoints[newest, k]
             for k in range(len(mode)):
                 mode[k] = full_state[k]
-            aloft[newest] = _go_on_alone(
-                swept[newest], branch, setpoint, mode, gains, later_body, level_after, off_after, control, motors
-            )
+            _go_on_alone(
+                swept[newest], branch, setpoint, mode, gains, later_body, level_after, off_after, wrong, astray,
+                control, motors,
+            )  # fmt: skip
         for step in range(arrivals[newest], arrivals[newest + 1]):
             if step % STEPS_A_CONTROL == 0:
                 step_control(now, now, gains, setpoints[newest], full_state, body, CONTROL_PERIOD, control, motors)
@@ -288,13 +287,16 @@ def _go_on_alone(
     body: NDArray,
     level_after: int,
     off_after: int,
+    wrong: NDArray,
+    astray: NDArray,
     control: NDArray,
     motors: NDArray,
-) -> float:
-    """Fly on with the last setpoint, to the floor; write the box swept, and return how long that takes, s.
+) -> None:
+    """Fly on with the last setpoint, to the floor; write the box swept.
 
-    `now`, `setpoint`, `mode`, `control` and `motors` are overwritten.
+    `now`, `setpoint`, `mode`, `astray`, `control` and `motors` are overwritten.
     """
+    astray[0] = astray[1] = astray[2] = 0.0  # m, m/s: drift to a side, its speed; m/s: at which it believes to sink
     settled_after = level_after + round(_SETTLED_AFTER / _STEP)
     for k in range(3):
         swept[0, k], swept[1, k] = now[k], now[k]
@@ -303,21 +305,31 @@ def _go_on_alone(
             level_out(setpoint, mode)
         turning = abs(now[10]) + abs(now[11]) + abs(now[12])
         if settled_after <= after < off_after and turning < _SETTLED_RATE:
-            return after * _STEP + _coast(swept, now, setpoint, gains, body, (off_after - after) * _STEP)
+            _coast(swept, now, setpoint, gains, body, (off_after - after) * _STEP, wrong, astray)
+            return
         if after < off_after:
             step_control(now, now, gains, setpoint, mode, body, _STEP, control, motors)
         else:
             for k in range(4):
                 now[THRUSTS + k] = 0.0
         step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
-        _widen(swept, now)
+        _go_astray(astray, setpoint, wrong, after < off_after, _STEP)
+        _widen(swept, now, astray[0])
         if after > off_after and now[2] <= 0.0:
-            return after * _STEP
-    return _LONGEST
+            return
 
 
 @njit(allocates=False)
-def _coast(swept: NDArray, now: NDArray, setpoint: NDArray, gains: NDArray, body: NDArray, powered: float) -> float:
+def _coast(
+    swept: NDArray,
+    now: NDArray,
+    setpoint: NDArray,
+    gains: NDArray,
+    body: NDArray,
+    powered: float,
+    wrong: NDArray,
+    astray: NDArray,
+) -> None:
     """Follow the place of a vehicle whose attitude stands still, for `powered` s with motors and to the floor.
 
     Semi-implicit midpoint: height control, motor lag and drag as in the whole simulation.
@@ -342,18 +354,34 @@ def _coast(swept: NDArray, now: NDArray, setpoint: NDArray, gains: NDArray, body
             speed = now[3 + k]
             now[3 + k] += _COAST_STEP * (lift - drag * speed) / (1.0 + 0.5 * drag * _COAST_STEP)
             now[k] += _COAST_STEP * 0.5 * (speed + now[3 + k])
-        _widen(swept, now)
+        _go_astray(astray, setpoint, wrong, time < powered, _COAST_STEP)
+        _widen(swept, now, astray[0])
         time += _COAST_STEP
         if time > powered and now[2] <= 0.0:
             break
-    return time
 
 
 @njit(allocates=False)
-def _widen(swept: NDArray, now: NDArray) -> None:
-    """Make a box, (2, 3), hold a place; written so that what is no number is taken over."""
+def _go_astray(astray: NDArray, setpoint: NDArray, wrong: NDArray, powered: bool, step: float) -> None:
+    """Let what the vehicle has wrong act for a step: a wrong attitude pushes to a side, a wrong height lifts.
+
+    All that the controller sees of a height that is believed too low is how far off the setpoint is; so that rises.
+    """
+    push = wrong[_PUSH] if powered else 0.0
+    speed = astray[1]
+    astray[1] += step * (push - wrong[_DAMPING] * speed) / (1.0 + 0.5 * wrong[_DAMPING] * step)
+    astray[0] += step * 0.5 * (speed + astray[1])
+    setpoint[2] += step * (astray[2] + 0.5 * step * wrong[_LIFT])
+    setpoint[5] += step * wrong[_LIFT]
+    astray[2] += step * wrong[_LIFT]
+
+
+@njit(allocates=False)
+def _widen(swept: NDArray, now: NDArray, astray: float) -> None:
+    """Make a box, (2, 3), hold a place and all `astray`, m, to its sides; what is no number is taken over."""
     for k in range(3):
-        if not swept[0, k] <= now[k]:
-            swept[0, k] = now[k]
-        if not swept[1, k] >= now[k]:
-            swept[1, k] = now[k]
+        aside = astray if k < 2 else 0.0
+        if not swept[0, k] <= now[k] - aside:
+            swept[0, k] = now[k] - aside
+        if not swept[1, k] >= now[k] + aside:
+            swept[1, k] = now[k] + aside

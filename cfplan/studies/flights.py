@@ -193,7 +193,7 @@ def _without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFlig
         hopf_quaternion((axis[0], axis[1], axis[2]), np.cos(states.yaw / 2), np.sin(states.yaw / 2)), 1
     )
     motion = replace(motion_at(trajectory, times), acceleration=states.acceleration, quaternion=quaternion)
-    payloads = encode_motion(motion, trajectory.at(times + BRAKE_LEAD).acceleration, encoded.gains)
+    payloads = encode_motion(motion, trajectory.at(times + BRAKE_LEAD).acceleration, encoded.gains, space=encoded.space)
     return replace(encoded, payloads=payloads, decoded=decode(payloads))
 
 

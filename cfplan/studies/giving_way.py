@@ -101,12 +101,12 @@ def _trial(
     name: str, path: Path, yaw: YawMode, yaw_angle: float, limits: Limits, lags: Sequence[float]
 ) -> dict[str, Any]:
     planned = plan(path, limits.airframe, limits, yaw=yaw, yaw_angle=yaw_angle)
-    before = encode_trajectory(planned.trajectory)
+    before = encode_trajectory(planned.trajectory, space=limits.space)
     refused, after = "", before
     slowed = planned
     try:
         slowed, _ = give_way(planned)
-        after = encode_trajectory(slowed.trajectory)
+        after = encode_trajectory(slowed.trajectory, space=limits.space)
     except InfeasibleError as error:
         refused = str(error)
     before_beyond = _beyond(before, limits, lags)

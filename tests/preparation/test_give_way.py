@@ -37,7 +37,7 @@ def gave_way(path_file, limits):
 
 def beyond(planned, limits) -> float:
     """How far beyond a wall the vehicle comes down from the worst of all setpoints, with the worst of all lags."""
-    payloads = encode_trajectory(planned.plan.trajectory).payloads
+    payloads = encode_trajectory(planned.plan.trajectory, space=limits.space).payloads
     return float(link_loss_at_every_setpoint(payloads, limits).beyond.max())
 
 
@@ -88,7 +88,7 @@ def test_where_slowness_does_not_help_the_path_is_refused_by_its_wall(limits, tm
 
 
 def test_the_assessment_tells_of_each_setpoint_which_wall_is_nearest_and_how_far(gave_way, limits):
-    encoded = encode_trajectory(gave_way.plan.trajectory)
+    encoded = encode_trajectory(gave_way.plan.trajectory, space=limits.space)
     assessed = assess_link_loss(encoded, limits, margin=0.0)
     moments = link_loss_at_every_setpoint(encoded.payloads, limits)
     assert len(assessed.excess) == len(encoded.payloads)

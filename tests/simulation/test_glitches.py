@@ -1,6 +1,7 @@
 """A gap in setpoints, poses or both: against the dry run's own loop, and in limit cases."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dynamics.body import hovering
 from cfplan.simulation.dynamics.closed_loop import fly_setpoints
-from cfplan.simulation.glitches import AFTERWARDS, GAP, KINDS, glitch_at_every_setpoint
+from cfplan.simulation.glitches import AFTERWARDS, GAP, KINDS, WITHOUT_POSES_EVERY, glitch_at_every_setpoint
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -46,7 +47,8 @@ def test_a_gap_in_setpoints_does_what_the_dry_run_says_of_a_flight_with_that_gap
     assert found.tilt[0, number] == pytest.approx(np.arccos(1 - 2 * (x * x + y * y)).max(), abs=np.radians(2.0))
 
 
-def test_without_poses_a_right_attitude_flies_on_as_the_dry_run_does(found, line, limits):
+def test_without_poses_a_right_attitude_flies_on_as_the_dry_run_does(line, limits):
+    found = glitch_at_every_setpoint(line, replace(limits, link_loss=replace(limits.link_loss, attitude_error=0.0)))
     start = hovering(limits.airframe, decode(line).position[0])
     seconds = GAP + AFTERWARDS
     end = len(line) / 100 + seconds
@@ -83,6 +85,15 @@ def test_without_poses_a_wrong_attitude_carries_the_vehicle_off(line, limits):
     right, wrong = poses_missing(0.0), poses_missing(3.0)
     assert right.max() < 0.03
     assert 0.005 < (wrong - right).max() < 0.1  # 0.5 m/s² for 0.2 s is 1 cm, and 10 cm/s to be taken back
+
+
+def test_between_setpoints_at_which_poses_stop_too_the_worse_one_counts(found, line):
+    sampled = np.unique(np.append(np.arange(0, len(line), WITHOUT_POSES_EVERY), len(line) - 1))
+    for kind, least in ((1, 0.0), (2, found.deviation[0])):
+        assert np.all(found.deviation[kind] >= least)
+        for first, last in pairwise(sampled):
+            assert np.all(found.deviation[kind, first + 1 : last] >= found.deviation[kind, first])
+            assert np.all(found.tilt[kind, first + 1 : last] >= found.tilt[kind, first])
 
 
 def test_a_vehicle_that_turns_over_is_lost(line, limits):

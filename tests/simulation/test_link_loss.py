@@ -7,19 +7,21 @@ import numpy as np
 import pytest
 from link_loss_oracle import fly_on
 
+from cfplan.flight.firmware import gains_for
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
 from cfplan.preparation.prepare_flight import prepare_mission
+from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.link_loss import (
     link_loss_at_every_setpoint,
     link_loss_of_stops,
     link_loss_of_transfer,
     simulate_link_loss,
-    swept_after_link_loss,
 )
 from cfplan.studies.fault_scenarios import SCENARIOS
 from cfplan.studies.faults import fly_stepped
+from cfplan.vehicle.airframe import GRAVITY
 
 REPOSITORY = Path(__file__).parents[2]
 KILLED = next(row for row in SCENARIOS if row.name == "pilot killed")
@@ -28,6 +30,12 @@ KILLED = next(row for row in SCENARIOS if row.name == "pilot killed")
 @pytest.fixture(scope="module")
 def limits():
     return load_limits(REPOSITORY / "safety.yaml")
+
+
+def without_errors(limits: Limits, **changes) -> Limits:
+    """A vehicle that has attitude and acceleration right."""
+    right = {"attitude_error": 0.0, "vertical_acceleration_error": 0.0}
+    return replace(limits, link_loss=replace(limits.link_loss, **right | changes))
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +59,7 @@ def straight(speed: float, seconds: float = 1.0) -> np.ndarray:
 
 
 def test_a_vehicle_that_hovers_comes_down_below_where_it_was(limits):
-    lost = simulate_link_loss(straight(0.0), limits)
+    lost = simulate_link_loss(straight(0.0), without_errors(limits))
     assert lost.distance < 0.05
     assert lost.beyond < -0.9
     assert "inside the walls" in str(lost)
@@ -76,9 +84,8 @@ def test_roll_and_pitch_rates_in_the_last_packet_carry_it_away_and_the_watchdog_
 @pytest.mark.parametrize("rates", [(0.0, 0.0), (1.0, -2.5)], ids=["as sent", "with rates"])
 def test_it_sweeps_what_a_whole_simulation_sweeps(line, limits, rates, lag):
     """4 ms steps and an attitude that stands still once settled, against steps of 1 ms to the floor."""
-    alone = replace(limits.link_loss, motor_lags=(lag,), attitude_error=0.0)
     airframe = replace(limits.airframe, motor_time_constant=lag)
-    limits = replace(limits, airframe=airframe, link_loss=alone)
+    limits = replace(without_errors(limits, motor_lags=(lag,)), airframe=airframe)
     for last in (40, 171, 260, 390):
         told = decode(line.payloads)
         told.body_rate[last, :2] += rates
@@ -115,6 +122,45 @@ def test_an_attitude_that_is_wrong_drifts_to_all_sides(limits):
     assert 0.7 * undamped < aside[0] < undamped
 
 
+def test_the_drift_at_a_place_is_that_of_the_time_until_there(limits):
+    """A vehicle that flies back is farthest out before it has drifted as far as it will."""
+    wrong = without_errors(limits, attitude_error=np.radians(1.0))
+    sent = straight(1.0)
+    right, found = link_loss_at_every_setpoint(sent, without_errors(limits)), link_loss_at_every_setpoint(sent, wrong)
+    at_end = GRAVITY * np.radians(1.0) * (2.04**2 / 2 + 2.04 * 0.45)  # less what drag takes
+    assert 0.0 <= (right.low[-1] - found.low[-1])[0] < 0.05 * at_end  # behind it lies where it began
+    assert 0.7 * at_end < (found.high[-1] - right.high[-1])[0] < at_end
+
+
+def test_an_accelerometer_that_says_too_little_lifts_the_vehicle_and_one_that_says_too_much_counts_too(line, limits):
+    def with_error(error):
+        wrong = replace(limits.link_loss, vertical_acceleration_error=error)
+        return link_loss_at_every_setpoint(line.payloads, replace(limits, link_loss=wrong))
+
+    lifted, right, sunk = (with_error(error) for error in (0.1, 0.0, -0.1))
+    rise = (lifted.high - right.high)[:, 2]
+    assert rise[-1] == pytest.approx(0.5 * 0.1 * 2.04**2, rel=0.15)
+    assert np.all((rise > 0.0) & (rise < 0.25))
+    near = lifted.beyond > -0.1
+    assert near.any()
+    assert np.all(sunk.beyond[near] <= lifted.beyond[near] + 1e-9)
+    assert np.all(sunk.beyond <= lifted.beyond + 0.02)
+
+
+@pytest.mark.parametrize("speed", [0.8, -0.8])
+def test_it_climbs_on_with_the_vertical_speed_of_its_last_setpoint(limits, speed):
+    """Level-out keeps height and vertical speed of the setpoint: kp (z - z₀) = kd v ends kd/kp · v above it."""
+    time = np.arange(101) / 100.0
+    told = decode(straight(0.0))
+    told.position[:, 2], told.velocity[:, 2] = 1.0 + speed * (time - 1.0), speed
+    found = link_loss_at_every_setpoint(encode(told), without_errors(limits))
+    places = fly_on(encode(told), limits.airframe, 100, lag=limits.airframe.motor_time_constant)
+    assert found.high[100, 2] == pytest.approx(places[:, 2].max(), abs=0.02)
+    if speed > 0:
+        gains = gains_for(limits.airframe)
+        assert found.high[100, 2] == pytest.approx(1.0 + gains.kd_z / gains.kp_z * speed, abs=0.06)
+
+
 def test_it_says_which_wall(limits):
     found = link_loss_at_every_setpoint(straight(1.0, 2.0), limits)
     assert found.name_of_wall(0, limits) == f"the wall x = {limits.space.low[0]:g} m"  # it begins 2 m to the left
@@ -123,6 +169,7 @@ def test_it_says_which_wall(limits):
 
 
 def test_stops_from_a_flight_are_harmless_too(line, limits):
+    limits = without_errors(limits)
     flight = link_loss_at_every_setpoint(line.payloads, limits)
     every = link_loss_of_stops(line.payloads, line.stops, limits, every=10, each=8)
     assert len(every.time) == 11 * len(range(0, len(line.payloads), 10))
@@ -157,11 +204,11 @@ def test_setpoints_as_they_are_sent_are_harmless_when_they_stop(line, limits):
 
 def test_the_virtual_crazyflie_goes_there_too(line, limits):
     moments = np.round(np.array([0.3, 0.5, 0.7]) * line.motion_ends, 2)
-    places, swept = swept_after_link_loss(line.payloads, limits, moments)
-    for moment, place, box in zip(moments, places, swept, strict=True):
+    right = link_loss_at_every_setpoint(line.payloads, without_errors(limits))
+    for moment in moments:
+        row = round(100 * moment)
         flown = fly_stepped(replace(KILLED, moment=float(moment)), line)
         alone = flown.truth.position[flown.truth.time >= flown.struck]
-        # 0.35 m: its own estimate drifts so far in two seconds without poses.
-        assert alone.min(axis=0) == pytest.approx(box[0], abs=0.35)
-        assert alone.max(axis=0) == pytest.approx(box[1], abs=0.35)
-        assert np.abs(box - place)[:, 1].max() < 1.1
+        # 0.2 m: its own estimate drifts so far in two seconds without poses.
+        assert alone.min(axis=0) == pytest.approx(right.low[row], abs=0.2)
+        assert alone.max(axis=0) == pytest.approx(right.high[row], abs=0.2)

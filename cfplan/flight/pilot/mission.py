@@ -55,7 +55,7 @@ class Mission:
 
 def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0) -> Mission:
     """Return the mission that flies these setpoints, with a stop from each of them."""
-    stops = encode_stops(encoded.motion, RATE, gains=encoded.gains)
+    stops = encode_stops(encoded.motion, RATE, gains=encoded.gains, space=encoded.space)
     return Mission(encoded.payloads, stops, limits, encoded.lead, hold_time)
 
 

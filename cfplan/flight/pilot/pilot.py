@@ -151,8 +151,11 @@ class Pilot:
         """Return setpoints from hover to hover, with a way to stop from each."""
         rate = self._mission.rate
         motion = hover_to_hover(begin, yaw, end, end_yaw, duration, rate)
-        payloads = encode_motion(motion, ahead(motion.acceleration, rate))
-        return Stream(payloads, rate, stop_from=lambda row: encode_stops(motion, rate, rows=np.array([row]))[0])
+        space = self._limits.space
+        payloads = encode_motion(motion, ahead(motion.acceleration, rate), space=space)
+        return Stream(
+            payloads, rate, stop_from=lambda row: encode_stops(motion, rate, rows=np.array([row]), space=space)[0]
+        )
 
     def _follow(self, stream: Stream) -> None:
         """Fly a stream to its end."""

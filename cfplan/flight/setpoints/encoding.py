@@ -31,6 +31,7 @@ from cfplan.flight.setpoints.rate_trade import (
 from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import INSTANT
+from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.measures import measures_of
@@ -68,6 +69,7 @@ class EncodedFlight:
     rate_lead: float  # s by which its body rate is ahead of that
     thrust_lead: float  # s by which the length of its thrust vector is ahead of that
     gains: AttitudeGains  # of the vehicle that these packets are for
+    space: Space | None  # whose walls level-out leans away from
 
     @property
     def duration(self) -> float:
@@ -84,11 +86,13 @@ def encode_trajectory(
     rate_lead: float = RATE_LEAD,
     thrust_lead: float = THRUST_LEAD,
     gains: AttitudeGains = FIRMWARE_GAINS,
+    space: Space | None = None,
 ) -> EncodedFlight:
     """Encode a flight: full states at `rate`, Hz, then hover at the end for at least `hold`, s.
 
     `lead`, s, samples the trajectory that much ahead of the clock; the default is none, because a setpoint is held for
-    10 ms and poses are about as old, and the two cancel. Raises NotCertifiedError with the setpoint where a value is
+    10 ms and poses are about as old, and the two cancel. `space` has the walls that a vehicle whose setpoints stop is
+    to keep away from. Raises NotCertifiedError with the setpoint where a value is
     not finite or does not fit its 16 bits.
     """
     if not (np.isfinite([trajectory.duration, lead, rate_lead, thrust_lead]).all() and rate > 0 and hold >= 0):
@@ -104,10 +108,10 @@ def encode_trajectory(
         moments = times[rows] + lead
         motion = motion_at(trajectory, moments, rate_lead, thrust_lead)
         coming = trajectory.at(moments + BRAKE_LEAD).acceleration
-        payloads.append(encode_motion(motion, coming, gains, rows.start))
+        payloads.append(encode_motion(motion, coming, gains, rows.start, space=space))
     sent = np.concatenate(payloads)
     planned = motion_at(trajectory, times + lead, 0.0, 0.0)
-    return EncodedFlight(times, sent, decode(sent), planned, lead, rate_lead, thrust_lead, gains)
+    return EncodedFlight(times, sent, decode(sent), planned, lead, rate_lead, thrust_lead, gains, space)
 
 
 def motion_at(
@@ -134,14 +138,19 @@ def motion_at(
 
 
 def encode_motion(
-    motion: FullStateSetpoints, acceleration_ahead: NDArray, gains: AttitudeGains = FIRMWARE_GAINS, first: int = 0
+    motion: FullStateSetpoints,
+    acceleration_ahead: NDArray,
+    gains: AttitudeGains = FIRMWARE_GAINS,
+    first: int = 0,
+    *,
+    space: Space | None = None,
 ) -> NDArray:
     """Return the payloads, (N, 29) uint8, that make the vehicle fly a motion and are harmless when they stop.
 
     `acceleration_ahead`, (N, 3) m/s², is that of the motion BRAKE_LEAD later; `first` is the number of the first
     setpoint, for the error's text. Raises NotCertifiedError where a value is not finite or does not fit.
     """
-    sent = trade_rates(motion, acceleration_ahead, gains)
+    sent = trade_rates(motion, acceleration_ahead, gains, space)
     return encode(replace(sent, quaternion=command_quaternion(sent.quaternion)), first)
 
 
@@ -187,15 +196,21 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajector
             body_rate=trajectory.at(times + encoded.rate_lead).body_rate,
         )
         coming = trajectory.at(times + BRAKE_LEAD).acceleration
-        flown = check_motion(payloads[rows], motion, coming, encoded.gains, rows.start)
+        flown = check_motion(payloads[rows], motion, coming, encoded.gains, rows.start, space=encoded.space)
         # What is sent makes up for drag besides, so the planned acceleration is judged, with the packet's error.
         acceleration = planned.acceleration + flown.acceleration - motion.acceleration
         _check_limits(flown, acceleration, limits, partial(_require, first=rows.start))
-    _require_hover(decode(payloads[-1:]), trajectory, len(payloads))
+    _require_hover(decode(payloads[-1:]), flown, trajectory, len(payloads))
 
 
 def check_motion(
-    payloads: NDArray, motion: FullStateSetpoints, acceleration_ahead: NDArray, gains: AttitudeGains, first: int = 0
+    payloads: NDArray,
+    motion: FullStateSetpoints,
+    acceleration_ahead: NDArray,
+    gains: AttitudeGains,
+    first: int = 0,
+    *,
+    space: Space | None = None,
 ) -> FullStateSetpoints:
     """Check that payloads, (N, 29) uint8, make the vehicle fly this motion; return the motion that they make.
 
@@ -208,7 +223,8 @@ def check_motion(
     decoded, frames = decode(payloads), matrices_of(motion.quaternion)
     _check_values("position", decoded.position - motion.position, require)
     _check_values("velocity", decoded.velocity - motion.velocity, require)
-    sent_rate = np.concatenate([harmless_rates(motion, acceleration_ahead, gains), motion.body_rate[:, 2:]], axis=1)
+    harmless = harmless_rates(motion, acceleration_ahead, gains, space)
+    sent_rate = np.concatenate([harmless, motion.body_rate[:, 2:]], axis=1)
     _check_values("body_rate", decoded.body_rate - sent_rate, require)
 
     traded = motion.body_rate[:, :2] - decoded.body_rate[:, :2]
@@ -285,11 +301,23 @@ def _check_limits(
         )
 
 
+<<<<<<< Updated upstream
 def _require_hover(last: FullStateSetpoints, trajectory: Trajectory | JoinedTrajectory, count: int) -> None:
     """Check that the last setpoint, with which the vehicle is left if nothing more comes, is a hover."""
     moves = [last.velocity, last.acceleration, last.body_rate]
     end = trajectory.at(trajectory.duration).position
     if np.any(moves) or np.any(np.abs(last.position[0] - end) > HALF_QUANTUM + _ROUNDING):
+=======
+def _require_hover(last: FullStateSetpoints, flown: FullStateSetpoints, trajectory: Trajectory, count: int) -> None:
+    """Check that the last setpoint, with which the vehicle is left if nothing more comes, is a hover.
+
+    `flown` is the motion that the setpoints make the vehicle fly, the last of them in its last row.
+    """
+    moves = [flown.acceleration[-1], flown.body_rate[-1]]
+    end = trajectory.path(trajectory.path.end)
+    off = np.abs(last.position[0] - end).max()
+    if np.any(last.velocity) or np.max(np.abs(moves)) > 4 * HALF_QUANTUM or off > HALF_QUANTUM + _ROUNDING:
+>>>>>>> Stashed changes
         raise NotCertifiedError(
             "the last setpoint is not a hover at the end of the path",
             where=f"setpoint {count - 1}",

@@ -10,8 +10,9 @@ to the wanted one. Any share of the rate can therefore be moved into the wanted 
 
 This matters once setpoints stop: the firmware then wants a level attitude, yet keeps the last roll and pitch rates, and
 settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25° for 1.5 s. So the rates that are sent are only
-those with which that tilt brakes what speed will be left: v_left = 0.41 v + 0.089 s · a(t + 0.15 s), horizontally, as
-the vehicle first holds its last place for half a second.
+those with which that tilt does good: it brakes what speed will be left, v_left = 0.41 v + 0.089 s · a(t + 0.15 s),
+horizontally, as the vehicle first holds its last place for half a second; and within 1.5 m of a wall it leans away from
+that wall, the more the nearer, so that an attitude that the vehicle has wrong does not carry it there.
 """
 
 import math
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from cfplan.flight.firmware import MellingerGains
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.machine_code import njit
+from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import heading_of, product, yaw_of
 
@@ -31,6 +33,10 @@ SPEED_LEFT = 0.41  # share of the velocity that is left when the firmware begins
 SPEED_GAINED = 0.089  # s, speed gained until then for each m/s² of acceleration
 BRAKING = 1.0  # 1/s, deceleration by level-out over the speed left
 BRAKE_RATE_MAX = 0.6  # rad/s; 4.9° of tilt, for 1.5 s
+WALL_LEAD = 0.3  # s by which the place that tells how near a wall will be is ahead of the setpoint
+WALL_REACH = 1.5  # m from a wall, within which level-out leans away from it
+WALL_STIFFNESS = 0.35  # 1/s², acceleration away from a wall for each m nearer than that
+WALL_PULL_MAX = 0.45  # m/s²; 2.6° of tilt
 TRADED_RATE_MAX = 4.5  # rad/s; what exceeds it is sent as a rate, as φ grows to 90° at 7 rad/s
 _QUANTUM = 1e-3  # rad/s, of rates in a packet
 _LONGEST_GAP = 0.05  # s between setpoints, after which they are read anew
@@ -56,41 +62,56 @@ GAIN_TOLERANCE = 0.05
 
 
 def trade_rates(
-    motion: FullStateSetpoints, acceleration_ahead: NDArray, gains: AttitudeGains = FIRMWARE_GAINS
+    motion: FullStateSetpoints,
+    acceleration_ahead: NDArray,
+    gains: AttitudeGains = FIRMWARE_GAINS,
+    space: Space | None = None,
 ) -> FullStateSetpoints:
     """Return setpoints with the same torque and thrust as the motion, but harmless roll and pitch rates.
 
     `motion` has the attitudes and rates to fly and, as acceleration, the thrust to give less gravity;
-    `acceleration_ahead`, (N, 3) m/s², is that of the motion BRAKE_LEAD later. The rates come out in whole millirad/s,
-    as packets hold them, and the attitudes make up for just those.
+    `acceleration_ahead`, (N, 3) m/s², is that of the motion BRAKE_LEAD later; without a space there are no walls to
+    lean away from. The rates come out in whole millirad/s, as packets hold them, and the attitudes make up for those.
     """
     rate, quaternion, acceleration = _traded(
+        np.array(motion.position, dtype=float),
         np.array(motion.velocity, dtype=float),
         np.array(motion.acceleration, dtype=float),
         np.array(acceleration_ahead, dtype=float),
         np.array(motion.quaternion, dtype=float),
         np.array(motion.body_rate, dtype=float),
+        _walls(space),
         gains.full_rate,
     )
     return replace(motion, acceleration=acceleration, quaternion=quaternion, body_rate=rate)
 
 
 def harmless_rates(
-    motion: FullStateSetpoints, acceleration_ahead: NDArray, gains: AttitudeGains = FIRMWARE_GAINS
+    motion: FullStateSetpoints,
+    acceleration_ahead: NDArray,
+    gains: AttitudeGains = FIRMWARE_GAINS,
+    space: Space | None = None,
 ) -> NDArray:
-    """Return the roll and pitch rates to send, (N, 2) rad/s: those that brake, and what exceeds TRADED_RATE_MAX.
+    """Return the roll and pitch rates to send, (N, 2) rad/s: those that do good, and what exceeds TRADED_RATE_MAX.
 
     The check of the bytes compares with these, so they are computed apart from trade_rates, from a(t) to tilt to rate.
     """
+    low, high = _walls(space)
+    place = motion.position[:, :2] + WALL_LEAD * motion.velocity[:, :2]
+    off_low, off_high = (
+        np.minimum(WALL_STIFFNESS * np.maximum(WALL_REACH - far, 0.0), WALL_PULL_MAX)
+        for far in (place - low, high - place)
+    )
     speed_left = SPEED_LEFT * motion.velocity[:, :2] + SPEED_GAINED * acceleration_ahead[:, :2]
     yaw = yaw_of(motion.quaternion.T)
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
-    pull = -BRAKING * np.stack([np.sum(speed_left * forward, axis=1), np.sum(speed_left * left, axis=1)], axis=1)
+    wanted = off_low - off_high - BRAKING * speed_left
+    pull = np.stack([np.sum(wanted * forward, axis=1), np.sum(wanted * left, axis=1)], axis=1)
     size = np.maximum(np.linalg.norm(pull, axis=1), 1e-12)
     rate = np.minimum(gains.full_rate * np.sin(np.arctan2(size, GRAVITY)), BRAKE_RATE_MAX)
-    braking = (rate / size)[:, None] * np.stack([-pull[:, 1], pull[:, 0]], axis=1)
-    traded = motion.body_rate[:, :2] - braking
+    good = (rate / size)[:, None] * np.stack([-pull[:, 1], pull[:, 0]], axis=1)
+    traded = motion.body_rate[:, :2] - good
     most = TRADED_RATE_MAX / np.maximum(np.linalg.norm(traded, axis=1), TRADED_RATE_MAX)
     return np.asarray(motion.body_rate[:, :2] - most[:, None] * traded)
 
@@ -152,21 +173,28 @@ def _meant(
     return attitudes, accelerations, rates
 
 
+def _walls(space: Space | None) -> NDArray:
+    """Return (2, 2) m: x and y of the low walls and of the high ones."""
+    return np.array([space.low[:2], space.high[:2]]) if space else np.array([[-np.inf] * 2, [np.inf] * 2])
+
+
 @njit(error_model="numpy")
 def _traded(
+    position: NDArray,
     velocity: NDArray,
     acceleration: NDArray,
     acceleration_ahead: NDArray,
     quaternion: NDArray,
     body_rate: NDArray,
+    walls: NDArray,
     full_rate: float,
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return what trade_rates gives: body rates (N, 3), attitudes (N, 4) and accelerations (N, 3)."""
     rates, attitudes, accelerations = body_rate.copy(), np.empty_like(quaternion), np.empty_like(acceleration)
     for n in range(len(velocity)):
         wx, wy = body_rate[n, 0], body_rate[n, 1]
-        brake_x, brake_y = _braking_rate(velocity[n], acceleration_ahead[n], quaternion[n], full_rate)
-        dx, dy = wx - brake_x, wy - brake_y
+        good_x, good_y = _good_rate(position[n], velocity[n], acceleration_ahead[n], quaternion[n], walls, full_rate)
+        dx, dy = wx - good_x, wy - good_y
         size = math.sqrt(dx * dx + dy * dy)
         share = TRADED_RATE_MAX / size if size > TRADED_RATE_MAX else 1.0
         rates[n, 0] = math.floor((wx - share * dx) / _QUANTUM + 0.5) * _QUANTUM
@@ -192,18 +220,33 @@ def _traded(
 
 
 @njit(error_model="numpy")
-def _braking_rate(
-    velocity: NDArray, acceleration_ahead: NDArray, quaternion: NDArray, full_rate: float
+def _good_rate(
+    position: NDArray,
+    velocity: NDArray,
+    acceleration_ahead: NDArray,
+    quaternion: NDArray,
+    walls: NDArray,
+    full_rate: float,
 ) -> tuple[float, float]:
-    """Return the roll and pitch rates, rad/s, at which level-out settles at a tilt that brakes the speed left."""
+    """Return the roll and pitch rates, rad/s, at which level-out brakes the speed left and leans away from walls."""
     x, y = heading_of(quaternion)
     size = math.sqrt(x * x + y * y)
     cos, sin = (x / size, y / size) if size > 0.0 else (1.0, 0.0)
     pull_x = -BRAKING * (SPEED_LEFT * velocity[0] + SPEED_GAINED * acceleration_ahead[0])
     pull_y = -BRAKING * (SPEED_LEFT * velocity[1] + SPEED_GAINED * acceleration_ahead[1])
+    pull_x += _pull_off(position[0] + WALL_LEAD * velocity[0], walls[0, 0], walls[1, 0])
+    pull_y += _pull_off(position[1] + WALL_LEAD * velocity[1], walls[0, 1], walls[1, 1])
     forward, left = cos * pull_x + sin * pull_y, cos * pull_y - sin * pull_x
     pull = math.sqrt(forward * forward + left * left)
     scale = full_rate / math.sqrt(GRAVITY * GRAVITY + pull * pull)  # sin(atan(pull / g)) / pull
     if scale * pull > BRAKE_RATE_MAX:
         scale = BRAKE_RATE_MAX / pull
     return -scale * left, scale * forward
+
+
+@njit(error_model="numpy")
+def _pull_off(place: float, low: float, high: float) -> float:
+    """Return the acceleration, m/s², away from two opposite walls."""
+    off_low = min(max(WALL_STIFFNESS * (WALL_REACH - (place - low)), 0.0), WALL_PULL_MAX)
+    off_high = min(max(WALL_STIFFNESS * (WALL_REACH - (high - place)), 0.0), WALL_PULL_MAX)
+    return off_low - off_high

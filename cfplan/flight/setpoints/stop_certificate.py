@@ -18,6 +18,7 @@ from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains
 from cfplan.flight.setpoints.stops import chunks, stop_motion
 from cfplan.safety.limits import Limits
 from cfplan.safety.quantities import AT_MOST, PACKET_ROUNDING, QUANTITIES
+from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.flatness import motor_thrusts
 from cfplan.vehicle.measures import measures_of
@@ -58,6 +59,7 @@ def certify_stops(
     rate: float,
     rows: NDArray | None = None,
     gains: AttitudeGains = FIRMWARE_GAINS,
+    space: Space | None = None,
 ) -> StopCertificate:
     """Return the worst values of stops (N, M, 29) uint8 at `rate`, Hz, from each row of a motion, or from `rows`.
 
@@ -70,7 +72,7 @@ def certify_stops(
         wanted, coming = stop_motion(motion, begin[some], rate, duration)
         payloads = stops[some].reshape(-1, PAYLOAD_SIZE)
         try:
-            flown = check_motion(payloads, wanted, coming, gains, some.start * stops.shape[1])
+            flown = check_motion(payloads, wanted, coming, gains, some.start * stops.shape[1], space=space)
         except NotCertifiedError as error:
             number = int(error.where.split()[-1])
             where = f"setpoint {number % stops.shape[1]} of the stop from {begin[number // stops.shape[1]]}"

@@ -22,6 +22,7 @@ from cfplan.flight.setpoints.encoding import (
 )
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains, ahead
+from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import about_z, quaternions_of, yaw_of
 
@@ -36,17 +37,18 @@ def encode_stops(
     duration: float = DURATION,
     rows: NDArray | None = None,
     gains: AttitudeGains = FIRMWARE_GAINS,
+    space: Space | None = None,
 ) -> NDArray:
     """Return (N, M, 29) uint8: stop i begins with the place of the motion's row i and ends in hover; M at `rate`, Hz.
 
     `motion` is what the setpoints of the flight make the vehicle fly, N rows at `rate`. Where `rows` are given, stops
-    from these alone.
+    from these alone. `gains` and `space` as for the setpoints of the flight.
     """
     begin = np.arange(len(motion.position)) if rows is None else rows
     out = np.empty((len(begin), round(duration * rate) + 1, PAYLOAD_SIZE), dtype=np.uint8)
     for some in chunks(len(begin)):
         stops, coming = stop_motion(motion, begin[some], rate, duration)
-        out[some] = encode_motion(stops, coming, gains).reshape(-1, *out.shape[1:])
+        out[some] = encode_motion(stops, coming, gains, space=space).reshape(-1, *out.shape[1:])
     return out
 
 
