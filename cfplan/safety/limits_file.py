@@ -113,16 +113,10 @@ class _Pose(_Section):
 
 
 class _LinkLoss(_Section):
-<<<<<<< Updated upstream
     outside: Literal["refuse", "warn"]
     motor_lags: Annotated[tuple[_MotorLag, ...], Field(min_length=1, max_length=5)]
     attitude_error_deg: Annotated[float, Field(ge=0.0, le=10.0)]
-=======
-    outside: Literal["refuse", "warn"] = "refuse"
-    motor_lags: Annotated[tuple[_MotorLag, ...], Field(min_length=1, max_length=5)] = _ALONE.motor_lags
-    attitude_error_deg: Annotated[float, Field(ge=0.0, le=10.0)] = math.degrees(_ALONE.attitude_error)
-    vertical_acceleration_error: Annotated[float, Field(ge=0.0, le=2.0)] = _ALONE.vertical_acceleration_error
->>>>>>> Stashed changes
+    vertical_acceleration_error: Annotated[float, Field(ge=0.0, le=2.0)]
 
 
 class _Firmware(_Section):

@@ -73,13 +73,7 @@ NO_POSITIVE_NUMBER = {
     "vehicle", "low", "high", "latency", "controller", "estimator", "watchdog", "outside", "attitude_error_deg",
     "vertical_acceleration_error",
 }  # fmt: skip
-OPTIONAL = {  # which older files lack
-    "stop_tilt_deg", "link_loss", "outside", "motor_lags", "attitude_error_deg", "vertical_acceleration_error",
-}  # fmt: skip
-<<<<<<< Updated upstream
 NEEDED = ("vehicle", "space", "space.low", "space.high")  # which nobody but the lab knows
-=======
->>>>>>> Stashed changes
 
 
 def without(tmp_path, place):

@@ -301,23 +301,17 @@ def _check_limits(
         )
 
 
-<<<<<<< Updated upstream
-def _require_hover(last: FullStateSetpoints, trajectory: Trajectory | JoinedTrajectory, count: int) -> None:
-    """Check that the last setpoint, with which the vehicle is left if nothing more comes, is a hover."""
-    moves = [last.velocity, last.acceleration, last.body_rate]
-    end = trajectory.at(trajectory.duration).position
-    if np.any(moves) or np.any(np.abs(last.position[0] - end) > HALF_QUANTUM + _ROUNDING):
-=======
-def _require_hover(last: FullStateSetpoints, flown: FullStateSetpoints, trajectory: Trajectory, count: int) -> None:
+def _require_hover(
+    last: FullStateSetpoints, flown: FullStateSetpoints, trajectory: Trajectory | JoinedTrajectory, count: int
+) -> None:
     """Check that the last setpoint, with which the vehicle is left if nothing more comes, is a hover.
 
     `flown` is the motion that the setpoints make the vehicle fly, the last of them in its last row.
     """
     moves = [flown.acceleration[-1], flown.body_rate[-1]]
-    end = trajectory.path(trajectory.path.end)
+    end = trajectory.at(trajectory.duration).position
     off = np.abs(last.position[0] - end).max()
     if np.any(last.velocity) or np.max(np.abs(moves)) > 4 * HALF_QUANTUM or off > HALF_QUANTUM + _ROUNDING:
->>>>>>> Stashed changes
         raise NotCertifiedError(
             "the last setpoint is not a hover at the end of the path",
             where=f"setpoint {count - 1}",
