@@ -17,7 +17,7 @@ from cfplan.errors import CfplanError
 
 NEEDED = ("numpy", "scipy", "numba", "casadi", "cflib", "pydantic", "mcap", "pyarrow", "rerun-sdk")
 OPTIONAL = {
-    "torch": "the learned planner: pip install 'cfplan[learn]'",
+    "torch": "training, planning needs none: pip install 'cfplan[learn]'",
     "motioncapture": "motion capture other than Vicon: pip install 'cfplan[mocap]'",
     "rosbags": "ROS bags in cfplan replay: pip install 'cfplan[ros]'",
     "pymavlink": "MAVLink logs in cfplan replay: pip install 'cfplan[mavlink]'",

@@ -69,7 +69,7 @@ def _sides(text: str) -> tuple[float, float, float]:
         raise InputError(
             f"a room of {x:g} m by {y:g} m, {z:g} m high",
             where="--room",
-            hint=f"write metres: {_LEAST_SIDE:g} to {_MOST_SIDE:g} m a side, {_LEAST_HEIGHT:g} to {_MOST_HEIGHT:g} m high",
+            hint=f"write metres: {_LEAST_SIDE:g} to {_MOST_SIDE:g} a side, {_LEAST_HEIGHT:g} to {_MOST_HEIGHT:g} high",
         )
     return x, y, z
 

@@ -1,5 +1,6 @@
 """`cfplan sim`: the dry run alone."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,8 @@ def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning:
     planned = plan_flight(path_or_plan, limits, FlightOptions(**planning), steps)
     encoded = encode_flight(planned, steps)
     rehearsed = rehearse(planned, encoded, steps)
-    find_link_loss(encoded, limits, steps, planned.link_loss)
+    lost = find_link_loss(encoded, limits, steps, planned.link_loss)
     if as_json:
-        print_json(planned.to_dict() | {"dry_run": rehearsed.summary()})
+        print_json(planned.to_dict() | {"dry_run": rehearsed.summary(), "link_loss": asdict(lost)})
     else:
-        print_table("Dry run", ["", "value"], rehearsed.rows())
+        print_table("Dry run", ["", "value"], [*rehearsed.rows(), ("link loss", str(lost))])

@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 @options.as_json
 def train(dataset: Path, folder: Path, device: str, as_json: bool, **what: Any) -> None:
     """Train a model on DATASET. Given again after a stop, it goes on where the last whole epoch ended."""
+    if not dataset.is_dir():  # before torch is loaded, which takes seconds
+        raise InputError("no such dataset", where=str(dataset), hint="make one: `cfplan dataset make` says how")
     try:
         from cfplan.learning.checkpoints import Epoch
         from cfplan.learning.networks import Architecture

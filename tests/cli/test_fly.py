@@ -54,9 +54,21 @@ def test_the_record_holds_the_plan_and_the_flight(flight):
     folder = Path(flight["record"])
     files = {"flight.mcap", "plan.parquet", "summary.json", "telemetry.tlog"}
     assert {file.name for file in folder.iterdir()} == files
-    assert json.loads((folder / "summary.json").read_text())["travel_time_planned"] == pytest.approx(
-        flight["plan"]["duration"]
-    )
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["travel_time_planned"] == pytest.approx(flight["plan"]["duration"])
+    assert summary["travel_time_flown"] != summary["travel_time_planned"]
+
+
+def test_the_flight_has_the_same_figures_wherever_they_stand(flight):
+    """In what `fly` prints, in summary.json and in the report; each figure once."""
+    folder = Path(flight["record"])
+    summary = json.loads((folder / "summary.json").read_text())
+    (reported,) = json.loads(run("report", folder, "--json").stdout)["flights"]
+    figures = {key: value for key, value in summary.items() if isinstance(value, float)}
+    assert {"travel_time_flown", "settling", "max_deviation"} <= set(figures)
+    for key, value in figures.items():
+        assert flight[key] == reported[key] == value, key
+    assert not {"flown", "settled_after", "deviation_max"} & set(summary["outcome"])
 
 
 def test_the_log_of_the_ground_station_is_whole(flight):
@@ -81,7 +93,9 @@ def test_the_recorded_plan_can_be_checked_and_rehearsed_again(flight):
     assert run("check", plan).returncode == 0
     rehearsed = run("sim", plan, "--json")
     assert rehearsed.returncode == 0
-    assert json.loads(rehearsed.stdout)["dry_run"]["passed"]
+    document = json.loads(rehearsed.stdout)
+    assert document["dry_run"]["passed"]
+    assert document["link_loss"]["beyond"] < 0.0
 
 
 def test_a_truncated_record_says_so_and_replays_what_is_there(flight, tmp_path):

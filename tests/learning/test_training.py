@@ -160,7 +160,7 @@ def test_the_loss_knows_the_error_of_time():
 @pytest.mark.integration
 def test_two_processes_train_one_model(tiny, tmp_path):
     command = [
-        sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "cfplan.cli",
+        sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "cfplan",
         "train", str(tiny), "-o", str(tmp_path / "both"), "--hidden", "6", "--layers", "1", "--window", "16",
         "--epochs", "2", "--batch", "8", "--json",
     ]  # fmt: skip
