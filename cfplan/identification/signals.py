@@ -1,13 +1,13 @@
 """The part of a record that identification uses: the streamed flight in the air, as arrays on the vehicle's clock."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
 from cfplan.flight.telemetry import Phase
-from cfplan.recording.record import Record
+from cfplan.recording.record import Estimates, Poses, Record, Setpoints, StatusReports
 from cfplan.vehicle.airframe import Airframe
 
 _FULL_COMMAND = 65535  # of one motor, 16 bits
@@ -17,6 +17,8 @@ _ENDS = (Phase.HAND_BACK, Phase.LAND, Phase.DISARM, Phase.CLOSED)
 _LARGEST_GAPS = {"poses": 0.1, "estimates": 0.1, "status": 0.2}  # s, median interval; sparser streams say too little
 _UNIT = 0.1  # by which the length of a quaternion may differ from 1
 _ON_TIME = 5  # percentile of the poses' arrivals: those that nothing delayed
+
+_Stream = Setpoints | Poses | Estimates | StatusReports
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,16 +101,15 @@ def _airborne(record: Record, where: str) -> tuple[float, float]:
     return begin, end
 
 
-def _rows(stream: object, begin: float, end: float, finite: tuple[str, ...]) -> dict[str, NDArray]:
+def _rows(stream: _Stream, begin: float, end: float, finite: tuple[str, ...]) -> dict[str, NDArray]:
     """Return a stream's columns between two times, in order of time, without rows that are not finite."""
-    time = np.asarray(stream.time)  # type: ignore[attr-defined]
+    columns: dict[str, NDArray] = {field.name: np.asarray(getattr(stream, field.name)) for field in fields(stream)}
+    time = columns["time"]
     keep = (time >= begin - 0.5) & (time <= end + 0.5)
     for name in finite:
-        values = np.asarray(getattr(stream, name))
-        keep &= np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
-    if hasattr(stream, "quaternion"):
-        keep &= np.abs(np.linalg.norm(stream.quaternion, axis=1) - 1.0) < _UNIT
+        keep &= np.isfinite(columns[name]).all(axis=tuple(range(1, columns[name].ndim)))
+    if "quaternion" in columns:
+        keep &= np.abs(np.linalg.norm(columns["quaternion"], axis=1) - 1.0) < _UNIT
     order = np.flatnonzero(keep)[np.argsort(time[keep], kind="stable")]
     order = order[np.diff(time[order], prepend=-np.inf) > 0.0]
-    names = stream.__slots__  # type: ignore[attr-defined]
-    return {name: np.asarray(getattr(stream, name))[order] for name in names}
+    return {name: values[order] for name, values in columns.items()}

@@ -151,7 +151,7 @@ def _use_mavlink(folder: Path) -> None:
     """Let the bridge hear and answer, as its thread does, while the pilot reports."""
     station = GroundStation(parse_place("udp:127.0.0.1:14550"), folder / "bridge.tlog")
     station._socket.close()
-    link = station._socket = _Datagrams()  # type: ignore[assignment]
+    link = station._socket = _Datagrams()
     try:
         for data in _packets(folder):
             link.outside.send(data)
@@ -264,7 +264,7 @@ def _use_datastream(folder: Path) -> None:
     messages = _heard(content)
     surveyor, gate, predictor = Surveyor(), PoseGate(0.1), PosePredictor()
     source = pose_source("vicon://lab/cf1", load_limits(SAFETY).pose)
-    source._feed = SimpleNamespace(messages=lambda: messages)  # type: ignore[assignment]
+    source._feed = SimpleNamespace(messages=lambda: messages)
     for message in messages:
         if isinstance(message, child.Scene):
             surveyor.scene = message

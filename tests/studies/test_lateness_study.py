@@ -2,14 +2,14 @@
 
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from cfplan.errors import InputError
 from cfplan.studies import lateness
-from cfplan.studies.lateness import FIRST, ORDINARY, WakeUps, lateness_study, lateness_table
+from cfplan.studies.lateness import FIRST, ORDINARY, WakeUps, lateness_table
 from cfplan.studies.real_time import RealTimeFlight
 
 REPOSITORY = Path(__file__).parents[2]
@@ -24,30 +24,8 @@ sys.exit(subprocess.run([sys.executable, "-c",
 """
 
 
-def measured(result):
-    names = [field.name for field in fields(WakeUps)]
-    return [WakeUps(**{name: row[name] for name in names if name in row}) for row in result.table("lateness").rows]
-
-
 def refused(reason):
     return lambda: RealTimeFlight(None, reason)
-
-
-@pytest.fixture
-def study(monkeypatch):
-    """The study with flights that are not flown; nothing is given up, as other tests may need it."""
-    given_up, flights = [], []
-    monkeypatch.setattr(lateness, "give_up_priority", lambda: given_up.append(True))
-    monkeypatch.setattr(lateness, "fly_in_real_time", lambda *_, **__: flights.pop(0)())
-
-    def run(*ends, permitted=True):
-        monkeypatch.setattr(lateness, "may_use_fifo_scheduling", lambda: permitted)
-        flights.extend(ends)
-        result = lateness_study(REPOSITORY / "flights" / "line.yaml", REPOSITORY / "safety.yaml", 0.1)
-        assert given_up == [True]
-        return result
-
-    return run
 
 
 def test_percentiles_are_those_of_the_setpoints():
@@ -59,14 +37,14 @@ def test_percentiles_are_those_of_the_setpoints():
     assert row.seconds == 10.0
 
 
-def test_what_did_not_fly_is_told(study):
+def test_what_did_not_fly_is_told(study, measured):
     result = study(refused("the vehicle is gone"), refused("too late"))
     assert [row.reason for row in measured(result)] == ["", "the vehicle is gone", "", "too late"]
     titles, cells = result.table("lateness").cells()
     assert all(len(row) == len(titles) for row in cells)
 
 
-def test_where_it_is_not_permitted_to_go_first_the_rest_is_measured(study):
+def test_where_it_is_not_permitted_to_go_first_the_rest_is_measured(study, measured):
     result = study(refused("too late"), permitted=False)
     assert measured(result)[0].reason == "not permitted here"
     assert [row.priority for row in measured(result)[1:]] == [ORDINARY, ORDINARY]

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import time
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -14,8 +13,7 @@ from cfplan.errors import ExitCode
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.outcome import Deviation, FlightOutcome, Rung
 from cfplan.flight.telemetry import SetpointSent
-from cfplan.studies import lateness
-from cfplan.studies.lateness import FIRST, ORDINARY, WakeUps, lateness_study
+from cfplan.studies.lateness import FIRST, ORDINARY
 from cfplan.studies.real_time import RealTimeFlight
 from cfplan.studies.sleeper import Sleeper
 
@@ -23,11 +21,6 @@ pytestmark = pytest.mark.slow
 
 REPOSITORY = Path(__file__).parents[2]
 STILL, LEVEL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-
-
-def measured(result):
-    names = [field.name for field in fields(WakeUps)]
-    return [WakeUps(**{name: row[name] for name in names if name in row}) for row in result.table("lateness").rows]
 
 
 def streamed(late):
@@ -43,24 +36,7 @@ def streamed(late):
     return RealTimeFlight(outcome, "landed", sent=sent)
 
 
-@pytest.fixture
-def study(monkeypatch):
-    """The study with flights that are not flown; nothing is given up, as other tests may need it."""
-    given_up, flights = [], []
-    monkeypatch.setattr(lateness, "give_up_priority", lambda: given_up.append(True))
-    monkeypatch.setattr(lateness, "fly_in_real_time", lambda *_, **__: flights.pop(0)())
-
-    def run(*ends, permitted=True):
-        monkeypatch.setattr(lateness, "may_use_fifo_scheduling", lambda: permitted)
-        flights.extend(ends)
-        result = lateness_study(REPOSITORY / "flights" / "line.yaml", REPOSITORY / "safety.yaml", 0.1)
-        assert given_up == [True]
-        return result
-
-    return run
-
-
-def test_a_sleeper_stands_before_each_stream_and_beside_it_over_the_same_seconds(study):
+def test_a_sleeper_stands_before_each_stream_and_beside_it_over_the_same_seconds(study, measured):
     result = study(lambda: streamed(1e-3), lambda: streamed(2e-3))
     assert [(row.what, row.priority) for row in measured(result)] == [
         (what, priority)

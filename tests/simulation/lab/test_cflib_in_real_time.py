@@ -13,43 +13,11 @@ from cflib.crtp.crtpstack import CRTPPort
 from cflib.positioning.motion_commander import MotionCommander
 from waiting import until
 
-from cfplan.simulation.lab.lab import start_lab
 from cfplan.simulation.lab.room import RoomPoseSource
-from cfplan.simulation.lab.sim_driver import register_sim_driver
-from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.vehicle.airframes import AIRFRAMES
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
 AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
-
-
-@pytest.fixture(scope="module")
-def lab():
-    """One lab for all that leave it whole."""
-    register_sim_driver()
-    with start_lab(AIRFRAME, vehicle=VehicleSettings(position=(0.5, -0.3, 0.0))) as running:
-        yield running
-
-
-@pytest.fixture
-def doomed():
-    """A lab for those that do not."""
-    register_sim_driver()
-    with start_lab(AIRFRAME, number=5) as running:
-        yield running
-
-
-@pytest.fixture
-def link(lab):
-    with SyncCrazyflie(lab.uri, cf=Crazyflie()) as sync:
-        sync.wait_for_params()
-        yield sync.cf
-
-
-def read_back(cf, name, value):
-    """Set a parameter and wait for the vehicle to say that it has it."""
-    cf.param.set_value(name, value)
-    assert until(lambda: abs(float(cf.param.get_value(name)) - value) <= 1e-6 * max(1.0, abs(value)))
 
 
 class PoseFeed(threading.Thread):
@@ -70,7 +38,7 @@ class PoseFeed(threading.Thread):
         self.source.close()
 
 
-def prepare(cf, feed):
+def prepare(cf, feed, set_and_read_back):
     cf.commander.send_notify_setpoint_stop()
     for name, value in (
         ("stabilizer.controller", 2),
@@ -81,7 +49,7 @@ def prepare(cf, feed):
         ("kalman.dragB_x", AIRFRAME.drag[0] / AIRFRAME.mass),
         ("kalman.dragB_y", AIRFRAME.drag[0] / AIRFRAME.mass),
     ):
-        read_back(cf, name, value)
+        set_and_read_back(name, value)
     feed.start()
     for axis, value in zip("XYZ", feed.start_position, strict=True):
         cf.param.set_value(f"kalman.initial{axis}", value)
@@ -89,11 +57,11 @@ def prepare(cf, feed):
     time.sleep(0.7)
 
 
-def test_a_whole_flight_take_off_go_to_stream_hand_back_land(lab, link):
+def test_a_whole_flight_take_off_go_to_stream_hand_back_land(lab, link, set_and_read_back):
     codes = []
     link.add_port_callback(CRTPPort.SETPOINT_HL, lambda packet: codes.append(packet.data[3]))
     feed = PoseFeed(link)
-    prepare(link, feed)
+    prepare(link, feed, set_and_read_back)
     commander, planner = link.commander, link.high_level_commander
 
     started = time.monotonic()
@@ -129,11 +97,11 @@ def test_a_whole_flight_take_off_go_to_stream_hand_back_land(lab, link):
     assert np.allclose(np.diff(truth.time[begun_at:]), 0.01, atol=1e-6)
 
 
-def test_motion_commander_flies_with_the_default_controller(lab, link):
+def test_motion_commander_flies_with_the_default_controller(lab, link, set_and_read_back):
     """The firmware's PID and its velocity setpoints, as cflib's own examples use them."""
-    read_back(link, "stabilizer.controller", 1)
+    set_and_read_back("stabilizer.controller", 1)
     feed = PoseFeed(link)
-    read_back(link, "stabilizer.estimator", 2)
+    set_and_read_back("stabilizer.estimator", 2)
     feed.start()
     for axis, value in zip("XYZ", feed.start_position, strict=True):
         link.param.set_value(f"kalman.initial{axis}", value)

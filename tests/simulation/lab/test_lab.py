@@ -32,35 +32,6 @@ AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
 EMPTY = b"\xf3"  # an echo without data
 
 
-@pytest.fixture(scope="module")
-def lab():
-    """One lab for all that leave it whole."""
-    register_sim_driver()
-    with start_lab(AIRFRAME, vehicle=VehicleSettings(position=(0.5, -0.3, 0.0))) as running:
-        yield running
-
-
-@pytest.fixture
-def doomed():
-    """A lab for those that do not."""
-    register_sim_driver()
-    with start_lab(AIRFRAME, number=5) as running:
-        yield running
-
-
-@pytest.fixture
-def link(lab):
-    with SyncCrazyflie(lab.uri, cf=Crazyflie()) as sync:
-        sync.wait_for_params()
-        yield sync.cf
-
-
-def read_back(cf, name, value):
-    """Set a parameter and wait for the vehicle to say that it has it."""
-    cf.param.set_value(name, value)
-    assert until(lambda: abs(float(cf.param.get_value(name)) - value) <= 1e-6 * max(1.0, abs(value)))
-
-
 def test_cflib_connects_and_sees_tables_parameters_and_supervisor(link):
     assert len([name for group in link.log.toc.toc.values() for name in group]) > 550
     assert len([name for group in link.param.toc.toc.values() for name in group]) > 300
@@ -72,8 +43,8 @@ def test_cflib_connects_and_sees_tables_parameters_and_supervisor(link):
     assert not link.supervisor.is_flying
 
 
-def test_parameters_are_set_and_read_back_and_have_defaults(link):
-    read_back(link, "ctrlMel.mass", 0.031)
+def test_parameters_are_set_and_read_back_and_have_defaults(link, set_and_read_back):
+    set_and_read_back("ctrlMel.mass", 0.031)
     answers = []
     link.param.get_default_value("ctrlMel.mass", lambda name, value: answers.append((name, value)))
     assert until(lambda: answers)
