@@ -16,7 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
-from cfplan.geometry.min_snap import MIN_DENSE_SPACING, MIN_SPACING, check_points, pieces_through
+from cfplan.geometry.min_snap import (
+    MIN_DENSE_SPACING,
+    MIN_SPACING,
+    centripetal_times,
+    check_points,
+    check_times,
+    pieces_through,
+)
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import hermite, padded, shifted
 from cfplan.geometry.rest import with_rest_end
@@ -31,7 +38,7 @@ def continued_min_snap(start: ArrayLike, waypoints: ArrayLike, times: ArrayLike 
     """Return the path of least snap that begins with γ to γ'''' as `start`, (5, 3), has them, and ends at rest.
 
     It goes through the waypoints, (K, 3) m, K at least 1; `times`, (K,) s of nominal time, are those of the segments
-    that end in each. Where they are not given, each segment takes its straight length at 1 m/s. With the times that are
+    that end in each. Where they are not given, they are centripetal. With the times that are
     left of another path of least snap through the same waypoints, from a state of that path, it is the rest of it.
 
     Raises:
@@ -39,7 +46,7 @@ def continued_min_snap(start: ArrayLike, waypoints: ArrayLike, times: ArrayLike 
             positive.
     """
     begin, points = _checked(start, waypoints, MIN_SPACING)
-    spans = _checked_times(points, times)
+    spans = centripetal_times(points) if times is None else check_times(points, times)
     return _fitted(begin, spans, pieces_through(points, spans, start=begin[1:4], rest_end=True))
 
 
@@ -55,7 +62,7 @@ def continued_through(start: ArrayLike, points: ArrayLike) -> Path:
             where="points",
             hint="give more points, or lay a path of least snap through these",
         )
-    times = _checked_times(points, None)
+    times = np.linalg.norm(np.diff(points, axis=0), axis=1)
     spans, table = with_rest_end(times, pieces_through(points, times, start=begin[1:4], rest_end=False))
     return _fitted(begin, spans, table)
 
@@ -86,20 +93,6 @@ def _checked(start: ArrayLike, waypoints: ArrayLike, spacing: float) -> tuple[ND
         )
     check_points(points[:2], spacing, lambda index: f"waypoint {index}" if index else "start")
     return begin, points
-
-
-def _checked_times(points: NDArray, times: ArrayLike | None) -> NDArray:
-    """Return the nominal time of each segment, (K,) s."""
-    if times is None:
-        return np.asarray(np.linalg.norm(np.diff(points, axis=0), axis=1))
-    spans = np.asarray(times, dtype=float)
-    if spans.shape != (len(points) - 1,) or not (np.isfinite(spans).all() and (spans > 0.0).all()):
-        raise InputError(
-            f"{len(points) - 1} segments need as many positive times, not {spans.tolist()}",
-            where="times",
-            hint="leave them out to have them chosen",
-        )
-    return spans
 
 
 def _fitted(start: NDArray, spans: NDArray, table: NDArray) -> Path:

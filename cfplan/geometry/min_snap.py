@@ -34,16 +34,28 @@ _HERMITE = hermite(4)
 _ENERGY = _HERMITE.T @ _snap_energy() @ _HERMITE
 
 
-def min_snap(waypoints: ArrayLike, *, nominal_speed: float = 1.0) -> Path:
+def min_snap(waypoints: ArrayLike, *, nominal_speed: float = 1.0, times: ArrayLike | None = None) -> Path:
     """Return the path of least snap through waypoints, (K, 3) m, at rest at both ends.
 
-    Each segment takes its straight length over the nominal speed, m/s, so at 1 m/s s is roughly the distance flown, m.
+    Each segment takes its straight length over the nominal speed, m/s, so at 1 m/s s is roughly the distance flown, m;
+    or as long as `times`, (K-1,) s, say.
 
     Raises:
-        InputError: fewer than two waypoints, two in a row closer than MIN_SPACING, numbers that are not finite.
+        InputError: fewer than two waypoints, two in a row closer than MIN_SPACING, numbers that are not finite, times
+            that are not positive.
     """
-    points, times = _checked(waypoints, nominal_speed, MIN_SPACING)
+    points, spans = _checked(waypoints, nominal_speed, MIN_SPACING)
+    times = spans if times is None else check_times(points, times)
     return rest_path(times, pieces_through(points, times, start=REST, rest_end=True))
+
+
+def centripetal_times(points: ArrayLike) -> NDArray:
+    """Return nominal times, (K-1,) s, for segments between points, (K, 3) m: the root of each straight length.
+
+    Where lengths differ much, the curve swings out far less than with times like the lengths, and is flown sooner
+    (centripetal parameterisation, after Lee, "Choosing nodes in parametric curve interpolation", 1989).
+    """
+    return np.asarray(np.sqrt(np.linalg.norm(np.diff(np.asarray(points, dtype=float), axis=0), axis=1)))
 
 
 def smooth_through(points: ArrayLike) -> Path:
@@ -93,6 +105,18 @@ def check_points(points: NDArray, spacing: float = MIN_SPACING, where: Callable[
             where=where(near + 1),
             hint="remove one of them",
         )
+
+
+def check_times(points: NDArray, times: ArrayLike) -> NDArray:
+    """Return the nominal times of the segments between points, (K-1,) s. Raises InputError where they are none."""
+    spans = np.asarray(times, dtype=float)
+    if spans.shape != (len(points) - 1,) or not (np.isfinite(spans).all() and (spans > 0.0).all()):
+        raise InputError(
+            f"{len(points) - 1} segments need as many positive times, not {spans.tolist()}",
+            where="times",
+            hint="leave them out to have them chosen",
+        )
+    return spans
 
 
 def _checked(waypoints: ArrayLike, nominal_speed: float, spacing: float) -> tuple[NDArray, NDArray]:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import CfplanError, InfeasibleError
 from cfplan.geometry.continued import continued_min_snap
+from cfplan.geometry.min_snap import centripetal_times
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.features import REFERENCE, Bounds, bounds, node_features
@@ -32,8 +33,10 @@ from cfplan.vehicle.joint import Joint, joint_at
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
 
-FIRST_TIMES = (0.7, 1.0, 1.5, 2.5)  # times the first segment's own, that are tried
-RATE = 1.25  # units of s a second, where they are those of time: about the speed in m/s
+# Nominal times of the first segment that are tried, in its own, where s goes on as it was and where it is time. Shorter
+# ones look faster than they are: the state at the start allows too little.
+FIRST_TIMES, FIRST_TIMES_TIMED = (0.7, 1.0, 1.4, 2.0, 3.0), (1.0, 1.4, 2.0)
+RATE = 1.0  # units of s a second, where it is time: about the speed in m/s
 TRIES = 4  # paths that are planned
 ROOM = 0.005  # share of each limit that plans leave to whoever continues them
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
@@ -123,11 +126,11 @@ class _Way(NamedTuple):
 
 def _ways(joint: Joint, trajectory: Trajectory, points: NDArray, times: ArrayLike | None) -> Iterator[_Way]:
     """Yield the paths that are worth a try."""
-    straight = np.linalg.norm(np.diff(np.concatenate([joint.derivatives[:1], points]), axis=0), axis=1)
+    straight = centripetal_times(np.concatenate([joint.derivatives[:1], points]))
     if times is not None:
         yield _way(joint, points, np.asarray(times, dtype=float))
-    for begin in (joint, joint.timed(trajectory, RATE)):
-        for factor in FIRST_TIMES:
+    for begin, factors in ((joint, FIRST_TIMES), (joint.timed(trajectory, RATE), FIRST_TIMES_TIMED)):
+        for factor in factors:
             yield _way(begin, points, np.concatenate([[factor * straight[0]], straight[1:]]))
 
 

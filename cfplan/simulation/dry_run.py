@@ -20,9 +20,11 @@ from cfplan.machine_code import njit
 from cfplan.safety.limits import FlightLimits
 from cfplan.safety.quantities import ON_LADDER
 from cfplan.simulation.dynamics.body import TIME_STEP, hovering
+from cfplan.simulation.dynamics.branching import MEMORY, THRUSTS
 from cfplan.simulation.dynamics.closed_loop import PERFECT, ClosedLoop, EstimateErrors, fly_setpoints
 from cfplan.simulation.dynamics.mellinger import FULL_COMMAND
 from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.trajectory import Trajectory
 
 SETTLING = 1.0  # s simulated after the last payload, which the vehicle keeps
@@ -86,30 +88,34 @@ class DryRun:
 
 def dry_run(
     encoded: EncodedFlight,
-    trajectory: Trajectory,
+    trajectory: Trajectory | JoinedTrajectory,
     airframe: Airframe,
     limits: FlightLimits,
     *,
     believed: Airframe | None = None,
     delay: float = 0.0,
     estimate: EstimateErrors = PERFECT,
+    snapshot: NDArray | None = None,
 ) -> DryRun:
     """Fly the payloads on `airframe`; compare with `trajectory`.
 
     `believed` is the airframe for which the controller is tuned, the same where not given; `delay`, s, makes every
-    setpoint late. The real-time factor counts everything but the compilation at the first call ever.
+    setpoint late; `snapshot`, (31,), is that of another flight from which this one goes on, instead of a hover. The
+    real-time factor counts everything but the compilation at the first call ever.
     """
     start = trajectory.at(0.0)
+    state = hovering(airframe, start.position, float(start.yaw)) if snapshot is None else snapshot[:MEMORY]
     fly = partial(
         fly_setpoints,
         decode(encoded.payloads),
         encoded.times,
         airframe,
-        hovering(airframe, start.position, float(start.yaw)),
+        state,
         gains=gains_for(believed or airframe),
         floor=_NO_FLOOR,
         delay=delay,
         estimate=estimate,
+        memory=None if snapshot is None else snapshot[MEMORY:THRUSTS],
     )
     fly(duration=0.0)  # compiles if need be, as does the next line
     _distances_to_path(np.zeros((1, 3)), np.zeros((1, 3)))
@@ -135,7 +141,7 @@ def stress(
     }
 
 
-def _judge(loop: ClosedLoop, trajectory: Trajectory, limits: FlightLimits) -> DryRun:
+def _judge(loop: ClosedLoop, trajectory: Trajectory | JoinedTrajectory, limits: FlightLimits) -> DryRun:
     times, positions = loop.time[::_STRIDE], loop.position[::_STRIDE]
     wanted = trajectory.at(times).position
     error = np.linalg.norm(positions - wanted, axis=1)

@@ -69,13 +69,17 @@ class GlitchMoments:
 
 
 def glitch_at_every_setpoint(
-    payloads: NDArray, limits: Limits, rate: float = RATE, *, gap: float = GAP
+    payloads: NDArray, limits: Limits, rate: float = RATE, *, gap: float = GAP, start: NDArray | None = None
 ) -> GlitchMoments:
-    """Let a gap, s, begin at each setpoint of a flight that begins in hover, (N, 29) uint8 at `rate`, Hz."""
+    """Let a gap, s, begin at each setpoint of a flight, (N, 29) uint8 at `rate`, Hz.
+
+    The flight begins in hover, or from the snapshot `start`, (31,), of another at the same setpoint.
+    """
     state, airframe = decode(payloads), limits.airframe
+    begin = hovering_snapshot(airframe, state) if start is None else start
     deviation, tilt = np.empty((3, len(payloads))), np.empty((3, len(payloads)))
     _fly(
-        deviation, tilt, setpoint_rows(state), arrival_steps(len(payloads), rate), hovering_snapshot(airframe, state),
+        deviation, tilt, setpoint_rows(state), arrival_steps(len(payloads), rate), begin,
         gains_for(airframe).pack(), pack_body(airframe, floor=-np.inf),
         pack_body(airframe, floor=-np.inf, step=_STEP), round(gap / _STEP), round((gap + AFTERWARDS) / _STEP), rate,
         GRAVITY * math.tan(limits.link_loss.attitude_error),

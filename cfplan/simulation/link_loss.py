@@ -91,6 +91,7 @@ class LinkLossMoments:
     beyond: NDArray  # (N,) m beyond the walls or the ceiling; negative inside
     wall: NDArray  # (N,) int, the wall that it comes nearest to or goes farthest beyond, as in WALLS
     distance: NDArray  # (N,) m, horizontally from the setpoint to the far corner of the box
+    snapshots: NDArray  # (L, N, 31) as in `branching`, at each setpoint, for each motor lag; (L, 0, 31) within stops
 
     @property
     def worst(self) -> LinkLoss:
@@ -110,22 +111,37 @@ def simulate_link_loss(payloads: NDArray, limits: Limits, rate: float = RATE) ->
     return link_loss_at_every_setpoint(payloads, limits, rate).worst
 
 
-def link_loss_at_every_setpoint(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLossMoments:
-    """Lose the link after each setpoint of a flight that begins in hover, (N, 29) uint8 at `rate`, Hz."""
-    state, time, wrong = decode(payloads), np.arange(len(payloads)) / rate, _wrong(limits)
+def link_loss_at_every_setpoint(
+    payloads: NDArray, limits: Limits, rate: float = RATE, starts: NDArray | None = None
+) -> LinkLossMoments:
+    """Lose the link after each setpoint of a flight, (N, 29) uint8 at `rate`, Hz.
 
-    def swept(forks: NDArray, wrong: NDArray) -> list[NDArray]:
+    The flight begins in hover, or from the snapshots `starts`, (L, 31), of another at the same setpoint.
+    """
+    state, time, wrong, bodies = decode(payloads), np.arange(len(payloads)) / rate, _wrong(limits), _bodies(limits)
+    begins = [hovering_snapshot(limits.airframe, state)] * len(bodies) if starts is None else list(starts)
+
+    def swept(forks: NDArray, wrong: NDArray) -> tuple[list[NDArray], list[NDArray]]:
+        def one(body: tuple[NDArray, NDArray], begin: NDArray) -> tuple[NDArray, NDArray]:
+            return _swept(state, limits, body, rate, begin, forks, wrong)
+
         with ThreadPoolExecutor() as pool:  # a motor lag each
-            flown = pool.map(lambda body: _swept(state, limits, body, rate, forks, wrong), _bodies(limits))
-            return [boxes for boxes, _ in flown]
+            flown = list(pool.map(one, bodies, begins))
+        return [boxes for boxes, _ in flown], [snapshots for _, snapshots in flown]
 
-    boxes = swept(np.ones(len(payloads), dtype=np.bool_), wrong)
-    found = _judge(time, state.position, boxes, limits)
+    boxes, snapshots = swept(np.ones(len(payloads), dtype=np.bool_), wrong)
+    found = _judge(time, state.position, boxes, limits, snapshots)
     near = ~(found.beyond < -_NEAR)
     if wrong[_LIFT] and near.any():
-        sinking = [np.where(near[:, None, None], box, boxes[0]) for box in swept(near, wrong * (1.0, 1.0, -1.0))]
-        found = _judge(time, state.position, boxes + sinking, limits)
+        also, _ = swept(near, wrong * (1.0, 1.0, -1.0))
+        sinking = [np.where(near[:, None, None], box, boxes[0]) for box in also]
+        found = _judge(time, state.position, boxes + sinking, limits, snapshots)
     return found
+
+
+def as_believed(snapshots: NDArray, limits: Limits) -> NDArray:
+    """Return, of snapshots (L, ...) for each motor lag, those with the lag that the airframe has by safety.yaml."""
+    return np.asarray(snapshots[_lags(limits).index(limits.airframe.motor_time_constant)])
 
 
 def link_loss_of_stops(
@@ -141,7 +157,8 @@ def link_loss_of_stops(
     rows = setpoint_rows(told).reshape(len(begin), stops.shape[1], SETPOINT_SIZE)
     arrivals, boxes = arrival_steps(stops.shape[1], rate), []
     for body in _bodies(limits):
-        snapshots = _swept(state, limits, body, rate, np.zeros(len(payloads), dtype=np.bool_), _wrong(limits))[1][begin]
+        start, forks = hovering_snapshot(limits.airframe, state), np.zeros(len(payloads), dtype=np.bool_)
+        snapshots = _swept(state, limits, body, rate, start, forks, _wrong(limits))[1][begin]
         swept = np.empty((len(begin), stops.shape[1], 2, 3))
         forks = np.zeros(stops.shape[1], dtype=np.bool_)
         forks[within] = True
@@ -149,7 +166,7 @@ def link_loss_of_stops(
         boxes.append(swept[:, within].reshape(-1, 2, 3))
     times = begin[:, None] / rate + within / rate
     places = rows[:, within, 0:3].reshape(-1, 3)
-    return _judge(times.reshape(-1), places, boxes, limits)
+    return _judge(times.reshape(-1), places, boxes, limits, [np.empty((0, SNAPSHOT_SIZE))] * len(boxes))
 
 
 def link_loss_of_transfer(
@@ -171,7 +188,9 @@ def _wrong(limits: Limits) -> NDArray:
     return np.array([push, max(drag / limits.airframe.mass, 1e-6), wrong.vertical_acceleration_error])
 
 
-def _judge(time: NDArray, place: NDArray, boxes: list[NDArray], limits: Limits) -> LinkLossMoments:
+def _judge(
+    time: NDArray, place: NDArray, boxes: list[NDArray], limits: Limits, snapshots: list[NDArray]
+) -> LinkLossMoments:
     """Return the worst of the boxes, (N, 2, 3) m, of each motor lag."""
     low, high = np.min([box[:, 0] for box in boxes], axis=0), np.max([box[:, 1] for box in boxes], axis=0)
     space = np.array([limits.space.low, limits.space.high])
@@ -180,15 +199,19 @@ def _judge(time: NDArray, place: NDArray, boxes: list[NDArray], limits: Limits) 
     )
     away = np.maximum(place - low, high - place)[:, :2]
     return LinkLossMoments(
-        time, place, low, high, out.max(axis=1), np.argmax(out, axis=1), np.hypot(away[:, 0], away[:, 1])
-    )
+        time, place, low, high, out.max(axis=1), np.argmax(out, axis=1), np.hypot(away[:, 0], away[:, 1]),
+        np.array(snapshots),
+    )  # fmt: skip
 
 
 def _bodies(limits: Limits) -> list[tuple[NDArray, NDArray]]:
     """Return the parameters of the body, for each motor lag, for steps before and after the last setpoint."""
-    lags = {*limits.link_loss.motor_lags, limits.airframe.motor_time_constant}
-    airframes: list[Airframe] = [replace(limits.airframe, motor_time_constant=lag) for lag in sorted(lags)]
+    airframes: list[Airframe] = [replace(limits.airframe, motor_time_constant=lag) for lag in _lags(limits)]
     return [(pack_body(airframe), pack_body(airframe, step=_STEP)) for airframe in airframes]
+
+
+def _lags(limits: Limits) -> list[float]:
+    return sorted({*limits.link_loss.motor_lags, limits.airframe.motor_time_constant})
 
 
 def _gains(limits: Limits) -> NDArray:
@@ -206,13 +229,14 @@ def _swept(
     limits: Limits,
     body: tuple[NDArray, NDArray],
     rate: float,
+    start: NDArray,
     forks: NDArray,
     wrong: NDArray,
 ) -> tuple[NDArray, NDArray]:
     """Return boxes (N, 2, 3) where `forks`, (N,), and snapshots of vehicle and controller at each setpoint."""
     count, rows = len(state.position), setpoint_rows(state)
     swept, snapshots = np.empty((count, 2, 3)), np.empty((count, SNAPSHOT_SIZE))
-    start, arrivals = hovering_snapshot(limits.airframe, state), arrival_steps(count, rate)
+    arrivals = arrival_steps(count, rate)
     _fly(swept, snapshots, rows, start, forks, _gains(limits), *body, *_steps(limits), arrivals, wrong)
     return swept, snapshots
 

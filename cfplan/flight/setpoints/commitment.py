@@ -5,7 +5,7 @@ its first setpoint is the committed one with that number, and all after it repla
 be late, mistaken or broken, so the pilot verifies by itself, without trusting anybody, that
 
 - the bytes are those that were certified (checksum), and were made for just this commitment (order);
-- the splice is still ahead of the clock (time), and within what is committed;
+- the splice is still ahead of the clock (time), and not farther than a minute;
 - position, velocity, acceleration, attitude and body rates there are the committed ones within a quantum (joint);
 - from setpoint to setpoint the vehicle moves as the velocities say, inside the space, and ends at rest;
 - from each setpoint there is a stop, which begins there and ends at rest inside the space.
@@ -21,15 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, RATE
+from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, RATE, controller_attitude
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode
-from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD
+from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, turns_for
 from cfplan.safety.space import Space
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import rotations_of
 
 SPLICE_AHEAD = round(BRAKE_LEAD * RATE)  # setpoints from a splice to its joint: as far ahead a setpoint looks
 LEAST_AHEAD = 2  # setpoints from the clock to a splice, at least, in time for it
+FARTHEST_AHEAD = 6000  # setpoints from the clock to a splice, at most: a minute
 KEPT_BEHIND = 100  # setpoints before a splice that are kept, for a vehicle that fell behind
 QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
+LEVEL = 0.01  # rad of tilt, below which a vehicle hovers: twice what bytes round an attitude by
 LARGEST_JERK = 400.0  # m/s³, beyond which velocities do not belong together: ten times what plans reach
 _ROUNDING = 1e-9
 
@@ -41,7 +45,7 @@ class Fault(StrEnum):
     CHECKSUM = "the proposal is not what was certified: its checksum differs"
     ORDER = "the proposal continues another commitment than the present one"
     LATE = "the proposal came too late"
-    OUTSIDE = "the proposal begins where nothing is committed"
+    OUTSIDE = "the proposal begins where nothing is committed yet, or no more"
     JOINT = "the proposal does not begin with the committed setpoint"
     MOTION = "the proposed setpoints do not follow from one another"
     SPACE = "the proposal leaves the space"
@@ -125,9 +129,9 @@ def splice(commitment: Commitment, proposal: Proposal, now: int, space: Space) -
         return Refusal(Fault.ORDER, "")
     if proposal.splice < now + LEAST_AHEAD:
         return Refusal(Fault.LATE, f"for setpoint {proposal.splice}, with {now} due")
-    if not commitment.first <= proposal.splice <= commitment.last:
-        return Refusal(Fault.OUTSIDE, f"at setpoint {proposal.splice}, committed to {commitment.last}")
-    kept = proposal.splice - commitment.first
+    if not commitment.first <= proposal.splice <= now + FARTHEST_AHEAD:
+        return Refusal(Fault.OUTSIDE, f"at setpoint {proposal.splice}, with {now} due")
+    kept = min(proposal.splice, commitment.last) - commitment.first  # after its end the vehicle hovers
     asked = decode(proposal.payloads)
     if refusal := (
         _differs(decode(commitment.payloads[kept : kept + 1]), asked, proposal.splice)
@@ -135,12 +139,12 @@ def splice(commitment: Commitment, proposal: Proposal, now: int, space: Space) -
         or _unfit_stops(asked, proposal.stops, proposal.splice, space)
     ):
         return refusal
-    begin = max(kept - KEPT_BEHIND, 0)
-    first = commitment.first + begin
+    first = max(proposal.splice - KEPT_BEHIND, commitment.first)
+    behind = np.minimum(np.arange(first, proposal.splice), commitment.last) - commitment.first
     return Commitment(
         first,
-        np.concatenate([commitment.payloads[begin:kept], proposal.payloads]),
-        np.concatenate([commitment.stops[begin:kept], proposal.stops]),
+        np.concatenate([commitment.payloads[behind], proposal.payloads]),
+        np.concatenate([commitment.stops[behind], proposal.stops]),
         (*(one for one in commitment.splices if first <= one < proposal.splice), proposal.splice),
     )
 
@@ -208,6 +212,11 @@ def _unfit_stops(asked: FullStateSetpoints, stops: NDArray, first: int, space: S
 
 
 def _rests(setpoints: FullStateSetpoints) -> NDArray:
-    """Return (N,) whether each setpoint is a hover: nothing moves, and the thrust is upwards."""
-    moves = np.concatenate([setpoints.velocity, setpoints.body_rate], axis=1)
-    return np.asarray(~moves.any(axis=1) & ~setpoints.acceleration.any(axis=1))
+    """Return (N,) whether each setpoint makes the vehicle hover: turned back by what its rates ask for, it is level."""
+    force = setpoints.acceleration + np.array([0.0, 0.0, GRAVITY])
+    turn = rotations_of(turns_for(-setpoints.body_rate[:, :2]))
+    axis = (controller_attitude(force, setpoints.quaternion) @ np.swapaxes(turn, 1, 2))[:, :, 2]
+    thrust = np.linalg.norm(force, axis=1) * turn[:, 2, 2]
+    still = ~setpoints.velocity.any(axis=1) & (setpoints.body_rate[:, 2] == 0.0)
+    level = np.hypot(axis[:, 0], axis[:, 1]) <= LEVEL
+    return np.asarray(still & level & (np.abs(thrust - GRAVITY) <= 10 * QUANTUM))

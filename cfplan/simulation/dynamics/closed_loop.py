@@ -97,11 +97,13 @@ def fly_setpoints(
     estimate: EstimateErrors = PERFECT,
     wind: NDArray = STILL_AIR,
     efficiency: NDArray = FULL_EFFICIENCY,
+    memory: NDArray | None = None,
 ) -> ClosedLoop:
     """Fly setpoints that arrive at `times` + `delay`, (N,) s, from the state `start`, (17,), for `duration` s.
 
     Until the first arrives, the controller holds the first. `gains` are the airframe's where not given; `wind`
-    (3,) m/s and motor `efficiency` (4,) are constant.
+    (3,) m/s and motor `efficiency` (4,) are constant. `memory`, (10,), is the controller's at the start, zeros
+    where not given.
     """
     steps = round(duration / TIME_STEP)
     arrivals = np.round((np.asarray(times) + delay) / TIME_STEP).astype(np.int64)
@@ -123,6 +125,7 @@ def fly_setpoints(
         np.asarray(wind, dtype=float),
         np.asarray(efficiency, dtype=float),
         FULL_STATE,
+        np.zeros(MEMORY_SIZE) if memory is None else memory.copy(),
     )
     return ClosedLoop(np.arange(steps + 1) * TIME_STEP, states, commands)
 
@@ -140,8 +143,9 @@ def _run(
     wind: NDArray,
     efficiency: NDArray,
     mode: NDArray,
+    memory: NDArray,
 ) -> None:
-    memory, control = np.zeros(MEMORY_SIZE), np.zeros(4)
+    control = np.zeros(4)
     motors, thrusts = np.zeros(4), np.zeros(4)
     believed, state = np.empty(STATE_SIZE), states[0].copy()
     newest = 0

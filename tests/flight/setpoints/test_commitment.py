@@ -32,21 +32,23 @@ from cfplan.safety.limits_file import load_limits
 from cfplan.vehicle.joint import JoinedTrajectory
 
 WAYPOINTS = np.array([[-1.2, -2.0, 0.8], [1.0, -1.0, 1.2], [-0.8, 0.6, 0.9], [0.9, 2.0, 1.2]])
+LIMITS = load_limits(Path(__file__).parents[3] / "safety.yaml")
+SPACE = LIMITS.space
 LOW, HIGH = np.array([-1.3, -2.8, 0.7]), np.array([1.3, 2.8, 1.3])
 
 
 def encoded(flown: JoinedTrajectory, first: int):
-    return encode_trajectory(flown.since(first / RATE))
+    return encode_trajectory(flown.since(first / RATE), space=SPACE)
 
 
 def stops_of(payloads):
-    return encode_stops(payloads.motion, RATE, gains=payloads.gains)
+    return encode_stops(payloads.motion, RATE, gains=payloads.gains, space=SPACE)
 
 
 @pytest.fixture(scope="module")
 def limits():
     """The limits of the project's own safety.yaml."""
-    return load_limits(Path(__file__).parents[3] / "safety.yaml")
+    return LIMITS
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +101,7 @@ def test_its_bytes_and_stops_pass_the_checks_of_every_plan(spliced, limits):
     joined, _ = spliced
     setpoints = encoded(joined, 120)
     check_bytes(setpoints, joined.since(120 / RATE), limits.plan)
-    certify_stops(stops_of(setpoints), setpoints.motion, limits, RATE).require(limits)
+    certify_stops(stops_of(setpoints), setpoints.motion, limits, RATE, space=SPACE).require(limits)
 
 
 def test_splices_follow_one_another(flown, committed, spliced, limits):

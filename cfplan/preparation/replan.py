@@ -1,0 +1,145 @@
+"""Replanning: from what is committed and a request to a proposal that is certified like any plan, for the pilot.
+
+A held flight is what the planner knows of what the pilot is bound to fly: the trajectories behind the bytes, and the
+simulated vehicle at each setpoint. So what is checked of a new plan is checked of the whole flight: bytes, stops, link
+loss, gaps and the dry run go on from the splice as if the flight had been planned so from its beginning.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
+from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, propose
+from cfplan.flight.setpoints.encoding import RATE, EncodedFlight, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.stop_certificate import certify_stops
+from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, min_snap
+from cfplan.planning.continuation import continue_plan
+from cfplan.planning.plan import plan
+from cfplan.planning.plan_result import Plan
+from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT
+from cfplan.safety.limits import Limits
+from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.glitches import glitch_at_every_setpoint
+from cfplan.simulation.link_loss import as_believed, link_loss_at_every_setpoint
+from cfplan.vehicle.joint import JoinedTrajectory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldFlight:
+    """What is committed, and what it was made from; its clock is 0 at setpoint 0."""
+
+    commitment: Commitment
+    flown: JoinedTrajectory
+    ahead: NDArray  # (K, 3) m, waypoints of the last plan, in order
+    reached: tuple[float, ...]  # s on the last plan's path, of each of them
+    begin: int  # number of the setpoint of the first snapshot
+    snapshots: NDArray  # (L, N, 31) of the simulated vehicle at each setpoint, for each motor lag
+
+    @property
+    def ends(self) -> float:
+        """Return when the motion ends, s."""
+        return self.flown.duration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replanned:
+    """A proposal, what will be held once the pilot has accepted it, and the plan behind it."""
+
+    proposal: Proposal
+    held: HeldFlight
+    plan: Plan
+
+
+def hold(planned: Plan, waypoints: ArrayLike) -> HeldFlight:
+    """Return what is held of a plan that begins at rest, through waypoints (K, 3) m with centripetal times.
+
+    The first waypoint is its start. Raises InfeasibleError or NotCertifiedError where it does not pass what replan()
+    asks of plans.
+    """
+    points = np.asarray(waypoints, dtype=float)
+    flown = JoinedTrajectory((planned.trajectory,), (0.0,))
+    encoded, stops, snapshots = _certified(flown, planned.limits, None)
+    reached = tuple(np.cumsum(centripetal_times(points)).tolist())
+    return HeldFlight(Commitment(0, encoded.payloads, stops), flown, points[1:], reached, 0, snapshots)
+
+
+def replan(
+    held: HeldFlight, splice: int, waypoints: ArrayLike, limits: Limits, *, keep: bool = False, yaw_angle: float = 0.0
+) -> Replanned:
+    """Return the proposal to leave what is held at setpoint `splice` and to go through waypoints, (K, 3) m, to rest.
+
+    The motion changes SPLICE_AHEAD setpoints after the splice. With `keep`, the waypoints follow those that are ahead
+    there; else they replace them. Where the vehicle rests by then, the plan begins from rest.
+
+    Raises:
+        InputError: what is given are no waypoints.
+        InfeasibleError: no plan leads through them from there, or link loss would end outside the walls.
+        NotCertifiedError: the plan, its bytes, a stop, a gap or the dry run does not pass.
+    """
+    points = np.asarray(waypoints, dtype=float)
+    if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
+        raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint="give rows of x, y, z in metres")
+    joint = (splice + SPLICE_AHEAD) / RATE
+    if joint >= held.ends:
+        place = held.flown.at(held.ends)
+        points = np.concatenate([place.position[None], points])
+        planned = plan(min_snap(points), limits.airframe, limits, planner="expert", yaw_angle=float(place.yaw))
+        reached = tuple(np.cumsum(centripetal_times(points)).tolist())
+        points = points[1:]
+    else:
+        leave = joint - held.flown.starts[-1]
+        times = None
+        if keep:
+            kept, times = _still_ahead(held, leave, points)
+            points = np.concatenate([kept, points])
+        made = continue_plan(held.flown.trajectories[-1], leave, points, limits, times=times, yaw_angle=yaw_angle)
+        planned, reached = made.plan, made.reached
+    flown = held.flown.continued(joint, planned.trajectory)
+    row = min(splice - held.begin, held.snapshots.shape[1] - 1)
+    encoded, stops, snapshots = _certified(flown.since(splice / RATE), limits, held.snapshots[:, row])
+    proposal = propose(held.commitment, splice, encoded.payloads, stops)
+    return Replanned(proposal, HeldFlight(held.commitment, flown, points, reached, splice, snapshots), planned)
+
+
+def accepted(replanned: Replanned, commitment: Commitment) -> HeldFlight:
+    """Return what is held once the pilot has accepted a proposal: it is committed to this."""
+    return replace(replanned.held, commitment=commitment)
+
+
+def _still_ahead(held: HeldFlight, leave: float, more: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the waypoints not yet passed at `leave`, s, and the nominal times to each of them and to those after."""
+    last = held.flown.trajectories[-1]
+    s = float(last.s_at(leave))
+    here = last.path(s)
+    kept = [
+        number
+        for number, (point, at) in enumerate(zip(held.ahead, held.reached, strict=True))
+        if at > s and math.dist(point, here) >= MIN_SPACING
+    ]
+    times = np.diff([s, *(held.reached[number] for number in kept)])
+    begin = held.ahead[kept[-1]] if kept else here
+    new = centripetal_times(np.concatenate([begin[None], more]))
+    return held.ahead[kept].reshape(-1, 3), np.concatenate([times, new])
+
+
+def _certified(
+    flown: JoinedTrajectory, limits: Limits, starts: NDArray | None
+) -> tuple[EncodedFlight, NDArray, NDArray]:
+    """Return setpoints, stops and snapshots of a flight that goes on from snapshots (L, 31) or from hover."""
+    encoded = encode_trajectory(flown, space=limits.space)
+    check_bytes(encoded, flown, limits.plan)
+    stops = encode_stops(encoded.motion, RATE, gains=encoded.gains, space=encoded.space)
+    certify_stops(stops, encoded.motion, limits, RATE, gains=encoded.gains, space=encoded.space).require(limits)
+    lost = link_loss_at_every_setpoint(encoded.payloads, limits, starts=starts)
+    if lost.worst.beyond > 0.0 and not limits.link_loss.only_warn:
+        raise InfeasibleError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
+    believed = None if starts is None else as_believed(starts, limits)
+    glitches = glitch_at_every_setpoint(encoded.payloads, limits, start=believed)
+    if glitches.lost.any():
+        raise NotCertifiedError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
+    dry_run(encoded, flown, limits.airframe, limits.flight, snapshot=believed).require_passed()
+    return encoded, stops, lost.snapshots

@@ -1,0 +1,125 @@
+"""Replanning: proposals that a pilot accepts, checked as if the whole flight had been planned so from its beginning."""
+
+import numpy as np
+import pytest
+
+from cfplan.errors import CfplanError, InfeasibleError, InputError
+from cfplan.flight.setpoints.commitment import Commitment, splice
+from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.packets import decode
+from cfplan.geometry.min_snap import centripetal_times, min_snap
+from cfplan.planning.plan import plan
+from cfplan.preparation.replan import accepted, hold, replan
+from cfplan.safety.certificate import certify
+from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.glitches import glitch_at_every_setpoint
+from cfplan.simulation.link_loss import as_believed, link_loss_at_every_setpoint
+
+WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
+NOW = 100  # number of the setpoint that is due when a plan is proposed
+
+
+@pytest.fixture(scope="module")
+def held(limits):
+    path = min_snap(WAYPOINTS, times=centripetal_times(WAYPOINTS))
+    return hold(plan(path, limits.airframe, limits, planner="expert"), WAYPOINTS)
+
+
+def after(held, limits, replanned, now=NOW):
+    committed = splice(held.commitment, replanned.proposal, now, limits.space)
+    assert isinstance(committed, Commitment), str(committed)
+    return accepted(replanned, committed)
+
+
+def test_simulated_on_from_a_snapshot_a_flight_is_the_whole_flight(held, limits):
+    """Link loss and gaps from setpoint 150 on are to the last digit those of the whole flight, the dry run to 10 µm."""
+    payloads, begin = held.commitment.payloads, 150
+    whole = link_loss_at_every_setpoint(payloads, limits)
+    starts = whole.snapshots[:, begin]
+    part = link_loss_at_every_setpoint(payloads[begin:], limits, starts=starts)
+    np.testing.assert_array_equal(part.beyond, whole.beyond[begin:])
+    np.testing.assert_array_equal(part.snapshots, whole.snapshots[:, begin:])
+
+    believed = as_believed(starts, limits)
+    gaps = glitch_at_every_setpoint(payloads, limits)
+    np.testing.assert_array_equal(
+        glitch_at_every_setpoint(payloads[begin:], limits, start=believed).deviation, gaps.deviation[:, begin:]
+    )
+    flown, later = held.flown, held.flown.since(begin / RATE)
+    at_once = dry_run(encode_trajectory(flown, space=limits.space), flown, limits.airframe, limits.flight)
+    gone_on = dry_run(
+        encode_trajectory(later, space=limits.space), later, limits.airframe, limits.flight, snapshot=believed
+    )
+    rows = slice(begin * 10, begin * 10 + 2000)
+    np.testing.assert_allclose(gone_on.loop.position[:2000], at_once.loop.position[rows], atol=1e-5)
+
+
+def test_new_waypoints_replace_those_ahead(held, limits):
+    new = after(held, limits, replan(held, NOW + 5, [[-0.5, 0.8, 1.0], [0.5, 2.0, 1.0]], limits))
+    assert new.commitment.splices == (NOW + 5,)
+    end = decode(new.commitment.payloads[-1:])
+    np.testing.assert_allclose(end.position, [[0.5, 2.0, 1.0]], atol=5.1e-4)
+
+
+def test_more_waypoints_follow_those_ahead_without_a_stop(held, limits):
+    more = [-0.8, 2.4, 0.9]
+    new = after(held, limits, replan(held, NOW + 5, [more], limits, keep=True))
+    np.testing.assert_allclose(new.ahead[-2:], [WAYPOINTS[-1], more])
+    flown = new.flown.at(np.arange(0.0, new.flown.duration, 0.01))
+    for waypoint in WAYPOINTS[1:]:  # still flown through
+        assert np.linalg.norm(flown.position - waypoint, axis=1).min() < 0.02
+    at_the_old_end = int(np.argmin(np.linalg.norm(flown.position - WAYPOINTS[-1], axis=1)))
+    assert np.linalg.norm(flown.velocity[at_the_old_end]) > 0.5
+
+
+def test_after_its_end_the_vehicle_starts_from_rest(held, limits):
+    late = held.commitment.last + 300
+    new = after(held, limits, replan(held, late, [[0.0, 0.5, 1.0]], limits), now=late - 5)
+    state = decode(new.commitment.payloads)
+    np.testing.assert_allclose(state.position[0], WAYPOINTS[-1], atol=5.1e-4)
+    np.testing.assert_allclose(state.position[-1], [0.0, 0.5, 1.0], atol=5.1e-4)
+
+
+def test_a_flight_replanned_again_and_again_keeps_every_limit_in_what_was_sent(held, limits):
+    """Random waypoints, some 0.4 s apart: the sequence that was sent is the encoding of one motion without a jump."""
+    random = np.random.default_rng(4)
+    now, sent, replanned = 20, [held.commitment.payloads[:20]], 0
+    for _ in range(14):
+        points = random.uniform([-1.0, -2.2, 0.8], [1.0, 2.2, 1.2], (3, 3))
+        try:
+            made = replan(held, now + 5, points, limits)
+        except InfeasibleError:
+            made = None
+        if made is not None:
+            held, replanned = after(held, limits, made, now), replanned + 1
+            assert certify(made.plan.trajectory, limits.plan, limits.space).passed
+        span = int(random.integers(25, 55))
+        rows = np.minimum(np.arange(now, now + span), held.commitment.last) - held.commitment.first
+        sent.append(held.commitment.payloads[rows])
+        now += span
+    assert replanned >= 8
+    rows = np.arange(now, held.commitment.last + 1) - held.commitment.first
+    sequence = np.concatenate([*sent, held.commitment.payloads[rows]])
+    whole = encode_trajectory(held.flown, space=limits.space)
+    check_bytes(whole, held.flown, limits.plan)
+    assert len(sequence) == len(whole.payloads)
+    np.testing.assert_allclose(decode(sequence).position, decode(whole.payloads).position, atol=1.001e-3)
+    np.testing.assert_allclose(decode(sequence).velocity, decode(whole.payloads).velocity, atol=1.001e-3)
+    assert dry_run(whole, held.flown, limits.airframe, limits.flight).passed
+
+
+@pytest.mark.parametrize(
+    ("waypoints", "error"),
+    [
+        ([], InputError),
+        ([[0, 0]], InputError),
+        ([[0, 0, np.nan]], InputError),
+        ([[0, 0, 5]], InfeasibleError),
+        ([[0.5, 0, 1], [0.5, 0, 1]], InputError),
+    ],
+)
+def test_what_cannot_be_flown_is_refused_in_words(held, limits, waypoints, error):
+    with pytest.raises(error) as refused:
+        replan(held, NOW, waypoints, limits)
+    assert isinstance(refused.value, CfplanError)
+    assert refused.value.hint
