@@ -21,7 +21,6 @@ class Phase(StrEnum):
     GO_TO_START = "go to start"
     STREAM = "stream"
     HOLD = "hold"
-    HAND_BACK = "hand back"
     LAND = "land"
     DISARM = "disarm"
     CLOSED = "closed"

@@ -13,7 +13,7 @@ from cfplan.vehicle.airframe import Airframe
 _FULL_COMMAND = 65535  # of one motor, 16 bits
 SHORTEST = 5.0  # s of flight that say anything
 _BEGINS = (Phase.GO_TO_START, Phase.STREAM)
-_ENDS = (Phase.HAND_BACK, Phase.LAND, Phase.DISARM, Phase.CLOSED)
+_ENDS = (Phase.LAND, Phase.DISARM, Phase.CLOSED)
 _LARGEST_GAPS = {"poses": 0.1, "estimates": 0.1, "status": 0.2}  # s, median interval; sparser streams say too little
 _UNIT = 0.1  # by which the length of a quaternion may differ from 1
 _ON_TIME = 5  # percentile of the poses' arrivals: those that nothing delayed

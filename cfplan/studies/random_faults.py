@@ -56,9 +56,8 @@ _PHASES: tuple[tuple[Phase, float], ...] = (
     (Phase.GO_TO_START, 1.7),
     *((Phase.STREAM, math.inf),) * 6,
     (Phase.HOLD, 1.0),
-    (Phase.HAND_BACK, 1.0),
-    (Phase.LAND, 2.5),
-    (Phase.LAND, 2.5),
+    *((Phase.LAND, 2.5),) * 2,
+    (Phase.LAND, 6.0),  # until it lies on the floor
 )
 
 _STALL, _MAIN, _PILOT = "stall", "main process killed", "pilot killed"

@@ -14,7 +14,6 @@ from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.pilot import Pilot
 from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES
-from cfplan.flight.radio.link import GO_TO, LAND, TAKE_OFF
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Estimate, Event, Phase, PhaseEntered, Telemetry, VehicleStatus
@@ -31,7 +30,7 @@ from cfplan.safety.limits import (
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframes import AIRFRAMES
 
-ARMED, CAN_FLY, FLYING, LOCKED, ON_BOARD = 1 << 1, 1 << 3, 1 << 4, 1 << 6, 1 << 8
+ARMED, CAN_FLY, FLYING, LOCKED = 1 << 1, 1 << 3, 1 << 4, 1 << 6
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -82,12 +81,15 @@ class World:
     lost: str = ""
     fault: str = ""
     round_trip: float = 0.002
-    refuses: dict[int, int] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
     unknown: tuple[str, ...] = ()
     arms_lost: int = 0  # orders to arm or disarm that the radio swallows
     cuts_lost: int = 0  # emergency stops that the radio swallows
     other_body: bool = False  # motion capture tracks one that stays on the floor
+    stops_lost: int = 0  # stop setpoints and releases of priority that the radio swallows
+    deaf: bool = False  # it is armed, and setpoints do not turn its motors
+    floor: float = 0.02  # m, the height of a body that stands
+    can_fly: bool = True  # what its supervisor says
     stubborn: dict[str, float] = field(default_factory=dict)
     replies: dict[int, int] = field(default_factory=dict)
     has_setpoint: bool = False
@@ -109,10 +111,10 @@ class World:
 
     def __post_init__(self) -> None:
         self.clock = SteppedClock(100.0, self.pass_time)
-        self._on_board, self._curve, self._stopping = True, None, -math.inf
+        self.motors_on, self._blown = False, (0.0, 0.0, 0.0)
         self._poses: list[Pose] = []
         self._count = 0
-        self._motors_off_since = -math.inf
+        self.motors_off_since = -math.inf
         self.estimate: Estimate | None = None
         self.status: VehicleStatus | None = None
         self.position_variance = (1e-5, 1e-5, 1e-5)
@@ -151,28 +153,19 @@ class World:
 
     def _move(self, step: float) -> None:
         before = self.position
-        if self._on_board and self._curve is not None:
-            start, end, began, duration, landing = self._curve
-            share = min(1.0, (self.now - began) / duration)
-            self.position = tuple(a + share * (b - a) for a, b in zip(start, end, strict=True))
-            if landing and share == 1.0:
-                self._curve = None
-        flying = self.position[2] > 0.05
+        flying = self.position[2] > self.floor + 0.03
         if self.motors_on:
-            self._motors_off_since = math.inf
-        elif self._motors_off_since == math.inf:
-            self._motors_off_since = self.now
+            self.motors_off_since = math.inf
+        elif self.motors_off_since == math.inf:
+            self.motors_off_since = self.now
         if flying and not self.motors_on:
             self.motors_off_in_the_air += step
+        self._blown = tuple(a + b * step for a, b in zip(self._blown, self.push, strict=True))
         self.position = tuple(a + b * step for a, b in zip(self.position, self.push, strict=True))
         self.velocity = tuple((a - b) / step for a, b in zip(self.position, before, strict=True))
         self._count += 1
         if self._count % 2 == 0:
             self._sense()
-
-    @property
-    def motors_on(self) -> bool:
-        return not self.stopped and (not self._on_board or self._curve is not None)
 
     def _sense(self) -> None:
         wobble = 0.0 if self.poses_frozen else 1e-5 * (self._count % 7)
@@ -186,11 +179,12 @@ class World:
             self._poses.append(Pose(self.now - 0.005, self.now, place, turn))
             self._poses_last = place
         if self._logging and not self.logs_stopped:
-            flying = self.motors_on or self.now - self._motors_off_since < 2.0
-            bits = (ARMED if self.armed else 0) | CAN_FLY | (FLYING if flying else 0) | self.extra_bits
-            bits |= ON_BOARD if self._on_board and self._curve is not None else 0
+            flying = self.motors_on or self.now - self.motors_off_since < 2.0
+            bits = (ARMED if self.armed else 0) | (FLYING if flying else 0) | self.extra_bits
+            bits |= CAN_FLY if self.can_fly else 0
             self.estimate = Estimate(self.now, self.position, self.velocity, (0.0, 0.0, 0.0), turn)
-            self.status = VehicleStatus(self.now, (0.0, 0.0, 0.0), (0, 0, 0, 0), self.voltage, bits)
+            motor = 4 * (40000 if self.motors_on else 0,)
+            self.status = VehicleStatus(self.now, (0.0, 0.0, 0.0), motor, self.voltage, bits)
 
     # The pose source.
 
@@ -207,9 +201,11 @@ class World:
     # The link.
 
     def send(self, packet) -> None:
-        self._on_board, self._curve = False, None
-        state = decode(np.frombuffer(bytes(packet.data), dtype=np.uint8))
-        self.position = tuple(state.position[0].tolist())
+        if self.deaf or self.stopped:
+            return
+        self.motors_on = True
+        x, y, z = decode(np.frombuffer(bytes(packet.data), dtype=np.uint8)).position[0].tolist()
+        self.position = x + self._blown[0], y + self._blown[1], max(z + self._blown[2], self.floor)
 
     def send_pose(self, position, quaternion) -> None:
         self.forwarded.append((self.now, *position))
@@ -232,8 +228,7 @@ class World:
         self.calls.append("preflight logs off")
 
     def release_priority(self) -> None:
-        self.calls.append("release")
-        self._on_board = True
+        self._note_once("release")
 
     def arm(self, do_arm: bool) -> None:
         self.calls.append("arm" if do_arm else "disarm")
@@ -247,34 +242,23 @@ class World:
         if self.cuts_lost:
             self.cuts_lost -= 1
             return
-        self.stopped, self.armed = True, False
+        self.stopped, self.armed, self.motors_on = True, False, False
         self.extra_bits |= LOCKED
-
-    def take_off(self, height: float, duration: float) -> None:
-        self._command(TAKE_OFF, "take off", (*self.position[:2], height), duration)
-
-    def go_to(self, position, yaw: float, duration: float) -> None:
-        self._command(GO_TO, "go to", tuple(position), duration)
-
-    def land(self, height: float, duration: float) -> None:
-        self._command(LAND, "land", (*self.position[:2], height), duration)
-
-    def stop_motors(self) -> None:
-        self.calls.append("stop")
-        self._curve = None
 
     def keep_alive(self) -> None:
         self.signs_of_life.append(self.now)
 
     def stop_setpoint(self) -> None:
-        self.calls.append("stop setpoint")
-        self.stopped = True
+        self._note_once("stop setpoint")
+        if self.stops_lost:
+            self.stops_lost -= 1
+            return
+        self.motors_on = False
 
-    def _command(self, number: int, name: str, end, duration: float) -> None:
-        self.calls.append(name)
-        self.replies[number] = self.refuses.get(number, 0)
-        if not self.replies[number]:
-            self._curve = (self.position, end, self.now, duration, number == LAND)
+    def _note_once(self, call: str) -> None:
+        """Note a call, but not again where it is repeated."""
+        if self.calls[-1:] != [call]:
+            self.calls.append(call)
 
     def close(self) -> None:
         self.calls.append("close")

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cfplan.errors import InputError
@@ -10,8 +11,10 @@ from cfplan.flight.telemetry import Phase
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.studies.fault_scenarios import FOR_GOOD, SCENARIOS, Scenario
-from cfplan.studies.faults import fly_scenario, fly_stepped
+from cfplan.studies.faults import fly_scenario, fly_stepped, judge
 from cfplan.studies.random_faults import fly_random, prepare_missions, random_flights, random_scenario
 
 REPOSITORY = Path(__file__).parents[2]
@@ -24,7 +27,7 @@ QUICK = (
     "radio loses 50 %",
     "radio dead for 1 s",
     "stream stalled for 0.6 s",
-    "take-off refused",
+    "locked between arming and take-off",
     "two bodies swapped",
     "disk full",
 )
@@ -80,16 +83,58 @@ def test_a_flight_in_the_stepped_lab_repeats_to_the_last_bit(missions):
     assert fly_random(11, missions) == fly_random(11, missions)
 
 
-@pytest.mark.parametrize("phase", [Phase.TAKE_OFF, Phase.GO_TO_START, Phase.STREAM, Phase.HOLD])
+# Moments of each phase: on the floor before the first setpoint, shortly after lift-off, and so on down to the floor,
+# where the motors have just been stopped.
+MOMENTS = (
+    (Phase.TAKE_OFF, 0.005),
+    (Phase.TAKE_OFF, 0.3),
+    (Phase.TAKE_OFF, 0.9),
+    (Phase.GO_TO_START, 0.7),
+    (Phase.STREAM, 1.7),
+    (Phase.HOLD, 0.7),
+    (Phase.LAND, 0.005),
+    (Phase.LAND, 1.2),
+    (Phase.LAND, 2.2),
+    (Phase.LAND, 3.4),
+    (Phase.LAND, 4.5),
+)
+
+
+@pytest.mark.parametrize(("phase", "moment"), MOMENTS)
 @pytest.mark.parametrize("dies", ["pilot", "radio"])
-def test_a_vehicle_that_is_left_alone_while_setpoints_fly_it_comes_down_beneath_and_disarms(phase, dies, line):
+def test_a_vehicle_that_is_left_alone_in_any_phase_comes_down_beneath_and_disarms(phase, moment, dies, line):
     radio = (RadioFault(RadioFaultKind.DEAD, 0.0, FOR_GOOD),) if dies == "radio" else ()
-    alone = Scenario(dies, Rung.NONE, radio, phase, 0.7, pilot_killed=dies == "pilot")
+    alone = Scenario(dies, Rung.NONE, radio, phase, moment, pilot_killed=dies == "pilot")
     flown = fly_scenario(alone, line)
     assert flown.to_wall > 0.0
     assert flown.landed
     assert flown.disarmed
     assert flown.readable
+
+
+@pytest.mark.slow
+def test_without_poses_for_good_the_vehicle_comes_down_inside_and_not_like_a_stone(missions):
+    names, speeds = sorted(missions), []
+    for seed in range(48):
+        mission = missions[names[seed % len(names)]]
+        moment = float(np.random.default_rng(seed).uniform(0.0, mission.duration))
+        x, y, _ = mission.start[0]
+        vehicle = VehicleSettings(auto_arming=False, seed=seed, position=(x, y, 0.0))
+        hidden = ViconFault(FaultKind.OCCLUDE, 0.0, FOR_GOOD)
+        lost = Scenario("no poses", Rung.LAND, (hidden,), moment=moment, vehicle=vehicle)
+        flown = fly_stepped(lost, mission, seed=seed)
+        judged = judge(lost, flown, mission, readable=True)
+        assert judged.rung == "land", judged.reason
+        assert judged.to_wall > 0.0
+        assert judged.landed
+        assert judged.disarmed
+        truth = flown.truth
+        down = int(np.argmax((truth.time > flown.struck) & (truth.position[:, 2] < 0.005)))
+        speeds.append((truth.position[down - 3, 2] - truth.position[down - 1, 2]) / 0.02)
+        off = int(np.argmax((truth.time > flown.struck) & ~truth.motor.any(axis=1)))
+        assert truth.position[off, 2] < 0.8
+    assert np.median(speeds) < 2.0
+    assert max(speeds) < 3.5
 
 
 @pytest.mark.parametrize("seed", RANDOM_SEEDS)

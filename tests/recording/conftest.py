@@ -125,8 +125,8 @@ def flight_messages(seed: int = 0) -> list[Telemetry]:
     entries = [
         (0.0, Phase.CONNECT), (0.3, Phase.RELEASE), (0.5, Phase.CONFIGURE), (0.9, Phase.FEED), (1.3, Phase.CONVERGE),
         (2.3, Phase.PREFLIGHT), (2.7, Phase.ARM), (3.2, Phase.TAKE_OFF), (5.5, Phase.GO_TO_START),
-        (STREAM, Phase.STREAM), (STREAM + TRAVEL, Phase.HOLD), (STREAM + TRAVEL + HOLD, Phase.HAND_BACK),
-        (LANDED - 3.6, Phase.LAND), (LANDED - 0.6, Phase.DISARM), (LANDED - 0.1, Phase.CLOSED),
+        (STREAM, Phase.STREAM), (STREAM + TRAVEL, Phase.HOLD), (STREAM + TRAVEL + HOLD, Phase.LAND),
+        (LANDED - 0.6, Phase.DISARM), (LANDED - 0.1, Phase.CLOSED),
     ]  # fmt: skip
     messages += [PhaseEntered(MONOTONIC + t, phase) for t, phase in entries]
     messages += [

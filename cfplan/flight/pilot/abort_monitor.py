@@ -16,7 +16,7 @@ from cfplan.safety.quantities import ON_LADDER
 
 LATEST_SETPOINT = 0.25  # s that a setpoint may be late; the vehicle stops following after 0.5 s
 OLDEST_LOG = 0.5  # s without the vehicle's log
-LINK_GONE = 10.0  # s without a log, after which the link counts as lost; until then the vehicle may be hovering
+LINK_GONE = 10.0  # s without a log, after which the link counts as lost; until then it may come back
 DISAGREEMENT_FACTOR = 5.0  # times preflight's limit that estimate and pose may be apart in the air
 # By what a quantity of the table with a ladder is measured.
 MEASURED: Mapping[str, Callable[[Estimate, VehicleStatus], Triple]] = MappingProxyType(
@@ -47,6 +47,7 @@ class Observation:
     link_lost: str = ""
     pose: Pose | None = None  # the last good one
     pose_fault: str = ""  # why none has come since
+    without_pose: float = 0.0  # s since the last pose that went to the vehicle: late ones do not
     wanted: Triple | None = None
     """m, where the vehicle should have been when the pose was taken; None where no setpoint says so."""
     estimate: Estimate | None = None
@@ -98,6 +99,9 @@ class AbortMonitor:
             rung = Rung.LAND if age > limits.age_land else Rung.BRAKE
             why = f" ({observation.pose_fault})" if observation.pose_fault else ""
             yield safety_abort(rung, f"the last good pose is {age:.2f} s old{why}")
+        without = observation.without_pose
+        if without > limits.age_land >= age:
+            yield safety_abort(Rung.LAND, f"no pose for {without:.2f} s: they come {age:.2f} s late")
 
     def _vehicle(self, observation: Observation) -> Iterator[Abort]:
         if observation.estimate is None or observation.status is None:

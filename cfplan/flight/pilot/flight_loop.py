@@ -23,12 +23,13 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.radio.link import Link
-from cfplan.flight.telemetry import Level, PoseReceived, Quaternion, Triple
+from cfplan.flight.telemetry import Level, PoseReceived, Triple
+from cfplan.vehicle.rotations import yaw_of
 
-REPLY = 0.2  # s in which the on-board commander must answer; setpoints may be missing for 0.5 s
 TRIES = 3
 _KEEP_ALIVE_PERIOD = 0.1  # s; the vehicle's watchdog stops the motors after 1 s without a keep-alive packet
 _RECENT = 1.0  # s of good poses that are kept
+_STREAMS = 8  # that are remembered: a pose that comes late is judged by the stream of its time
 
 
 class OrderSource(Protocol):
@@ -72,11 +73,13 @@ class FlightLoop:
         self._link: Link | None = None
         self._feeding = False  # poses are read and forwarded
         self.airborne = False
+        self._stop_expected = math.inf  # s, from when on motors that do not turn were meant to stop
         self._tolerated = Rung.NONE  # an abort of this rung or a lesser one changes nothing
         self.plan = Stream(mission.payloads, mission.rate, stop_from=mission.stops.__getitem__)
-        self.stream: Stream | None = None  # what each tick sends; None while the on-board commander flies
-        self._sending_paused = False
+        self.stream: Stream | None = None  # what each tick sends
+        self._begun: deque[Stream] = deque(maxlen=_STREAMS)  # the last streams, each with its start
         self.pose_fault = ""  # why the last pose was not good
+        self._forwarded = math.inf  # s, the time of the last pose that was forwarded
         self._source_fault = ""
         self._kept_alive = -math.inf  # s, when the vehicle's watchdog was last sent a keep-alive packet
         self.recent: deque[Pose] = deque()  # the good poses of the last second
@@ -117,6 +120,10 @@ class FlightLoop:
         """From now on only orders count again."""
         self.airborne = False
 
+    def expect_stop(self) -> None:
+        """From now on only orders count once the motors are seen to stand: they are meant to."""
+        self._stop_expected = self.now()
+
     def tolerate(self, rung: Rung) -> None:
         """Ignore aborts of this rung and of lesser ones from now on."""
         self._tolerated = rung
@@ -125,7 +132,8 @@ class FlightLoop:
 
     def begin(self, stream: Stream) -> Stream:
         """Send this stream from the next deadline on; return it with its start."""
-        self.stream, self._sending_paused = stream.starting_at(self._deadlines.upcoming), False
+        self.stream = stream.starting_at(self._deadlines.upcoming)
+        self._begun.append(self.stream)
         return self.stream
 
     def begin_plan(self) -> None:
@@ -133,16 +141,22 @@ class FlightLoop:
         self.plan = self.begin(self.plan)
         self.history.first_setpoint = self.plan.start
 
-    def pause_sending(self) -> None:
-        """Send no setpoint until `resume_sending`; the stream's clock runs on."""
-        self._sending_paused = True
-
-    def resume_sending(self) -> None:
-        self._sending_paused = False
-
     def end_stream(self) -> None:
         """Send no setpoints any more."""
-        self.stream, self._sending_paused = None, False
+        self.stream = None
+
+    def wanted(self, time: float) -> Triple | None:
+        """Return where the vehicle was asked to be, m, at a time, s; None before the streams that are remembered."""
+        moment = time - self.mission.lead
+        if self.stream is None:
+            return None
+        return next((stream.position(moment) for stream in reversed(self._begun) if stream.start <= moment), None)
+
+    def asked(self) -> tuple[Triple, Triple, float]:
+        """Return position, m, velocity, m/s, and yaw, rad, that the vehicle is asked for now, by its stream."""
+        assert self.stream is not None
+        position, velocity, _, quaternion, _ = self.stream.states[self.stream.index(self.now())]
+        return position, velocity, yaw_of(quaternion)
 
     # Ticks.
 
@@ -151,7 +165,7 @@ class FlightLoop:
         due = self._deadlines.wait()
         now = self.now()
         stream = self.stream
-        if stream is not None and not self._sending_paused:
+        if stream is not None:
             index = stream.index(now)
             self.link.send(stream.packets[index])
             if self.history.first_setpoint:
@@ -188,13 +202,15 @@ class FlightLoop:
         now = self.now()
         if newest is not None and now - newest.time < self.limits.pose.age_brake:
             self.link.send_pose(self._predictor.position(now), newest.quaternion)
+            self._forwarded = newest.time
         while len(self.recent) > 1 and self.recent[0].time < self.recent[-1].time - _RECENT:
             self.recent.popleft()
 
     def _note_deviation(self, pose: Pose) -> None:
-        if self.stream is not self.plan or pose.time < self.plan.start:
+        moment = pose.time - self.mission.lead
+        if self.stream is not self.plan or moment < self.plan.start:
             return
-        distance = math.dist(pose.position, self.plan.position(pose.time - self.mission.lead))
+        distance = math.dist(pose.position, self.plan.position(moment))
         self.history.off_plan.append((pose.time - self.plan.start, distance))
 
     def _monitor_flight(self, now: float, late: float) -> None:
@@ -202,21 +218,27 @@ class FlightLoop:
         link = self.link
         if link.lost or (self.airborne and link.estimate is not None and now - link.estimate.time > LINK_GONE):
             raise LinkLost
-        pose, stream = self._pose_gate.last, self.stream
+        pose = self._pose_gate.last
         observation = Observation(
             now=now,
             order=self._orders.worst,
             main_gone=self._orders.gone,
             pose=pose,
             pose_fault=self._source.fault or self.pose_fault,
-            wanted=stream.position(pose.time - self.mission.lead) if stream is not None and pose is not None else None,
+            without_pose=self.blind_for,
+            wanted=self.wanted(pose.time) if pose is not None else None,
             estimate=link.estimate,
             status=link.status,
-            late=late if stream is not None else 0.0,
+            late=late if self.stream is not None else 0.0,
         )
-        abort = self._monitor.gravest(observation) if self.airborne else self._monitor.ordered(observation)
+        watched = self.airborne and not self._stopped(link)
+        abort = self._monitor.gravest(observation) if watched else self._monitor.ordered(observation)
         if abort is not None and abort.rung > self._tolerated:
             raise AbortRaised(abort)
+
+    def _stopped(self, link: Link) -> bool:
+        """Return whether the motors stand, as they are meant to."""
+        return link.status is not None and link.status.time > self._stop_expected and not any(link.status.motor)
 
     def _obey_orders(self) -> None:
         """Do what a tick does while there is no link: raise AbortRaised for an order."""
@@ -247,14 +269,6 @@ class FlightLoop:
         """Tick for `duration`, s."""
         self.until(lambda: False, duration)
 
-    def ask(self, command: Callable[[], None], number: int, tries: int = TRIES) -> int | None:
-        """Send a command to the on-board commander; return its answer, None where there is none."""
-        for _ in range(tries):
-            command()
-            if self.until(lambda: number in self.link.replies, REPLY):
-                return self.link.replies[number]
-        return None
-
     # The vehicle's state.
 
     def pose(self) -> Pose:
@@ -263,12 +277,26 @@ class FlightLoop:
         assert pose is not None
         return pose
 
-    def resting(self) -> tuple[Triple, Quaternion]:
-        """Return where the vehicle is asked to hover: at the stream's end, or where it is if there is no stream."""
-        if self.stream is None:
-            return self.pose().position, self.pose().quaternion
-        position, _, _, quaternion, _ = self.stream.states[self.stream.last]
-        return position, quaternion
+    def seen(self) -> tuple[Triple, Triple, float]:
+        """Return position, m, velocity, m/s, and yaw, rad, now, by the last good poses."""
+        return self._predictor.position(self.now()), self._predictor.velocity(), yaw_of(self.pose().quaternion)
+
+    def heights(self, duration: float) -> list[float]:
+        """Return the heights, m, of the good poses of the last `duration`, s; none if they do not reach back as far."""
+        since = self.now() - duration
+        if not self.recent or self.recent[0].time > since:
+            return []
+        return [pose.position[2] for pose in self.recent if pose.time > since]
+
+    @property
+    def blind_for(self) -> float:
+        """Return how long, s, the vehicle has been without a pose: late ones are not forwarded."""
+        return self.now() - self._forwarded
+
+    @property
+    def blind(self) -> bool:
+        """Return whether the vehicle has been without a pose for so long that it must land."""
+        return self.blind_for > self.limits.pose.age_land
 
     def bits(self, mask: int) -> int:
         """Return the bits of `mask` that are set in the log variable supervisor.info; 0 without a log."""

@@ -1,7 +1,7 @@
 """The pilot: the phases of one flight in the air, and the abort ladder that ends it early.
 
-Each rung of the abort ladder can only be left for a graver one. Motors never stop between the stream and the on-board
-commander: the commander gets its command first, and the priority only when it has answered.
+Each rung of the abort ladder can only be left for a graver one. From lift-off to the floor the vehicle flies by
+setpoints alone: it has time-outs for these, and none for what its on-board commander flies.
 """
 
 import math
@@ -14,13 +14,14 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.pilot.abort_monitor import Abort, safety_abort
 from cfplan.flight.pilot.flight_history import FlightHistory
-from cfplan.flight.pilot.flight_loop import REPLY, TRIES, AbortRaised, FlightLoop, LinkLost, OrderSource
+from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop, LinkLost, OrderSource
+from cfplan.flight.pilot.landing import Landing, stop_motors
 from cfplan.flight.pilot.mission import Mission, manoeuvre_time
 from cfplan.flight.pilot.outcome import FlightOutcome, Rung
 from cfplan.flight.pilot.prearm import prepare
 from cfplan.flight.pilot.stream import Stream
-from cfplan.flight.radio.link import GO_TO, LAND, TAKE_OFF, Link
-from cfplan.flight.radio.supervisor_bits import ARMED, FLYING, HIGH_LEVEL_ACTIVE, LOCKED
+from cfplan.flight.radio.link import Link
+from cfplan.flight.radio.supervisor_bits import ARMED, CAN_FLY, FAULTS, FLYING, LOCKED
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.rate_trade import ahead
@@ -32,11 +33,7 @@ _AT_START_WITHIN = 0.06  # m
 _AT_START_FOR = 0.5  # s
 _FOLLOWS_WITHIN = 0.15  # m from its setpoint; a vehicle farther off stops from the setpoint nearest to it
 _BRAKE_HOLD = 1.0  # s of hover after a stop
-_ON_THE_FLOOR = 0.15  # m above where it took off
-_BELOW_FLOOR = 0.03  # m below the floor that landings aim at, so that motors stop on the floor and not above
-_BLIND_LAND_SPEED = 0.6  # m/s, mean, at least: without poses the vehicle drifts half a metre in 2 s
-_SETTLE_ON_FLOOR = 0.3  # s on the floor before motors stop
-_MOTORS_STOP_WITHIN = 4.0  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
+_READY_WITHIN = 1.0  # s; a vehicle that arms itself is briefly not ready now and then
 # m above the floor: when the setpoint has reached the first, the pose must have reached the second
 _ASKED_TO_RISE, _RISEN = 0.12, 0.015
 _LOCKED_WITHIN = 2.5  # s for a cut to arrive; without setpoints the vehicle stops its motors after 2 s by itself
@@ -61,6 +58,7 @@ class Pilot:
         self._history = FlightHistory(report, clock)
         self._loop = FlightLoop(mission, source, orders, self._history, clock)
         self._floor = 0.0  # m, height of the tracked body before take-off
+        self._landing = Landing(self._loop, self._floor)
 
     def fly(self) -> FlightOutcome:
         """Fly all phases. Raises a CfplanError if the vehicle or its poses are not available; nothing is armed then."""
@@ -79,11 +77,11 @@ class Pilot:
         loop = self._loop
         try:
             self._floor = prepare(loop, self._connect, self._enter_real_time)
+            self._landing = Landing(loop, self._floor)
             self._take_off()
             self._go_to_start()
             self._fly_plan()
-            self._hand_back()
-            self._land()
+            self._landing.land()
         except AbortRaised as raised:
             return self._leave_plan(raised.abort)
         except LinkLost:
@@ -99,11 +97,7 @@ class Pilot:
         return ExitCode.OK, "landed"
 
     def _take_off(self) -> None:
-        """Climb by setpoints, once the on-board commander has agreed to take off: it knows whether the vehicle may fly.
-
-        Flown by the on-board commander the vehicle would hover on without this program or its poses; flown by setpoints
-        it has time-outs.
-        """
+        """Climb by setpoints."""
         loop = self._loop
         self._history.enter(Phase.TAKE_OFF)
         height, (x, y, _) = self._mission.take_off_height, loop.pose().position
@@ -112,11 +106,7 @@ class Pilot:
         way = self._way((x, y, self._floor), yaw, (x, y, height), yaw, duration)
         if way.stop_from is not None:
             way.stop_from(0)  # the first call is slow: make it on the ground
-        code = loop.ask(lambda: loop.link.take_off(height, duration), TAKE_OFF)
-        if code:
-            raise PreflightError(
-                f"the vehicle refuses to take off (code {code})", hint="restart the vehicle, and look at its battery"
-            )
+        self._require_ready()
         loop.lift_off()
         way = loop.begin(way)
         if loop.until(lambda: loop.now() > way.end or self._pose_stays(way), math.inf) and self._pose_stays(way):
@@ -124,6 +114,22 @@ class Pilot:
         loop.until(lambda: abs(loop.pose().position[2] - height) < _AT_START_WITHIN, 2.0)
         if loop.pose().position[2] - self._floor < climb / 2:
             raise AbortRaised(safety_abort(Rung.LAND, "the vehicle does not rise"))
+
+    def _require_ready(self) -> None:
+        """Wait until the vehicle's supervisor says that it may fly: it ignores setpoints until then.
+
+        Raises PreflightError if it does not say so.
+        """
+        loop = self._loop
+        if loop.until(lambda: loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, _READY_WITHIN):
+            return
+        faults = " and ".join(fault for bit, fault in FAULTS.items() if loop.bits(bit))
+        armed = "is armed and not ready to fly" if loop.bits(ARMED) else "is no longer armed"
+        raise PreflightError(
+            f"the vehicle may not take off: it {faults or armed}",
+            where="vehicle",
+            hint="restart it on a level floor; its console says more",
+        )
 
     def _pose_stays(self, way: Stream) -> bool:
         """Return whether the tracked body stays on the floor while the vehicle must rise.
@@ -138,9 +144,16 @@ class Pilot:
 
     def _stay_down(self) -> None:
         """Stop the motors, at most a quarter of a metre above the floor, and raise PreflightError."""
-        self._stop_motors()
-        self._loop.touch_down()
-        self._motors_stop()
+        loop = self._loop
+        turning = bool(loop.bits(FLYING))
+        stop_motors(loop)
+        loop.touch_down()
+        if not turning:
+            raise PreflightError(
+                "the vehicle does not start its motors",
+                where="vehicle",
+                hint="restart it; its console may say why its supervisor ignores setpoints",
+            )
         raise PreflightError(
             "the tracked body stays on the floor while the vehicle takes off",
             where="motion capture",
@@ -157,19 +170,15 @@ class Pilot:
             payloads, rate, stop_from=lambda row: encode_stops(motion, rate, rows=np.array([row]), space=space)[0]
         )
 
-    def _follow(self, stream: Stream) -> None:
-        """Fly a stream to its end."""
-        end = self._loop.begin(stream).end
-        self._loop.until(lambda: self._loop.now() > end, math.inf)
-
     def _go_to_start(self) -> None:
         """Fly to the plan's first setpoint and wait until the vehicle is there."""
         loop = self._loop
         self._history.enter(Phase.GO_TO_START)
         start, yaw = self._mission.start
-        (above, quaternion), here = loop.resting(), loop.pose().position
-        duration = manoeuvre_time(math.dist(here, start), self._limits.ground.go_to_speed)
-        self._follow(self._way(above, yaw_of(quaternion), start, yaw, duration))
+        above, _, yaw_above = loop.asked()
+        duration = manoeuvre_time(math.dist(loop.pose().position, start), self._limits.ground.go_to_speed)
+        way = loop.begin(self._way(above, yaw_above, start, yaw, duration))
+        loop.until(lambda: loop.now() > way.end, math.inf)
         near_since = math.inf
 
         def settled() -> bool:
@@ -194,96 +203,6 @@ class Pilot:
         self._history.enter(Phase.HOLD)
         loop.pause(self._mission.hold_time)
 
-    def _hand_back(self) -> None:
-        """Let the on-board commander hover at the plan's end."""
-        loop = self._loop
-        self._history.enter(Phase.HAND_BACK)
-        end, yaw = self._mission.end
-        if self._hand_over(lambda: loop.link.go_to(end, yaw, 1.0), GO_TO):
-            loop.pause(1.0)
-
-    def _hand_over(self, command: Callable[[], None], number: int) -> bool:
-        """Hand the vehicle from the stream to the on-board commander; return whether that takes over.
-
-        A setpoint would undo the command, so none is sent meanwhile. The stream goes on if the commander refuses.
-        """
-        loop = self._loop
-        for _ in range(TRIES):
-            loop.pause_sending()
-            code = loop.ask(command, number, tries=1)
-            if code == 0:
-                break
-            loop.resume_sending()  # hover on while asking again
-            loop.pause(0.05)
-        else:
-            self._history.say(Level.WARNING, f"the on-board commander does not take over (code {code})")
-            return False
-        loop.end_stream()
-        for _ in range(TRIES):
-            loop.link.release_priority()
-            if loop.until(lambda: bool(loop.bits(HIGH_LEVEL_ACTIVE)), REPLY):
-                break
-        return True
-
-    def _land(self) -> None:
-        """Descend where the vehicle is until it reports that it no longer flies."""
-        self._history.enter(Phase.LAND)
-        for _ in range(TRIES):
-            if self._try_to_land():
-                self._loop.touch_down()
-                return
-        raise AbortRaised(safety_abort(Rung.CUT, "the vehicle does not land"))
-
-    def _try_to_land(self) -> bool:
-        """Command a landing, by setpoints if the on-board commander refuses; return whether the motors stopped."""
-        loop = self._loop
-        height = max(loop.pose().position[2] - self._floor, 0.0)
-        blind = loop.now() - loop.pose().time > self._limits.pose.age_brake
-        speed = max(self._limits.ground.land_speed, _BLIND_LAND_SPEED if blind else 0.0)
-        duration = manoeuvre_time(height, speed)
-
-        def land() -> None:
-            loop.link.land(self._floor - _BELOW_FLOOR, duration)
-
-        if not self._commanded(land):
-            self._descend(duration)
-            return self._motors_stop()
-        loop.pause(duration)
-        if self._motors_stop():
-            return True
-        if loop.pose().position[2] - self._floor > _ON_THE_FLOOR:
-            return False
-        self._history.say(Level.WARNING, "on the floor with turning motors: stopping them")
-        loop.link.stop_motors()
-        return self._motors_stop()
-
-    def _commanded(self, land: Callable[[], None]) -> bool:
-        """Return whether the on-board commander lands; without a stream, no answer counts as yes."""
-        if self._loop.stream is not None:
-            return self._hand_over(land, LAND)
-        return not self._loop.ask(land, LAND)
-
-    def _descend(self, duration: float) -> None:
-        """Descend by setpoints from where the vehicle hovers, and stop the motors."""
-        loop = self._loop
-        place, quaternion = loop.resting()
-        yaw = yaw_of(quaternion)
-        self._follow(self._way(place, yaw, (*place[:2], self._floor - _BELOW_FLOOR), yaw, duration))
-        loop.pause(_SETTLE_ON_FLOOR)
-        self._stop_motors()
-
-    def _stop_motors(self) -> None:
-        """Stop the motors by stop setpoints, the last setpoints to be sent."""
-        loop = self._loop
-        loop.end_stream()
-        for _ in range(TRIES):
-            loop.link.stop_setpoint()
-            loop.pause(0.02)
-        loop.link.release_priority()
-
-    def _motors_stop(self) -> bool:
-        return self._loop.until(lambda: not self._loop.bits(FLYING), _MOTORS_STOP_WITHIN)
-
     # The abort ladder.
 
     def _leave_plan(self, abort: Abort) -> tuple[ExitCode, str]:
@@ -293,7 +212,6 @@ class Pilot:
         while True:
             self._history.rung = max(self._history.rung, abort.rung)
             loop.tolerate(self._history.rung)
-            loop.resume_sending()
             level = Level.ERROR if abort.rung is Rung.CUT else Level.WARNING
             self._history.say(level, f"{abort.rung.name.lower()}: {abort.text}")
             try:
@@ -312,25 +230,29 @@ class Pilot:
 
     def _brake(self) -> None:
         self._stop()
-        self._history.enter(Phase.HOLD)
-        self._loop.pause(_BRAKE_HOLD)
-        self._land()
+        if not self._landing.begun:
+            self._history.enter(Phase.HOLD)
+            self._loop.pause(_BRAKE_HOLD)
+        self._landing.land()
 
     def _stop_and_land(self) -> None:
         self._stop()
-        self._land()
+        self._landing.land()
 
     def _stop(self) -> None:
-        """Brake along the path to a hover, or finish a stop that has begun; without a stream do nothing."""
-        loop = self._loop
-        left = loop.stream
-        if left is not None and left.stop_from is not None:
+        """Brake along the path to a hover, or finish a stop that has begun; sink besides where poses are gone."""
+        loop, left = self._loop, self._loop.stream
+        if left is None or self._landing.begun:
+            return
+        if left.stop_from is not None:
             stop = left.stop_from(self._present_index(left))
             started = loop.begin(Stream(stop, self._mission.rate))
             if left is loop.plan:
                 self._history.stopped_at = started.start
-        if loop.stream is not None:
-            end = loop.stream.end
+        end = loop.stream.end if loop.stream is not None else 0.0
+        loop.until(lambda: loop.now() > end or loop.blind, math.inf)
+        if loop.now() < end:
+            self._landing.sink_while_stopping()
             loop.until(lambda: loop.now() > end, math.inf)
 
     def _present_index(self, stream: Stream) -> int:
@@ -340,8 +262,8 @@ class Pilot:
         pose = loop.pose()
         if loop.now() - pose.time > self._limits.pose.age_warning:
             return due
-        lead = self._mission.lead
-        if math.dist(pose.position, stream.position(pose.time - lead)) < _FOLLOWS_WITHIN:
+        wanted = loop.wanted(pose.time)
+        if wanted is None or math.dist(pose.position, wanted) < _FOLLOWS_WITHIN:
             return due
         nearest, least = due, math.inf
         for index in range(due, -1, -1):

@@ -15,8 +15,8 @@ class Stream:
     """Setpoints at a fixed rate from a start on; before it the first, after its end the last.
 
     `payloads` (N, 29) uint8, the last of them at rest; `rate` in Hz; `start` in s on the clock of time.monotonic();
-    `stop_from` returns (M, 29) uint8, a way to stop from one of the setpoints, and is None for a stop. Everything slow
-    is done when the stream is made, so that sending is a look-up.
+    `stop_from` returns (M, 29) uint8, a way to stop from one of the setpoints, and is None for a stop and a descent.
+    Everything slow is done when the stream is made, so that sending is a look-up.
     """
 
     def __init__(
@@ -26,7 +26,7 @@ class Stream:
         start: float = 0.0,
         stop_from: Callable[[int], NDArray] | None = None,
     ):
-        self.start, self.rate, self.stop_from = start, rate, stop_from
+        self.payloads, self.start, self.rate, self.stop_from = payloads, start, rate, stop_from
         self.packets: list[Any] = [packet(GENERIC_PORT, 0, row.tobytes()) for row in payloads]
         state = decode(payloads)
         fields = (state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate)

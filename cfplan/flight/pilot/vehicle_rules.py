@@ -182,7 +182,8 @@ PARAMETER_RULES: tuple[ParameterRule, ...] = (
     ),
     ParameterRule(
         "commander.enHighLevel", _always((1, 1)), "1", Action.SET,
-        "Take-off and landing are the on-board commander's; since firmware 2022.01 the parameter has no effect.",
+        "After a flight the on-board commander's null setpoints keep the supervisor from locking; since firmware "
+        "2022.01 the parameter has no effect.",
         "restart the vehicle", optional=True,
     ),
     ParameterRule(
@@ -287,7 +288,7 @@ COMMANDER_SIGNS: tuple[CommanderSign, ...] = (
     CommanderSign(
         "the controller has a setpoint", lambda traffic: traffic.setpoint,
         "The setpoint in force, in the log group ctrltarget, is not empty although cfplan sends none: another client, "
-        "an app or a remote control does, at a priority that overrules take-off and landing.",
+        "an app or a remote control does, at the priority of cfplan's own or a higher one.",
     ),
 )  # fmt: skip
 

@@ -19,7 +19,6 @@ from cfplan.flight.telemetry import Estimate, Telemetry, Triple, VehicleStatus
 from cfplan.vehicle.airframe import GRAVITY
 
 HIGH_LEVEL_PORT, GENERIC_PORT, LOCALIZATION_PORT, SUPERVISOR_PORT, PLATFORM_PORT = 8, 7, 6, 9, 13
-TAKE_OFF, LAND, STOP, GO_TO = 7, 8, 3, 12  # commands of the on-board commander
 EXTERNAL_POSE = 8
 
 _MILLI = 1e-3
@@ -92,28 +91,9 @@ class Link:
         """Give the vehicle back to its on-board commander."""
         self._send(GENERIC_PORT, 1, struct.pack("<BI", 0, 0))
 
-    def take_off(self, height: float, duration: float) -> None:
-        """Take off straight up to `height`, m above the origin, in `duration`, s, keeping yaw."""
-        self._command(TAKE_OFF, struct.pack("<Bff?f", 0, height, 0.0, True, duration))
-
-    def land(self, height: float, duration: float) -> None:
-        """Land straight down to `height`, m above the origin, in `duration`, s, keeping yaw; motors off at the end."""
-        self._command(LAND, struct.pack("<Bff?f", 0, height, 0.0, True, duration))
-
-    def go_to(self, position: Sequence[float], yaw: float, duration: float) -> None:
-        self._command(GO_TO, struct.pack("<BBB5f", 0, False, False, *position, yaw, duration))
-
-    def stop_motors(self) -> None:
-        """End whatever the on-board commander does; motors off."""
-        self._command(STOP, b"\0")
-
     def stop_setpoint(self) -> None:
         """Switch the motors off until another setpoint comes."""
         self._send(GENERIC_PORT, 0, b"\0")
-
-    def _command(self, command: int, arguments: bytes) -> None:
-        self.replies.pop(command, None)
-        self._send(HIGH_LEVEL_PORT, 0, bytes([command]) + arguments)
 
     def arm(self, do_arm: bool) -> None:
         if self.protocol >= 12:

@@ -1,4 +1,4 @@
-"""Hover to hover by setpoints: to the start of a plan, and down if the on-board commander does not land.
+"""Hover to hover by setpoints: up to the height of take-off, and to the start of a plan.
 
 While setpoints come, the vehicle's own time-outs watch over it: it levels out when they stop, and stops its motors
 2 s later. In the hands of its on-board commander it would hover on without poses, and drift.

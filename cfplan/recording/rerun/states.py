@@ -19,7 +19,6 @@ PHASE_COLOURS = {
     Phase.GO_TO_START: _AIR,
     Phase.STREAM: _PATH,
     Phase.HOLD: _HELD,
-    Phase.HAND_BACK: _AIR,
     Phase.LAND: _DOWN,
     Phase.DISARM: _GROUND,
     Phase.CLOSED: _GROUND,

@@ -39,4 +39,3 @@ class VehicleSettings:
     stored: Mapping[str, float] = field(default_factory=dict)  # parameters that it has other values of than the usual
     stubborn: tuple[str, ...] = ()  # parameters that writing does not change
     parameter_delay: float = 0.0  # s until it answers a write
-    busy: bool = False  # the vehicle refuses every command to the on-board commander

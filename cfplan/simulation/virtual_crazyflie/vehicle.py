@@ -151,9 +151,7 @@ class VirtualCrazyflie:
         elif port == Port.MEMORY:
             answer = self.memories.receive(channel, payload)
         elif port == Port.HIGH_LEVEL:
-            answer = self.planner.receive(
-                payload, self.tick / 1000, blocked=self.settings.busy or not self.supervisor.can_fly
-            )
+            answer = self.planner.receive(payload, self.tick / 1000, blocked=not self.supervisor.can_fly)
         elif port == Port.SUPERVISOR:
             answer = self._supervise(channel, payload)
         elif port == Port.LOCALIZATION:

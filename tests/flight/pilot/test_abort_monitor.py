@@ -42,6 +42,13 @@ def test_old_poses_brake_and_then_land(monitor, age, expected):
     assert rung(monitor, observation(age=age)) is expected
 
 
+def test_poses_that_stay_late_land_as_soon_as_none_at_all(monitor):
+    assert rung(monitor, observation(age=0.2, without_pose=0.45)) is Rung.BRAKE
+    late = monitor.gravest(observation(age=0.2, without_pose=0.55))
+    assert late.rung is Rung.LAND
+    assert "0.20 s late" in late.text
+
+
 @pytest.mark.parametrize(
     ("off", "expected"), [(0.29, Rung.NONE), (0.31, Rung.BRAKE), (0.61, Rung.LAND), (1.01, Rung.CUT)]
 )

@@ -9,8 +9,8 @@ import pytest
 from cfplan.errors import ExitCode, InputError
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.outcome import Rung
-from cfplan.flight.radio.link import GO_TO, LAND, TAKE_OFF
 from cfplan.flight.telemetry import Phase, PoseReceived, SetpointSent
+from cfplan.safety.limits import Ladder
 
 
 def test_a_flight_goes_through_every_phase_in_order_and_ends_disarmed(world, fly):
@@ -32,10 +32,17 @@ def test_each_setpoint_is_sent_when_it_is_due(world, mission, fly):
     assert outcome.lateness.skipped == 0
 
 
-def test_the_command_comes_before_the_priority_is_given_back(world, fly):
+def test_motors_stop_by_stop_setpoints_on_the_floor_and_the_vehicle_counts_its_own_again(world, fly):
     fly()
-    after_take_off = world.calls[world.calls.index("take off") :]
-    assert after_take_off[:4] == ["take off", "go to", "release", "land"]
+    flown = world.calls[world.calls.index("arm") :]
+    assert flown == ["arm", "preflight logs off", "stop setpoint", "release", "disarm", "close", "close"]
+
+
+def test_stop_setpoints_that_the_radio_swallows_are_sent_again(world, fly):
+    world.stops_lost = 5
+    assert fly().exit_code is ExitCode.OK
+    assert world.calls.count("stop setpoint") == 2
+    assert not world.motors_on
 
 
 def test_good_poses_are_forwarded_while_the_stream_runs(world, fly):
@@ -162,7 +169,7 @@ def test_no_pose_of_a_frozen_source_is_forwarded(world, fly):
     assert not [place for place in world.forwarded if place[0] > frozen_from]
 
 
-@pytest.mark.parametrize("phase", [Phase.TAKE_OFF, Phase.GO_TO_START, Phase.HOLD, Phase.HAND_BACK, Phase.LAND])
+@pytest.mark.parametrize("phase", [Phase.TAKE_OFF, Phase.GO_TO_START, Phase.HOLD, Phase.LAND])
 @pytest.mark.parametrize("after", [0.0, 0.01, 0.02, 0.7])
 def test_the_operator_can_land_at_any_time_in_the_air(world, fly, phase, after):
     if phase is Phase.TAKE_OFF and after == 0.0:
@@ -180,7 +187,7 @@ def test_an_order_on_the_ground_ends_it_there(world, fly, phase):
     world.when(phase, 0.0, lambda: land(world))
     outcome = fly()
     assert outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
-    assert "take off" not in world.calls
+    assert world.position[2] == world.floor
     assert world.closed
 
 
@@ -269,35 +276,87 @@ def test_older_firmware_flies_without_it_and_that_is_said(world, fly):
     assert "no kalman.dragB_x" in world.said
 
 
-def test_a_refused_take_off_ends_on_the_ground(world, fly):
-    world.refuses[TAKE_OFF] = 16
+@pytest.mark.parametrize(
+    ("refuse", "text"),
+    [
+        (lambda world: setattr(world, "can_fly", False), "it is armed and not ready to fly"),
+        (lambda world: setattr(world, "armed", False), "it is no longer armed"),
+        (lambda world: vars(world).update(can_fly=False, extra_bits=1 << 5), "it tumbled"),
+    ],
+)
+def test_a_vehicle_that_may_not_fly_gets_no_setpoint(world, fly, refuse, text):
+    world.when(Phase.ARM, 0.1, lambda: refuse(world))
     outcome = fly()
     assert outcome.exit_code is ExitCode.PREFLIGHT
-    assert "refuses to take off" in outcome.reason
+    assert f"may not take off: {text}" in outcome.reason
+    assert world.position[2] == world.floor
+    assert not world.motors_on
     assert world.calls[-3:-1] == ["disarm", "close"]
 
 
-def test_a_vehicle_whose_commander_refuses_to_land_is_brought_down_by_setpoints(world, fly):
-    world.refuses[LAND] = 16
+def test_a_vehicle_that_ignores_setpoints_is_disarmed(world, fly):
+    world.deaf = True
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.PREFLIGHT
+    assert "does not start its motors" in outcome.reason
+    assert not world.armed
+    assert world.closed
+
+
+@pytest.mark.parametrize("floor", [0.3, 0.1, -0.1, -0.25])
+def test_a_floor_that_is_higher_or_lower_than_believed_stops_the_motors_where_it_is(world, fly, floor):
+    world.when(Phase.HOLD, 0.0, lambda: setattr(world, "floor", floor))
     outcome = fly()
     assert outcome.exit_code is ExitCode.OK
     assert outcome.rung is Rung.NONE
-    assert world.position[2] < 0.05
+    assert world.position[2] == pytest.approx(floor)
     assert world.motors_off_in_the_air == 0.0
-    assert "stop setpoint" in world.calls
-    assert "emergency stop" not in world.calls
 
 
-def test_a_refused_hand_over_leaves_the_stream_flying_and_lands_by_it(world, fly):
-    def refuse():
-        world.refuses.update({GO_TO: 16, LAND: 16})
-
-    world.when(Phase.HOLD, 0.1, refuse)
+def test_where_no_floor_comes_the_motors_stop_a_little_below_it(world, fly):
+    world.when(Phase.HOLD, 0.0, lambda: setattr(world, "floor", -10.0))
     outcome = fly()
-    assert outcome.rung is Rung.NONE
-    assert "does not take over" in world.said
-    assert world.position[2] < 0.05
+    assert outcome.exit_code is ExitCode.OK
+    assert "nothing shows that the vehicle stands" in world.said
+    assert world.position[2] == pytest.approx(-0.3, abs=0.01)
+
+
+def test_landing_is_gentle_and_touches_the_floor_slowly(world, fly):
+    begun = dict(fly().phases)[Phase.LAND]
+    sent = [each for each in world.messages if isinstance(each, SetpointSent) and each.time > begun]
+    assert max(-each.velocity[2] for each in sent) <= 1.5 * 0.4 + 1e-3
+    assert -next(each for each in sent if each.position[2] < world.floor).velocity[2] == pytest.approx(0.1, abs=0.01)
+    assert max(abs(each.acceleration[2]) for each in sent) < 1.0
+    assert all(each.velocity[:2] == (0.0, 0.0) and each.body_rate == (0.0, 0.0, 0.0) for each in sent)
+
+
+def test_poses_that_go_in_landing_make_it_quick_and_those_that_come_back_gentle(world, fly):
+    world.when(Phase.LAND, 0.3, lambda: stop_poses(world))
+    world.when(Phase.LAND, 1.05, lambda: setattr(world, "poses_stopped", False))
+    outcome = fly()
+    begun = dict(outcome.phases)[Phase.LAND]
+    sent = [(each.time - begun, -each.velocity[2]) for each in world.messages if isinstance(each, SetpointSent)]
+    assert max(speed for time, speed in sent if 0.0 < time < 0.7) <= 0.6 + 1e-3
+    assert max(speed for time, speed in sent if 0.9 < time < 1.1) > 1.0
+    assert max(speed for time, speed in sent if time > 1.7) <= 0.6 + 1e-3
+    assert outcome.rung is Rung.LAND
     assert world.motors_off_in_the_air == 0.0
+
+
+def test_without_poses_the_motors_stop_in_time_wherever_the_vehicle_is(world, fly):
+    world.when(Phase.HOLD, 0.0, lambda: setattr(world, "floor", -10.0))
+    world.when(Phase.HOLD, 0.0, lambda: stop_poses(world))
+    outcome = fly()
+    assert outcome.rung is Rung.LAND
+    lost = dict(outcome.phases)[Phase.HOLD]
+    assert world.motors_off_since - lost == pytest.approx(2.5, abs=0.1)
+
+
+def test_a_pose_from_before_a_stream_is_not_judged_by_it(world, fly):
+    world.when(Phase.GO_TO_START, 0.05, lambda: stop_poses(world))
+    outcome = fly()
+    assert outcome.rung is Rung.LAND
+    assert "from the setpoint" not in outcome.reason
 
 
 def test_a_source_without_poses_is_an_error_with_a_hint(world, fly):
@@ -319,9 +378,9 @@ def test_a_fault_of_the_program_itself_lands(world, fly):
     assert world.position[2] < 0.05
 
 
-def test_leaving_the_room_beyond_the_last_line_cuts(world, fly):
+def test_leaving_the_room_beyond_the_last_line_cuts(world, limits, fly):
     world.when(Phase.GO_TO_START, 0.5, lambda: blow_away(world))
-    outcome = fly()
+    outcome = fly(flight=replace(limits.flight, deviation=Ladder(9.0, 9.0, 9.0)))
     assert outcome.rung is Rung.CUT
     assert "fence" in outcome.reason
 

@@ -108,13 +108,6 @@ def test_a_slow_write_is_answered_after_its_delay():
     assert [packet for packet in rig.received if packet[0] >> 4 == Port.PARAMETERS]
 
 
-def test_a_busy_vehicle_refuses_to_take_off():
-    rig = Rig(VehicleSettings(busy=True))
-    rig.run(1.0)
-    (answer,) = rig.send(Port.HIGH_LEVEL, 0, bytes((TAKE_OFF,)) + struct.pack("<Bff?f", 0, 0.5, 0.0, True, 1.5))
-    assert answer[4] == 16
-
-
 def test_older_firmware_has_no_supervisor_port_and_no_drag():
     rig = Rig(VehicleSettings(protocol=10, firmware="2025.12"))
     assert not rig.send(Port.SUPERVISOR, 0, bytes((12,)))

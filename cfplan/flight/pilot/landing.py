@@ -1,0 +1,157 @@
+"""The landing: down by setpoints, and motors off once the vehicle stands.
+
+The vehicle is never given to its on-board commander, which has no time-out: while setpoints fly it, a vehicle whose
+pilot or radio dies levels out after 0.5 s and stops its motors after 2 s, at any height.
+
+The setpoints sink on beneath the floor. A vehicle that no longer follows them stands, be it on a box or lower than
+where it took off, and its motors are stopped. Without poses only its own estimate is left, whose height goes wrong with
+the square of time; so it comes down as fast as it may touch the floor. Its estimate still feels the floor. When neither
+that nor a pose has come in time, the motors stop wherever the vehicle is: it falls, but does not fly away.
+"""
+
+import math
+
+from numpy.typing import NDArray
+
+from cfplan.flight.pilot.abort_monitor import safety_abort
+from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.pilot.stream import Stream
+from cfplan.flight.radio.supervisor_bits import FLYING
+from cfplan.flight.setpoints.descent import descent, quick_descent, sinking
+from cfplan.flight.telemetry import Level, Phase
+
+_CRUISE = 1.5  # times the mean speed of landing: what a descent sinks at between its ends
+_BENEATH_FLOOR = 0.3  # m below where it took off, and below the space, that setpoints sink to
+_NEAR_FLOOR = 0.15  # m above where it took off
+_NOT_FOLLOWING = 0.05  # m that a standing vehicle is above its setpoint, near the floor
+_NOT_HELD = 0.25  # m above its setpoint, where the controller asks for no thrust: what does not fall, stands
+_STANDS_FOR = 0.3  # s
+_STANDS_WITHIN = 0.015  # m, the range of the heights of a standing body's poses
+_SETTLE = 0.3  # s at the end of a descent before the motors stop
+_QUICK_SPEED = 2.0  # m/s, of a descent without poses: that of a fall from 0.2 m
+_QUICK_BENEATH = 3.0  # m below the floor that it sinks to, so that its time ends first
+_QUICK_FOR = 2.5  # s without poses after which the motors stop, as the estimate may be metres off
+_CLEAR = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
+_SEEN_FOR = 0.1  # s of good poses after which they are believed again
+_MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
+_LATEST_ESTIMATE = 0.1  # s
+
+
+class Landing:
+    """Lands once. Where an abort interrupts it, the next call of `land` goes on."""
+
+    def __init__(self, loop: FlightLoop, floor: float):
+        self._loop, self._floor = loop, floor  # m, height of the tracked body on the floor
+        self.begun = False
+        self._stands = False
+
+    def begin(self) -> None:
+        """Enter the phase, once."""
+        if not self.begun:
+            self.begun = True
+            self._loop.history.enter(Phase.LAND)
+
+    def sink_while_stopping(self) -> None:
+        """Begin while the vehicle still brakes: let what is left of that stop sink besides."""
+        self.begin()
+        loop, stream = self._loop, self._loop.stream
+        if stream is not None:
+            left = stream.payloads[stream.index(loop.now()) :]
+            loop.begin(Stream(sinking(left, self._floor + _CLEAR, _QUICK_SPEED, stream.rate), stream.rate))
+
+    def land(self) -> None:
+        """Descend from where the vehicle is asked to be, and stop its motors. Raises AbortRaised if they do not."""
+        self.begin()
+        loop, seen = self._loop, False
+        while not self._stands:
+            if loop.blind:
+                self._descend_blindly()
+                seen = True
+            else:
+                self._descend(seen)
+        if not stop_motors(loop):
+            raise AbortRaised(safety_abort(Rung.CUT, "the vehicle does not land"))
+        loop.touch_down()
+
+    def _descend(self, seen_again: bool) -> None:
+        """Sink until the vehicle stands, or poses are gone; from the pose if those have only come back."""
+        loop = self._loop
+        position, velocity, yaw = loop.seen() if seen_again else loop.asked()
+        lowest = min(self._floor, loop.limits.space.low[2]) - _BENEATH_FLOOR
+        speed = _CRUISE * loop.limits.ground.land_speed
+        self._sink(descent(position, yaw, -velocity[2], self._floor, lowest, speed, loop.mission.rate))
+        loop.until(lambda: self._stands_by_poses() or self._sunk() or loop.blind, math.inf)
+        if not loop.blind:
+            self._conclude(self._stands_by_poses())
+
+    def _descend_blindly(self) -> None:
+        """Sink quickly until the estimate or the time says that it is enough, or poses are back."""
+        loop = self._loop
+        position, velocity, yaw = loop.asked()
+        self._sink(
+            quick_descent(position, yaw, -velocity[2], self._floor - _QUICK_BENEATH, _QUICK_SPEED, loop.mission.rate)
+        )
+        seen_since = math.inf
+
+        def seen() -> bool:
+            nonlocal seen_since
+            good = loop.blind_for < loop.limits.pose.age_warning
+            seen_since = min(seen_since, loop.now()) if good else math.inf
+            return loop.now() - seen_since > _SEEN_FOR
+
+        def over() -> bool:
+            return self._sunk() or loop.blind_for > _QUICK_FOR
+
+        loop.until(lambda: self._stands_by_estimate() or over() or seen(), math.inf)
+        if not seen():
+            self._conclude(self._stands_by_estimate())
+
+    def _sink(self, payloads: NDArray) -> None:
+        self._loop.begin(Stream(payloads, self._loop.mission.rate))
+
+    def _sunk(self) -> bool:
+        stream = self._loop.stream
+        return stream is None or self._loop.now() > stream.end + _SETTLE
+
+    def _conclude(self, shown: bool) -> None:
+        self._stands = True
+        if not shown:
+            self._loop.history.say(Level.WARNING, "nothing shows that the vehicle stands; its motors are stopped")
+
+    def _stands_by_poses(self) -> bool:
+        """Return whether the tracked body stays where it is although its setpoint has sunk on."""
+        loop, pose = self._loop, self._loop.pose()
+        wanted, heights = loop.wanted(pose.time), loop.heights(_STANDS_FOR)
+        if wanted is None or not heights or max(heights) - min(heights) > _STANDS_WITHIN:
+            return False
+        height = pose.position[2]
+        near = height - self._floor < _NEAR_FLOOR
+        return height - wanted[2] > (_NOT_FOLLOWING if near else _NOT_HELD)
+
+    def _stands_by_estimate(self) -> bool:
+        """Return whether the estimate does not follow though the controller asks for no thrust."""
+        loop, estimate = self._loop, self._loop.link.estimate
+        if estimate is None or loop.now() - estimate.time > _LATEST_ESTIMATE:
+            return False
+        wanted = loop.wanted(estimate.time)
+        return wanted is not None and estimate.position[2] - wanted[2] > _NOT_HELD
+
+
+def stop_motors(loop: FlightLoop) -> bool:
+    """Stop the motors by stop setpoints, the last setpoints to be sent; return whether the vehicle says so.
+
+    Then the vehicle's own null setpoints must count again: if none came, its supervisor would lock.
+    """
+    loop.end_stream()
+    loop.expect_stop()
+    for _ in range(TRIES):
+        for _ in range(TRIES):
+            loop.link.stop_setpoint()
+            loop.pause(0.02)
+        for _ in range(TRIES):
+            loop.link.release_priority()
+            loop.pause(0.02)
+        if loop.until(lambda: not loop.bits(FLYING), _MOTORS_STOP_WITHIN):
+            return True
+    return False
