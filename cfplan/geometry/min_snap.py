@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solveh_banded
 
 from cfplan.errors import InputError
+from cfplan.geometry.banded import solve_definite
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import hermite
 from cfplan.geometry.rest import rest_path, with_rest_ends
@@ -182,11 +182,11 @@ def _solve_block_tridiagonal(diagonal: NDArray, beside: NDArray, force: NDArray)
     scale = 1.0 / np.sqrt(np.diagonal(diagonal, axis1=1, axis2=2))  # (n, 3)
     diagonal = diagonal * scale[:, :, None] * scale[:, None, :]
     beside = beside * scale[:-1, :, None] * scale[1:, None, :]
-    bands = np.zeros((6, count))  # upper form: bands[5 + row - column, column]
+    matrix = np.zeros((count, 6))
     for row in range(3):
         for column in range(3):
             if column >= row:
-                bands[5 + row - column, column::3] = diagonal[:, row, column]
-            bands[2 + row - column, 3 + column :: 3] = beside[:, row, column]
-    flat = solveh_banded(bands, (force * scale[..., None]).reshape(count, 3))
+                matrix[column::3, column - row] = diagonal[:, row, column]
+            matrix[3 + column :: 3, 3 + column - row] = beside[:, row, column]
+    flat = solve_definite(matrix, (force * scale[..., None]).reshape(count, 3))
     return flat.reshape(-1, 3, 3) * scale[..., None]

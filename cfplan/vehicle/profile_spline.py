@@ -11,8 +11,8 @@ quadratic spline on the same grid, yaw_spline.py has the same.
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
-from scipy.linalg import solveh_banded
 
+from cfplan.geometry.banded import solve_definite
 from cfplan.machine_code import njit
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.rotations import Scalar
@@ -118,16 +118,16 @@ def _fit(grid: NDArray, s: NDArray, values: NDArray, weights: NDArray, degree: i
     knot = np.arange(count - degree - 1)
     local = np.interp(knot + (degree + 1) / 2, _coefficient(grid, s, count), weights)
     stiff = (stiffness + 1e-9) * local / count  # the floor keeps the problem regular if an interval has no sample
-    bands, target = np.zeros((degree + 2, count)), np.zeros(count)
+    matrix, target = np.zeros((count, degree + 2)), np.zeros(count)
     for i in range(degree + 2):
         if i <= degree:
             target += np.bincount(interval + i, basis[i] * shares * values, count)
         for j in range(i, degree + 2):
-            band = bands[degree + 1 - (j - i)]
+            band = matrix[:, j - i]
             band += np.bincount(knot + j, stiff * difference[i] * difference[j], count)
             if j <= degree:
                 band += np.bincount(interval + j, shares * basis[i] * basis[j], count)
-    return solveh_banded(bands, target)
+    return solve_definite(matrix, target[:, None])[:, 0]
 
 
 def _coefficient(grid: NDArray, s: NDArray, count: int) -> NDArray:

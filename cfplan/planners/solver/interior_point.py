@@ -19,7 +19,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.planners.solver import banded
+from cfplan.geometry import banded
 from cfplan.planners.solver.barrier import (
     Errors,
     SearchDirection,

@@ -5,9 +5,8 @@ from dataclasses import replace
 import casadi
 import numpy as np
 import pytest
-from scipy.linalg import solveh_banded
 
-from cfplan.planners.solver import banded, barrier
+from cfplan.planners.solver import barrier
 from cfplan.planners.solver.barrier import bounds_of
 from cfplan.planners.solver.interior_point import Linearisation, Search, Values, minimise
 
@@ -126,21 +125,3 @@ def test_what_is_not_a_number_is_told():
     ended = minimise(Valley(8, 0.0, 1.0), np.full(8, np.nan), Search())
     assert not ended.solved
     assert "not a number" in ended.message
-
-
-@pytest.mark.parametrize("width", [1, 2, 5, 9])
-def test_banded_matrices_are_factored_as_lapack_does(width):
-    rng = np.random.default_rng(width)
-    size = 30
-    matrix = rng.normal(size=(size, width))
-    matrix[:, 0] = 4.0 * width
-    x = rng.normal(size=size)
-    bands = np.zeros((width, size))
-    for d in range(width):
-        bands[d, : size - d] = matrix[d:, d]
-    bands[0] += 0.5
-    expected = solveh_banded(bands, x, lower=True)
-    factor, definite = banded.factorise(matrix, 0.5)
-    assert definite
-    np.testing.assert_allclose(banded.solve(factor, x), expected, rtol=1e-10)
-    assert not banded.factorise(matrix, -4.0 * width)[1]

@@ -6,15 +6,17 @@ A matrix is a (size, width) array whose entry [r, d] is the matrix's (r, r - d).
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 
 REGULARISED, REGULARISED_MOST = 1e-4, 1e14  # added to a diagonal where it must, at first and at most
+_LEAST_PIVOT = 1e-12  # of matrices that are regularised
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def factorise(matrix, added):
-    """Return the Cholesky factor of the matrix plus `added` on its diagonal, and whether there is one.
+def factorise(matrix, added, least=_LEAST_PIVOT):
+    """Return the Cholesky factor of the matrix plus `added` on its diagonal, and whether all pivots exceed `least`.
 
     The diagonal of the factor is inverted. A row of zeros counts as that of the unit matrix.
     """
@@ -33,7 +35,7 @@ def factorise(matrix, added):
         for e in range(1, reach + 1):
             value -= factor[r, e] * factor[r, e]
         value += added
-        if not value > 1e-12:
+        if not value > least:
             return factor, False
         factor[r, 0] = 1.0 / math.sqrt(value)
     return factor, True
@@ -71,3 +73,23 @@ def solve_regularised(matrix, right, regularised):
             return np.full(len(right), math.nan), added
         factor, definite = factorise(matrix, added)
     return solve(factor, right), added
+
+
+def solve_definite(matrix: NDArray, right: NDArray) -> NDArray:
+    """Return the solution for right sides, (size, K), of a positive definite matrix, (size, width).
+
+    Raises LinAlgError where the matrix is not positive definite.
+    """
+    solution, definite = _solve_columns(np.ascontiguousarray(matrix), np.ascontiguousarray(right))
+    if not definite:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    return np.asarray(solution)
+
+
+@njit(error_model="numpy")
+def _solve_columns(matrix, right):
+    factor, definite = factorise(matrix, 0.0, 0.0)
+    solution = np.empty_like(right)
+    for k in range(right.shape[1]):
+        solution[:, k] = solve(factor, right[:, k].copy())
+    return solution, definite
