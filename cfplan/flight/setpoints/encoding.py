@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
@@ -35,7 +36,7 @@ from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.measures import measures_of
-from cfplan.vehicle.rotations import heading_of, matrices_of, quaternions_of, rotations_of, write_quaternion
+from cfplan.vehicle.rotations import heading_of, matrices_of, rotations_of, write_quaternion
 from cfplan.vehicle.trajectory import Trajectory
 
 RATE = 100.0  # Hz
@@ -233,19 +234,14 @@ def check_motion(
     force = decoded.acceleration + _GRAVITY
     thrust = np.linalg.norm(motion.acceleration + _GRAVITY, axis=1) / along
     _check_values("acceleration", force - thrust[:, None] * wanted[:, :, 2], require)
-    _check_attitude(decoded, force, wanted, turn, frames, require)
+    sent, quaternion = (np.ascontiguousarray(values) for values in (force, decoded.quaternion))
+    turned, off, flown, attitude = _turned_back(sent, quaternion, wanted, turn, frames)
+    _check_attitude(turned, off, force, require)
 
-    # The attitude at which the torque is that of the motion's rates, and the rates asked for at the motion's attitude.
-    back = frames @ np.swapaxes(wanted, 1, 2)
-    flown = np.einsum("nij,nj->ni", back, force) * along[:, None]
+    # The rates that setpoints ask for at the motion's attitude.
     lean = np.einsum("nij,ni->nj", frames, force) / np.linalg.norm(force, axis=1)[:, None]
     rates = gains.full_rate * np.stack([-lean[:, 1], lean[:, 0], np.zeros(len(lean))], axis=1)
-    return replace(
-        decoded,
-        acceleration=flown - _GRAVITY,
-        quaternion=quaternions_of(back @ controller_attitude(force, decoded.quaternion)),
-        body_rate=decoded.body_rate + rates,
-    )
+    return replace(decoded, acceleration=flown - _GRAVITY, quaternion=attitude, body_rate=decoded.body_rate + rates)
 
 
 def _check_values(name: str, error: NDArray, require: Callable[..., None]) -> None:
@@ -254,22 +250,12 @@ def _check_values(name: str, error: NDArray, require: Callable[..., None]) -> No
     require(largest <= HALF_QUANTUM + _ROUNDING, f"{name} in the packet is not that of the trajectory, off by", largest)
 
 
-def _check_attitude(
-    decoded: FullStateSetpoints,
-    force: NDArray,
-    wanted: NDArray,
-    turn: NDArray,
-    frames: NDArray,
-    require: Callable[..., None],
-) -> None:
-    """Check the quaternion, and the attitude that the controller makes of it and of the thrust vector.
+def _check_attitude(turned: NDArray, off: NDArray, force: NDArray, require: Callable[..., None]) -> None:
+    """Check by what angles, (N,) rad, the quaternion and the controller's attitude are off, as _turned_back gives them.
 
-    `wanted`, (N, 3, 3), is `frames`, the attitudes to fly, with the `turn` that stands for rates; turned back by it,
-    the controller's must be the attitude to fly.
+    The thrust vectors that are sent, (N, 3), may not lean too far.
     """
-    turned = _angles(matrices_of(decoded.quaternion), matrices_of(command_quaternion(quaternions_of(wanted))))
     require(turned <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", turned)
-    off = _angles(controller_attitude(force, decoded.quaternion) @ np.swapaxes(turn, 1, 2), frames)
     # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(tilt) as far.
     level = force[:, 2] / np.linalg.norm(force, axis=1)
     require(level >= _LEAST_LIFT, "the thrust that is sent leans too far, with a vertical share of", level)
@@ -330,10 +316,52 @@ def _require(good: NDArray, what: str, values: NDArray, first: int = 0) -> None:
         )
 
 
-def _angles(first: NDArray, second: NDArray) -> NDArray:
-    """Return the angles between rotation matrices (N, 3, 3), (N,) rad: ‖A - B‖² = 8 sin²(angle / 2)."""
-    half = np.sqrt(np.square(first - second).sum(axis=(1, 2)) / 8.0)
-    return 2.0 * np.arcsin(np.minimum(half, 1.0))
+@njit(error_model="numpy")
+def _turned_back(
+    force: NDArray, quaternion: NDArray, wanted: NDArray, turn: NDArray, frames: NDArray
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Hold thrust vectors, (N, 3), and quaternions, (N, 4), as sent against the attitudes that they are to make.
+
+    `wanted`, (N, 3, 3), is `frames`, the attitudes to fly, with the `turn` that stands for rates. Returned are by what
+    angles, (N,) rad, the quaternions are off, and the controller's attitudes turned back; and the thrust vectors and
+    attitudes, (N, 3) and (N, 4), that these make the vehicle fly.
+    """
+    count = len(force)
+    turned, off, flown, attitude = np.empty(count), np.empty(count), np.empty((count, 3)), np.empty((count, 4))
+    sent, made = matrices_of(quaternion), _attitudes(force, quaternion)
+    command, planned, back = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for n in range(count):
+        command[:] = wanted[n]
+        _point_to_yaw(command)
+        turned[n] = _angle(sent[n], command)
+        _multiply_transposed(planned, made[n], turn[n])
+        off[n] = _angle(planned, frames[n])
+        _multiply_transposed(back, frames[n], wanted[n])
+        for i in range(3):
+            thrust = back[i, 0] * force[n, 0] + back[i, 1] * force[n, 1] + back[i, 2] * force[n, 2]
+            flown[n, i] = thrust * turn[n, 2, 2]
+            for j in range(3):
+                planned[i, j] = back[i, 0] * made[n, 0, j] + back[i, 1] * made[n, 1, j] + back[i, 2] * made[n, 2, j]
+        write_quaternion(attitude[n], planned)
+    return turned, off, flown, attitude
+
+
+@register_jitable
+def _multiply_transposed(out: NDArray, first: NDArray, second: NDArray) -> None:
+    """Write the product of a matrix and the transpose of another, (3, 3) each."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = first[i, 0] * second[j, 0] + first[i, 1] * second[j, 1] + first[i, 2] * second[j, 2]
+
+
+@register_jitable
+def _angle(first: NDArray, second: NDArray) -> float:
+    """Return the angle between rotation matrices (3, 3), rad: ‖A - B‖² = 8 sin²(angle / 2)."""
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += (first[i, j] - second[i, j]) ** 2
+    return 2.0 * math.asin(min(math.sqrt(total / 8.0), 1.0))
 
 
 @njit(error_model="numpy")
@@ -361,16 +389,21 @@ def _commands(quaternions: NDArray) -> NDArray:
     out = np.empty((len(quaternions), 4))
     planned = matrices_of(quaternions)
     for n in range(len(quaternions)):
-        frame = planned[n]
-        a, b, c = frame[0, 2], frame[1, 2], frame[2, 2]
-        cos, sin = _direction(frame[1, 1], -frame[0, 1])  # of yaw
-        rise = -(cos * a + sin * b) / c
-        norm = math.sqrt(1.0 + rise * rise)
-        p, q, r = cos / norm, sin / norm, rise / norm
-        frame[0, 0], frame[1, 0], frame[2, 0] = p, q, r
-        frame[0, 1], frame[1, 1], frame[2, 1] = b * r - c * q, c * p - a * r, a * q - b * p
-        write_quaternion(out[n], frame)
+        _point_to_yaw(planned[n])
+        write_quaternion(out[n], planned[n])
     return out
+
+
+@register_jitable
+def _point_to_yaw(frame: NDArray) -> None:
+    """Turn a planned attitude, (3, 3), about its z, in place, to the one that is sent: x above [cos yaw, sin yaw]."""
+    a, b, c = frame[0, 2], frame[1, 2], frame[2, 2]
+    cos, sin = _direction(frame[1, 1], -frame[0, 1])  # of yaw
+    rise = -(cos * a + sin * b) / c
+    norm = math.sqrt(1.0 + rise * rise)
+    p, q, r = cos / norm, sin / norm, rise / norm
+    frame[0, 0], frame[1, 0], frame[2, 0] = p, q, r
+    frame[0, 1], frame[1, 1], frame[2, 1] = b * r - c * q, c * p - a * r, a * q - b * p
 
 
 @njit(error_model="numpy")

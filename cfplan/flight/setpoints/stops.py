@@ -28,7 +28,7 @@ from cfplan.vehicle.rotations import about_z, quaternions_of, yaw_of
 
 DURATION = 0.8  # s, from full speed to rest: 3.75 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
-_CHUNK = 1000  # stops at a time, so that memory does not grow with all fields of all stops
+_CHUNK = 200  # stops at a time, so that all fields of them stay in a processor's cache
 
 
 def encode_stops(
