@@ -9,6 +9,7 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.pilot import Pilot
 from cfplan.flight.pilot.process import Attendant
+from cfplan.flight.pilot.proposals import NO_PROPOSALS, ProposalSource
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry
 from cfplan.simulation.lab.lab import Truth
 from cfplan.simulation.lab.stepped_lab import SteppedLab
@@ -59,6 +60,7 @@ def fly_stepped(
     lab: SteppedLab | None = None,
     orders: HeldOrders | None = None,
     more_orders: Callable[[], Sequence[Order]] = tuple,
+    proposals: ProposalSource = NO_PROPOSALS,
 ) -> Flight:
     """Fly; `react` sees each message as it comes. What the main process would raise is raised."""
     lab, orders = lab or SteppedLab(mission.limits.airframe), orders or HeldOrders()
@@ -80,6 +82,7 @@ def fly_stepped(
             source=SteppedPoses(lab, mission.limits.pose),
             report=report,
             orders=orders,
+            proposals=proposals,
             clock=lab.clock,
         )
         last: FlightOutcome | CfplanError

@@ -6,6 +6,7 @@ loss, gaps and the dry run go on from the splice as if the flight had been plann
 """
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,9 @@ from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.glitches import glitch_at_every_setpoint
 from cfplan.simulation.link_loss import as_believed, link_loss_at_every_setpoint
 from cfplan.vehicle.joint import JoinedTrajectory
+
+HALTS = (1.0, 1.15, 1.35, 1.6, 2.0, 2.6)  # times the way that braking takes at its limit, where a stop may end
+REACTION = 0.05  # s at full speed before braking is felt: the vehicle must lean first
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +107,36 @@ def replan(
     encoded, stops, snapshots = _certified(flown.since(splice / RATE), limits, held.snapshots[:, row])
     proposal = propose(held.commitment, splice, encoded.payloads, stops)
     return Replanned(proposal, HeldFlight(held.commitment, flown, points, reached, splice, snapshots), planned)
+
+
+def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned:
+    """Return the proposal to leave what is held at setpoint `splice` and to come to rest soon, ahead on its path.
+
+    Places are tried from where the limit on braking would allow rest at the earliest. Raises InfeasibleError where the
+    vehicle rests soon anyway, or no place is found: then what is held ends as soon.
+    """
+    joint = (splice + SPLICE_AHEAD) / RATE
+    left = held.ends - joint
+    moving = held.flown.at(joint)
+    speed = float(np.linalg.norm(moving.velocity))
+    last = held.flown.trajectories[-1]
+    if left > 0.0 and speed > 0.0:
+        s = float(last.s_at(joint - held.flown.starts[-1])) + np.linspace(0.0, 1.0, 201) * last.path.end
+        s = s[s <= last.path.end]
+        points = last.path(s)
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        for share in HALTS:
+            far = share * speed**2 / (2.0 * limits.plan.acceleration) + REACTION * speed
+            if far > along[-1]:
+                break
+            place = [np.interp(far, along, points[:, axis]) for axis in range(3)]
+            with suppress(InfeasibleError, InputError, NotCertifiedError):
+                return replan(held, splice, [place], limits, yaw_angle=float(moving.yaw))
+    raise InfeasibleError(
+        f"at {speed:.2f} m/s, {max(left, 0.0):.1f} s before its end, the vehicle cannot stop sooner",
+        where="stop",
+        hint="it rests at the end of what is committed",
+    )
 
 
 def accepted(replanned: Replanned, commitment: Commitment) -> HeldFlight:

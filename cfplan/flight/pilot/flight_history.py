@@ -7,7 +7,6 @@ from cfplan.errors import ExitCode
 from cfplan.flight.clock import Clock
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.deadlines import Lateness
-from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Check, Deviation, FlightOutcome, Rung, settle_time
 from cfplan.flight.telemetry import Event, Level, Phase, PhaseEntered, Telemetry
 
@@ -39,9 +38,9 @@ class FlightHistory:
         """Report an event."""
         self.report(Event(self._now(), level, text))
 
-    def outcome(self, mission: Mission, exit_code: ExitCode, reason: str, last_pose: Pose | None) -> FlightOutcome:
-        """Return how the flight went."""
-        start, ends = self.first_setpoint, mission.motion_ends + mission.lead
+    def outcome(self, ends: float, exit_code: ExitCode, reason: str, last_pose: Pose | None) -> FlightOutcome:
+        """Return how the flight went, the motion of which ended `ends` s after its first setpoint."""
+        start = self.first_setpoint
         return FlightOutcome(
             exit_code=exit_code,
             reason=reason,

@@ -21,8 +21,10 @@ from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Rung
-from cfplan.flight.pilot.stream import Stream
+from cfplan.flight.pilot.proposals import NO_PROPOSALS, ProposalSource
+from cfplan.flight.pilot.stream import Stream, stream_of
 from cfplan.flight.radio.link import Link
+from cfplan.flight.setpoints.commitment import Commitment, splice
 from cfplan.flight.telemetry import Level, PoseReceived, Triple
 from cfplan.vehicle.rotations import yaw_of
 
@@ -63,10 +65,11 @@ class FlightLoop:
         source: PoseSource,
         orders: OrderSource,
         history: FlightHistory,
+        proposals: ProposalSource = NO_PROPOSALS,
         clock: Clock = REAL_CLOCK,
     ):
         self.mission, self.limits, self.history, self.now = mission, mission.limits, history, clock.now
-        self._source, self._orders, self._clock = source, orders, clock
+        self._source, self._orders, self._proposals, self._clock = source, orders, proposals, clock
         self._monitor, self._pose_gate = AbortMonitor(mission.limits), PoseGate(mission.limits.pose.jump)
         self._predictor = PosePredictor()
         self._deadlines = Deadlines(mission.rate, clock)
@@ -75,7 +78,8 @@ class FlightLoop:
         self.airborne = False
         self._stop_expected = math.inf  # s, from when on motors that do not turn were meant to stop
         self._tolerated = Rung.NONE  # an abort of this rung or a lesser one changes nothing
-        self.plan = Stream(mission.payloads, mission.rate, stop_from=mission.stops.__getitem__)
+        self.commitment = Commitment(0, mission.payloads, mission.stops)
+        self.plan = stream_of(self.commitment, mission.rate)
         self.stream: Stream | None = None  # what each tick sends
         self._begun: deque[Stream] = deque(maxlen=_STREAMS)  # the last streams, each with its start
         self.pose_fault = ""  # why the last pose was not good
@@ -145,6 +149,25 @@ class FlightLoop:
         """Send no setpoints any more."""
         self.stream = None
 
+    @property
+    def motion_ends(self) -> float:
+        """Time, s, from the plan's first setpoint to the first of those that only hover at its end."""
+        return self.commitment.motion_ends / self.mission.rate
+
+    def _consider_proposal(self, now: float) -> None:
+        """Fly what a planner proposes from its splice on if it verifies; answer the planner."""
+        proposal = self._proposals.newest()
+        if proposal is None:
+            return
+        answer = splice(self.commitment, proposal, self.plan.number(now), self.limits.space)
+        if isinstance(answer, Commitment):
+            self.commitment = answer
+            self.plan = self.stream = self._begun[-1] = stream_of(answer, self.mission.rate, self.plan.start)
+            self.history.say(Level.INFO, f"a new plan is flown from setpoint {answer.splices[-1]} on")
+        else:
+            self.history.say(Level.WARNING, f"a new plan is refused: {answer}")
+        self._proposals.answer(proposal, answer)
+
     def wanted(self, time: float) -> Triple | None:
         """Return where the vehicle was asked to be, m, at a time, s; None before the streams that are remembered."""
         moment = time - self.mission.lead
@@ -155,7 +178,7 @@ class FlightLoop:
     def asked(self) -> tuple[Triple, Triple, float]:
         """Return position, m, velocity, m/s, and yaw, rad, that the vehicle is asked for now, by its stream."""
         assert self.stream is not None
-        position, velocity, _, quaternion, _ = self.stream.states[self.stream.index(self.now())]
+        position, velocity, _, quaternion, _ = self.stream.state(self.stream.index(self.now()))
         return position, velocity, yaw_of(quaternion)
 
     # Ticks.
@@ -167,7 +190,7 @@ class FlightLoop:
         stream = self.stream
         if stream is not None:
             index = stream.index(now)
-            self.link.send(stream.packets[index])
+            self.link.send(stream.packet(index))
             if self.history.first_setpoint:
                 self.history.report(stream.sent(index, now, due))
             if stream is self.plan and now < stream.end:
@@ -178,6 +201,8 @@ class FlightLoop:
         self.waking.append(now - due)
         if self._feeding:
             self._forward_poses()
+        if stream is not None and stream is self.plan:
+            self._consider_proposal(now)
         self._monitor_flight(now, now - due)
         return now
 

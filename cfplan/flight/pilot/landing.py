@@ -57,7 +57,7 @@ class Landing:
         self.begin()
         loop, stream = self._loop, self._loop.stream
         if stream is not None:
-            left = stream.payloads[stream.index(loop.now()) :]
+            left = stream.payloads[stream.index(loop.now()) - stream.first :]
             loop.begin(Stream(sinking(left, self._floor + _CLEAR, _QUICK_SPEED, stream.rate), stream.rate))
 
     def land(self) -> None:

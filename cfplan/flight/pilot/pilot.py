@@ -19,6 +19,7 @@ from cfplan.flight.pilot.landing import Landing, stop_motors
 from cfplan.flight.pilot.mission import Mission, manoeuvre_time
 from cfplan.flight.pilot.outcome import FlightOutcome, Rung
 from cfplan.flight.pilot.prearm import prepare
+from cfplan.flight.pilot.proposals import NO_PROPOSALS, ProposalSource
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.radio.link import Link
 from cfplan.flight.radio.supervisor_bits import ARMED, CAN_FLY, FAULTS, FLYING, LOCKED
@@ -51,12 +52,13 @@ class Pilot:
         report: Callable[[Telemetry], None],
         orders: OrderSource,
         enter_real_time: Callable[[], None] = lambda: None,
+        proposals: ProposalSource = NO_PROPOSALS,
         clock: Clock = REAL_CLOCK,
     ):
         self._mission, self._limits = mission, mission.limits
         self._connect, self._enter_real_time = connect, enter_real_time
         self._history = FlightHistory(report, clock)
-        self._loop = FlightLoop(mission, source, orders, self._history, clock)
+        self._loop = FlightLoop(mission, source, orders, self._history, proposals, clock)
         self._floor = 0.0  # m, height of the tracked body before take-off
         self._landing = Landing(self._loop, self._floor)
 
@@ -70,7 +72,8 @@ class Pilot:
             self._history.say(Level.ERROR, reason)
         finally:
             self._finish()
-        return self._history.outcome(self._mission, exit_code, reason, loop.recent[-1] if loop.recent else None)
+        last_pose = loop.recent[-1] if loop.recent else None
+        return self._history.outcome(loop.motion_ends + self._mission.lead, exit_code, reason, last_pose)
 
     def _fly(self) -> tuple[ExitCode, str]:
         """Go through the phases; return how the flight counts, and why it ended."""
@@ -193,15 +196,17 @@ class Pilot:
             raise AbortRaised(safety_abort(Rung.LAND, f"still {away:.2f} m from the start"))
 
     def _fly_plan(self) -> None:
-        """Stream the plan, then hover for the mission's hold time."""
+        """Stream the plan, then hover for the mission's hold time; a new plan that comes meanwhile is flown too."""
         loop = self._loop
-        self._history.enter(Phase.STREAM)
         skipped = loop.skipped
         loop.begin_plan()
-        loop.until(lambda: loop.now() > loop.plan.end, math.inf)
-        self._history.skipped = loop.skipped - skipped
-        self._history.enter(Phase.HOLD)
-        loop.pause(self._mission.hold_time)
+        while True:
+            self._history.enter(Phase.STREAM)
+            loop.until(lambda: loop.now() > loop.plan.end, math.inf)
+            self._history.skipped = loop.skipped - skipped
+            self._history.enter(Phase.HOLD)
+            if not loop.until(lambda: loop.now() < loop.plan.end, self._mission.hold_time):
+                break
 
     # The abort ladder.
 
@@ -266,8 +271,8 @@ class Pilot:
         if wanted is None or math.dist(pose.position, wanted) < _FOLLOWS_WITHIN:
             return due
         nearest, least = due, math.inf
-        for index in range(due, -1, -1):
-            distance = math.dist(pose.position, stream.states[index][0])
+        for index in range(due, stream.first - 1, -1):
+            distance = math.dist(pose.position, stream.state(index)[0])
             if distance < least:
                 nearest, least = index, distance
             elif distance > least + _FOLLOWS_WITHIN:  # what comes nearer again is another turn of the path

@@ -7,8 +7,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cfplan.flight.radio.link import GENERIC_PORT, packet
+from cfplan.flight.setpoints.commitment import Commitment
 from cfplan.flight.setpoints.packets import decode
-from cfplan.flight.telemetry import SetpointSent, Triple
+from cfplan.flight.telemetry import Quaternion, SetpointSent, Triple
+
+State = tuple[Triple, Triple, Triple, Quaternion, Triple]
 
 
 class Stream:
@@ -16,7 +19,8 @@ class Stream:
 
     `payloads` (N, 29) uint8, the last of them at rest; `rate` in Hz; `start` in s on the clock of time.monotonic();
     `stop_from` returns (M, 29) uint8, a way to stop from one of the setpoints, and is None for a stop and a descent.
-    Everything slow is done when the stream is made, so that sending is a look-up.
+    Setpoints have numbers, from `first` to `last`; number 0 is due at the start. Everything slow is done when the
+    stream is made.
     """
 
     def __init__(
@@ -25,14 +29,13 @@ class Stream:
         rate: float,
         start: float = 0.0,
         stop_from: Callable[[int], NDArray] | None = None,
+        first: int = 0,
     ):
         self.payloads, self.start, self.rate, self.stop_from = payloads, start, rate, stop_from
-        self.packets: list[Any] = [packet(GENERIC_PORT, 0, row.tobytes()) for row in payloads]
+        self.first, self.last = first, first + len(payloads) - 1
         state = decode(payloads)
         fields = (state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate)
-        self.states = list(zip(*([tuple(row) for row in field.tolist()] for field in fields), strict=True))
-        """(position, velocity, acceleration, quaternion, body rate) of each setpoint, as the vehicle decodes them."""
-        self.last = len(self.packets) - 1
+        self._states: list[State] = list(zip(*(map(tuple, field.tolist()) for field in fields), strict=True))
 
     def starting_at(self, start: float) -> "Stream":
         """Return the same setpoints with another start, s."""
@@ -45,18 +48,36 @@ class Stream:
         """Return when the last setpoint is due, s."""
         return self.start + self.last / self.rate
 
+    def number(self, time: float) -> int:
+        """Return the number that the setpoint due at a time, s, has or would have."""
+        return round((time - self.start) * self.rate)
+
     def index(self, time: float) -> int:
-        """Return the index of the setpoint that belongs to a time, s, so that a late packet carries the right state."""
-        return min(max(round((time - self.start) * self.rate), 0), self.last)
+        """Return the number of the setpoint for a time, s, so that a late packet carries the right state."""
+        return min(max(self.number(time), self.first), self.last)
+
+    def packet(self, index: int) -> Any:
+        """Return a setpoint as it goes over the radio."""
+        return packet(GENERIC_PORT, 0, self.payloads[index - self.first].tobytes())
+
+    def state(self, index: int) -> State:
+        """Return position, velocity, acceleration, quaternion and body rate as the vehicle decodes them."""
+        return self._states[index - self.first]
 
     def position(self, time: float) -> Triple:
         """Return where the vehicle is asked to be, m, at a time, s."""
-        place = min(max((time - self.start) * self.rate, 0.0), float(self.last))
-        row = min(int(place), self.last - 1) if self.last else 0
-        share = place - row
-        (x, y, z), (x1, y1, z1) = self.states[row][0], self.states[min(row + 1, self.last)][0]
+        place = min(max((time - self.start) * self.rate, float(self.first)), float(self.last))
+        before = min(int(place), self.last)
+        share = place - before
+        (x, y, z), (x1, y1, z1) = self.state(before)[0], self.state(min(before + 1, self.last))[0]
         return x + share * (x1 - x), y + share * (y1 - y), z + share * (z1 - z)
 
     def sent(self, index: int, time: float, due: float) -> SetpointSent:
         """Return the telemetry of a setpoint sent at `time` and due at `due`, s."""
-        return SetpointSent(time, due, index, *self.states[index])
+        return SetpointSent(time, due, index, *self.state(index))
+
+
+def stream_of(commitment: Commitment, rate: float, start: float = 0.0) -> Stream:
+    """Return the stream of a commitment, of which setpoint 0 was or would have been due at `start`, s."""
+    first, stops = commitment.first, commitment.stops
+    return Stream(commitment.payloads, rate, start, lambda number: stops[number - first], first)

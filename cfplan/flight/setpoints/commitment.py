@@ -89,6 +89,12 @@ class Commitment:
         """Return the number of the last setpoint, a hover."""
         return self.first + len(self.payloads) - 1
 
+    @property
+    def motion_ends(self) -> int:
+        """Return the number of the first of the setpoints that only hover at the end."""
+        moving = np.flatnonzero(np.any(decode(self.payloads).velocity != 0.0, axis=1))
+        return self.first + (int(moving[-1]) + 1 if len(moving) else 0)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Proposal:
