@@ -1,9 +1,11 @@
 """A virtual lab in its own process, and cflib's link to it."""
 
+import threading
+
 import pytest
 from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
-from waiting import until
+from waiting import PATIENCE, until
 
 from cfplan.simulation.lab.lab import start_lab
 from cfplan.simulation.lab.sim_driver import register_sim_driver
@@ -27,6 +29,18 @@ def doomed():
     register_sim_driver()
     with start_lab(AIRFRAME, number=5) as running:
         yield running
+
+
+@pytest.fixture
+def doomed_link(doomed):
+    """Give cflib's link to it, open, and an event that tells that it is lost."""
+    lost, connected, cf = threading.Event(), threading.Event(), Crazyflie()
+    cf.connection_lost.add_callback(lambda uri, why: lost.set())
+    cf.connected.add_callback(lambda uri: connected.set())
+    cf.open_link(doomed.uri)
+    assert connected.wait(PATIENCE)
+    yield cf, lost
+    cf.close_link()
 
 
 @pytest.fixture

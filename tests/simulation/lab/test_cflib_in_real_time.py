@@ -127,17 +127,10 @@ def test_the_link_closes_at_once(lab):
         assert time.monotonic() - begun < 0.5
 
 
-def test_a_lab_that_hangs_is_a_lost_connection(doomed):
-    lost = threading.Event()
-    cf = Crazyflie()
-    cf.connection_lost.add_callback(lambda uri, why: lost.set())
-    connected = threading.Event()
-    cf.connected.add_callback(lambda uri: connected.set())
-    cf.open_link(doomed.uri)
-    assert connected.wait(60)
+def test_a_lab_that_hangs_is_a_lost_connection(doomed, doomed_link):
+    _, lost = doomed_link
     os.kill(doomed.process_id, signal.SIGSTOP)
     try:
         assert lost.wait(5)
     finally:
         os.kill(doomed.process_id, signal.SIGCONT)
-        cf.close_link()

@@ -7,7 +7,6 @@ import socket
 import subprocess
 import sys
 import textwrap
-import threading
 
 import cflib.crtp
 import numpy as np
@@ -93,14 +92,8 @@ def test_the_link_closes_and_opens_again(lab):
             assert sync.cf.param.is_updated
 
 
-def test_a_lab_that_dies_is_a_lost_connection(doomed):
-    lost = threading.Event()
-    cf = Crazyflie()
-    cf.connection_lost.add_callback(lambda uri, why: lost.set())
-    connected = threading.Event()
-    cf.connected.add_callback(lambda uri: connected.set())
-    cf.open_link(doomed.uri)
-    assert connected.wait(PATIENCE)
+def test_a_lab_that_dies_is_a_lost_connection(doomed, doomed_link):
+    cf, lost = doomed_link
     os.kill(doomed.process_id, signal.SIGKILL)
     assert lost.wait(PATIENCE)
     cf.close_link()
