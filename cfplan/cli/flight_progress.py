@@ -25,12 +25,13 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _REFRESH = 0.1  # s
+_NOTES = 4.0  # s between lines within a phase, where there is no bar
 KEYS = "space lands · Esc cuts the motors · Ctrl-C lands, twice cuts"
 SIGNALS_ALONE = "Ctrl-C lands, twice cuts the motors"  # where standard input is no terminal
 
 
 class FlightProgress:
-    """Shows telemetry. On a terminal the bar moves; elsewhere only lines are printed."""
+    """Shows telemetry: on a terminal a bar moves; elsewhere lines say the phase, and now and then how far it is."""
 
     def __init__(self, *, duration: float, steps: Steps, clock: Clock = REAL_CLOCK):
         from rich.console import Console
@@ -64,6 +65,8 @@ class FlightProgress:
         self._battery: float | None = None  # V
         self.heard_vehicle = False
         self._shown = -math.inf  # s
+        self._phase, self._noted = "", math.inf  # the phase, and when a line last said how far it is, s
+        self._entered = math.inf  # s
         self._clock, self._began = clock, clock.now()
 
     def __enter__(self) -> "FlightProgress":
@@ -97,27 +100,33 @@ class FlightProgress:
         now = self._clock.now()
         if now - self._shown > _REFRESH:
             self._shown = now
-            self._draw()
+            self._draw(now)
 
     def _enter(self, message: PhaseEntered) -> None:
         elapsed = message.time - self._began
         if message.phase is Phase.ARM and self._bar.disable:  # there is no bar, under which they stand else
             self._bar.console.print(f"  {self._keys}", highlight=False)
         self._bar.console.print(f"  {elapsed:6.2f} s  {message.phase}", highlight=False)
+        self._phase, self._entered, self._noted = str(message.phase), message.time, message.time
         streaming = message.phase is Phase.STREAM
         self._first_index_time = message.time if streaming else None
         # without a total the bar only shows that something goes on
         self._bar.reset(self._task, total=self._duration if streaming else None, description=str(message.phase))
 
-    def _draw(self) -> None:
+    def _draw(self, now: float) -> None:
         numbers = []
         done = 0.0
         if self._first_index_time is not None and self._setpoint is not None:
             done = min(max(self._setpoint.time - self._first_index_time, 0.0), self._duration)
             numbers.append(f"{done:.1f} of {self._duration:.1f} s")
+        elif self._bar.disable:
+            numbers.append(f"{now - self._entered:.0f} s")
         if self._pose is not None:
             x, y, z = (round(value, 2) + 0.0 for value in self._pose.position)  # no -0.0
             numbers.append(f"({x:.2f}, {y:.2f}, {z:.2f}) m")
         if self._battery is not None:
             numbers.append(f"{self._battery:.2f} V")
         self._bar.update(self._task, completed=done, numbers="  ".join(numbers))
+        if self._bar.disable and now - self._noted >= _NOTES:
+            self._noted = now
+            self._bar.console.print(f"  … {self._phase}, {', '.join(numbers)}", highlight=False)

@@ -8,7 +8,9 @@ from cfplan.cli import flight_progress
 from cfplan.cli.flight_progress import KEYS, SIGNALS_ALONE, FlightProgress
 from cfplan.cli.output import Steps
 from cfplan.flight.clock import SteppedClock
-from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived
+from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived, SetpointSent
+
+LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.fixture
@@ -58,3 +60,24 @@ def test_a_battery_that_was_not_heard_is_not_shown_and_zero_has_no_sign(shown):
     text = shown(screen=True, keyboard=True)[Phase.TAKE_OFF]
     assert " V" not in text
     assert "(0.00, 1.00, 0.50) m" in text
+
+
+def test_without_a_bar_a_long_phase_says_every_few_seconds_how_far_it_is(capsys, monkeypatch):
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    clock = SteppedClock()
+    with FlightProgress(duration=10.0, steps=Steps(as_json=False), clock=clock) as progress:
+        for phase, seconds in ((Phase.ARM, 1), (Phase.GO_TO_START, 9), (Phase.STREAM, 10)):
+            progress.show(PhaseEntered(clock.now(), phase))
+            for index in range(10 * seconds):
+                if phase is Phase.STREAM:
+                    progress.show(
+                        SetpointSent(clock.now(), clock.now(), index, *[(0.0, 0.0, 0.0)] * 3, LEVEL, (0.0, 0.0, 0.0))
+                    )
+                progress.show(PoseReceived(clock.now(), clock.now(), (0.1, 1.0, 0.5), LEVEL))
+                clock.sleep(0.1)
+    notes = [line.strip() for line in capsys.readouterr().err.splitlines() if "…" in line]
+    place = "(0.10, 1.00, 0.50) m"
+    assert notes == [
+        f"… go to start, 4 s, {place}", f"… go to start, 8 s, {place}",
+        f"… stream, 4.0 of 10.0 s, {place}", f"… stream, 8.0 of 10.0 s, {place}",
+    ]  # fmt: skip
