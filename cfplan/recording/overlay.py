@@ -1,6 +1,7 @@
 """Lay flights over one another and over a plan: each is a trial, with time 0 where the path begins."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -85,6 +86,12 @@ class Alignment:
             f"{100 * self.rms_deviation:.1f} cm rms, {100 * self.max_deviation:.1f} cm max, "
             f"in the mean ({x:.1f}, {y:.1f}, {z:.1f}) cm aside"
         )
+
+
+def short_name(name: str) -> str:
+    """Return a label for charts: `figure8 09:42:21` for the record 20261122-094221-figure8; other names as they are."""
+    stamped = re.fullmatch(r"\d{8}-(\d\d)(\d\d)(\d\d)-(.+)", name)
+    return f"{stamped[4]} {stamped[1]}:{stamped[2]}:{stamped[3]}" if stamped else name
 
 
 def reference_of(trajectory: Trajectory, name: str) -> Reference:

@@ -10,6 +10,7 @@ from cfplan.recording.record import Record, meant_motion
 from cfplan.recording.summary import deviation
 
 FULL_COMMAND = 65535  # of a motor, 16 bits
+FAR_LIMIT = 2.0  # times the measured span beyond it, from which on a limit is not drawn
 
 Colour = tuple[int, int, int]
 FLOWN: Colour = (86, 180, 233)
@@ -119,6 +120,16 @@ def pose_age(record: Record) -> tuple[NDArray, NDArray]:
 def finite_limits(plot: Plot) -> tuple[float, ...]:
     """Return the limits that can be drawn."""
     return tuple(limit for limit in plot.limits if math.isfinite(limit))
+
+
+def near_limits(plot: Plot) -> tuple[float, ...]:
+    """Return the limits beside which what was measured can still be seen: at most FAR_LIMIT of its span beyond it."""
+    values = np.concatenate([line.values[np.isfinite(line.values)] for line in plot.lines] or [np.empty(0)])
+    if len(values) == 0:
+        return plot.limits
+    low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
+    reach = FAR_LIMIT * (high - low)
+    return tuple(limit for limit in plot.limits if low - reach <= limit <= high + reach)
 
 
 def _flown(name: str, time: NDArray, values: NDArray, label: str = "flown") -> Line:

@@ -23,7 +23,7 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import save_plan
 from cfplan.recording.importers.mocap_log import LoggedSubject
-from cfplan.recording.overlay import Reference, align, extent, trial_of_record, trial_of_subject
+from cfplan.recording.overlay import Reference, align, extent, short_name, trial_of_record, trial_of_subject
 from cfplan.recording.reader import is_record
 from cfplan.recording.rerun import layout
 from cfplan.recording.rerun.overlay_view import DASH, dashes, references, stretches, write_overlay
@@ -279,3 +279,11 @@ def test_a_record_is_told_from_other_logs(tmp_path, flight, vicon):
     assert is_record(flight.folder)
     assert is_record(named)
     assert not any(is_record(place) for place in (other, vicon, tmp_path, tmp_path / "none"))
+
+
+@pytest.mark.parametrize(
+    ("name", "short"),
+    [("20261122-094221-figure8", "figure8 09:42:21"), ("20261122-094221-a-b-2", "a-b-2 09:42:21"), ("cf1", "cf1")],
+)
+def test_a_record_has_a_label_that_can_be_read(name, short):
+    assert short_name(name) == short

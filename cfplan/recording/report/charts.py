@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.recording.plots import LIMIT, Colour
+from cfplan.recording.plots import FAR_LIMIT, LIMIT, Colour
 
 WIDTH, HEIGHT = 560, 250  # of a chart, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 46, 34  # around what is drawn
 LIGHTEST = 0.55  # of a colour's luminance on white paper; lighter ones are darkened to it
+TALLEST = 320.0  # of a chart of places
 NARROWEST = 1.0  # m across a chart of places, or millimetres of noise would fill it
 _SMALLEST_SPAN = 1e-9  # of the values, or of 1: smaller ones cannot be told apart
 COLUMNS = 400  # pixels across a chart, within which points cannot be distinguished
@@ -44,7 +45,8 @@ def time_chart(
     """
     x = _span([curve.x for curve in curves])
     y = _span([curve.y for curve in curves])
-    near = [limit for limit in limits if y[0] - 2 * (y[1] - y[0]) <= limit <= y[1] + 2 * (y[1] - y[0])]
+    reach = FAR_LIMIT * (y[1] - y[0])
+    near = [limit for limit in limits if y[0] - reach <= limit <= y[1] + reach]
     far = [limit for limit in limits if limit not in near]
     low, high = _padded(min([y[0], *near]), max([y[1], *near]))
     frame = _Frame(x[0], x[1], low, high, WIDTH, HEIGHT)
@@ -75,7 +77,7 @@ def place_chart(title: str, curves: Sequence[Curve], axes: tuple[str, str]) -> s
     narrow = max(NARROWEST - (right - left), 0.0) / 2
     left, right = left - narrow, right + narrow
     across = WIDTH - LEFT - RIGHT
-    tall = min(max((high - low) / (right - left) * across, 60.0), 420.0)
+    tall = min(max((high - low) / (right - left) * across, 60.0), TALLEST)
     height = tall + TOP + BOTTOM
     scale = min(across / (right - left), tall / (high - low))
     spare = (across / scale - (right - left)) / 2
@@ -186,7 +188,11 @@ def _svg(
     title: str, labels: Sequence[tuple[str, Colour, bool]], parts: Sequence[str], width: float, height: float
 ) -> str:
     legend, x = [], float(LEFT)
-    for label, colour, dashed in dict.fromkeys(labels):
+    labels = list(dict.fromkeys(labels))
+    room = (width - LEFT - RIGHT) / max(len(labels), 1) - 30
+    if sum(30 + _LETTER * len(label) for label, _, _ in labels) > width - LEFT - RIGHT:
+        labels = [(_shortened(label, int(room / _LETTER)), colour, dashed) for label, colour, dashed in labels]
+    for label, colour, dashed in labels:
         dash = ' stroke-dasharray="5 3"' if dashed else ""
         legend.append(
             f'<line x1="{x:.0f}" x2="{x + 14:.0f}" y1="32" y2="32" stroke="{_css(colour)}" stroke-width="3"{dash}/>'
@@ -199,6 +205,10 @@ def _svg(
         f'<text x="{LEFT}" y="16" font-size="13" font-weight="600">{html.escape(title)}</text>'
         f"{''.join(legend)}{''.join(parts)}</svg>"
     )
+
+
+def _shortened(label: str, letters: int) -> str:
+    return label if len(label) <= letters else label[: max(letters - 1, 1)] + "…"
 
 
 def _css(colour: Colour) -> str:

@@ -3,16 +3,18 @@
 import html
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from cfplan.errors import InputError
-from cfplan.recording.overlay import Trial, trial_of_record
+from cfplan.flight.telemetry import Level
+from cfplan.recording.overlay import Trial, short_name, trial_of_record
 from cfplan.recording.plots import FLOWN, Colour, finite_limits, plots
+from cfplan.recording.record import Record
 from cfplan.recording.report.charts import Curve, place_chart, time_chart
-from cfplan.recording.report.report import ReportedFlight, rows
+from cfplan.recording.report.report import ReportedFlight, head, rows
 from cfplan.recording.rerun.overlay_view import COLOURS, references
 from cfplan.recording.summary import reference_span
 
@@ -25,7 +27,8 @@ h3 { font-size: 1.05em; } table { border-collapse: collapse; font-variant-numeri
 th, td { padding: .25em .9em .25em 0; text-align: left; border-bottom: 1px solid #eee; vertical-align: top; }
 td.n, th.n { text-align: right; } .note { background: #fff6e0; padding: .4em .8em; border-left: 4px solid #e69f00; }
 .fail, .error { color: #b02020; font-weight: 600; } .warning { color: #9a6700; }
-.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(440px, 1fr)); gap: 1em 1.5em; }
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(440px, 100%), 1fr)); gap: 1em 1.5em; }
+.heads { display: flex; flex-wrap: wrap; gap: 0 5em; align-items: start; } summary { cursor: pointer; color: #555; }
 .charts svg { width: 100%; height: auto; } .scroll { overflow-x: auto; } footer { color: #777; margin-top: 3em; }
 @media print { body { max-width: none; margin: 0; } .charts svg, table { break-inside: avoid; } }
 """
@@ -69,16 +72,22 @@ def write_page(flights: Sequence[ReportedFlight], file: Path, *, overwrite: bool
 
 
 def _summary(flights: Sequence[ReportedFlight]) -> str:
-    """Return a table with a row for each number and a column for each flight."""
-    columns = [rows(flight) for flight in flights]
-    head = "" if len(flights) == 1 else "".join(f'<th class="n">{html.escape(f.name)}</th>' for f in flights)
+    """Return what flew, and the numbers: a row each, and a column for each flight; of one flight side by side."""
+    if len(flights) == 1:
+        return f'<div class="heads">{_columns(flights, head)}{_columns(flights, rows)}</div>'
+    return _columns(flights, lambda flight: [*head(flight), *rows(flight)])
+
+
+def _columns(flights: Sequence[ReportedFlight], table: Callable[[ReportedFlight], list[tuple[str, str]]]) -> str:
+    columns = [table(flight) for flight in flights]
+    names = "" if len(flights) == 1 else "".join(f'<th class="n">{html.escape(f.name)}</th>' for f in flights)
     body = [
         f"<tr><td>{html.escape(label)}</td>"
         + "".join(f'<td class="n">{html.escape(column[index][1])}</td>' for column in columns)
         + "</tr>"
         for index, (label, _) in enumerate(columns[0])
     ]
-    heading = f"<tr><th></th>{head}</tr>" if head else ""
+    heading = f"<tr><th></th>{names}</tr>" if names else ""
     return f'<div class="scroll"><table>{heading}{"".join(body)}</table></div>'
 
 
@@ -91,10 +100,10 @@ def _comparison(flights: Sequence[ReportedFlight]) -> str:
         ("Speed, m/s", [trial.speed for trial in trials]),
     ):
         curves = [
-            Curve(trial.name, trial.time[along_rows], value[along_rows], COLOURS[index % len(COLOURS)])
+            Curve(short_name(trial.name), trial.time[along_rows], value[along_rows], COLOURS[index % len(COLOURS)])
             for index, (trial, value, along_rows) in enumerate(zip(trials, values, over, strict=True))
         ]
-        charts.append(time_chart(f"{title}, from the begin of the path", curves))
+        charts.append(time_chart(f"{title}, from the start of the path", curves))
     return f'<h2>Side by side</h2><div class="charts">{"".join(charts)}</div>'
 
 
@@ -112,15 +121,16 @@ def _views(trials: Sequence[Trial]) -> list[str]:
 
 
 def _places(trials: Sequence[Trial], title: str, across: int, up: int) -> str:
-    curves = [
-        Curve(f"{reference.name} (reference)", reference.position[:, across], reference.position[:, up], _PATH, True)
-        for reference in references(trials)
-    ]
+    curves = []
     for index, trial in enumerate(trials):
         colour = COLOURS[index % len(COLOURS)] if len(trials) > 1 else FLOWN
         along_rows = _along(trial)
-        label = trial.name if len(trials) > 1 else "flown"
+        label = short_name(trial.name) if len(trials) > 1 else "flown"
         curves.append(Curve(label, trial.position[along_rows, across], trial.position[along_rows, up], colour))
+    curves += [  # last, or the flown lines would cover its dashes
+        Curve(f"{reference.name} (reference)", reference.position[:, across], reference.position[:, up], _PATH, True)
+        for reference in references(trials)
+    ]
     return place_chart(title, curves, ("xyz"[across], "xyz"[up]))
 
 
@@ -161,12 +171,21 @@ def _events(flight: ReportedFlight) -> str:
     ]
     if not entries:
         return "<h3>Events</h3><p>None were recorded.</p>"
-    lines = [
+    entries.sort(key=lambda entry: entry[0])
+    grave = [entry for entry in entries if entry[1] in (Level.WARNING, Level.ERROR)]
+    told = f"<table>{_event_rows(record, grave)}</table>" if grave else "<p>No warnings and no errors.</p>"
+    return (
+        f"<h3>Events</h3>{told}<details><summary>All {len(entries)} events and phases</summary>"
+        f"<table>{_event_rows(record, entries)}</table></details>"
+    )
+
+
+def _event_rows(record: Record, entries: Sequence[tuple[float, str, str]]) -> str:
+    return "".join(
         f'<tr class="{html.escape(level)}"><td class="n">{time - record.start:.2f} s</td><td>{html.escape(level)}</td>'
         f"<td>{html.escape(text)}</td></tr>"
-        for time, level, text in sorted(entries, key=lambda entry: entry[0])
-    ]
-    return f"<h3>Events</h3><table>{''.join(lines)}</table>"
+        for time, level, text in entries
+    )
 
 
 def _certificate(flight: ReportedFlight) -> str:

@@ -79,6 +79,22 @@ def outcome(flight: ReportedFlight) -> str:
     return str(ended.get("reason") or UNKNOWN) if isinstance(ended, Mapping) else UNKNOWN
 
 
+def head(flight: ReportedFlight) -> list[tuple[str, str]]:
+    """Return what flew, where, when and by what, for the head of the page."""
+    header = flight.record.header
+    low, high = header.fence
+    sides = " × ".join(f"{b - a:g}" for a, b in zip(low, high, strict=True))
+    return [
+        ("begun", begun(flight.record)),
+        ("path", header.name),
+        ("vehicle", header.vehicle.name),
+        ("reached by", header.uri),
+        ("planned by", header.planner or UNKNOWN),
+        ("room", f"{sides} m"),
+        ("cfplan", header.version),
+    ]
+
+
 def rows(flight: ReportedFlight) -> list[tuple[str, str]]:
     """Return the summary table: what each number is, and its value as people read it."""
     return [

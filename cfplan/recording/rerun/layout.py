@@ -37,7 +37,7 @@ _STATES = "Phases, limit that holds the plan back, supervisor"
 
 def blueprint(header: RecordHeader, *, play_state: PlayState = "paused") -> rrb.Blueprint:
     """Return the layout: 3-D at the left, the plots beside it in two columns, phases, events and the summary below."""
-    grid = rrb.Grid(*(_plot(name, title) for name, title in TITLES.items()), grid_columns=2)
+    grid = rrb.Grid(*(time_plot(name, title) for name, title in TITLES.items()), grid_columns=2)
     below = rrb.Horizontal(
         rrb.StateTimelineView(contents=[PHASES, ACTIVE_LIMIT, SUPERVISOR], name=_STATES),
         rrb.Tabs(
@@ -62,8 +62,14 @@ def _event_columns() -> rrb.TextLogColumns:
     )
 
 
-def _plot(name: str, title: str) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=title, plot_legend=rrb.PlotLegend("RightTop"))
+def time_plot(name: str, title: str) -> rrb.TimeSeriesView:
+    """Return one set of axes: its time moves with that of all others, its legend covers the time on the ground."""
+    return rrb.TimeSeriesView(
+        origin=f"{PLOTS}/{name}",
+        name=title,
+        plot_legend=rrb.PlotLegend("LeftTop"),
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+    )
 
 
 def _room(header: RecordHeader) -> rrb.Spatial3DView:

@@ -9,9 +9,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from cfplan.recording.overlay import Reference, Trial, extent
+from cfplan.recording.overlay import Reference, Trial, extent, short_name
 from cfplan.recording.plots import FOUR, WANTED, Colour
-from cfplan.recording.rerun.layout import PLOTS, TIMELINE, WORLD, tail_range
+from cfplan.recording.rerun.layout import PLOTS, TIMELINE, WORLD, tail_range, time_plot
 from cfplan.recording.rerun.picture import write_png
 from cfplan.recording.rerun.record_view import (
     FLOOR_COLOUR,
@@ -60,10 +60,7 @@ def blueprint(trials: Sequence[Trial]) -> rrb.Blueprint:
     names = {"speed": "Speed, m/s", **{axis: f"{axis}, m" for axis in _AXES}}
     if references(trials):
         names = {"deviation": "Deviation, m", **names}
-    plots = [
-        rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=title, plot_legend=rrb.PlotLegend("RightTop"))
-        for name, title in names.items()
-    ]
+    plots = [time_plot(name, title) for name, title in names.items()]
     return rrb.Blueprint(
         rrb.Horizontal(_room(trials), rrb.Vertical(*plots), column_shares=[6, 5]),
         rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="paused"),
@@ -126,7 +123,7 @@ def log_trials(stream: rr.RecordingStream, trials: Sequence[Trial]) -> None:
         if trial.reference is not None:
             curves["deviation"] = trial.deviation
         for name, values in curves.items():
-            _log_curve(stream, f"{PLOTS}/{name}/trial_{index}", trial.name, colour, trial.time, values)
+            _log_curve(stream, f"{PLOTS}/{name}/trial_{index}", short_name(trial.name), colour, trial.time, values)
 
 
 def dashes(points: NDArray) -> list[NDArray]:

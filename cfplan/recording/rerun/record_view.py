@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cfplan.flight.telemetry import Level
 from cfplan.recording.header import RecordHeader
 from cfplan.recording.plots import FLOWN as FLOWN_COLOUR
-from cfplan.recording.plots import LIMIT, Colour, Plot, finite_limits, motor_thrust, plots
+from cfplan.recording.plots import LIMIT, Colour, Plot, finite_limits, motor_thrust, near_limits, plots
 from cfplan.recording.plots import WANTED as WANTED_COLOUR
 from cfplan.recording.record import Record, meant_motion
 from cfplan.recording.rerun import layout
@@ -68,7 +68,7 @@ def log_record(stream: rr.RecordingStream, record: Record) -> None:
     """Send all of a record."""
     stream.send_recording_name(record.header.name)
     log_room(stream, record.header)
-    shown = plots(record)
+    shown = [replace(plot, limits=near_limits(plot)) for plot in plots(record)]
     log_styles(stream, shown)
     log_columns(stream, record, shown, record.start)
     log_plan(stream, record)

@@ -19,7 +19,7 @@ from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import save_plan
-from cfplan.recording.plots import finite_limits, motor_thrust, plots
+from cfplan.recording.plots import motor_thrust, near_limits, plots
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE, meant_motion
 from cfplan.recording.rerun import layout
@@ -109,11 +109,15 @@ def test_every_curve_reads_back_equal(flight, rrd):
             np.testing.assert_array_equal(np.array(values).reshape(line.values.shape), line.values)
 
 
-def test_every_limit_is_a_level_line_over_the_whole_flight(flight, rrd):
-    for plot in plots(flight.record):
-        times, values = rows(rrd, f"/{layout.PLOTS}/{plot.name}/limit", "Scalars:scalars")
-        np.testing.assert_allclose(times, [0, flight.record.duration], atol=2e-9)
-        assert values == [list(finite_limits(plot))] * 2
+def test_every_limit_near_what_was_measured_is_a_level_line_over_the_whole_flight(flight, rrd):
+    drawn = {plot.name: near_limits(plot) for plot in plots(flight.record)}
+    assert len(drawn["motor_thrust"]) == 2
+    assert drawn["deviation"] == ()  # 0.5 m would make centimetres invisible
+    for name, limits in drawn.items():
+        if limits:
+            times, values = rows(rrd, f"/{layout.PLOTS}/{name}/limit", "Scalars:scalars")
+            np.testing.assert_allclose(times, [0, flight.record.duration], atol=2e-9)
+            assert values == [list(limits)] * 2
 
 
 def test_curves_are_drawn_such_that_no_spike_is_averaged_away(rrd):
