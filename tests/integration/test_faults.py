@@ -31,7 +31,10 @@ QUICK = (
     "two bodies swapped",
     "disk full",
 )
-RANDOM_SEEDS = (0, 2, 7, 11)  # of thousands that `cfplan study random-faults` flies
+SEEDS = [  # the first ones in their order; none is left out
+    *range(8),
+    *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8, 200)),
+]
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +116,7 @@ def test_a_vehicle_that_is_left_alone_in_any_phase_comes_down_beneath_and_disarm
 
 
 @pytest.mark.slow
-def test_without_poses_for_good_the_vehicle_comes_down_inside_and_not_like_a_stone(missions):
+def test_without_poses_for_good_the_vehicle_comes_down_inside_and_touches_the_floor_softly(missions):
     names, speeds = sorted(missions), []
     for seed in range(48):
         mission = missions[names[seed % len(names)]]
@@ -132,12 +135,12 @@ def test_without_poses_for_good_the_vehicle_comes_down_inside_and_not_like_a_sto
         down = int(np.argmax((truth.time > flown.struck) & (truth.position[:, 2] < 0.005)))
         speeds.append((truth.position[down - 3, 2] - truth.position[down - 1, 2]) / 0.02)
         off = int(np.argmax((truth.time > flown.struck) & ~truth.motor.any(axis=1)))
-        assert truth.position[off, 2] < 0.8
-    assert np.median(speeds) < 2.0
-    assert max(speeds) < 3.5
+        assert truth.position[off, 2] < 0.05
+    assert np.median(speeds) < 0.7
+    assert max(speeds) < 1.5
 
 
-@pytest.mark.parametrize("seed", RANDOM_SEEDS)
+@pytest.mark.parametrize("seed", SEEDS)
 def test_random_faults_end_inside_the_walls_disarmed_with_a_record(seed, missions):
     flown = fly_random(seed, missions)
     assert flown.to_wall > 0.0

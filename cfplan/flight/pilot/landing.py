@@ -11,15 +11,13 @@ that nor a pose has come in time, the motors stop wherever the vehicle is: it fa
 
 import math
 
-from numpy.typing import NDArray
-
 from cfplan.flight.pilot.abort_monitor import safety_abort
 from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.radio.supervisor_bits import FLYING
-from cfplan.flight.setpoints.descent import descent, quick_descent, sinking
-from cfplan.flight.telemetry import Level, Phase
+from cfplan.flight.setpoints.descent import QUICK, Pace, descent, gentle, sinking
+from cfplan.flight.telemetry import Level, Phase, Triple
 
 _CRUISE = 1.5  # times the mean speed of landing: what a descent sinks at between its ends
 _BENEATH_FLOOR = 0.3  # m below where it took off, and below the space, that setpoints sink to
@@ -29,13 +27,13 @@ _NOT_HELD = 0.25  # m above its setpoint, where the controller asks for no thrus
 _STANDS_FOR = 0.3  # s
 _STANDS_WITHIN = 0.015  # m, the range of the heights of a standing body's poses
 _SETTLE = 0.3  # s at the end of a descent before the motors stop
-_QUICK_SPEED = 2.0  # m/s, of a descent without poses: that of a fall from 0.2 m
-_QUICK_BENEATH = 3.0  # m below the floor that it sinks to, so that its time ends first
-_QUICK_FOR = 2.5  # s without poses after which the motors stop, as the estimate may be metres off
+_BLIND_BENEATH = 2.0  # m below the floor that setpoints sink to without poses, so that their time ends first
+_BLIND_FOR = 3.0  # s without poses after which the motors stop, as the estimate may be metres off
 _CLEAR = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
 _SEEN_FOR = 0.1  # s of good poses after which they are believed again
 _MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
 _LATEST_ESTIMATE = 0.1  # s
+_IDLE_FOR = 0.2  # s without any thrust, which no descent asks for
 
 
 class Landing:
@@ -45,6 +43,8 @@ class Landing:
         self._loop, self._floor = loop, floor  # m, height of the tracked body on the floor
         self.begun = False
         self._stands = False
+        self._was_blind = False  # the setpoints may be far from where the vehicle is
+        self._idle_since = math.inf  # s, since when the controller lets all motors stand
 
     def begin(self) -> None:
         """Enter the phase, once."""
@@ -58,29 +58,27 @@ class Landing:
         loop, stream = self._loop, self._loop.stream
         if stream is not None:
             left = stream.payloads[stream.index(loop.now()) - stream.first :]
-            loop.begin(Stream(sinking(left, self._floor + _CLEAR, _QUICK_SPEED, stream.rate), stream.rate))
+            loop.begin(Stream(sinking(left, self._floor + _CLEAR, QUICK.speed, stream.rate), stream.rate))
 
     def land(self) -> None:
         """Descend from where the vehicle is asked to be, and stop its motors. Raises AbortRaised if they do not."""
         self.begin()
-        loop, seen = self._loop, False
         while not self._stands:
-            if loop.blind:
+            if self._loop.blind:
                 self._descend_blindly()
-                seen = True
             else:
-                self._descend(seen)
-        if not stop_motors(loop):
+                self._descend()
+        if not stop_motors(self._loop):
             raise AbortRaised(safety_abort(Rung.CUT, "the vehicle does not land"))
-        loop.touch_down()
+        self._loop.touch_down()
 
-    def _descend(self, seen_again: bool) -> None:
+    def _descend(self) -> None:
         """Sink until the vehicle stands, or poses are gone; from the pose if those have only come back."""
         loop = self._loop
-        position, velocity, yaw = loop.seen() if seen_again else loop.asked()
         lowest = min(self._floor, loop.limits.space.low[2]) - _BENEATH_FLOOR
-        speed = _CRUISE * loop.limits.ground.land_speed
-        self._sink(descent(position, yaw, -velocity[2], self._floor, lowest, speed, loop.mission.rate))
+        pace = gentle(_CRUISE * loop.limits.ground.land_speed)
+        self._sink(loop.seen() if self._was_blind else loop.asked(), pace, lowest)
+        self._was_blind = False
         loop.until(lambda: self._stands_by_poses() or self._sunk() or loop.blind, math.inf)
         if not loop.blind:
             self._conclude(self._stands_by_poses())
@@ -88,10 +86,8 @@ class Landing:
     def _descend_blindly(self) -> None:
         """Sink quickly until the estimate or the time says that it is enough, or poses are back."""
         loop = self._loop
-        position, velocity, yaw = loop.asked()
-        self._sink(
-            quick_descent(position, yaw, -velocity[2], self._floor - _QUICK_BENEATH, _QUICK_SPEED, loop.mission.rate)
-        )
+        self._sink(loop.asked(), QUICK, self._floor - _BLIND_BENEATH)
+        self._was_blind = True
         seen_since = math.inf
 
         def seen() -> bool:
@@ -101,14 +97,17 @@ class Landing:
             return loop.now() - seen_since > _SEEN_FOR
 
         def over() -> bool:
-            return self._sunk() or loop.blind_for > _QUICK_FOR
+            return self._sunk() or loop.blind_for > _BLIND_FOR
 
         loop.until(lambda: self._stands_by_estimate() or over() or seen(), math.inf)
         if not seen():
             self._conclude(self._stands_by_estimate())
 
-    def _sink(self, payloads: NDArray) -> None:
-        self._loop.begin(Stream(payloads, self._loop.mission.rate))
+    def _sink(self, begin: tuple[Triple, Triple, float], pace: Pace, lowest: float) -> None:
+        """Send a descent from a position, m, velocity, m/s, and yaw, rad, to a height, m."""
+        loop, (position, velocity, yaw) = self._loop, begin
+        rate, space = loop.mission.rate, loop.limits.space
+        loop.begin(Stream(descent(position, yaw, -velocity[2], pace, self._floor, lowest, space, rate), rate))
 
     def _sunk(self) -> bool:
         stream = self._loop.stream
@@ -130,8 +129,15 @@ class Landing:
         return height - wanted[2] > (_NOT_FOLLOWING if near else _NOT_HELD)
 
     def _stands_by_estimate(self) -> bool:
-        """Return whether the estimate does not follow though the controller asks for no thrust."""
-        loop, estimate = self._loop, self._loop.link.estimate
+        """Return whether the estimate is so far above its setpoint, or the motors are off for so long, that it stands.
+
+        A vehicle that touches the floor leaning believes anything afterwards, but its controller gives up.
+        """
+        loop, estimate, status = self._loop, self._loop.link.estimate, self._loop.link.status
+        if status is not None:
+            self._idle_since = min(self._idle_since, status.time) if not any(status.motor) else math.inf
+            if status.time - self._idle_since > _IDLE_FOR:
+                return True
         if estimate is None or loop.now() - estimate.time > _LATEST_ESTIMATE:
             return False
         wanted = loop.wanted(estimate.time)
