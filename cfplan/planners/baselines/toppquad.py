@@ -1,5 +1,9 @@
 """TOPPQuad as a planner: the paper's, with which the expert and the learned planner are compared.
 
+K. Mao, I. Spasojevic, M. A. Hsieh, V. Kumar, "TOPPQuad: Dynamically-Feasible Time-Optimal Path Parametrization for
+Quadrotors", IROS 2024, arXiv:2309.11637; as used in K. Mao et al., "Sequence Modeling for Time-Optimal Quadrotor
+Trajectory Optimization with Sampling-based Robustness Analysis", 2025, arXiv:2506.13915, which is "the paper".
+
 Of the solver's answer only h and yaw at the grid points are kept: attitude, rates and thrusts follow from them through
 flatness, as the paper recovers them, so the solver's own values of them are dropped.
 """
