@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from cfplan.preparation.prepare_flight import PreparedFlight
 
 
+BUSY = 0.02  # s by which a setpoint is sent late only where the computer does other things
+
+
 @click.command(
     short_help="Plan, certify, rehearse, fly and record a path.",
     epilog="""\b
@@ -106,7 +109,18 @@ def _print_result(prepared: "PreparedFlight", flown: "RecordedFlight", as_json: 
     if outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:  # as asked: no error
         click.echo(f"{styled('ended:', 'yellow')} {outcome.reason}", err=True)
     elif outcome.exit_code is not ExitCode.OK:
-        click.echo(f"{styled('error:', 'red')} {outcome.reason}", err=True)
+        click.echo(f"{styled('error:', 'red')} {outcome.reason}{why_late(outcome.exit_code, summary)}", err=True)
+
+
+def why_late(exit_code: ExitCode, summary: dict[str, Any]) -> str:
+    """Return the hint that the computer itself was busy, where a safety rule ended a flight and setpoints were late."""
+    late = summary["lateness_max"]
+    if exit_code is not ExitCode.ENDED_BY_SAFETY or late is None or late < BUSY:
+        return ""
+    return (
+        f" (hint: setpoints were sent up to {1e3 * late:.0f} ms late: this computer was busy, which may be the cause; "
+        "run nothing else on it)"
+    )
 
 
 def _rows(prepared: "PreparedFlight", flown: "RecordedFlight") -> list[tuple[str, str]]:

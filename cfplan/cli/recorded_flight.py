@@ -54,10 +54,11 @@ def fly_and_record(
             raise
         for what, failure in failures:
             steps.failed(what, failure)
-        record = read_record(folder)
-        summary = {"uri": vehicle.uri, "outcome": outcome.to_dict(), **summarise(record).to_json()}
-        summary["deviation_grows_with_speed"] = suggests_identification(record)
-        write_summary(folder, summary)
+        with steps.waiting("measuring the flight"):
+            record = read_record(folder)
+            summary = {"uri": vehicle.uri, "outcome": outcome.to_dict(), **summarise(record).to_json()}
+            summary["deviation_grows_with_speed"] = suggests_identification(record)
+            write_summary(folder, summary)
     return RecordedFlight(outcome, record, summary)
 
 

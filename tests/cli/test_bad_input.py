@@ -4,6 +4,9 @@ import re
 
 import pytest
 
+from cfplan.cli.fly import why_late
+from cfplan.errors import ExitCode
+
 LINE = "waypoints: [[0, 0, 1], [1, 0, 1]]\n"
 
 BAD_PATHS = {
@@ -142,3 +145,11 @@ def test_what_would_fail_at_the_end_is_refused_before_anything_is_planned(cfplan
     ended = cfplan(*(word.format(path=path) for word in words), "--safety", safety_file())
     assert_one_line(ended, 2, *parts)
     assert ended.out == ""
+
+
+@pytest.mark.parametrize(
+    ("code", "late", "said"),
+    [(7, 0.12, True), (7, 0.004, False), (7, None, False), (6, 0.12, False), (8, 0.12, False)],
+)
+def test_a_flight_that_a_safety_rule_ended_on_a_busy_computer_says_so(code, late, said):
+    assert ("120 ms late" in why_late(ExitCode(code), {"lateness_max": late})) is said
