@@ -39,6 +39,7 @@ _SHARE_DEAD = 0.4  # of the flights: the pilot or the radio dies
 _MANY = (0.5, 0.3, 0.2)  # share of flights with one, two, three faults
 _APART = 1.5  # s within which several faults begin
 _BESIDE_START = 0.4  # m from the path's start at which the vehicle stands
+_INSIDE = 0.02  # m that it stands inside the margin, as preflight measures its place
 _GROUPS = {FaultKind: "pose", RadioFaultKind: "radio", VehicleFaultKind: "vehicle"}
 _LONGEST_STALL = 5.0  # s
 _GROUP_SIZE = 10  # flights that a process flies before it reports
@@ -203,7 +204,8 @@ def random_scenario(seed: int, mission: Mission) -> Scenario:
 
 def _beside_start(mission: Mission, chance: np.random.Generator) -> tuple[float, float, float]:
     space = mission.limits.space
-    low, high = np.array(space.low[:2]) + space.margin, np.array(space.high[:2]) - space.margin
+    inside = space.margin + _INSIDE
+    low, high = np.array(space.low[:2]) + inside, np.array(space.high[:2]) - inside
     x, y = np.clip(mission.start[0][:2] + chance.uniform(-_BESIDE_START, _BESIDE_START, 2), low, high).tolist()
     return x, y, 0.0
 
