@@ -1,3 +1,13 @@
 """The pilot: its phases, preflight, the stream of setpoints, the abort ladder, and its process."""
 
-__all__ = ["deadlines", "keys", "mission", "outcome", "pilot", "process", "vehicle_rules", "vehicle_survey"]
+__all__ = [
+    "deadlines",
+    "keys",
+    "mission",
+    "outcome",
+    "pilot",
+    "process",
+    "proposals",
+    "vehicle_rules",
+    "vehicle_survey",
+]

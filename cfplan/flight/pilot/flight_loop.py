@@ -144,6 +144,7 @@ class FlightLoop:
         """Send the plan from the next deadline on."""
         self.plan = self.begin(self.plan)
         self.history.first_setpoint = self.plan.start
+        self._proposals.begin(self.plan.start)
 
     def end_stream(self) -> None:
         """Send no setpoints any more."""

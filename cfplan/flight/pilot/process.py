@@ -22,6 +22,7 @@ from cfplan.flight.pilot.keys import HeldOrders, Keyboard, Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.pilot import Pilot
+from cfplan.flight.pilot.proposals import ReceivedProposals
 from cfplan.flight.pilot.reporter import Reporter
 from cfplan.flight.radio.connection import connect
 from cfplan.flight.real_time import STREAM_PRIORITY, lock_memory, shorten_time_slice, use_fifo_scheduling
@@ -46,8 +47,9 @@ class _Assignment:
 class PilotProcess:
     """The pilot's process, which imports what it needs until it is assigned a mission; a context manager."""
 
-    def __init__(self, process: BaseProcess, telemetry: Connection, orders: Connection):
+    def __init__(self, process: BaseProcess, telemetry: Connection, orders: Connection, proposals: Connection):
         self.process, self.telemetry, self.orders = process, telemetry, orders
+        self.proposals = proposals  # for a planner's process: it sends proposals, and hears answers
         self._assigned = False
 
     def assign(self, mission: Mission, uri: str, pose_source: PoseSource) -> None:
@@ -62,6 +64,7 @@ class PilotProcess:
         """End it: at once on the ground, after its landing in flight. May be called twice."""
         self.orders.close()  # if this end fails, the pilot notices and lands
         self.telemetry.close()
+        self.proposals.close()
         self.process.join(_LANDING_TIME if self._assigned else 0.0)
         if self.process.is_alive():
             self.process.kill()
@@ -80,12 +83,16 @@ def start_pilot(drivers: Sequence[type] = ()) -> PilotProcess:
     context = multiprocessing.get_context("spawn")
     telemetry, telemetry_end = context.Pipe(duplex=False)
     orders_end, orders = context.Pipe(duplex=False)
-    process = context.Process(target=_run, args=(tuple(drivers), telemetry_end, orders_end), name="pilot")
+    proposals_end, proposals = context.Pipe()
+    process = context.Process(
+        target=_run, args=(tuple(drivers), telemetry_end, orders_end, proposals_end), name="pilot"
+    )
     with _signals_ignored():
         process.start()
     telemetry_end.close()
     orders_end.close()
-    return PilotProcess(process, telemetry, orders)
+    proposals_end.close()
+    return PilotProcess(process, telemetry, orders, proposals)
 
 
 def fly(
@@ -215,7 +222,9 @@ class OrderReceiver(HeldOrders):
             self.gone = True
 
 
-def _run(drivers: tuple[type, ...], telemetry: Connection, orders_connection: Connection) -> None:
+def _run(
+    drivers: tuple[type, ...], telemetry: Connection, orders_connection: Connection, proposals: Connection
+) -> None:
     """Run the pilot's process, from its first line to its last."""
     with contextlib.suppress(OSError):
         os.setsid()  # the terminal's signals are for the main process
@@ -243,6 +252,7 @@ def _run(drivers: tuple[type, ...], telemetry: Connection, orders_connection: Co
             report=report,
             orders=orders,
             enter_real_time=_enter_real_time,
+            proposals=ReceivedProposals(proposals),
         )
         last = replace(pilot.fly(), telemetry_dropped=report.dropped)
     except CfplanError as error:

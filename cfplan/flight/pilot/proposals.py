@@ -1,13 +1,26 @@
 """Proposals: where the pilot finds what a planner proposes, and answers it. The pilot never waits for a planner."""
 
+import contextlib
+import struct
+import threading
 from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
 from typing import Protocol
 
 from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal
 
+LONGEST_MESSAGE = 1 << 26  # bytes, of a proposal: five minutes of flight
+_ANSWER = struct.Struct("<8sIId")  # kind, checksum of the proposal, of the commitment, time
+_BEGUN, _ACCEPTED, _REFUSED = b"begun   ", b"accepted", b"refused "
+
 
 class ProposalSource(Protocol):
     """A planner as the pilot sees it."""
+
+    def begin(self, start: float) -> None:
+        """Tell the planner that setpoint 0 is due at `start`, s on the clock of time.monotonic(). Must not wait."""
 
     def newest(self) -> Proposal | None:
         """Return the newest proposal since the last call, None where there is none. Must not wait."""
@@ -18,6 +31,9 @@ class ProposalSource(Protocol):
 
 class NoProposals:
     """No planner: the flight is that of its mission."""
+
+    def begin(self, start: float) -> None:
+        pass
 
     def newest(self) -> Proposal | None:
         return None
@@ -36,6 +52,9 @@ class HeldProposals:
         self._newest: Proposal | None = None
         self.on_answer = on_answer
 
+    def begin(self, start: float) -> None:
+        pass
+
     def give(self, proposal: Proposal) -> None:
         """Propose; a proposal that was not taken yet is forgotten."""
         self._newest = proposal
@@ -46,3 +65,62 @@ class HeldProposals:
 
     def answer(self, proposal: Proposal, answer: Commitment | Refusal) -> None:
         self.on_answer(proposal, answer)
+
+
+class ReceivedProposals(HeldProposals):
+    """Proposals of a planner's process, read by a thread; another thread answers it.
+
+    A planner that died, hangs or sends what is no proposal is one that proposes nothing.
+    """
+
+    def __init__(self, connection: Connection):
+        super().__init__(self._answer)
+        self._connection = connection
+        self._answers: SimpleQueue[bytes] = SimpleQueue()
+        threading.Thread(target=self._read, name="proposals", daemon=True).start()
+        threading.Thread(target=self._write, name="answers", daemon=True).start()
+
+    def begin(self, start: float) -> None:
+        self._answers.put(_ANSWER.pack(_BEGUN, 0, 0, start))
+
+    def _answer(self, proposal: Proposal, answer: Commitment | Refusal) -> None:
+        if isinstance(answer, Commitment):
+            self._answers.put(_ANSWER.pack(_ACCEPTED, proposal.checksum, answer.checksum, 0.0))
+        else:
+            self._answers.put(_ANSWER.pack(_REFUSED, proposal.checksum, 0, 0.0) + str(answer).encode())
+
+    def _read(self) -> None:
+        with contextlib.suppress(EOFError, OSError, TypeError):  # TypeError: it was closed here while it was read
+            while True:
+                if proposal := Proposal.of_bytes(self._connection.recv_bytes(LONGEST_MESSAGE)):
+                    self.give(proposal)
+
+    def _write(self) -> None:
+        with contextlib.suppress(OSError, TypeError):
+            while True:
+                self._connection.send_bytes(self._answers.get())
+
+
+@dataclass(frozen=True, slots=True)
+class PilotAnswer:
+    """What a planner hears of the pilot."""
+
+    begun: float | None = None  # s, when setpoint 0 is due, where that is told
+    proposal: int = 0  # checksum of the proposal that is answered
+    commitment: int | None = None  # checksum of what is committed with it; None where it was refused
+    reason: str = ""  # why it was refused
+
+
+def read_answer(message: bytes) -> PilotAnswer:
+    """Return what the pilot answered a planner. Raises ValueError where that is no answer."""
+    if len(message) < _ANSWER.size:
+        raise ValueError(f"an answer of {len(message)} bytes")
+    kind, proposal, commitment, time = _ANSWER.unpack_from(message)
+    match kind:
+        case b"begun   ":
+            return PilotAnswer(begun=time)
+        case b"accepted":
+            return PilotAnswer(proposal=proposal, commitment=commitment)
+        case b"refused ":
+            return PilotAnswer(proposal=proposal, reason=message[_ANSWER.size :].decode())
+    raise ValueError(f"an answer of the kind {kind!r}")

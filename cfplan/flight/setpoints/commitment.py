@@ -13,6 +13,7 @@ be late, mistaken or broken, so the pilot verifies by itself, without trusting a
 Where anything of that fails, the old commitment is flown to its end. A commitment is a value: splicing makes a new one.
 """
 
+import struct
 import zlib
 from dataclasses import dataclass
 from enum import StrEnum
@@ -36,6 +37,8 @@ QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
 LEVEL = 0.01  # rad of tilt, below which a vehicle hovers: twice what bytes round an attitude by
 LARGEST_JERK = 400.0  # m/s³, beyond which velocities do not belong together: ten times what plans reach
 _ROUNDING = 1e-9
+_MAGIC = b"proposal"
+_HEAD = struct.Struct("<8sIIQII")  # magic, what it follows, checksum, splice, setpoints, setpoints of a stop
 
 
 class Fault(StrEnum):
@@ -105,6 +108,23 @@ class Proposal:
     payloads: NDArray  # (K, 29) uint8
     stops: NDArray  # (K, M, 29) uint8
     checksum: int  # of splice, payloads and stops
+
+    def to_bytes(self) -> bytes:
+        """Return the proposal as it goes from process to process."""
+        shape = self.stops.shape[:2]
+        head = _HEAD.pack(_MAGIC, self.follows, self.checksum, self.splice, *shape)
+        return b"".join((head, self.payloads.tobytes(), self.stops.tobytes()))
+
+    @classmethod
+    def of_bytes(cls, message: bytes) -> "Proposal | None":
+        """Return the proposal of a message, None where it is none. What it proposes may still be anything."""
+        if len(message) < _HEAD.size or message[: len(_MAGIC)] != _MAGIC:
+            return None
+        _, follows, checksum, first, count, length = _HEAD.unpack_from(message)
+        if not count or not length or len(message) != _HEAD.size + count * (1 + length) * PAYLOAD_SIZE:
+            return None
+        rows = np.frombuffer(message, np.uint8, offset=_HEAD.size).reshape(-1, PAYLOAD_SIZE)
+        return cls(follows, first, rows[:count], rows[count:].reshape(count, length, PAYLOAD_SIZE), checksum)
 
 
 def propose(commitment: Commitment, splice: int, payloads: NDArray, stops: NDArray) -> Proposal:

@@ -1,0 +1,243 @@
+"""The planner's process, beside the pilot: it makes certified proposals of what is asked for while the vehicle flies.
+
+It plans from the earliest setpoint that it can make, by how long its last plans took. The latest request wins: one that
+waits is dropped when another comes. It may die, hang or be killed; then the vehicle ends on what is committed.
+"""
+
+import contextlib
+import math
+import multiprocessing
+import os
+import signal
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from multiprocessing.connection import Connection, wait
+from types import TracebackType
+
+from cfplan.errors import CfplanError
+from cfplan.flight.clock import REAL_CLOCK
+from cfplan.flight.pilot.proposals import PilotAnswer, read_answer
+from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, splice
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.telemetry import Triple
+from cfplan.preparation.replan import HeldFlight, Replanned, accepted, halt, replan
+from cfplan.safety.limits import Limits
+
+FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
+LEARNED_FROM = 8  # plans, the longest of which says how long the next may take
+SLACK = 0.05  # s more than that, for the way to the pilot
+TRIES = 2  # of a request whose proposal comes late
+_ANSWER_WITHIN = 1.0  # s in which a pilot answers
+_CLOSE_WITHIN = 1.0  # s
+
+
+class Wish(StrEnum):
+    """What a request is for."""
+
+    EXTEND = "extend"  # fly on through these waypoints after those ahead
+    REPLACE = "replace"  # fly through these instead
+    STOP = "stop"  # come to rest soon, ahead on the path
+
+
+class Verdict(StrEnum):
+    """What became of a request."""
+
+    ACCEPTED = "accepted"
+    REFUSED = "refused"  # no plan, or the pilot did not verify it
+    LATE = "late"  # planned, but not in time
+    SUPERSEDED = "superseded"  # another request came before it was planned
+
+
+@dataclass(frozen=True, slots=True)
+class PathRequest:
+    """A request to change the path in flight."""
+
+    number: int  # by which its answer names it
+    wish: Wish
+    waypoints: tuple[Triple, ...] = ()  # m
+
+
+@dataclass(frozen=True, slots=True)
+class PathAnswer:
+    """The answer to a request."""
+
+    number: int
+    verdict: Verdict
+    reason: str = ""  # why not, one line
+    joint: float = math.nan  # s from the first setpoint, from when on the new plan is flown
+    ends: float = math.nan  # s from the first setpoint, when it ends
+    seconds: float = 0.0  # s from the request to the answer
+
+
+class AirPlanner:
+    """The planner's process as the main process sees it; a context manager."""
+
+    def __init__(self, held: HeldFlight, limits: Limits, pilot: Connection):
+        """Start it; `held` is what the pilot's mission was made from, `pilot` the end of its proposals."""
+        context = multiprocessing.get_context("spawn")
+        self._requests, requests_end = context.Pipe()
+        self._process = context.Process(target=_run, args=(held, limits, requests_end, pilot), name="planner")
+        self._process.start()
+        requests_end.close()
+        self._number = 0
+        self.ready = False  # whether it has said that it can plan
+
+    def request(self, wish: Wish, waypoints: Sequence[Triple] = ()) -> int:
+        """Ask for a change; return the number of its answer. A planner that has ended answers nothing."""
+        self._number += 1
+        points = tuple((float(x), float(y), float(z)) for x, y, z in waypoints)
+        with contextlib.suppress(OSError):
+            self._requests.send(PathRequest(self._number, wish, points))
+        return self._number
+
+    def answers(self, patience: float = 0.0) -> list[PathAnswer]:
+        """Return the answers since the last call; wait for one for `patience`, s."""
+        found: list[PathAnswer] = []
+        with contextlib.suppress(EOFError, OSError):
+            while self._requests.poll(0.0 if found else patience):
+                message = self._requests.recv()
+                if isinstance(message, PathAnswer):
+                    found.append(message)
+                else:
+                    self.ready, patience = True, 0.0
+        return found
+
+    @property
+    def process_id(self) -> int | None:
+        """Return the number of the process."""
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Return whether it runs."""
+        return self._process.is_alive()
+
+    def close(self) -> None:
+        """End it. May be called twice."""
+        self._requests.close()
+        self._process.join(_CLOSE_WITHIN)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+    def __enter__(self) -> "AirPlanner":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class _Worker:
+    """The planner in its own process."""
+
+    def __init__(self, held: HeldFlight, limits: Limits, requests: Connection, pilot: Connection):
+        self._held, self._limits, self._requests, self._pilot = held, limits, requests, pilot
+        self._begun: float | None = None  # s, when setpoint 0 was due
+        self._took: deque[float] = deque([FIRST_TIME], maxlen=LEARNED_FROM)
+        self._waiting: tuple[PathRequest, float] | None = None
+
+    def warm_up(self) -> None:
+        """Make two plans for nobody: what a first call compiles or loads is there before the flight."""
+        held = self._held
+        for _ in range(2):
+            begun = REAL_CLOCK.now()
+            with contextlib.suppress(CfplanError):
+                middle = held.flown.at(held.ends / 2).position
+                replan(held, max(round(held.ends / 4 * RATE), 1), [middle, held.ahead[-1]], self._limits)
+                self._took[0] = REAL_CLOCK.now() - begun
+
+    def serve(self) -> None:
+        """Plan until the main process or the pilot has ended."""
+        while True:
+            watched = [self._requests, self._pilot]
+            wait(watched)
+            self._read(0.0)
+            if self._waiting is not None:
+                (request, since), self._waiting = self._waiting, None
+                answer = self._answer(request)
+                self._requests.send(replace(answer, seconds=REAL_CLOCK.now() - since))
+
+    def _read(self, patience: float) -> PilotAnswer | None:
+        """Take what has come; return the pilot's answer to a proposal if there is one, waiting for it if asked to."""
+        found = None
+        until = REAL_CLOCK.now() + patience
+        while ready := wait([self._requests, self._pilot], max(until - REAL_CLOCK.now(), 0.0)):
+            if self._pilot in ready:
+                answer = read_answer(self._pilot.recv_bytes())
+                if answer.begun is not None:
+                    self._begun = answer.begun
+                else:
+                    found = answer
+                    until = 0.0
+            if self._requests in ready:
+                request = self._requests.recv()
+                if self._waiting is not None:
+                    self._requests.send(PathAnswer(self._waiting[0].number, Verdict.SUPERSEDED))
+                self._waiting = request, REAL_CLOCK.now()
+        return found
+
+    def _answer(self, request: PathRequest) -> PathAnswer:
+        """Plan what is asked for, and propose it."""
+        if self._begun is None:
+            return PathAnswer(request.number, Verdict.REFUSED, "the plan is not flown yet")
+        reason = ""
+        for _ in range(TRIES):
+            begun = REAL_CLOCK.now()
+            ahead = max(self._took) + SLACK
+            first = math.ceil((begun - self._begun + ahead) * RATE) + LEAST_AHEAD
+            try:
+                made = self._plan(request, first)
+            except CfplanError as error:
+                return PathAnswer(request.number, Verdict.REFUSED, str(error))
+            finally:
+                self._took.append(REAL_CLOCK.now() - begun)
+            answer = self._propose(made)
+            if answer is None:
+                return PathAnswer(request.number, Verdict.REFUSED, "the pilot does not answer")
+            if answer.commitment is not None:
+                joint = self._held.flown.starts[-1]
+                return PathAnswer(request.number, Verdict.ACCEPTED, joint=joint, ends=self._held.ends)
+            reason = answer.reason
+            if not reason.startswith(Fault.LATE):
+                return PathAnswer(request.number, Verdict.REFUSED, reason)
+        return PathAnswer(request.number, Verdict.LATE, reason)
+
+    def _plan(self, request: PathRequest, first: int) -> Replanned:
+        if request.wish is Wish.STOP:
+            return halt(self._held, first, self._limits)
+        return replan(self._held, first, request.waypoints, self._limits, keep=request.wish is Wish.EXTEND)
+
+    def _propose(self, made: Replanned) -> PilotAnswer | None:
+        """Send a proposal and wait for the pilot's answer; what it accepts is held from then on."""
+        self._pilot.send_bytes(made.proposal.to_bytes())
+        until = REAL_CLOCK.now() + _ANSWER_WITHIN
+        while (left := until - REAL_CLOCK.now()) > 0.0:
+            answer = self._read(left)
+            if answer is None or answer.proposal != made.proposal.checksum:
+                continue
+            if answer.commitment is not None:
+                committed = splice(
+                    self._held.commitment, made.proposal, made.proposal.splice - LEAST_AHEAD, self._limits.space
+                )
+                assert isinstance(committed, Commitment)
+                assert committed.checksum == answer.commitment
+                self._held = accepted(made, committed)
+            return answer
+        return None
+
+
+def _run(held: HeldFlight, limits: Limits, requests: Connection, pilot: Connection) -> None:
+    """Run the planner's process."""
+    with contextlib.suppress(OSError):
+        os.setsid()  # the terminal's signals are for the main process
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
+        signal.signal(number, signal.SIG_IGN)
+    worker = _Worker(held, limits, requests, pilot)
+    worker.warm_up()
+    with contextlib.suppress(EOFError, OSError):
+        requests.send("ready")
+        worker.serve()

@@ -1,0 +1,145 @@
+"""The planner's process: what it proposes verifies, and whatever happens to it the pilot has what is committed."""
+
+import multiprocessing
+import os
+import signal
+
+import numpy as np
+import pytest
+from waiting import until
+
+from cfplan.flight.clock import REAL_CLOCK
+from cfplan.flight.pilot.proposals import ReceivedProposals
+from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal, propose, splice
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.geometry.min_snap import centripetal_times, min_snap
+from cfplan.planning.plan import plan
+from cfplan.preparation.air_planner import AirPlanner, PathAnswer, Verdict, Wish
+from cfplan.preparation.replan import hold
+
+WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
+
+
+class PilotSide:
+    """The pilot as the planner sees it: what it is committed to, at which moment."""
+
+    def __init__(self, commitment, limits, connection):
+        self.commitment, self.limits = commitment, limits
+        self.proposals = ReceivedProposals(connection)
+        self.begun = 0.0
+        self.given: list[Commitment | Refusal] = []
+
+    def begin(self) -> None:
+        self.begun = REAL_CLOCK.now()
+        self.proposals.begin(self.begun)
+
+    def tick(self) -> None:
+        proposal = self.proposals.newest()
+        if proposal is not None:
+            now = round((REAL_CLOCK.now() - self.begun) * RATE)
+            answer = splice(self.commitment, proposal, now, self.limits.space)
+            if isinstance(answer, Commitment):
+                self.commitment = answer
+            self.given.append(answer)
+            self.proposals.answer(proposal, answer)
+
+
+@pytest.fixture(scope="module")
+def held(limits):
+    path = min_snap(WAYPOINTS, times=centripetal_times(WAYPOINTS))
+    return hold(plan(path, limits.airframe, limits, planner="expert"), WAYPOINTS)
+
+
+@pytest.fixture
+def both(held, limits):
+    """A planner's process that is ready, and the pilot's side of it."""
+    theirs, ours = multiprocessing.get_context("spawn").Pipe()
+    with AirPlanner(held, limits, theirs) as planner:
+        theirs.close()
+        assert until(lambda: bool(planner.answers()) or planner.ready)
+        yield planner, PilotSide(held.commitment, limits, ours)
+
+
+def answer_to(number: int, planner: AirPlanner, pilot: PilotSide) -> PathAnswer:
+    found: list[PathAnswer] = []
+
+    def answered() -> bool:
+        pilot.tick()
+        found.extend(planner.answers())
+        return any(answer.number == number for answer in found)
+
+    assert until(answered)
+    return next(answer for answer in found if answer.number == number)
+
+
+def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(both, limits):
+    planner, pilot = both
+    early = answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)]), planner, pilot)
+    assert (early.verdict, early.reason) == (Verdict.REFUSED, "the plan is not flown yet")
+    pilot.begin()
+    told: list[PathAnswer] = []
+
+    def knows() -> bool:
+        told.append(answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 7.0)]), planner, pilot))
+        return told[-1].reason != early.reason
+
+    assert until(knows)
+    assert told[-1].verdict is Verdict.REFUSED
+    assert "waypoint 1" in told[-1].reason
+    assert "hint" in told[-1].reason
+    none = answer_to(planner.request(Wish.EXTEND), planner, pilot)
+    assert none.verdict is Verdict.REFUSED
+    # Late in the flight or after it, as slowly as this computer plans: from rest at the latest.
+    for _ in range(3):
+        answer = answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)]), planner, pilot)
+        if answer.verdict is Verdict.ACCEPTED:
+            break
+    assert answer.verdict is Verdict.ACCEPTED, answer
+    assert isinstance(pilot.given[-1], Commitment)
+    assert answer.joint == pytest.approx((pilot.commitment.splices[-1] + 15) / RATE)
+    again = answer_to(planner.request(Wish.EXTEND, [(0.5, -0.5, 1.0)]), planner, pilot)
+    assert again.verdict is Verdict.ACCEPTED, again
+
+
+def test_the_latest_request_wins(both):
+    planner, pilot = both
+    pilot.begin()
+    numbers = [planner.request(Wish.REPLACE, [(0.0, 0.1 * k, 1.0)]) for k in range(6)]
+    answers: list[PathAnswer] = []
+
+    def all_answered() -> bool:
+        pilot.tick()
+        answers.extend(planner.answers())
+        return len(answers) == len(numbers)
+
+    assert until(all_answered)
+    verdicts = {answer.number: answer.verdict for answer in answers}
+    assert [verdicts[number] for number in numbers[1:-1]] == [Verdict.SUPERSEDED] * 4
+    assert verdicts[numbers[-1]] is not Verdict.SUPERSEDED
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_planner_that_is_killed_or_stopped_leaves_the_pilot_its_commitment(both, held, how):
+    planner, pilot = both
+    pilot.begin()
+    assert planner.process_id is not None
+    planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)])
+    os.kill(planner.process_id, how)
+    planner.request(Wish.STOP)
+    for _ in range(20):
+        pilot.tick()
+        REAL_CLOCK.sleep(0.01)
+    assert pilot.commitment is held.commitment
+    assert planner.answers() == []
+
+
+def test_what_is_no_proposal_is_none(held):
+    commitment = held.commitment
+    good = propose(commitment, 100, commitment.payloads[100:], commitment.stops[100:])
+    message = good.to_bytes()
+    read = Proposal.of_bytes(message)
+    assert (read.follows, read.splice, read.checksum) == (good.follows, good.splice, good.checksum)
+    np.testing.assert_array_equal(read.payloads, good.payloads)
+    np.testing.assert_array_equal(read.stops, good.stops)
+    for broken in (b"", b"proposal", message[:-1], message + b"x", b"text " * 1000, bytes(len(message))):
+        assert Proposal.of_bytes(broken) is None
