@@ -12,6 +12,7 @@ from rich.text import Text
 _GAP = 2  # characters between two columns
 _EDGE = 1  # before the first
 _LEAST_TEXT = 12  # characters, to which a column of text is wrapped at most
+_TIE = "\N{NO-BREAK SPACE}"  # keeps a number and its unit on one line while the table is laid out
 _NUMBER = re.compile(r"[-+–(≤≥<>]?\s*\d.*|[-–]?")
 
 Rows = Sequence[Sequence[str]]
@@ -20,7 +21,9 @@ Rows = Sequence[Sequence[str]]
 def print_fitting(console: Console, title: str, columns: Sequence[str], rows: Rows) -> None:
     """Print a table no wider than the console; where even wrapping cannot do that, with a column for each row."""
     for heads, cells in _fitting(list(columns), [list(row) for row in rows], console.width):
-        console.print(_table(title, heads, cells))
+        with console.capture() as drawn:
+            console.print(_table(title, heads, cells))
+        console.file.write(drawn.get().replace(_TIE, " "))
         title = ""
 
 
@@ -45,15 +48,21 @@ def _turned(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[
 
 
 def _least_width(columns: list[str], rows: list[list[str]]) -> int:
-    least = 0
+    """Return how narrow the table may be drawn, in characters."""
+    return sum(_least_widths(columns, rows)) + _GAP * (len(columns) - 1) + 2 * _EDGE
+
+
+def _least_widths(columns: Sequence[str], rows: Rows) -> list[int]:
+    """Return how narrow each column may be: its longest number or word, and a little more of text."""
+    least = []
     for index, head in enumerate(columns):
         cells = [row[index] for row in rows]
-        if index == 0 or not _is_numeric(cells):
-            texts = (head, *cells)
-            least += max(max(map(_longest_word, texts)), min(_LEAST_TEXT, _longest(texts)))
+        width = max(map(_longest_word, (head, *cells)))
+        if index > 0 and _is_numeric(cells):
+            least.append(max(width, _longest(cells)))
         else:
-            least += max(_longest(cells), _longest_word(head))
-    return least + _GAP * (len(columns) - 1) + 2 * _EDGE
+            least.append(max(width, min(_LEAST_TEXT, _longest((head, *cells)))))
+    return least
 
 
 def _longest(texts: Sequence[str]) -> int:
@@ -72,9 +81,9 @@ def _table(title: str, columns: Sequence[str], rows: Rows) -> Table:
     table = Table(
         title=title or None, title_justify="left", header_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
-    for index, column in enumerate(columns):
+    for index, (column, least) in enumerate(zip(columns, _least_widths(columns, rows), strict=True)):
         numeric = index > 0 and _is_numeric([row[index] for row in rows])
-        table.add_column(column, justify="right" if numeric else "left", no_wrap=numeric, overflow="fold")
+        table.add_column(column, justify="right" if numeric else "left", min_width=least)
     for row in rows:
-        table.add_row(*map(Text, row))
+        table.add_row(*(Text(cell.replace(" ", _TIE) if _is_numeric([cell]) else cell) for cell in row))
     return table

@@ -134,6 +134,10 @@ WIDE = [["learned, refined", *(f"{number:.1f} ms" for number in range(15))], ["c
     [
         (["planner", *(f"figure {number}" for number in range(15))], WIDE),
         (["", "found", "verdict", "hint"], [["radio", "no Crazyradio is plugged in", "optional", "plug one in; " * 5]]),
+        (
+            ["planner", "plan, median", "to certificate, median", "speed-up, median"],
+            [[f"{name}, refined", "801.1 ms", "2407.7 ms", "124.0×"] for name in ("learned", "expert", "convex")] * 3,
+        ),
         (["limit", "worst", "allowed"], [["angular acceleration", "34.93 rad/s²", "35.00"]]),
     ],
 )
@@ -142,5 +146,6 @@ def test_tables_fit_80_columns_with_every_cell_whole(columns, rows):
     tables.print_fitting(console, "title", columns, rows)
     lines = console.file.getvalue().splitlines()
     assert max(map(len, lines)) <= 80
+    assert "\N{NO-BREAK SPACE}" not in "".join(lines)
     words = {word for line in lines for word in line.split()}
     assert {word for text in (*columns, *(cell for row in rows for cell in row)) for word in text.split()} <= words
