@@ -41,7 +41,7 @@ class Wish(StrEnum):
     STOP = "stop"  # come to rest soon, ahead on the path
 
 
-class Verdict(StrEnum):
+class PathVerdict(StrEnum):
     """What became of a request."""
 
     ACCEPTED = "accepted"
@@ -64,7 +64,7 @@ class PathAnswer:
     """The answer to a request."""
 
     number: int
-    verdict: Verdict
+    verdict: PathVerdict
     reason: str = ""  # why not, one line
     joint: float = math.nan  # s from the first setpoint, from when on the new plan is flown
     ends: float = math.nan  # s from the first setpoint, when it ends
@@ -176,14 +176,14 @@ class _Worker:
             if self._requests in ready:
                 request = self._requests.recv()
                 if self._waiting is not None:
-                    self._requests.send(PathAnswer(self._waiting[0].number, Verdict.SUPERSEDED))
+                    self._requests.send(PathAnswer(self._waiting[0].number, PathVerdict.SUPERSEDED))
                 self._waiting = request, REAL_CLOCK.now()
         return found
 
     def _answer(self, request: PathRequest) -> PathAnswer:
         """Plan what is asked for, and propose it."""
         if self._begun is None:
-            return PathAnswer(request.number, Verdict.REFUSED, "the plan is not flown yet")
+            return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
         reason = ""
         for _ in range(TRIES):
             begun = REAL_CLOCK.now()
@@ -192,19 +192,19 @@ class _Worker:
             try:
                 made = self._plan(request, first)
             except CfplanError as error:
-                return PathAnswer(request.number, Verdict.REFUSED, str(error))
+                return PathAnswer(request.number, PathVerdict.REFUSED, str(error))
             finally:
                 self._took.append(REAL_CLOCK.now() - begun)
             answer = self._propose(made)
             if answer is None:
-                return PathAnswer(request.number, Verdict.REFUSED, "the pilot does not answer")
+                return PathAnswer(request.number, PathVerdict.REFUSED, "the pilot does not answer")
             if answer.commitment is not None:
                 joint = self._held.flown.starts[-1]
-                return PathAnswer(request.number, Verdict.ACCEPTED, joint=joint, ends=self._held.ends)
+                return PathAnswer(request.number, PathVerdict.ACCEPTED, joint=joint, ends=self._held.ends)
             reason = answer.reason
             if not reason.startswith(Fault.LATE):
-                return PathAnswer(request.number, Verdict.REFUSED, reason)
-        return PathAnswer(request.number, Verdict.LATE, reason)
+                return PathAnswer(request.number, PathVerdict.REFUSED, reason)
+        return PathAnswer(request.number, PathVerdict.LATE, reason)
 
     def _plan(self, request: PathRequest, first: int) -> Replanned:
         if request.wish is Wish.STOP:

@@ -6,6 +6,7 @@ loss, gaps and the dry run go on from the splice as if the flight had been plann
 """
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -165,15 +166,32 @@ def _certified(
 ) -> tuple[EncodedFlight, NDArray, NDArray]:
     """Return setpoints, stops and snapshots of a flight that goes on from snapshots (L, 31) or from hover."""
     encoded = encode_trajectory(flown, space=limits.space)
-    check_bytes(encoded, flown, limits.plan)
-    stops = encode_stops(encoded.motion, RATE, gains=encoded.gains, space=encoded.space)
-    certify_stops(stops, encoded.motion, limits, RATE, gains=encoded.gains, space=encoded.space).require(limits)
-    lost = link_loss_at_every_setpoint(encoded.payloads, limits, starts=starts)
-    if lost.worst.beyond > 0.0 and not limits.link_loss.only_warn:
-        raise InfeasibleError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
     believed = None if starts is None else as_believed(starts, limits)
-    glitches = glitch_at_every_setpoint(encoded.payloads, limits, start=believed)
-    if glitches.lost.any():
-        raise NotCertifiedError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
-    dry_run(encoded, flown, limits.airframe, limits.flight, snapshot=believed).require_passed()
-    return encoded, stops, lost.snapshots
+
+    def stop_everywhere() -> NDArray:
+        stops = encode_stops(encoded.motion, RATE, gains=encoded.gains, space=encoded.space)
+        certified = certify_stops(stops, encoded.motion, limits, RATE, gains=encoded.gains, space=encoded.space)
+        certified.require(limits)
+        return stops
+
+    def lose_link() -> NDArray:
+        lost = link_loss_at_every_setpoint(encoded.payloads, limits, starts=starts)
+        if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
+            raise InfeasibleError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
+        return lost.snapshots
+
+    def meet_gaps() -> None:
+        glitches = glitch_at_every_setpoint(encoded.payloads, limits, start=believed)
+        if glitches.lost.any():
+            raise NotCertifiedError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
+
+    def rehearse() -> None:
+        check_bytes(encoded, flown, limits.plan)
+        dry_run(encoded, flown, limits.airframe, limits.flight, snapshot=believed).require_passed()
+
+    with ThreadPoolExecutor() as pool:  # compiled loops and most of numpy run side by side
+        snapshots, stops = pool.submit(lose_link), pool.submit(stop_everywhere)
+        gaps, rehearsed = pool.submit(meet_gaps), pool.submit(rehearse)
+        gaps.result()
+        rehearsed.result()
+        return encoded, stops.result(), snapshots.result()

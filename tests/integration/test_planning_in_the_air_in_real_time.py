@@ -13,7 +13,7 @@ from cfplan.flight.pilot.process import fly, start_pilot
 from cfplan.flight.telemetry import SetpointSent, Telemetry
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.preparation.air_planner import AirPlanner, PathAnswer, Verdict, Wish
+from cfplan.preparation.air_planner import AirPlanner, PathAnswer, PathVerdict, Wish
 from cfplan.preparation.replan import hold
 from cfplan.simulation.lab.room import RoomPoseSource
 from cfplan.simulation.lab.sim_driver import SimDriver
@@ -61,7 +61,7 @@ def test_waypoints_asked_for_in_flight_are_flown(fly_with_planner):
     flight, answers = fly_with_planner(react)
     assert flight.outcome.exit_code is ExitCode.OK, flight.outcome.reason
     assert {answer.number for answer in answers} == set(asked)
-    flown = [answer for answer in answers if answer.verdict is Verdict.ACCEPTED]
+    flown = [answer for answer in answers if answer.verdict is PathVerdict.ACCEPTED]
     assert flown, answers
     end = ASKED[max(answer.number for answer in flown) - 1]
     np.testing.assert_allclose(flight.truth.position[-1, :2], end[:2], atol=0.15)

@@ -14,7 +14,7 @@ from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal, pr
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.preparation.air_planner import AirPlanner, PathAnswer, Verdict, Wish
+from cfplan.preparation.air_planner import AirPlanner, PathAnswer, PathVerdict, Wish
 from cfplan.preparation.replan import hold
 
 WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
@@ -75,7 +75,7 @@ def answer_to(number: int, planner: AirPlanner, pilot: PilotSide) -> PathAnswer:
 def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(both, limits):
     planner, pilot = both
     early = answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)]), planner, pilot)
-    assert (early.verdict, early.reason) == (Verdict.REFUSED, "the plan is not flown yet")
+    assert (early.verdict, early.reason) == (PathVerdict.REFUSED, "the plan is not flown yet")
     pilot.begin()
     told: list[PathAnswer] = []
 
@@ -84,21 +84,21 @@ def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(b
         return told[-1].reason != early.reason
 
     assert until(knows)
-    assert told[-1].verdict is Verdict.REFUSED
+    assert told[-1].verdict is PathVerdict.REFUSED
     assert "waypoint 1" in told[-1].reason
     assert "hint" in told[-1].reason
     none = answer_to(planner.request(Wish.EXTEND), planner, pilot)
-    assert none.verdict is Verdict.REFUSED
+    assert none.verdict is PathVerdict.REFUSED
     # Late in the flight or after it, as slowly as this computer plans: from rest at the latest.
     for _ in range(3):
         answer = answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)]), planner, pilot)
-        if answer.verdict is Verdict.ACCEPTED:
+        if answer.verdict is PathVerdict.ACCEPTED:
             break
-    assert answer.verdict is Verdict.ACCEPTED, answer
+    assert answer.verdict is PathVerdict.ACCEPTED, answer
     assert isinstance(pilot.given[-1], Commitment)
     assert answer.joint == pytest.approx((pilot.commitment.splices[-1] + 15) / RATE)
     again = answer_to(planner.request(Wish.EXTEND, [(0.5, -0.5, 1.0)]), planner, pilot)
-    assert again.verdict is Verdict.ACCEPTED, again
+    assert again.verdict is PathVerdict.ACCEPTED, again
 
 
 def test_the_latest_request_wins(both):
@@ -114,8 +114,8 @@ def test_the_latest_request_wins(both):
 
     assert until(all_answered)
     verdicts = {answer.number: answer.verdict for answer in answers}
-    assert [verdicts[number] for number in numbers[1:-1]] == [Verdict.SUPERSEDED] * 4
-    assert verdicts[numbers[-1]] is not Verdict.SUPERSEDED
+    assert [verdicts[number] for number in numbers[1:-1]] == [PathVerdict.SUPERSEDED] * 4
+    assert verdicts[numbers[-1]] is not PathVerdict.SUPERSEDED
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
