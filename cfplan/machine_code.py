@@ -186,17 +186,21 @@ class _Compiling(event.Listener):
 
     depth = 0
     collector_was_on = False
+    begun, seconds = 0.0, 0.0  # s of the processor
 
     def on_start(self, event: Any) -> None:
         if self.depth == 0:
             self.collector_was_on = gc.isenabled()
             gc.disable()
+            self.begun = time.process_time()
         self.depth += 1
 
     def on_end(self, event: Any) -> None:
         self.depth -= 1
-        if self.depth == 0 and self.collector_was_on:
-            gc.enable()
+        if self.depth == 0:
+            self.seconds += time.process_time() - self.begun
+            if self.collector_was_on:
+                gc.enable()
 
 
 _listener = _Compiling()
@@ -206,6 +210,11 @@ event.register("numba:compile", _listener)
 def compiles() -> bool:
     """Return whether this process is compiling right now."""
     return _listener.depth > 0
+
+
+def time_without_compiling() -> float:
+    """Return the processor time of this process, s, less what compiling took: what its own work takes every time."""
+    return time.process_time() - _listener.seconds
 
 
 class _Library(JITCodeLibrary):
@@ -362,7 +371,9 @@ def kept_or_made(title: str, module: str, make: Callable[[], bytes]) -> bytes:
         _locks.take(name)
         data = _read(name)
         if data is None:
+            _listener.on_start(None)
             data = make()
+            _listener.on_end(None)
             _write(name, data)
         _locks.give_back(name)
     return data

@@ -46,6 +46,11 @@ def planning(command: Callable) -> Callable:
             ),
             click.option("--nodes", type=click.IntRange(4), help="Grid intervals; else chosen from the path's length."),
             click.option(
+                "--budget",
+                type=click.FloatRange(0, min_open=True),
+                help="s of the processor that planning may take.  [default: 5, and 0.02 a metre]",
+            ),
+            click.option(
                 "--speed",
                 "speed_factor",
                 type=click.FloatRange(0, 1, min_open=True),

@@ -13,6 +13,7 @@ class Status(StrEnum):
     SOLVED = "solved"
     NOT_CONVERGED = "the solver did not converge; try more nodes or another planner"
     INFEASIBLE = "no profile meets the limits; loosen them or make the path gentler"
+    OUT_OF_TIME = "the budget of time was spent; give more, or take fewer nodes"
     BAD_BOUNDARY = "the boundary state breaks the limits; start slower or loosen them"
 
 
@@ -22,6 +23,6 @@ class Solution:
 
     status: Status
     profile: SpeedProfile | None  # None exactly when the status is not SOLVED
-    reason: str = ""  # the solver's message, for people
+    reason: str = ""  # the solver's message, for people: why there is no profile, or which part of it is no solution
     stats: Mapping[str, float | int | str] = field(default_factory=dict)  # solve_seconds, iterations, solver, …
     joints: tuple[float, ...] = ()  # s, where the windows of a long path meet

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, field
 
+from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InputError
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
@@ -34,6 +35,7 @@ class PlanningTask:
     start: BoundaryState | None = None  # None: free within the limits (a rest end)
     end: BoundaryState | None = None
     speed_caps: SpeedCaps | None = None  # along the path, besides the limit on speed
+    deadline: Deadline = field(default=NEVER, compare=False, repr=False)  # by which to answer, if only with a reason
     refusal: Solution | None = field(init=False, compare=False, repr=False)
     """The answer of a planner that keeps all limits and boundary states, where no search is needed to see that none
     can be kept: the limits exclude hovering, or a boundary state breaks them. Other planners may answer otherwise."""

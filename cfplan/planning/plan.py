@@ -1,10 +1,13 @@
 """plan(): from a path and limits to a certified trajectory, with a record of how it was found."""
 
+import math
 import time
 
+from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError, InputError
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
+from cfplan.machine_code import interprets
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO, MOST_NODES, find_planner
@@ -16,6 +19,9 @@ from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState
 
 LEAST_SPEED_FACTOR = 0.01
+BUDGET, BUDGET_PER_METRE = 5.0, 0.02  # s, and s a metre
+INTERPRETED = 10.0  # times as long without machine code
+ANSWERING = 0.2  # of the time until the deadline, kept for making an answer of what was found
 REASONABLE_NODES = range(2, 10 * MOST_NODES + 1)
 
 
@@ -31,12 +37,16 @@ def plan(
     speed_factor: float = 1.0,
     start: BoundaryState | None = None,
     end: BoundaryState | None = None,
+    deadline: Deadline = NEVER,
 ) -> Plan:
     """Return the fastest certified flight along the path that the planner finds.
 
     "auto" asks several and takes the fastest of their flights, as policy.POLICIES says.
     `speed_factor` slows the whole result: the same motion at that factor of its speed, so that accelerations fall with
     its square. Where a boundary state is given, nothing may be slowed, or it would no longer hold.
+
+    By the deadline what is certified is answered; `Plan.left_out` says what there was no time for. A fifth of the time
+    is kept for what makes an answer of an unfinished search: lowering, slowing and their certificates.
 
     Raises:
         InfeasibleError: the path leaves the space, takes longer than the battery lasts, or no profile is found.
@@ -45,8 +55,12 @@ def plan(
     begun = time.perf_counter()
     _check_arguments(planner, nodes, speed_factor, bound=start is not None or end is not None)
     check_space(path, limits.space)
-    task = PlanningTask(path, airframe, limits.plan, yaw=yaw, yaw_angle=yaw_angle, start=start, end=end)
-    best, bound, notes = choose(planner, task, nodes, limits.space)
+    check_endurance(path.length / limits.plan.speed / speed_factor, limits, "at least ")
+    task = PlanningTask(
+        path, airframe, limits.plan, yaw=yaw, yaw_angle=yaw_angle, start=start, end=end,
+        deadline=deadline.earlier(ANSWERING * deadline.left) if deadline.left < math.inf else NEVER,
+    )  # fmt: skip
+    best, bound, notes, left_out = choose(planner, task, nodes, limits.space)
     repaired = flown = best.repaired
     if changed := repaired.describe():
         notes += (f"{best.planner}'s profile was {changed}",)
@@ -67,7 +81,13 @@ def plan(
         notes=notes,
         lower_bound=bound,
         joints=best.joints,
+        left_out=left_out,
     )
+
+
+def default_budget(path: Path) -> float:
+    """Return how long planning a path may take, s, if nobody says so: ten times as long without machine code."""
+    return (BUDGET + BUDGET_PER_METRE * path.length) * (INTERPRETED if interprets() else 1.0)
 
 
 def _check_arguments(planner: str, nodes: int | None, speed_factor: float, bound: bool) -> None:
@@ -93,15 +113,15 @@ def _check_arguments(planner: str, nodes: int | None, speed_factor: float, bound
         )
 
 
-def check_endurance(duration: float, limits: Limits) -> None:
+def check_endurance(duration: float, limits: Limits, which: str = "") -> None:
     """Refuse a flight that takes longer than the battery lasts. Raises InfeasibleError."""
     ground = limits.ground
     height = limits.space.high[2] - limits.space.low[2]
     around = height / ground.take_off_speed + height / ground.land_speed
     if duration + around > limits.battery.endurance:
         raise InfeasibleError(
-            f"the path takes {duration:.1f} s, with take-off and landing up to {duration + around:.1f} s; the battery "
-            f"is trusted for {limits.battery.endurance:g} s",
+            f"the path takes {which}{duration:.1f} s, with take-off and landing up to {duration + around:.1f} s; the "
+            f"battery is trusted for {limits.battery.endurance:g} s",
             where="battery.endurance",
             hint="fly fewer laps, a shorter path, or a larger share of the speed",
         )

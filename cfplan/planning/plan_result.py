@@ -52,6 +52,7 @@ class Plan:
     """s, below which no flight keeps the limits of speed, acceleration and collective thrust; None: not computed"""
     joints: tuple[float, ...] = ()  # s, where the windows of a long profile meet
     slowing: LocalSlowing | None = None  # None: nowhere slower than the limits allow
+    left_out: str = ""  # what planning had no time for; empty where its budget was enough
 
     @property
     def profile(self) -> SpeedProfile:

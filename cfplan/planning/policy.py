@@ -41,6 +41,7 @@ class Choice(NamedTuple):
     best: Found
     bound: float | None  # s, proven: no flight takes less; None where the policy needs no bound
     notes: tuple[str, ...]  # what a reader should know, one sentence each
+    left_out: str = ""  # what there was no time for; empty where the deadline did not pass
 
 
 class Due(NamedTuple):
@@ -106,7 +107,8 @@ POLICIES = MappingProxyType(
 def choose(policy: str, task: PlanningTask, nodes: int | None, space: Space) -> Choice:
     """Return the fastest flight that the policy's steps find.
 
-    `nodes` is the number of intervals where it is given, else each planner's own is taken.
+    `nodes` is the number of intervals where it is given, else each planner's own is taken. Steps that the task's
+    deadline comes before are taken only as long as nothing is found; no search begins then, so they are short.
 
     Raises:
         InfeasibleError: no planner finds a flight; says why of each.
@@ -115,7 +117,11 @@ def choose(policy: str, task: PlanningTask, nodes: int | None, space: Space) -> 
     bound = lower_bound(task) if policy == AUTO else None
     found: list[Found] = []
     notes: list[str] = []
+    skipped: list[str] = []
     for step in POLICIES[policy]:
+        if found and task.deadline.passed:
+            skipped.append(f"{step.planners[0]} not asked")
+            continue
         due = step.when(task, found, bound)
         notes += due.notes
         if due.due:
@@ -123,14 +129,21 @@ def choose(policy: str, task: PlanningTask, nodes: int | None, space: Space) -> 
             found += [one] if one else []
             notes += failures
     if not found:
-        raise InfeasibleError(
-            f"no plan. {'; '.join(notes)}", hint="loosen the plan's limits, or make the path gentler or longer"
-        )
+        hint = "loosen the plan's limits, or make the path gentler or longer"
+        if task.deadline.passed:
+            hint = "give planning more time (--budget), or the path fewer waypoints"
+        raise InfeasibleError(f"no plan. {'; '.join(notes)}", hint=hint)
     best = min(found, key=lambda one: one.duration)
     if bound is not None:
         times = ", ".join(f"{one.planner} {one.duration:.3f} s" for one in found)
         notes.append(f"{times}; the proven bound is {bound:.3f} s, the plan {best.duration / bound - 1:.1%} above it")
-    return Choice(best, bound, tuple(notes))
+    return Choice(best, bound, tuple(notes), _left_out(best, skipped) if task.deadline.passed else "")
+
+
+def _left_out(best: Found, skipped: Sequence[str]) -> str:
+    """Return what there was no time for."""
+    unrefined = [f"{best.planner}'s profile not refined ({best.repaired.failed})"] if best.repaired.failed else []
+    return ", ".join([*unrefined, *skipped])
 
 
 def _take(step: Step, task: PlanningTask, nodes: int | None, space: Space) -> tuple[Found | None, list[str]]:
@@ -145,7 +158,7 @@ def _take(step: Step, task: PlanningTask, nodes: int | None, space: Space) -> tu
                 notes.append(answer)
                 continue
             found.append(answer)
-            if answer.repaired.speed_factor >= GOOD_SPEED_FACTOR:
+            if answer.repaired.speed_factor >= GOOD_SPEED_FACTOR or task.deadline.passed:
                 break
         if found:
             return min(found, key=lambda one: one.duration), notes

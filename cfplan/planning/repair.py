@@ -1,24 +1,30 @@
 """Repair: turn any profile into a certified trajectory, by the least change.
 
 A profile that passes stays as it is. One that does not is refined: the expert's problem, searched from there, which
-lowers the speed where a limit is exceeded and raises it beside, with yaw and grid left alone. What cannot be refined
-is slowed as a whole, which always ends certified.
+lowers the speed where a limit is exceeded and raises it beside, with yaw and grid left alone. What cannot be refined is
+lowered where it exceeds a limit, and refined from there; what is left is slowed as a whole, which always ends
+certified.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from cfplan.errors import CfplanError, InfeasibleError, NotCertifiedError
 from cfplan.planners.expert.intersample import violates_at_nodes
 from cfplan.planners.expert.refine import refinements
 from cfplan.planners.task import PlanningTask
+from cfplan.planning.lowering import lower_locally
 from cfplan.safety.certificate import Certificate, certify
-from cfplan.safety.slowing import slow_until_certified
+from cfplan.safety.slowing import Slowed, slow_until_certified
 from cfplan.safety.space import Space
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import duration_of
 from cfplan.vehicle.trajectory import Trajectory
 
+NEARLY = 0.02  # by which a share of a limit may exceed 1 for slowing as a whole to be the end of it
 NOTICEABLE = 0.01  # relative change of speed at a place, from which it is reported
 
 
@@ -40,17 +46,20 @@ class Repaired:
         """Return one sentence, empty if nothing was changed."""
         duration = self.trajectory.duration
         cost = f"{self.before:.3f} s became {duration:.3f} s ({duration / self.before - 1:+.2%})"
+        why = f" ({self.failed})" if self.failed else ""
         if self.speed_factor < 1.0:
-            why = f" ({self.failed})" if self.failed else ""
             return f"slowed to {self.speed_factor:.2%} of its speed to pass{why}; {cost}"
+        how = f"lowered{why}" if self.failed else "refined"
         if self.slower:
             most = f"most at s = {self.where:.2f}, by {self.most:.1%}"
-            return f"refined; slower along {self.slower:.0%} of it, {most}; {cost}"
-        return f"refined; {cost}" if duration != self.before else ""
+            return f"{how}; slower along {self.slower:.0%} of it, {most}; {cost}"
+        return f"{how}; {cost}" if duration != self.before else ""
 
 
 def repair(task: PlanningTask, profile: SpeedProfile, space: Space | None = None) -> Repaired:
-    """Return the certified trajectory nearest to the profile. Boundary states are kept by refining, not by slowing.
+    """Return the certified trajectory nearest to the profile. Boundary states are kept, but by slowing as a whole.
+
+    What is not refined by the task's deadline is lowered only, which takes little longer.
 
     Raises:
         InfeasibleError: hovering, or the path itself, breaks a limit; says which.
@@ -63,25 +72,80 @@ def repair(task: PlanningTask, profile: SpeedProfile, space: Space | None = None
         certificate = certify(trajectory, limits, space, caps)
         if certificate.passed:
             return Repaired(trajectory, certificate, 1.0, trajectory.duration)
+    refined = _refined(task, profile, space)
+    if refined.certificate and (refined.certificate.passed or _nearly_passes(refined.certificate)):
+        slowed = slow_until_certified(refined.trajectory, limits, space, refined.certificate, caps, task.deadline)
+        return _repaired(slowed, before, profile, refined)
+    return _lowered(task, profile, space, refined, before)
+
+
+class _Refined(NamedTuple):
+    """What refining led to: the trajectory itself where it failed."""
+
+    trajectory: Trajectory
+    certificate: Certificate | None  # None where refining failed
+    failed: str = ""  # why, or from where on it was not refined
+    joints: tuple[float, ...] | None = None
+
+
+def _refined(task: PlanningTask, profile: SpeedProfile, space: Space | None) -> _Refined:
+    """Refine the profile until its certificate passes, or refining ends."""
     for solution in refinements(task, profile):
         if solution.profile is None:
-            return slow(task, profile, space, failed=solution.reason)
-        refined, joints = solution.profile, solution.joints
-        trajectory = Trajectory(path, refined, airframe)
-        certificate = certify(trajectory, limits, space, caps)
+            return _Refined(Trajectory(task.path, profile, task.airframe), None, solution.reason)
+        trajectory = Trajectory(task.path, solution.profile, task.airframe)
+        certificate = certify(trajectory, task.limits, space, task.speed_caps)
         if certificate.passed:
             break
-    slowed = slow_until_certified(trajectory, limits, space, certificate, caps)
+    return _Refined(trajectory, certificate, solution.reason, solution.joints)
+
+
+def _nearly_passes(certificate: Certificate) -> bool:
+    """Return whether slowing as a whole costs so little that nothing else need be tried."""
+    return certificate.worst.share < 1.0 + NEARLY
+
+
+def _lowered(
+    task: PlanningTask, profile: SpeedProfile, space: Space | None, refined: _Refined, before: float
+) -> Repaired:
+    """Return the fastest of what was refined, as far as it went, the same lowered, and that refined again."""
+    ways = [refined]
+    with suppress(NotCertifiedError):  # what passes nowhere near the profile need not be tried
+        low = lower_locally(task, refined.trajectory.profile)
+        ways.append(_Refined(Trajectory(task.path, low, task.airframe), None, refined.failed))
+        if not task.deadline.passed:
+            ways.insert(0, _refined(task, low, space))
+    best: Repaired | None = None
+    error: CfplanError | None = None
+    for way in ways:
+        try:
+            slowed = slow_until_certified(
+                way.trajectory, task.limits, space, way.certificate, task.speed_caps, task.deadline
+            )
+        except (InfeasibleError, NotCertifiedError) as failure:
+            error = error or failure
+            continue
+        if best is None or slowed.trajectory.duration < best.trajectory.duration:
+            best = _repaired(slowed, before, profile, way)
+        if way.certificate and way.certificate.passed and not way.failed:
+            break  # near the optimum
+    if best is None:
+        assert error
+        raise error
+    return best
+
+
+def _repaired(slowed: Slowed, before: float, profile: SpeedProfile, way: _Refined) -> Repaired:
     return Repaired(
-        slowed.trajectory, slowed.certificate, slowed.speed_factor, before, *_where_slower(profile, refined),
-        joints=joints,
+        slowed.trajectory, slowed.certificate, slowed.speed_factor, before,
+        *_where_slower(profile, way.trajectory.profile), failed=way.failed, joints=way.joints,
     )  # fmt: skip
 
 
 def slow(task: PlanningTask, profile: SpeedProfile, space: Space | None = None, *, failed: str = "") -> Repaired:
     """Slow the profile as a whole until it passes; one that does stays as it is. Raises as repair()."""
     trajectory = Trajectory(task.path, profile, task.airframe)
-    slowed = slow_until_certified(trajectory, task.limits, space, caps=task.speed_caps)
+    slowed = slow_until_certified(trajectory, task.limits, space, caps=task.speed_caps, deadline=task.deadline)
     return Repaired(slowed.trajectory, slowed.certificate, slowed.speed_factor, trajectory.duration, failed=failed)
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan_result import LocalSlowing, Plan
@@ -65,8 +66,10 @@ class Assessment:
 Assess = Callable[[Trajectory], Sequence[Assessment]]
 
 
-def slow_locally(plan: Plan, assess: Assess) -> tuple[Plan, Sequence[Assessment]]:
+def slow_locally(plan: Plan, assess: Assess, deadline: Deadline = NEVER) -> tuple[Plan, Sequence[Assessment]]:
     """Return the plan itself if all its setpoints end well, else one that is slower where they do not; and how it ends.
+
+    After the deadline plans are lowered to the caps, not refined, and no time is won back.
 
     Raises:
         InfeasibleError: a setpoint ends badly however slow the flight is there; says where, by how much, what helps.
@@ -85,10 +88,10 @@ def slow_locally(plan: Plan, assess: Assess) -> tuple[Plan, Sequence[Assessment]
             break
         lowest = np.min([each.speed for each in lower], axis=0)
         caps = SpeedCaps.of(places, lowest)
-        slowed = _replanned(plan, slowed, caps, tuple(reasons))
+        slowed = _replanned(plan, slowed, caps, tuple(reasons), deadline)
         assessed = assess(slowed.trajectory)
         if _passed(assessed):
-            return _faster(plan, assess, (slowed, assessed), caps)
+            return _faster(plan, assess, (slowed, assessed), caps, deadline)
     worst = max((each for each in assessed if not each.passed), key=lambda each: each.excess[each.worst])
     at = worst.worst
     x, y, z = slowed.trajectory.at(worst.time[at]).position
@@ -100,7 +103,7 @@ def slow_locally(plan: Plan, assess: Assess) -> tuple[Plan, Sequence[Assessment]
 
 
 def _faster(
-    plan: Plan, assess: Assess, passed: tuple[Plan, Sequence[Assessment]], caps: SpeedCaps
+    plan: Plan, assess: Assess, passed: tuple[Plan, Sequence[Assessment]], caps: SpeedCaps, deadline: Deadline
 ) -> tuple[Plan, Sequence[Assessment]]:
     """Return a faster plan that passes too: caps are raised half the way where that brings no setpoint to fault."""
     places = np.array(caps.s)
@@ -108,11 +111,12 @@ def _faster(
     raised = highest > caps.speed
     for _ in range(TRIALS):
         slowed = passed[0]
-        if slowed.slowing is None or slowed.time_lost <= CHEAP or not raised.any():
+        if slowed.slowing is None or slowed.time_lost <= CHEAP or not raised.any() or deadline.passed:
             break
         between = np.sqrt(np.array(caps.speed) * np.maximum(highest, caps.speed))
         trial = SpeedCaps.of(places, np.where(raised, between, caps.speed))
-        faster = _replanned(plan, plan, trial, slowed.slowing.reasons)  # from a slow one nothing would be gained
+        # From the slow one nothing would be gained.
+        faster = _replanned(plan, plan, trial, slowed.slowing.reasons, deadline)
         assessed = assess(faster.trajectory)
         if not _passed(assessed):
             for each in assessed:
@@ -173,12 +177,13 @@ def _speed_at(trajectory: Trajectory, s: NDArray) -> NDArray:
     return np.asarray(np.sqrt(trajectory.profile.at(s).h) * np.linalg.norm(trajectory.path(s, 1), axis=1))
 
 
-def _replanned(plan: Plan, nearest: Plan, caps: SpeedCaps, reasons: tuple[str, ...]) -> Plan:
+def _replanned(plan: Plan, nearest: Plan, caps: SpeedCaps, reasons: tuple[str, ...], deadline: Deadline) -> Plan:
     """Return the plan under these caps, refined from the nearest one; its speed factor is kept."""
     factor, limits, profile = plan.speed_factor, plan.limits, nearest.profile.slowed(1.0 / plan.speed_factor)
     task = PlanningTask(
-        plan.path, plan.airframe, limits.plan, nodes=len(profile.s) - 1, speed_caps=caps.scaled(1.0 / factor)
-    )
+        plan.path, plan.airframe, limits.plan, nodes=len(profile.s) - 1, speed_caps=caps.scaled(1.0 / factor),
+        deadline=deadline,
+    )  # fmt: skip
     repaired = flown = repair(task, profile, limits.space)
     if factor < 1.0:
         as_flown = replace(task, speed_caps=caps)

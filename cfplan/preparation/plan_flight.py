@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InputError
 from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.geometry.path_file import load_path_file
 from cfplan.machine_code import compile_from_here, interprets
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.task import PlanningTask
-from cfplan.planning.plan import plan
+from cfplan.planning.plan import default_budget, plan
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO
@@ -36,6 +37,7 @@ class FlightOptions:
     nodes: int | None = None  # grid intervals; None chooses them by the path's length
     speed_factor: float | None = None  # of the speed that the limits allow; None takes the path file's
     stream_for: float = 0.0  # s of setpoints at least; behind the end of the path they hover
+    budget: float | None = None  # s that planning and giving way may take; None chooses it by the path's length
     only_shown: bool = False  # whether the plan will neither fly nor be kept, so that it need not wait for compiling
 
 
@@ -71,6 +73,7 @@ class PlannedFlight:
             "notes": list(plan.notes),
             "time_lost": plan.time_lost,
             "slower_for": list(plan.slowing.reasons) if plan.slowing else [],
+            "left_out": plan.left_out,
             "certificate": plan.certificate.to_dict(),
         }
 
@@ -93,6 +96,7 @@ def plan_flight(
         results.append(f"{path_file.name}, {path_file.path.length:.1f} m, {len(path_file.waypoints)} waypoints")
     if path_file.path.length > LONG:
         compile_from_here()
+    deadline = Deadline.after(default_budget(path_file.path) if options.budget is None else options.budget)
     with step(on_step, "plan") as results:
         planned = plan(
             path_file.path,
@@ -103,10 +107,14 @@ def plan_flight(
             yaw=path_file.yaw,
             yaw_angle=path_file.yaw_angle,
             speed_factor=path_file.speed if options.speed_factor is None else options.speed_factor,
+            deadline=deadline,
         )
+        left = deadline.left
         results.append(f"{planned.trajectory.duration:.2f} s of flight by {planned.planner}")
         if planned.speed_factor < 1.0:
             results.append(f"at {planned.speed_factor:g} of full speed")
+        if planned.left_out:
+            results.warn(f"the budget of time is spent: {planned.left_out}")
         results.details += planned.notes
     with step(on_step, "bound") as results:
         bound = planned.lower_bound or lower_bound(PlanningTask(planned.path, planned.airframe, limits.plan))
@@ -117,15 +125,19 @@ def plan_flight(
         with step(on_step, "slowing") as results:
             results.warn("not looked at before machine code is compiled; plan again, or with -o, to see it")
         return PlannedFlight(path_file.name, planned, limits, bound)
-    planned, link_loss = give_way(planned, on_step)
+    compile_from_here()  # without, simulating takes minutes
+    planned, link_loss = give_way(planned, on_step, Deadline.after(left))
     return PlannedFlight(path_file.name, planned, limits, bound, link_loss)
 
 
-def give_way(planned: Plan, on_step: OnStep = ignore_steps) -> tuple[Plan, SimulatedLinkLoss | None]:
+def give_way(
+    planned: Plan, on_step: OnStep = ignore_steps, deadline: Deadline = NEVER
+) -> tuple[Plan, SimulatedLinkLoss | None]:
     """Return the plan, slower in places if link loss would take the vehicle outside the walls from there, or a gap in
     setpoints or poses would lose it; and what link loss does to it.
 
-    Where safety.yaml says only to warn of link loss, nothing is slowed for that, and it is not looked at.
+    Where safety.yaml says only to warn of link loss, nothing is slowed for that, and it is not looked at. After the
+    deadline plans are slowed more than they need be, which takes less time.
 
     Raises:
         InfeasibleError: at some place the vehicle would end so however slowly it flies there.
@@ -140,13 +152,15 @@ def give_way(planned: Plan, on_step: OnStep = ignore_steps) -> tuple[Plan, Simul
             return list(pool.map(lambda each: each(encoded, limits), assessments))
 
     with step(on_step, "slowing") as results:
-        slowed, (*link_loss, glitches) = slow_locally(planned, assess)
+        slowed, (*link_loss, glitches) = slow_locally(planned, assess, deadline)
         for each in link_loss:
             inside = MARGIN - each.excess[each.worst]
             results.append(f"at least {inside:.2f} m inside the walls after link loss at any setpoint")
         results.append(f"a gap {glitches.describe(glitches.worst)} at most")
         if slowed.slowing:
             results.append(slowed.describe_slowing())
+            if deadline.passed:
+                results.warn("perhaps more than needed, as the budget of time is spent")
     return slowed, link_loss[0].simulated if link_loss else None
 
 

@@ -6,7 +6,7 @@ from functools import lru_cache
 from cfplan.geometry.path import Path
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import AT_MOST, INSTANT, QUANTITIES, Quantity
-from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.flatness import flat_state
 from cfplan.vehicle.measures import measures
 from cfplan.vehicle.profile import BoundaryState
@@ -41,6 +41,18 @@ def spare_turning(airframe: Airframe, limits: PlanLimits) -> float:
     """Return the angular acceleration about roll or pitch, rad/s², that motors give with what they spare in hover."""
     spare = max(min(spare_thrust(airframe, limits)), LEAST_SPARE)
     return 4 * airframe.arm * spare / max(airframe.inertia[:2])
+
+
+def smoothing_half_width(airframe: Airframe, limits: PlanLimits) -> float:
+    """Return half the width, s, of the window that turns a jump of acceleration to its opposite into feasible motion.
+
+    Over w a jump of 2a makes a jerk of 2a/w and a snap of at most 4a/w², and g times the thrust axis's first and second
+    derivative are about that: to be met by body rate, and by the torque that motors have to spare in hover.
+    """
+    turning = min(spare_turning(airframe, limits), limits.angular_acceleration)
+    most = min(limits.acceleration, 4 * limits.motor_thrust_max / airframe.mass)
+    rate, acceleration = GRAVITY * limits.angular_velocity, GRAVITY * turning
+    return max(2 * most / rate, (4 * most / acceleration) ** 0.5)
 
 
 @lru_cache(maxsize=64)

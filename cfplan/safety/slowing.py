@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError, NotCertifiedError
 from cfplan.safety.certificate import WALLS, Certificate, certify
 from cfplan.safety.feasibility import describe_hover, hover_violation
@@ -35,10 +36,11 @@ def slow_until_certified(
     space: Space | None = None,
     certificate: Certificate | None = None,
     caps: SpeedCaps | None = None,
+    deadline: Deadline = NEVER,
 ) -> Slowed:
     """Return the trajectory itself where it passes, else at the largest speed factor that does, within RESOLUTION.
 
-    `certificate` is the trajectory's, if it is known.
+    `certificate` is the trajectory's, if it is known. After the deadline the first speed factor that passes is taken.
 
     Raises:
         InfeasibleError: no speed factor passes, because hovering or the path itself breaks a limit; says which.
@@ -66,7 +68,7 @@ def slow_until_certified(
         if certificate.passed:
             low, low_excess = square, _excess(certificate)
             best = Slowed(slower, certificate, square**0.5)
-            if low_excess > -RESOLUTION:
+            if low_excess > -RESOLUTION or deadline.passed:
                 break
         else:
             high, high_excess = square, _excess(certificate)

@@ -55,12 +55,27 @@ def test_the_certificate_is_that_of_the_trajectory():
     assert repaired.before == pytest.approx(Trajectory(path, profile, HARDWARE.airframe).duration, rel=1e-6)
 
 
-def test_what_cannot_be_refined_is_slowed_and_says_why(monkeypatch):
-    monkeypatch.setattr(
-        repairing,
-        "refinements",
-        lambda *_: [Solution(Status.NOT_CONVERGED, None, "refining: no step improves the solution")],
-    )
+def never_refined(monkeypatch):
+    failed = Solution(Status.NOT_CONVERGED, None, "refining: no step improves the solution")
+    monkeypatch.setattr(repairing, "refinements", lambda *_: [failed])
+
+
+def test_what_cannot_be_refined_is_lowered_where_it_must_be_and_says_why(monkeypatch):
+    never_refined(monkeypatch)
+    path = random_path(1, "10x10x10")
+    task = PlanningTask(path, HARDWARE.airframe, HARDWARE.limits)
+    profile = plan_learned(task).profile
+    repaired = repair(task, profile)
+    assert repaired.speed_factor == 1.0
+    assert 0.0 < repaired.slower < 1.0
+    assert certify(repaired.trajectory, HARDWARE.limits).passed
+    assert "no step improves the solution" in repaired.describe()
+    assert repaired.trajectory.duration < repairing.slow(task, profile).trajectory.duration
+
+
+def test_what_cannot_be_lowered_either_is_slowed_as_a_whole_and_says_why(monkeypatch):
+    never_refined(monkeypatch)
+    monkeypatch.setattr(repairing, "lower_locally", lambda task, profile: profile)
     path = random_path(1, "10x10x10")
     profile = plan_learned(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits)).profile
     repaired = repair(PlanningTask(path, HARDWARE.airframe, HARDWARE.limits), profile)

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InfeasibleError
-from cfplan.planners.baselines.convex_profile import smooth_profile, smoothing_half_width
+from cfplan.planners.baselines.convex_profile import smooth_profile
 from cfplan.planners.baselines.convex_rows import Rows, inner_rows, outer_rows
 from cfplan.planners.baselines.convex_stations import Stations, stations
 from cfplan.planners.baselines.selection import select_fastest
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
+from cfplan.safety.feasibility import smoothing_half_width
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.speed_caps import allowed_speed
 from cfplan.vehicle.airframe import Airframe

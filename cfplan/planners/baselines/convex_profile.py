@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 from cfplan.planners.baselines.convex_stations import Stations
-from cfplan.safety.feasibility import spare_turning
-from cfplan.safety.limits import PlanLimits
-from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.profile_spline import speed_through
 from cfplan.vehicle.yaw_spline import YawSpline
@@ -21,18 +18,6 @@ SAMPLES_PER_INTERVAL = 8
 TIME_STEPS_PER_WINDOW = 200
 H_STIFFNESS = 1e-4
 WINDOW_RANGE = (1e-4, 50.0)  # of half the window's width, in flights: narrower costs gigabytes, wider leaves no speed
-
-
-def smoothing_half_width(airframe: Airframe, limits: PlanLimits) -> float:
-    """Return half the width, s, of the window that turns a jump of acceleration to its opposite into feasible motion.
-
-    Over w a jump of 2a makes a jerk of 2a/w and a snap of at most 4a/w², and g times the thrust axis's first and second
-    derivative are about that: to be met by body rate, and by the torque that motors have to spare in hover.
-    """
-    turning = min(spare_turning(airframe, limits), limits.angular_acceleration)
-    most = min(limits.acceleration, 4 * limits.motor_thrust_max / airframe.mass)
-    rate, acceleration = GRAVITY * limits.angular_velocity, GRAVITY * turning
-    return max(2 * most / rate, (4 * most / acceleration) ** 0.5)
 
 
 def smooth_profile(

@@ -14,6 +14,7 @@ from cfplan.geometry.path import Path
 
 SAMPLES_PER_STATION = 5  # fine samples between stations at nominal speed, 1 m/s
 SAMPLES_MIN, SAMPLES_MAX = 2_000, 500_000
+MOST = 25_000  # stations: they take some 8 kB each, and as much time; a path with more has them further apart
 STATION_GROWTH = 0.05  # of the distance from the path's nearer end: curvature is unbounded at a rest end
 FIRST_STATION = 1e-5  # m from an end
 SWING = 0.2  # of e₃·N around a station: more than that and samples do not bound it
@@ -39,7 +40,10 @@ class Stations:
 
 
 def stations(path: Path, *, spacing: float, turn: float) -> Stations:
-    """Return stations at most `spacing`, m, and `turn`, rad of direction, apart; closer towards the path's ends."""
+    """Return stations at most `spacing`, m, and `turn`, rad of direction, apart; closer towards the path's ends.
+
+    Where that were more than MOST, all are further apart by the same factor.
+    """
     samples = int(np.clip(SAMPLES_PER_STATION * path.end / spacing, SAMPLES_MIN, SAMPLES_MAX))
     # Graded towards both ends, so that a rest end's first micrometres are resolved.
     x = np.linspace(0.0, 1.0, samples + 1)
@@ -51,7 +55,7 @@ def stations(path: Path, *, spacing: float, turn: float) -> Stations:
     density = np.maximum(1 / spacing, 1 / (STATION_GROWTH * distance))
     density = np.maximum(density, np.minimum(curvature, 1 / distance) / turn)
     count = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(length))])
-    wanted = np.linspace(0.0, count[-1], int(np.ceil(count[-1])) + 1)
+    wanted = np.linspace(0.0, count[-1], min(int(np.ceil(count[-1])), MOST) + 1)
     chosen = np.unique(np.concatenate([[0], np.searchsorted(count, wanted[1:-1]), [samples]]))
     binormal_square = np.clip(1.0 - slope**2 - normal**2, 0.0, 1.0)
 

@@ -19,13 +19,14 @@ import time
 from numpy.typing import NDArray
 
 from cfplan.geometry.yaw import YawMode
+from cfplan.planners.expert.initial_guess import guess_spline
 from cfplan.planners.expert.layout import Shape, layout_of
 from cfplan.planners.expert.point_constraints import Penalties
-from cfplan.planners.expert.problem import Ends, Segment, build_problem
+from cfplan.planners.expert.problem import Ends, Segment, build_problem, slowness_of
 from cfplan.planners.expert.search import COLD_START, rejection_reason, solve
 from cfplan.planners.expert.tightening import Tightened, tighten_until_feasible
-from cfplan.planners.expert.windows import WindowSize, by_windows, solution_of
-from cfplan.planners.solution import Solution, Status
+from cfplan.planners.expert.windows import WindowSize, by_windows, failed_status, solution_of
+from cfplan.planners.solution import Solution
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.yaw_spline import YawSpline
 
@@ -38,7 +39,8 @@ def plan_expert(task: PlanningTask, *, penalties: Penalties | None = None, windo
     Yaw is that of the Hopf fibration. FIXED holds the yaw angle, TANGENT follows the horizontal direction of flight;
     both are laid out before the speed (see YawSpline), which then respects what turning takes. FREE leaves yaw to the
     optimiser, from a first yaw between that angle and a quarter turn more, as the paper has it. A start or end state
-    brings its own yaw in every mode. A path longer than `window` is planned window by window.
+    brings its own yaw in every mode. A path longer than `window` is planned window by window. At the task's deadline
+    there is no profile, unless only limits between points were still exceeded.
 
     Raises:
         InputError: fewer nodes than the path needs.
@@ -50,14 +52,19 @@ def plan_expert(task: PlanningTask, *, penalties: Penalties | None = None, windo
     path, limits, nodes = task.path, task.limits, task.nodes
     yaw = YawSpline.along(path, nodes, task.yaw, task.yaw_angle, task.start, task.end)
     shape = Shape(nodes, task.yaw is YawMode.FREE, turning_limited=limits.angular_acceleration < math.inf)
-    whole = Segment(path, task.airframe, limits, Ends(task.start, task.end), yaw, layout_of(shape), task.speed_caps)
+    whole = Segment(
+        path, task.airframe, limits, Ends(task.start, task.end), yaw, layout_of(shape), task.speed_caps,
+        slowness_of(guess_spline(path, task.airframe, limits, nodes), limits),
+    )  # fmt: skip
 
     def search(segment: Segment, _near: NDArray) -> Tightened | str:
         problem = build_problem(segment, task.yaw_angle, penalties)
-        attempt = solve(problem, problem.coefficients, COLD_START)
-        return rejection_reason(attempt, segment) or tighten_until_feasible(attempt, problem, segment)
+        attempt = solve(problem, problem.coefficients, COLD_START, task.deadline)
+        return rejection_reason(attempt, segment) or tighten_until_feasible(
+            attempt, problem, segment, deadline=task.deadline
+        )
 
     joined = by_windows(whole, window, search)
     if isinstance(joined, str):
-        return Solution(Status.NOT_CONVERGED, None, joined)
+        return Solution(failed_status(task.deadline), None, joined)
     return solution_of(whole, joined, began)

@@ -11,11 +11,15 @@ from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import node_coefficients
 from cfplan.vehicle.yaw_spline import end_coefficients
 
+HIGHEST = 6.0  # h at most, where the path nearly stands still, in squares of the speed limit
 SHARE = 0.7  # of each limit that the guess uses
 WIDTH = 2.0  # intervals over which it is smoothed
 # Intervals over which h, and yaw, come away from a boundary state. In less they jerk; in more h is too fast to brake.
 H_BLEND, YAW_BLEND = 5.0, 4.0
-LOWERED_FROM, LOWERED_TO = 3, 10  # coefficients from an end that is held, where lowered() begins, and is complete
+# Coefficients from an end that is held, where lowered() begins, and is complete; on a fine grid, where so few take no
+# time to pass, after as many as take LOWERED_TIME, s.
+LOWERED_FROM, LOWERED_TO = 3, 10
+LOWERED_TIME = 0.15
 
 
 def guess(
@@ -23,17 +27,17 @@ def guess(
     airframe: Airframe,
     limits: PlanLimits,
     nodes: int,
-    ceiling: float,
+    unit: float,
     start: BoundaryState | None,
     end: BoundaryState | None,
     yaw: float | None,
 ) -> NDArray:
-    """Return (N+3, 1 or 2) spline coefficients: of h in squares of the speed limit, h at most `ceiling`; and of yaw.
+    """Return (N+3, 1 or 2) spline coefficients: of h over its `unit`, and of yaw.
 
     `yaw` is None where it is not to be guessed, else where it starts if no state says so.
     """
-    step, unit = path.end / nodes, limits.speed**2
-    cubic = guess_spline(path, airframe, limits, nodes, ceiling) / unit
+    step = path.end / nodes
+    cubic = guess_spline(path, airframe, limits, nodes) / unit
     slow, held = cubic.copy(), []
     for state, here, there in ((start, cubic, slow), (end, cubic[::-1], slow[::-1])):
         if state:
@@ -75,23 +79,26 @@ def _yaw(start: BoundaryState | None, end: BoundaryState | None, yaw: float, nod
     return spline
 
 
-def lowered(coefficients: NDArray, share: float, held: tuple[bool, bool]) -> NDArray:
-    """Return the coefficients with h less by that share; less so next to an end that is held by a boundary state."""
+def lowered(coefficients: NDArray, share: float, held: tuple[bool, bool], rate: float) -> NDArray:
+    """Return the coefficients with h less by that share; less so next to an end that is held by a boundary state.
+
+    `rate` is how many intervals a second pass where x is 1.
+    """
     result = coefficients.copy()
     if not any(held):
         result[:, 0] *= 1.0 - share
         return result
     less = np.full(len(coefficients), float(share))
-    ramp = np.clip((np.arange(LOWERED_TO) - LOWERED_FROM + 1) / (LOWERED_TO - LOWERED_FROM + 1), 0.0, 1.0)
-    for is_held, from_end in zip(held, (less, less[::-1]), strict=True):
+    for is_held, from_end, x in zip(held, (less, less[::-1]), (coefficients[1, 0], coefficients[-2, 0]), strict=True):
         if is_held:
-            count = min(len(less), LOWERED_TO)
-            from_end[:count] *= ramp[:count]
+            to = max(LOWERED_TO, int(LOWERED_TIME * rate * np.sqrt(max(x, 0.0))))
+            count = min(len(less), to)
+            from_end[:count] *= np.clip((np.arange(count) - LOWERED_FROM + 1) / (to - LOWERED_FROM + 1), 0.0, 1.0)
     result[:, 0] *= 1.0 - less
     return result
 
 
-def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int, ceiling: float) -> NDArray:
+def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int) -> NDArray:
     """Return (N+3,) coefficients of a cubic B-spline on the grid: h where it is taken to change slowly.
 
     With h' = 0 each limit alone gives a bound on h: |v|² = h|γ'|², |a| = h|γ''|, and with the thrust axis about
@@ -103,7 +110,7 @@ def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int,
     acceleration = min(limits.acceleration, GRAVITY * np.tan(min(limits.tilt, 1.0)), 4 * up / airframe.mass)
     turning = 0.5 * spare_turning(airframe, limits)
     h = np.minimum.reduce([
-        np.full(len(s), 0.3 * ceiling),
+        np.full(len(s), HIGHEST * limits.speed**2),
         SHARE * limits.speed**2 / first**2,
         SHARE * acceleration / second,
         (0.7 * SHARE * limits.angular_velocity * GRAVITY / third) ** (2 / 3),

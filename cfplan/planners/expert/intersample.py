@@ -76,10 +76,23 @@ class DensePath:
         upper, lower = highest.T - quantities.UPPER + self.allowance, quantities.LOWER - lowest.T + self.allowance
         return Violation(upper - self.held * np.maximum(upper, 0.0), lower - self.held * np.maximum(lower, 0.0))
 
-    def _extremes(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> tuple[NDArray, NDArray]:
-        """Return the highest and the lowest value of each row in each interval, (MEASURES, N)."""
+    def measures(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> NDArray:
+        """Return the measures at all places, (MEASURES, P · K), speed counted against caps as against the limit."""
         at = dense.dense_rows(airframe, self.derivatives, profile, self.places, self.interval)
         _count_against_caps(at, self.caps, limits)
+        return at
+
+    def least_of_intervals(self, values: NDArray) -> NDArray:
+        """Return the least of values at all places, (P · K,), in each interval, (N,)."""
+        least, end = np.empty(len(self.allowance)), 0
+        for which, places in self.groups:
+            begin, end = end, end + len(which) * len(places)
+            least[which] = values[begin:end].reshape(len(places), len(which)).min(axis=0)
+        return least
+
+    def _extremes(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> tuple[NDArray, NDArray]:
+        """Return the highest and the lowest value of each row in each interval, (MEASURES, N)."""
+        at = self.measures(profile, airframe, limits)
         highest, lowest = (np.empty((MEASURES, len(profile.dddh))) for _ in range(2))
         end = 0
         for which, places in self.groups:

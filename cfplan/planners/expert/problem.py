@@ -28,7 +28,8 @@ JOINT_MARGIN, AROUND_JOINT = 0.01, 6
 BOUNDARY_TOLERANCE = 0.1  # by which rows that a boundary state alone decides may exceed their limits: they are checked
 OVERTIGHTENING = 1.5  # times a violation between points, by which limits are lowered: the peak falls by less
 CEILING = 20.0  # h at most, where the path nearly stands still, in squares of the speed limit
-FLOOR = 1e-4  # coefficients of h at least, likewise
+FLOOR = 1e-4  # coefficients of x at least
+BRISK = 4.0  # times the typical speed of a flight, above which a speed limit is too far off to measure by
 REST = 1e-9  # |γ'| below which a path stands still
 
 
@@ -57,11 +58,12 @@ class Segment:
     yaw: YawSpline  # given before the speed; where yaw is free, of no account
     layout: Layout
     caps: SpeedCaps | None = None
+    slowness: float = 1.0  # the speed limit over the speed where x is 1; see slowness_of()
 
     @property
     def unit(self) -> float:
         """Return h where x is 1."""
-        return self.limits.speed**2
+        return (self.limits.speed / self.slowness) ** 2
 
     def profile(self, coefficients: NDArray) -> SpeedProfile:
         """Return the profile of a table of spline coefficients, (N+3, 1 or 2) of x and, where yaw is free, of yaw."""
@@ -69,6 +71,15 @@ class Segment:
         if coefficients.shape[1] == 2:
             yaw = YawSpline.from_coefficients(coefficients[:-1, 1], self.path.end / self.layout.shape.nodes)
         return spline_profile(coefficients[:, 0] * self.unit, self.path.end, yaw)
+
+
+def slowness_of(h: NDArray, limits: PlanLimits) -> float:
+    """Return the speed limit over BRISK times the typical speed of some h, (K,); at least 1.
+
+    Where other limits keep a flight far below the speed limit, h counted in its squares would be next to FLOOR, and
+    the search would end before it began.
+    """
+    return max(1.0, limits.speed / (BRISK * float(np.median(h)) ** 0.5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,14 +120,14 @@ def build_problem(
     nominal = np.linalg.norm(path(layout.speed_s * step, 1), axis=1)
     speed = allowed_speed(limits.speed, segment.caps, layout.speed_s * step)
     highest = ((1.0 - margin[layout.speed_interval]) * speed / np.maximum(nominal, REST)) ** 2 / unit
-    highest = np.minimum(highest, CEILING)
+    highest = np.minimum(highest, CEILING * segment.slowness**2)
     for node, boundary in ((0, ends.start), (nodes, ends.end)):
         if boundary:
             highest[node] = np.inf  # the state decides, and was checked
     lower, upper = _limits_at_points(layout, ends, margin)
     if coefficients is None:
         coefficients = guess(
-            path, segment.airframe, limits, nodes, CEILING * unit, ends.start, ends.end,
+            path, segment.airframe, limits, nodes, unit, ends.start, ends.end,
             yaw_angle + math.pi / 4 if layout.shape.free_yaw else None,
         )  # fmt: skip
     return Problem(

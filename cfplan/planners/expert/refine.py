@@ -6,14 +6,17 @@ A warm start: from a near-feasible profile the search of the expert's problem ta
 import math
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.deadline import Deadline
 from cfplan.planners.expert.initial_guess import lowered
 from cfplan.planners.expert.layout import Shape, layout_of
-from cfplan.planners.expert.problem import FLOOR, Ends, Problem, Segment, build_problem
+from cfplan.planners.expert.problem import FLOOR, Ends, Problem, Segment, build_problem, slowness_of
 from cfplan.planners.expert.search import (
     COLD_START,
     Attempt,
@@ -24,8 +27,16 @@ from cfplan.planners.expert.search import (
     solve,
 )
 from cfplan.planners.expert.tightening import Tightened, tighten_until_feasible
-from cfplan.planners.expert.windows import Joined, WindowSize, by_windows, far_enough, solution_of, windows_of
-from cfplan.planners.solution import Solution, Status
+from cfplan.planners.expert.windows import (
+    Joined,
+    WindowSize,
+    by_windows,
+    failed_status,
+    far_enough,
+    solution_of,
+    windows_of,
+)
+from cfplan.planners.solution import Solution
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.profile_spline import h_coefficients
@@ -38,7 +49,10 @@ SLOWER = 0.1
 
 
 def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WINDOW) -> Solution:
-    """Plan a profile within about 0.3 % of the fastest, with the grid and the yaw of the given one, not of the task."""
+    """Plan a profile within about 0.3 % of the fastest, with the grid and the yaw of the given one, not of the task.
+
+    A profile may come with a reason, which then says from where on it stayed as given.
+    """
     *_, last = refinements(task, profile, window=window)
     return last
 
@@ -47,30 +61,33 @@ def refinements(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize
     """Yield the refined profile: first with limits held at points, then, if it is asked for, between them too.
 
     The first often passes the certificate, and costs half. A path longer than `window` is planned window by window; its
-    profile comes once, with limits held between points. A failure comes alone.
+    profile comes once, with limits held between points. A failure comes alone. At the task's deadline what is not
+    refined yet stays as given.
     """
     began = time.perf_counter()
     path, limits, nodes = task.path, task.limits, len(profile.s) - 1
     layout = layout_of(Shape(nodes, False, turning_limited=limits.angular_acceleration < math.inf))
     ends, yaw = Ends(task.start, task.end), YawSpline.of(profile)
-    whole = Segment(path, task.airframe, limits, ends, yaw, layout, task.speed_caps)
+    whole = Segment(path, task.airframe, limits, ends, yaw, layout, task.speed_caps, slowness_of(profile.h, limits))
     near = np.maximum(h_coefficients(profile) / whole.unit, FLOOR)[:, None]
     if len(windows_of(nodes, *far_enough(window, path.end / nodes, limits))) > 1:
-        yield _solution(whole, by_windows(whole, window, _refine_window, near), began)
+        joined = by_windows(whole, window, partial(_refine_window, deadline=task.deadline), near)
+        yield _solution(whole, joined, began, task.deadline)
         return
-    found = _hold_at_points(whole, near)
+    found = _hold_at_points(whole, near, task.deadline)
     if isinstance(found, str):
-        yield _solution(whole, found, began)
+        yield _solution(whole, found, began, task.deadline)
         return
-    yield _solution(whole, Joined(found.attempt.coefficients, (), found.attempt.iterations, 0), began)
-    between = tighten_until_feasible(found.attempt, found.problem, whole, found.restarts)
-    yield _solution(whole, Joined(between.coefficients, (), between.iterations, between.rounds), began)
+    yield solution_of(whole, Joined(found.attempt.coefficients, (), found.attempt.iterations, 0), began)
+    between = tighten_until_feasible(found.attempt, found.problem, whole, found.restarts, task.deadline)
+    yield solution_of(whole, Joined(between.coefficients, (), between.iterations, between.rounds), began)
 
 
-def _solution(whole: Segment, joined: Joined | str, began: float) -> Solution:
+def _solution(whole: Segment, joined: Joined | str, began: float, deadline: Deadline) -> Solution:
     if isinstance(joined, str):
-        return Solution(Status.NOT_CONVERGED, None, f"refining: {joined}")
-    return solution_of(whole, joined, began)
+        return Solution(failed_status(deadline), None, f"refining: {joined}")
+    solution = solution_of(whole, joined, began)
+    return replace(solution, reason=solution.reason and f"refining: {solution.reason}")
 
 
 class _HeldAtPoints(NamedTuple):
@@ -81,22 +98,24 @@ class _HeldAtPoints(NamedTuple):
     restarts: Sequence[Start]
 
 
-def _hold_at_points(segment: Segment, near: NDArray) -> _HeldAtPoints | str:
+def _hold_at_points(segment: Segment, near: NDArray, deadline: Deadline) -> _HeldAtPoints | str:
     """Solve the problem from the coefficients `near`, or return why not."""
     ends = segment.ends
     slowness = float((1.0 / np.sqrt(segment.unit * near[:, 0])).sum()) / len(near)
-    interval = segment.path.end / segment.layout.shape.nodes * slowness
+    step = segment.path.end / segment.layout.shape.nodes
+    interval = step * slowness
     agrees = not ends.end and (ends.continues or not ends.start)  # with the boundary states
-    problem = build_problem(segment, coefficients=lowered(near, SLOWER, ends.held) if agrees else None)
-    attempt = solve(problem, problem.coefficients, refining_starts(interval))
-    if rejection_reason(attempt, segment):  # not near enough
+    rate = segment.unit**0.5 / step
+    problem = build_problem(segment, coefficients=lowered(near, SLOWER, ends.held, rate) if agrees else None)
+    attempt = solve(problem, problem.coefficients, refining_starts(interval), deadline)
+    if rejection_reason(attempt, segment) and not deadline.passed:  # not near enough
         problem = build_problem(segment)
-        attempt = solve(problem, problem.coefficients, COLD_START)
+        attempt = solve(problem, problem.coefficients, COLD_START, deadline)
     return rejection_reason(attempt, segment) or _HeldAtPoints(attempt, problem, refining_restarts(interval))
 
 
-def _refine_window(segment: Segment, near: NDArray) -> Tightened | str:
-    found = _hold_at_points(segment, near)
+def _refine_window(segment: Segment, near: NDArray, *, deadline: Deadline) -> Tightened | str:
+    found = _hold_at_points(segment, near, deadline)
     if isinstance(found, str):
         return found
-    return tighten_until_feasible(found.attempt, found.problem, segment, found.restarts)
+    return tighten_until_feasible(found.attempt, found.problem, segment, found.restarts, deadline)

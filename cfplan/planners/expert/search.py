@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.deadline import NEVER, Deadline
 from cfplan.planners.expert.initial_guess import lowered
 from cfplan.planners.expert.problem import Problem, Segment
 from cfplan.planners.expert.transcription import SplineProgram
@@ -64,14 +65,16 @@ def _early(barrier: float, push: float, iterations: int) -> Start:
     ))  # fmt: skip
 
 
-def solve(problem: Problem, coefficients: NDArray, starts: Sequence[Start]) -> Attempt:
-    """Search from these coefficients, (N+3, 1 or 2), as the first of `starts` that succeeds."""
+def solve(problem: Problem, coefficients: NDArray, starts: Sequence[Start], deadline: Deadline = NEVER) -> Attempt:
+    """Search from these coefficients, (N+3, 1 or 2), as the first of `starts` that succeeds, until the deadline."""
     program, iterations = SplineProgram(problem), 0
     for start in starts:
-        from_here = lowered(coefficients, start.lowered, problem.ends.held) if start.lowered else coefficients
-        result = minimise(program, program.v_of(from_here), start.search)
+        from_here = coefficients
+        if start.lowered:
+            from_here = lowered(coefficients, start.lowered, problem.ends.held, problem.unit**0.5 / problem.step)
+        result = minimise(program, program.v_of(from_here), start.search, deadline)
         iterations += result.iterations
-        if result.solved:
+        if result.solved or deadline.passed:
             break
     return Attempt(
         program.coefficients_of(result.v), program.rows_of(result.values.constraints), result.solved, iterations,

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from numpy.typing import NDArray
 
+from cfplan.deadline import NEVER, Deadline
 from cfplan.planners.expert.intersample import ALLOWANCE, DensePath
 from cfplan.planners.expert.problem import Problem, Segment, held_by, tightened
 from cfplan.planners.expert.search import WARM_START, Attempt, Start, rejection_reason, solve
@@ -22,9 +23,10 @@ class Tightened(NamedTuple):
 
 
 def tighten_until_feasible(
-    attempt: Attempt, problem: Problem, segment: Segment, starts: Sequence[Start] = WARM_START
-) -> Tightened:
-    """Lower limits and solve again until none is exceeded between points.
+    attempt: Attempt, problem: Problem, segment: Segment, starts: Sequence[Start] = WARM_START,
+    deadline: Deadline = NEVER,
+) -> Tightened:  # fmt: skip
+    """Lower limits and solve again until none is exceeded between points, or the deadline passes.
 
     A round that fails leaves the solution of the one before: slowing will do the rest.
     """
@@ -33,10 +35,10 @@ def tighten_until_feasible(
     iterations = attempt.iterations
     for done in range(ROUNDS):
         violation = dense.violation(segment.profile(attempt.coefficients), segment.airframe, segment.limits)
-        if violation.worst <= ENOUGH:
+        if violation.worst <= ENOUGH or deadline.passed:
             return Tightened(attempt.coefficients, done, iterations)
         problem = tightened(problem, violation, attempt.rows)
-        following = solve(problem, attempt.coefficients, starts)
+        following = solve(problem, attempt.coefficients, starts, deadline)
         iterations += following.iterations
         if rejection_reason(following, segment):
             return Tightened(attempt.coefficients, done, iterations)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.deadline import Deadline
 from cfplan.planners.expert.layout import Shape, layout_of
 from cfplan.planners.expert.problem import Ends, Segment
 from cfplan.planners.expert.tightening import Tightened
@@ -38,6 +39,7 @@ class Joined(NamedTuple):
     joints: tuple[float, ...]  # s, where windows meet
     iterations: int
     rounds: int  # of tightening
+    unfinished: str = ""  # why the windows from some place on are as they were given; empty where all are solved
 
 
 def windows_of(nodes: int, kept: int, ahead: int) -> list[tuple[int, int]]:
@@ -61,7 +63,7 @@ def by_windows(
     """Solve the whole by windows of that size, and join them; or return why not.
 
     `search` solves one window; it is given the coefficients that `near`, (N+3, 1 or 2), has there, else zeros, but for
-    those that a joint decides.
+    those that a joint decides. Where a window fails behind one that does not, that one and all behind it stay `near`.
     """
     shape, ends = whole.layout.shape, whole.ends
     nodes, step = shape.nodes, whole.path.end / shape.nodes
@@ -69,7 +71,7 @@ def by_windows(
     kept, ahead = far_enough(size, step, whole.limits)
     windows = windows_of(nodes, kept, ahead)
     iterations = rounds = 0
-    for first, last in windows:
+    for number, (first, last) in enumerate(windows):
         yaw = whole.yaw.part(first, last)
         at_start, at_end = first == 0, last == nodes
         state = ends.start if at_start else _state(coefficients[first : first + 3], yaw, whole.unit, step)
@@ -78,15 +80,28 @@ def by_windows(
             whole.airframe, whole.limits,
             Ends(state, ends.end if at_end else None, continues=not at_start, joint=None if at_end else kept), yaw,
             layout_of(Shape(last - first, shape.free_yaw, shape.turning_limited, (3 * at_start, 3 * at_end))),
-            whole.caps and whole.caps.part(first * step, last * step),
+            whole.caps and whole.caps.part(first * step, last * step), whole.slowness,
         )  # fmt: skip
         found = search(window, coefficients[first : last + 3])
         if isinstance(found, str):
-            return found if len(windows) == 1 else f"s = {first * step:.3g} to {last * step:.3g}: {found}"
+            failure = found if len(windows) == 1 else f"s = {first * step:.3g} to {last * step:.3g}: {found}"
+            if near is None or at_start:
+                return failure
+            return Joined(coefficients, tuple(step * k for k, _ in windows[1:number]), iterations, rounds, failure)
+        given = coefficients[first + kept + 3 : last + 3].copy()
         coefficients[first : last + 3] = found.coefficients
+        if near is not None and not at_end:
+            _lead_back(coefficients[first + kept + 3 : last + 3], given)
         iterations += found.iterations
         rounds += found.rounds
     return Joined(coefficients, tuple(first * step for first, _ in windows[1:]), iterations, rounds)
+
+
+def _lead_back(found: NDArray, given: NDArray) -> None:
+    """Lead what a window found beyond what it keeps back to what was given there, so that the next begins smoothly."""
+    share = np.clip(np.linspace(-1.0, 1.0, len(found)), 0.0, 1.0)
+    share = share**2 * (3.0 - 2.0 * share)
+    found[:, 0] = found[:, 0] ** (1.0 - share) * given[:, 0] ** share
 
 
 def _state(rows: NDArray, yaw_given: YawSpline, unit: float, step: float) -> BoundaryState:
@@ -98,6 +113,11 @@ def _state(rows: NDArray, yaw_given: YawSpline, unit: float, step: float) -> Bou
     return BoundaryState(float(h), float(slope / step), float(bend / step**2), float(yaw), float(dyaw))
 
 
+def failed_status(deadline: Deadline) -> Status:
+    """Return what a search that failed is called."""
+    return Status.OUT_OF_TIME if deadline.passed else Status.NOT_CONVERGED
+
+
 def solution_of(whole: Segment, joined: Joined, began: float) -> Solution:
     """Return the solution that windows were joined to; the search began at this time.perf_counter()."""
     stats: dict[str, float | int | str] = {
@@ -107,4 +127,4 @@ def solution_of(whole: Segment, joined: Joined, began: float) -> Solution:
         "windows": 1 + len(joined.joints),
         "solver": "interior point",
     }
-    return Solution(Status.SOLVED, whole.profile(joined.coefficients), "", stats, joined.joints)
+    return Solution(Status.SOLVED, whole.profile(joined.coefficients), joined.unfinished, stats, joined.joints)

@@ -19,6 +19,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.deadline import NEVER, Deadline
 from cfplan.geometry import banded
 from cfplan.planners.solver.barrier import (
     Errors,
@@ -37,6 +38,7 @@ FILTER = 1e-5  # share of the infeasibility by which a step must reduce it, or t
 SWITCH_COST, SWITCH_FEASIBILITY = 2.3, 1.1
 ARMIJO = 1e-4
 HALVINGS = 14
+OUT_OF_TIME = "out of time"
 
 
 class Values(NamedTuple):
@@ -128,8 +130,8 @@ class _Step(NamedTuple):
     widens: bool  # the filter
 
 
-def minimise(program: NonlinearProgram, v: NDArray, search: Search) -> SearchResult:
-    """Search from v, where the functions must be defined."""
+def minimise(program: NonlinearProgram, v: NDArray, search: Search, deadline: Deadline = NEVER) -> SearchResult:
+    """Search from v, where the functions must be defined, until the deadline."""
     barrier, bounds, rows = search.barrier, program.bounds, program.rows
     values = program.evaluate(v)
     slacks, terms = initialise(values.constraints, bounds, barrier, search.push)
@@ -140,6 +142,8 @@ def minimise(program: NonlinearProgram, v: NDArray, search: Search) -> SearchRes
         near = program.linearise(v, terms)
         gradient, by_multiplier, by_barrier, by_residual = near.gradients
         off_gradient = float(np.abs(gradient + by_multiplier).max())
+        if deadline.passed:
+            return SearchResult(v, values, False, iteration, f"{OUT_OF_TIME} after {iteration} iterations")
         if not math.isfinite(infeasible + off_gradient + values.cost):
             return SearchResult(v, values, False, iteration, "a value is not a number")
         lowered = False

@@ -13,7 +13,7 @@ from cfplan.planners.expert.intersample import Violation
 from cfplan.planners.expert.kernel import CompiledKernels, InterpretedKernels
 from cfplan.planners.expert.layout import Shape, layout_of
 from cfplan.planners.expert.point_constraints import Penalties
-from cfplan.planners.expert.problem import CEILING, Ends, Segment, build_problem, tightened
+from cfplan.planners.expert.problem import Ends, Segment, build_problem, tightened
 from cfplan.planners.expert.search import COLD_START, Attempt, solve
 from cfplan.planners.expert.transcription import OBJECTIVE_SCALE, SplineProgram
 from cfplan.planners.solution import Status
@@ -186,7 +186,7 @@ def test_an_instruction_that_cannot_be_written_out_is_named(monkeypatch):
 
 
 def test_an_answer_that_is_not_a_flight_is_not_believed(monkeypatch):
-    def claims(problem, coefficients, starts):
+    def claims(problem, coefficients, starts, deadline):
         return Attempt(np.full_like(coefficients, np.nan), problem.upper, True, 1, "solved")
 
     monkeypatch.setattr(expert, "solve", claims)
@@ -224,7 +224,7 @@ def test_a_guess_between_two_states_has_both_to_the_last_bit_and_does_not_jerk()
     part, nodes = PATH.part(profile.s[first], profile.s[last]), last - first
     start, end = profile.boundary(first), profile.boundary(last)
     unit = limits.speed**2
-    cubic = guess(part, SIMULATION.airframe, limits, nodes, CEILING * unit, start, end, None)[:, 0] * unit
+    cubic = guess(part, SIMULATION.airframe, limits, nodes, unit, start, end, None)[:, 0] * unit
     segment = Segment(part, SIMULATION.airframe, limits, Ends(start, end), YawSpline.fixed(part, nodes, 0.0),
                       layout_of(Shape(nodes, False)))  # fmt: skip
     found = segment.profile(cubic[:, None] / unit)
