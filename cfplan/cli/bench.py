@@ -276,6 +276,24 @@ def giving_way(path_files: tuple[Path, ...], **given: Any) -> None:
     _measure(partial(giving_way, path_files, _safety_file(path_files[0])), "simulating", given)
 
 
+@study.command(name="hard-paths", epilog="Example: cfplan study hard-paths --jobs 2 -o results/hard-paths.json")
+@_count(1000, "Families take turns.")
+@_seed(0)
+@click.option(
+    "--compare-every", type=click.IntRange(0), default=10, show_default=True,
+    help="Of so many paths one is planned by the expert too, with all the time that it wants; 0: none.",
+)  # fmt: skip
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@_output
+@options.as_json
+def hard_paths(**given: Any) -> None:
+    """Plan adversarial paths under limits from a hundredth to ten times the usual: time, memory, what is refused."""
+    _use_one_thread()
+    from cfplan.studies.hard_paths import hard_paths as run
+
+    _measure(partial(run, _safety_file(Path())), "planning", given)
+
+
 @study.command(short_help="Write the tables of docs/ from results/.")
 @click.argument("folder", metavar="[REPOSITORY]", type=click.Path(path_type=Path), default=Path())
 def docs(folder: Path) -> None:
