@@ -17,7 +17,7 @@ from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO
 from cfplan.preparation.glitch_assessment import assess_glitches
-from cfplan.preparation.link_loss_assessment import MARGIN, assess_link_loss
+from cfplan.preparation.link_loss_assessment import MARGIN, assess_link_loss, assess_link_loss_of_stops
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss, slow_locally
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.certificate import certify
@@ -133,8 +133,8 @@ def plan_flight(
 def give_way(
     planned: Plan, on_step: OnStep = ignore_steps, deadline: Deadline = NEVER
 ) -> tuple[Plan, SimulatedLinkLoss | None]:
-    """Return the plan, slower in places if link loss would take the vehicle outside the walls from there, or a gap in
-    setpoints or poses would lose it; and what link loss does to it.
+    """Return the plan, slower in places if link loss would take the vehicle outside the walls from there, or from a
+    stop from there, or a gap in setpoints or poses would lose it; and what link loss does to it.
 
     Where safety.yaml says only to warn of link loss, nothing is slowed for that, and it is not looked at. After the
     deadline plans are slowed more than they need be, which takes less time.
@@ -147,15 +147,19 @@ def give_way(
 
     def assess(trajectory: Trajectory) -> list[Assessment]:
         encoded = encode_trajectory(trajectory, space=limits.space)
-        assessments = [assess_glitches] if limits.link_loss.only_warn else [assess_link_loss, assess_glitches]
+        if limits.link_loss.only_warn:
+            return [assess_glitches(encoded, limits)]
         with ThreadPoolExecutor() as pool:
-            return list(pool.map(lambda each: each(encoded, limits), assessments))
+            glitches, link_loss = pool.map(lambda each: each(encoded, limits), (assess_glitches, assess_link_loss))
+        if not link_loss.passed or link_loss.simulated is None:
+            return [glitches, link_loss]  # which is mended first
+        return [glitches, link_loss, assess_link_loss_of_stops(encoded, limits, link_loss.simulated.moments)]
 
     with step(on_step, "slowing") as results:
-        slowed, (*link_loss, glitches) = slow_locally(planned, assess, deadline)
-        for each in link_loss:
+        slowed, (glitches, *link_loss) = slow_locally(planned, assess, deadline)
+        for each, where in zip(link_loss, ("at any setpoint", "within sampled stops"), strict=False):
             inside = MARGIN - each.excess[each.worst]
-            results.append(f"at least {inside:.2f} m inside the walls after link loss at any setpoint")
+            results.append(f"at least {inside:.2f} m inside the walls after link loss {where}")
         results.append(f"a gap {glitches.describe(glitches.worst)} at most")
         if slowed.slowing:
             results.append(slowed.describe_slowing())

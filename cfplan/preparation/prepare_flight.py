@@ -18,13 +18,13 @@ from cfplan.flight.setpoints.stop_certificate import StopCertificate, certify_st
 from cfplan.machine_code import compile_from_here
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.glitch_assessment import assess_glitches
-from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT
+from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
 from cfplan.preparation.local_slowing import SimulatedLinkLoss
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import DryRun, dry_run
-from cfplan.simulation.link_loss import LinkLoss, simulate_link_loss
+from cfplan.simulation.link_loss import LinkLoss, link_loss_at_every_setpoint, simulate_link_loss
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +61,7 @@ def prepare_flight(
     lost = find_link_loss(encoded, limits, on_step, planned.link_loss)
     if planned.was_read:  # else planning made sure of it, by the same bytes
         require_glitch_margin(encoded, limits, on_step)
+        require_harmless_stops(encoded, limits, on_step)
     mission, stops = make_mission(encoded, limits, on_step)
     return PreparedFlight(planned, encoded, rehearsed, lost, stops, mission)
 
@@ -140,6 +141,24 @@ def require_glitch_margin(encoded: EncodedFlight, limits: Limits, on_step: OnSte
         results.append(f"a gap {assessed.describe(assessed.worst)} at most")
         if not assessed.passed:
             raise NotCertifiedError(f"a gap {assessed.describe(assessed.worst)}", where="glitches", hint=assessed.hint)
+
+
+def require_harmless_stops(encoded: EncodedFlight, limits: Limits, on_step: OnStep = ignore_steps) -> None:
+    """Simulate link loss within sampled stops. Raises NotCertifiedError if one ends outside the walls.
+
+    Where safety.yaml says only to warn of link loss, it is not looked at.
+    """
+    if limits.link_loss.only_warn:
+        return
+    with step(on_step, "link loss of stops") as results:
+        plan = link_loss_at_every_setpoint(encoded.payloads, limits)
+        assessed = assess_link_loss_of_stops(encoded, limits, plan, margin=0.0)
+        results.append(f"link loss within a stop {assessed.describe(assessed.worst)} at most")
+        if not assessed.passed:
+            why = (
+                f"link loss within a stop at {assessed.time[assessed.worst]:.2f} s {assessed.describe(assessed.worst)}"
+            )
+            raise NotCertifiedError(why, where="link loss", hint=assessed.hint)
 
 
 def make_mission(

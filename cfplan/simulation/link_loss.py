@@ -169,6 +169,30 @@ def link_loss_of_stops(
     return _judge(times.reshape(-1), places, boxes, limits, [np.empty((0, SNAPSHOT_SIZE))] * len(boxes))
 
 
+def link_loss_within_stops(
+    stops: NDArray, starts: NDArray, limits: Limits, within: NDArray, rate: float = RATE
+) -> LinkLossMoments:
+    """Lose the link in K stops, (K, M, 29) uint8 at `rate`, Hz, after each of their setpoints `within`, (W,) rows.
+
+    Each stop begins from a snapshot of its flight, `starts`, (L, K, 31) for each motor lag, as the moments of a plan
+    hold them. Returns K · W moments, one stop after another; their times are from the first setpoint of the stop.
+    """
+    rows = setpoint_rows(decode(stops.reshape(-1, PAYLOAD_SIZE))).reshape(*stops.shape[:2], SETPOINT_SIZE)
+    arrivals, forks = arrival_steps(stops.shape[1], rate), np.zeros(stops.shape[1], dtype=np.bool_)
+    forks[within] = True
+
+    def one(body: tuple[NDArray, NDArray], begin: NDArray) -> NDArray:
+        swept = np.empty((*stops.shape[:2], 2, 3))
+        wrong = _wrong(limits)
+        _fly_stops(swept, rows, begin, forks, _gains(limits), *body, *_steps(limits), arrivals, wrong)
+        return swept[:, within].reshape(-1, 2, 3)
+
+    with ThreadPoolExecutor() as pool:  # a motor lag each
+        boxes = list(pool.map(one, _bodies(limits), starts))
+    times, places = np.tile(within / rate, len(stops)), rows[:, within, 0:3].reshape(-1, 3)
+    return _judge(times, places, boxes, limits, [np.empty((0, SNAPSHOT_SIZE))] * len(boxes))
+
+
 def link_loss_of_transfer(
     begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float, limits: Limits, rate: float = RATE
 ) -> LinkLossMoments:
@@ -241,7 +265,7 @@ def _swept(
     return swept, snapshots
 
 
-@njit
+@njit(nogil=True)
 def _fly_stops(
     swept: NDArray,
     stops: NDArray,

@@ -172,9 +172,9 @@ def test_stops_from_a_flight_are_harmless_too(line, limits):
     limits = without_errors(limits)
     flight = link_loss_at_every_setpoint(line.payloads, limits)
     every = link_loss_of_stops(line.payloads, line.stops, limits, every=10, each=8)
-    assert len(every.time) == 11 * len(range(0, len(line.payloads), 10))
+    assert len(every.time) == 16 * len(range(0, len(line.payloads), 10))
     assert every.worst.beyond < 0.0
-    first = np.flatnonzero(np.isin(every.time, flight.time) & (np.arange(len(every.time)) % 11 == 0))
+    first = np.flatnonzero(np.isin(every.time, flight.time) & (np.arange(len(every.time)) % 16 == 0))
     rows = np.round(every.time[first] * 100).astype(int)
     # A stop begins as the flight goes on, but brakes harder within its first setpoints.
     assert every.high[first] == pytest.approx(flight.high[rows], abs=0.25)

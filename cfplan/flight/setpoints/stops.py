@@ -5,7 +5,8 @@ on the path itself, where it was certified to be, and ends level at rest. With r
 
     v = r v₀,   a = r² a₀ + ṙ v₀,   attitude from a + g and heading,   body rates from the turn between attitudes.
 
-r falls as a smoothstep, so the braking deceleration is at most 1.5 v₀ / duration.
+r falls as a quintic smoothstep, so the braking deceleration is at most 1.875 v₀ / duration, and begins from nothing. A
+stop that begins at once, or is shorter, turns the vehicle so fast that link loss within it ends outside the walls.
 """
 
 from collections.abc import Iterator
@@ -26,7 +27,7 @@ from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import about_z, quaternions_of, yaw_of
 
-DURATION = 0.8  # s, from full speed to rest: 3.75 m/s² from 2 m/s on top of the turn's own
+DURATION = 1.2  # s, from full speed to rest: 3.1 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
 _CHUNK = 200  # stops at a time, so that all fields of them stay in a processor's cache
 
@@ -73,9 +74,10 @@ def stop_motion(
     """
     steps, count = round(duration * rate), len(motion.position)
     share = np.arange(steps + 1) / steps
-    clock_rate = 1.0 - share**2 * (3.0 - 2.0 * share)
-    slowing = -6.0 * share * (1.0 - share) / duration
-    elapsed = duration * rate * (share - share**3 + share**4 / 2.0)  # in setpoints; the integral of clock_rate
+    clock_rate = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    slowing = -30.0 * share**2 * (1.0 - share) ** 2 / duration
+    elapsed = share - 2.5 * share**4 + 3.0 * share**5 - share**6  # the integral of clock_rate
+    elapsed *= duration * rate  # in setpoints
     place = np.minimum(begin[:, None] + elapsed, count - 1.0)
     row = np.minimum(place.astype(int), max(count - 2, 0))
     between = (place - row)[..., None]

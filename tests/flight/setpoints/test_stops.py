@@ -62,7 +62,7 @@ def test_velocity_and_acceleration_are_the_derivatives_of_position(circle):
 def test_the_stop_takes_at_most_its_share_of_deceleration(circle):
     stop = stop_from(circle, 100, duration=0.8)
     along = np.sum(stop.acceleration * stop.velocity, axis=1) / np.maximum(np.linalg.norm(stop.velocity, axis=1), 0.1)
-    assert np.min(along) == pytest.approx(-1.5 * 1.8 / 0.8, rel=0.03)
+    assert np.min(along) == pytest.approx(-1.875 * 1.8 / 0.8, rel=0.03)
 
 
 def test_body_rates_are_those_of_the_attitudes_that_the_controller_makes(circle):
@@ -84,7 +84,7 @@ def test_rates_and_the_length_of_the_thrust_vector_are_sent_ahead(circle):
 
 def test_a_stop_at_the_end_of_the_plan_does_not_run_past_it(circle):
     stops = encode_stops(circle, 100.0)
-    assert decode(stops[-1]).position == pytest.approx(np.tile(circle.position[-1], (81, 1)), abs=1e-3)
+    assert decode(stops[-1]).position == pytest.approx(np.tile(circle.position[-1], (121, 1)), abs=1e-3)
 
 
 def test_roll_and_pitch_rates_are_sent_as_attitude(circle):
