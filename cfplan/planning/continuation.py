@@ -6,6 +6,7 @@ which its start is given: that of the path left, which keeps the curve where way
 where the path left is about to stop. Several are tried, first the one that looks fastest by a cheap estimate.
 """
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -28,6 +29,7 @@ from cfplan.planning.planners import default_nodes, find_planner
 from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.safety.space import check_space
+from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.joint import Joint, joint_at
 from cfplan.vehicle.profile import BoundaryState
@@ -38,6 +40,7 @@ from cfplan.vehicle.trajectory import Trajectory
 FIRST_TIMES, FIRST_TIMES_TIMED = (0.7, 1.0, 1.4, 2.0, 3.0), (1.0, 1.4, 2.0)
 RATE = 1.0  # units of s a second, where it is time: about the speed in m/s
 TRIES = 4  # paths that are planned
+SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², and s before that, with which the vehicle slows down to a lower speed
 ROOM = 0.005  # share of each limit that plans leave to whoever continues them
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
 _NODES = 60  # where a path's time is estimated
@@ -60,11 +63,13 @@ def continue_plan(
     times: ArrayLike | None = None,
     yaw: YawMode = YawMode.FIXED,
     yaw_angle: float = 0.0,
+    speed: float = math.inf,
 ) -> Continuation:
     """Return a certified plan that leaves a trajectory at `leave`, s, and goes through waypoints, (K, 3) m, to rest.
 
     `times`, (K,) s, are the nominal times of the segments that end in each, where waypoints of the path left stay: what
-    is left of it. In mode FIXED yaw turns to `yaw_angle`, rad, along the path.
+    is left of it. In mode FIXED yaw turns to `yaw_angle`, rad, along the path. `speed`, m/s, is not to be exceeded once
+    the vehicle has slowed down to it, gently.
 
     Raises:
         InputError: the waypoints are no waypoints, or the trajectory does not move then.
@@ -86,8 +91,9 @@ def continue_plan(
             failure = failure or error.what
             continue
         task = PlanningTask(
-            way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start
-        )
+            way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,
+            speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,
+        )  # fmt: skip
         found = _solve(task, limits)
         if not isinstance(found, str):
             check_endurance(found.trajectory.duration, limits)
@@ -137,6 +143,16 @@ def _ways(joint: Joint, trajectory: Trajectory, points: NDArray, times: ArrayLik
 def _way(joint: Joint, points: NDArray, times: NDArray) -> _Way:
     path = continued_min_snap(joint.derivatives, points, times)
     return _Way(path, joint.state, tuple(np.cumsum(times).tolist()))
+
+
+def _slowing_to(speed: float, way: _Way) -> SpeedCaps:
+    """Return caps of speed along a path, that fall from what the vehicle has at its start."""
+    s = np.linspace(0.0, way.path.end, 4 * default_nodes(way.path, PLANNER) + 1)
+    moving = np.linalg.norm(way.path(s, 1), axis=1)
+    length = np.append(0.0, np.cumsum((moving[1:] + moving[:-1]) / 2.0 * np.diff(s)))
+    first = moving[0] * way.start.h**0.5
+    falling = np.sqrt(np.maximum((first + 0.1) ** 2 - 2.0 * SLOWING * np.maximum(length - LEVEL_FOR * first, 0.0), 0.0))
+    return SpeedCaps.of(s, np.maximum(falling, speed))
 
 
 def _least_time(path: Path, bound: Bounds) -> float:

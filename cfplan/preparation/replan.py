@@ -29,8 +29,13 @@ from cfplan.simulation.glitches import glitch_at_every_setpoint
 from cfplan.simulation.link_loss import as_believed, link_loss_at_every_setpoint
 from cfplan.vehicle.joint import JoinedTrajectory
 
+SLOWER = (1.2, 0.7)  # m/s, at which a flight is tried that would end badly at full speed
 HALTS = (1.0, 1.15, 1.35, 1.6, 2.0, 2.6)  # times the way that braking takes at its limit, where a stop may end
 REACTION = 0.05  # s at full speed before braking is felt: the vehicle must lean first
+
+
+class EndsBadlyError(InfeasibleError):
+    """After link loss or a gap the vehicle would end outside the walls, or turn over."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +83,8 @@ def replan(
     """Return the proposal to leave what is held at setpoint `splice` and to go through waypoints, (K, 3) m, to rest.
 
     The motion changes SPLICE_AHEAD setpoints after the splice. With `keep`, the waypoints follow those that are ahead
-    there; else they replace them. Where the vehicle rests by then, the plan begins from rest.
+    there; else they replace them. Where the vehicle rests by then, the plan begins from rest. Where link loss or a gap
+    would end badly, the vehicle flies slower.
 
     Raises:
         InputError: what is given are no waypoints.
@@ -88,11 +94,30 @@ def replan(
     points = np.asarray(waypoints, dtype=float)
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
         raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint="give rows of x, y, z in metres")
+    for speed in (limits.plan.speed, *SLOWER):
+        try:
+            return _replan_at(speed, held, splice, points, limits, keep, yaw_angle)
+        except EndsBadlyError as error:
+            refused = error
+    raise refused
+
+
+def _replan_at(
+    speed: float, held: HeldFlight, splice: int, points: NDArray, limits: Limits, keep: bool, yaw_angle: float
+) -> Replanned:
+    """Return what replan() does, at that speed, m/s, or less."""
     joint = (splice + SPLICE_AHEAD) / RATE
     if joint >= held.ends:
         place = held.flown.at(held.ends)
         points = np.concatenate([place.position[None], points])
-        planned = plan(min_snap(points), limits.airframe, limits, planner="expert", yaw_angle=float(place.yaw))
+        planned = plan(
+            min_snap(points, times=centripetal_times(points)),
+            limits.airframe,
+            limits,
+            planner="expert",
+            yaw_angle=float(place.yaw),
+            speed_factor=min(speed / limits.plan.speed, 1.0),
+        )
         reached = tuple(np.cumsum(centripetal_times(points)).tolist())
         points = points[1:]
     else:
@@ -101,7 +126,9 @@ def replan(
         if keep:
             kept, times = _still_ahead(held, leave, points)
             points = np.concatenate([kept, points])
-        made = continue_plan(held.flown.trajectories[-1], leave, points, limits, times=times, yaw_angle=yaw_angle)
+        made = continue_plan(
+            held.flown.trajectories[-1], leave, points, limits, times=times, yaw_angle=yaw_angle, speed=speed
+        )
         planned, reached = made.plan, made.reached
     flown = held.flown.continued(joint, planned.trajectory)
     row = min(splice - held.begin, held.snapshots.shape[1] - 1)
@@ -177,13 +204,13 @@ def _certified(
     def lose_link() -> NDArray:
         lost = link_loss_at_every_setpoint(encoded.payloads, limits, starts=starts)
         if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
-            raise InfeasibleError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
+            raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
         return lost.snapshots
 
     def meet_gaps() -> None:
         glitches = glitch_at_every_setpoint(encoded.payloads, limits, start=believed)
         if glitches.lost.any():
-            raise NotCertifiedError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
+            raise EndsBadlyError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
 
     def rehearse() -> None:
         check_bytes(encoded, flown, limits.plan)

@@ -8,6 +8,7 @@ from cfplan.flight.setpoints.commitment import Commitment, splice
 from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
+from cfplan.planning.continuation import continue_plan
 from cfplan.planning.plan import plan
 from cfplan.preparation.replan import accepted, hold, replan
 from cfplan.safety.certificate import certify
@@ -78,6 +79,32 @@ def test_after_its_end_the_vehicle_starts_from_rest(held, limits):
     state = decode(new.commitment.payloads)
     np.testing.assert_allclose(state.position[0], WAYPOINTS[-1], atol=5.1e-4)
     np.testing.assert_allclose(state.position[-1], [0.0, 0.5, 1.0], atol=5.1e-4)
+    new = after(new, limits, replan(new, late + 60, [[0.5, -0.5, 1.0]], limits, keep=True), now=late + 55)
+    np.testing.assert_allclose(new.flown.trajectories[-1].path(new.reached), new.ahead, atol=1e-9)
+
+
+def test_where_link_loss_would_end_outside_the_vehicle_flies_slower(held, limits):
+    """Straight at a wall, 25 cm before which the last waypoint lies."""
+    wall = limits.space.high[1]
+    leave = held.commitment.last + 100
+    far = after(held, limits, replan(held, leave, [[0.0, -1.0, 1.0]], limits), now=leave - 5)
+    again = far.commitment.last + 100
+    slow = replan(far, again, [[0.0, wall - 0.25, 1.0]], limits)
+    speeds = np.linalg.norm(decode(slow.proposal.payloads).velocity, axis=1)
+    assert speeds.max() < 1.25
+    after(far, limits, slow, now=again - 5)
+
+
+def test_in_flight_it_slows_down_to_that(held, limits):
+    """A lower speed from the joint on, reached gently, and without a jump at the joint."""
+    leave = 1.2
+    made = continue_plan(held.flown.trajectories[0], leave, [[-0.4, 1.0, 1.0], [0.4, 2.4, 1.0]], limits, speed=0.8)
+    moments = np.arange(0.0, made.plan.trajectory.duration, 0.01)
+    speeds = np.linalg.norm(made.plan.trajectory.at(moments).velocity, axis=1)
+    before = float(np.linalg.norm(held.flown.at(leave).velocity))
+    assert speeds[0] == pytest.approx(before, abs=1e-6)
+    assert before > 1.0
+    assert speeds[len(speeds) // 2 :].max() < 0.81
 
 
 def test_a_flight_replanned_again_and_again_keeps_every_limit_in_what_was_sent(held, limits):
