@@ -91,5 +91,7 @@ def _solve_columns(matrix, right):
     factor, definite = factorise(matrix, 0.0, 0.0)
     solution = np.empty_like(right)
     for k in range(right.shape[1]):
-        solution[:, k] = solve(factor, right[:, k].copy())
+        column = solve(factor, right[:, k].copy())
+        for row in range(len(column)):
+            solution[row, k] = column[row]
     return solution, definite

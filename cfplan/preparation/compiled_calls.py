@@ -47,7 +47,8 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
 
         limits = load_limits(safety_file)
         middle = (np.array(limits.space.low) + limits.space.high) / 2
-        path = min_snap(middle + 0.2 * np.array([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]]))
+        places = np.array([[-1.0, -1.0, -0.5], [1.0, 0.0, 0.0], [1.0, 1.0, 0.5]])  # three, so that something is solved
+        path = min_snap(middle + 0.2 * places)
         with suppress(CfplanError):  # there may be no model for this vehicle
             plan(path, limits.airframe, limits, planner="learned", nodes=NODES)
         planned = plan(path, limits.airframe, limits, planner="expert", nodes=NODES)  # exceeds limits between nodes
