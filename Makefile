@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --editable
 
-.PHONY: install fly test slow fuzz lint clean
+.PHONY: install fly test slow fuzz pictures lint clean
 
 install: $(VENV)/installed
 
@@ -29,6 +29,18 @@ slow: $(VENV)/installed-tests
 
 fuzz: $(VENV)/installed-tests
 	$(BIN)/python -m tests.fuzzing --inputs 100000
+
+# The pictures of docs/; needs a Vulkan driver (mesa-vulkan-drivers) and chromium, and a computer that does nothing else.
+pictures: install
+	rm -rf build/pictures
+	$(BIN)/cfplan fly flights/figure8.yaml --records build/pictures/figure8
+	$(BIN)/cfplan fly flights/line.yaml --records build/pictures/line
+	$(BIN)/cfplan fly flights/line.yaml --records build/pictures/line --mocap vicon://lab/cf1
+	$(BIN)/cfplan replay build/pictures/figure8/* --png docs/images/replay.png --at 17.8 --force
+	$(BIN)/cfplan replay build/pictures/line/* --png docs/images/trials.png --at 2.4 --force
+	$(BIN)/cfplan report build/pictures/figure8/* -o build/pictures/report.html --force
+	chromium --headless --no-sandbox --hide-scrollbars --window-size=1200,1500 \
+		--screenshot=docs/images/report.png file://$(CURDIR)/build/pictures/report.html
 
 lint: $(VENV)/installed-tests
 	$(BIN)/ruff check .

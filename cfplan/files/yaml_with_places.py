@@ -49,6 +49,18 @@ _REMEDIES = {  # by the beginning of pydantic's name of a mistake
     "less": "choose a smaller value",
     "missing": "write a list of that length",
 }
+_PARSER_WORDS = (  # a part of what the parser says, what that means, and a hint
+    ("found character '\\t'", "a tab", "indent with blanks, not with tabs"),
+    ("expected <block end>", "this line is not indented like those around it", "indent keys of one section alike"),
+    ("expected ',' or ']'", "a list that is not closed before here", "write a comma between values, a ] at the end"),
+    (
+        "expected ',' or '}'",
+        "braces that are not closed before here",
+        "write a comma between values and a } at the end",
+    ),
+    ("mapping values are not allowed", "a second colon, or a line indented too far", "write one `key: value` a line"),
+    ("could not find expected ':'", "a key without a colon", "write `key: value`"),
+)
 _WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
 
 
@@ -139,12 +151,8 @@ def _composed(text: str, file: str) -> yaml.Node:
         finally:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
-        problems = [part for part in (error.context, error.problem) if part]
-        raise InputError(
-            _one_line(", ".join(problems) or "not YAML"),
-            where=_mark(file, error),
-            hint="check brackets, commas and indents there and just before",
-        ) from None
+        what, hint = _in_plain_words(_one_line(", ".join(filter(None, (error.context, error.problem)))))
+        raise InputError(what, where=_mark(file, error), hint=hint) from None
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         raise InputError(
@@ -155,6 +163,14 @@ def _composed(text: str, file: str) -> yaml.Node:
     if node is None:
         raise InputError("the file is empty", where=file, hint="start from a file in flights/")
     return node
+
+
+def _in_plain_words(problem: str) -> tuple[str, str]:
+    """Return what is wrong and a hint, of what the parser says in terms of its grammar."""
+    for part, what, hint in _PARSER_WORDS:
+        if part in problem:
+            return what, hint
+    return problem or "not YAML", "check brackets, commas and indents there and just before"
 
 
 def _mark(file: str, error: yaml.MarkedYAMLError) -> str:

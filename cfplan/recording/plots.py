@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.flight.telemetry import Phase
 from cfplan.recording.record import Record, meant_motion
-from cfplan.recording.summary import deviation
+from cfplan.recording.summary import deviation, reference_span
 
 FULL_COMMAND = 65535  # of a motor, 16 bits
 FAR_LIMIT = 2.0  # times the measured span beyond it, from which on a limit is not drawn
@@ -60,7 +61,7 @@ def plots(record: Record) -> tuple[Plot, ...]:
     setpoints, estimates, status = record.setpoints, record.estimates, record.status
     bounds, planned, motors = record.header.bounds, record.header.plan_limits, motor_thrust(record)
     _, meant_acceleration, meant_rate = meant_motion(setpoints)
-    off = deviation(record)
+    off = deviation(record, *_along_the_path(record))
     aged, age = pose_age(record)
     return (
         Plot(
@@ -105,6 +106,15 @@ def plots(record: Record) -> tuple[Plot, ...]:
             (bounds.lateness * 1e3,),
         ),
     )
+
+
+def _along_the_path(record: Record) -> tuple[float, float]:
+    """Return s, from when to when the vehicle is on the path or hovers at its end; always, where it never was."""
+    begin, end = reference_span(record)
+    if math.isnan(begin):
+        return -math.inf, math.inf
+    held = record.phase_span(Phase.HOLD)
+    return begin, held[1] if held is not None else end
 
 
 def motor_thrust(record: Record) -> NDArray:

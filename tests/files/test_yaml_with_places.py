@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cfplan.errors import InputError
 from cfplan.files.yaml_with_places import read_yaml, read_yaml_with_places
+from cfplan.geometry.path_file import load_path_file
 from cfplan.geometry.yaw import YawMode
 
 
@@ -96,7 +97,7 @@ def test_places_are_those_of_the_file(tmp_path):
         (GOOD + "name: again\n", "room.yaml:7:1: the key 'name' occurs twice"),
         (GOOD + "? [1]\n: 2\n", "room.yaml:7:3: a key must be a word"),
         (GOOD + "count: 1.5\n", "room.yaml:7:8: count should be a valid integer"),
-        (GOOD + "\tcount: 1\n", "room.yaml:7:1: while scanning"),
+        (GOOD + "\tcount: 1\n", "room.yaml:7:1: a tab"),
         (GOOD + "---\n" + GOOD, "room.yaml:7:1: expected a single document"),
         ("name: &a lab\nbox: *a\n", "room.yaml:1:7: anchors and aliases are not allowed"),
         ("name: !!python/name:os.system x\n", "room.yaml:1:7: the tag tag:yaml.org,2002:python/name:os.system is not"),
@@ -197,3 +198,22 @@ def test_a_file_that_would_take_long_to_read_is_refused_at_once(tmp_path):
     with pytest.raises(InputError, match="larger than 200 kB") as error:
         read_yaml(file, Box)
     assert "as a CSV" in error.value.hint
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "what"),
+    [
+        ("waypoints:\n  - [0, 0, 1]\n\t- [1, 0, 1]\n", ":3:1", "a tab"),
+        ("waypoints:\n  - [0, 0, 1]\n - [1, 0, 1]\n", ":3:2", "not indented like"),
+        ("waypoints: [[0, 0, 1]\nyaw: fixed\n", ":2:1", "not closed before here"),
+        ("name: a: b\n", ":1:8", "a second colon"),
+        ("waypoints: []\nyaw fixed\nlaps: 1\n", ":3:1", "a key without a colon"),
+    ],
+)
+def test_slips_of_typing_are_told_in_plain_words(tmp_path, text, place, what):
+    file = tmp_path / "path.yaml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=what) as error:
+        load_path_file(file)
+    assert error.value.where == f"{file}{place}"
+    assert "<" not in str(error.value)

@@ -1,8 +1,10 @@
 """The layout of the rerun view: the name of each entity, and the blueprint."""
 
+import math
 from typing import Literal
 
 import numpy as np
+import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
@@ -35,9 +37,14 @@ PlayState = Literal["paused", "playing", "following"]
 _STATES = "Phases, limit that holds the plan back, supervisor"
 
 
-def blueprint(header: RecordHeader, *, play_state: PlayState = "paused") -> rrb.Blueprint:
-    """Return the layout: 3-D at the left, the plots beside it in two columns, phases, events and the summary below."""
-    grid = rrb.Grid(*(time_plot(name, title) for name, title in TITLES.items()), grid_columns=2)
+def blueprint(
+    header: RecordHeader, *, play_state: PlayState = "paused", span: tuple[float, float] | None = None
+) -> rrb.Blueprint:
+    """Return the layout: 3-D at the left, the plots beside it in two columns, phases, events and the summary below.
+
+    All plots show `span`, s on the timeline, where it is given: a flight that goes on has none.
+    """
+    grid = rrb.Grid(*(time_plot(name, title, span) for name, title in TITLES.items()), grid_columns=2)
     below = rrb.Horizontal(
         rrb.StateTimelineView(contents=[PHASES, ACTIVE_LIMIT, SUPERVISOR], name=_STATES),
         rrb.Tabs(
@@ -62,14 +69,14 @@ def _event_columns() -> rrb.TextLogColumns:
     )
 
 
-def time_plot(name: str, title: str) -> rrb.TimeSeriesView:
-    """Return one set of axes: its time moves with that of all others, its legend covers the time on the ground."""
-    return rrb.TimeSeriesView(
-        origin=f"{PLOTS}/{name}",
-        name=title,
-        plot_legend=rrb.PlotLegend("LeftTop"),
-        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
-    )
+def time_plot(name: str, title: str, span: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
+    """Return one set of axes over `span`, s, or over what it holds; its legend covers the time on the ground."""
+    axis = None
+    if span is not None and all(map(math.isfinite, span)):
+        begin, end = (rrb.TimeRangeBoundary.absolute(seconds=moment) for moment in span)
+        axis = rrb.TimeAxis(view_range=rr.TimeRange(begin, end))
+    legend = rrb.PlotLegend("LeftTop")
+    return rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=title, plot_legend=legend, axis_x=axis)
 
 
 def _room(header: RecordHeader) -> rrb.Spatial3DView:

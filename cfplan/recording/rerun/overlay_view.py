@@ -60,7 +60,10 @@ def blueprint(trials: Sequence[Trial]) -> rrb.Blueprint:
     names = {"speed": "Speed, m/s", **{axis: f"{axis}, m" for axis in _AXES}}
     if references(trials):
         names = {"deviation": "Deviation, m", **names}
-    plots = [time_plot(name, title) for name, title in names.items()]
+    seen = [trial.time[np.isfinite(trial.position).all(axis=1)] for trial in trials]
+    moments = np.concatenate([*seen, np.zeros(1)])
+    span = (float(moments.min()), float(moments.max()))
+    plots = [time_plot(name, title, span) for name, title in names.items()]
     return rrb.Blueprint(
         rrb.Horizontal(_room(trials), rrb.Vertical(*plots), column_shares=[6, 5]),
         rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="paused"),

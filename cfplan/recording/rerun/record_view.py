@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cfplan.flight.telemetry import Level
@@ -44,12 +45,17 @@ LEVEL_NAMES = {Level.INFO: "INFO", Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 
 def write_rrd(record: Record, file: Path, *, overwrite: bool = False) -> None:
     """Write the recording with its blueprint; whole or not at all. Raises InputError where the file cannot be."""
-    save(file, layout.blueprint(record.header), partial(log_record, record=record), overwrite=overwrite)
+    save(
+        file,
+        _blueprint(record),
+        partial(log_record, record=record),
+        overwrite=overwrite,
+    )
 
 
 def show(record: Record) -> None:
     """Open the viewer on the recording; it outlives this command. Raises InputError where there is no screen."""
-    open_viewer(layout.blueprint(record.header), partial(log_record, record=record))
+    open_viewer(_blueprint(record), partial(log_record, record=record))
 
 
 def picture(record: Record, file: Path, *, moment: float | None = None, overwrite: bool = False) -> tuple[str, ...]:
@@ -61,7 +67,11 @@ def picture(record: Record, file: Path, *, moment: float | None = None, overwrit
     middle = (begin + end) / 2 - record.start if np.isfinite(begin) else record.duration / 2
     draw = partial(log_record, record=record)
     at = middle if moment is None else moment
-    return write_png(file, layout.blueprint(record.header), draw, at, overwrite=overwrite)
+    return write_png(file, _blueprint(record), draw, at, overwrite=overwrite)
+
+
+def _blueprint(record: Record) -> rrb.Blueprint:
+    return layout.blueprint(record.header, span=(0.0, record.duration))
 
 
 def log_record(stream: rr.RecordingStream, record: Record) -> None:
