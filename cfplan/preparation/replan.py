@@ -22,7 +22,7 @@ from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, min_snap
 from cfplan.planning.continuation import continue_plan
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
-from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT
+from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.glitches import glitch_at_every_setpoint
@@ -205,6 +205,11 @@ def _certified(
         lost = link_loss_at_every_setpoint(encoded.payloads, limits, starts=starts)
         if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
             raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
+        if not limits.link_loss.only_warn:
+            within = assess_link_loss_of_stops(encoded, limits, lost, margin=0.0)
+            if not within.passed:
+                what = f"{within.what} from {within.time[within.worst]:.2f} s on {within.describe(within.worst)}"
+                raise EndsBadlyError(what, where="link loss", hint=OUTSIDE_HINT)
         return lost.snapshots
 
     def meet_gaps() -> None:

@@ -16,6 +16,7 @@ from cfplan.flight.pilot.proposals import HeldProposals
 from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal, checksum_of
 from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.stops import DURATION
 from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent, Telemetry
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
@@ -201,7 +202,7 @@ def test_an_order_to_land_counts_for_what_is_committed_then(held, mission, limit
 
     flight = fly_stepped(mission, react, more_orders=more, proposals=planner.proposals)
     assert flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
-    stopped = planner.held.flown.at(np.array([2.0 + 0.8 * 0.5])).position[0]
+    stopped = planner.held.flown.at(2.0 + 0.5 * DURATION).position  # as far as the flight goes in half the time
     np.testing.assert_allclose(flight.truth.position[-1, :2], stopped[:2], atol=0.15)
     assert limits.space.beyond(flight.truth.position)[:, :2].max() < 0.0
 
