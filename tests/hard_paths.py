@@ -14,6 +14,7 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
+from cfplan.geometry import path_families
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
@@ -47,7 +48,10 @@ class HardPath:
     def path(self) -> Path:
         ((kind, given),) = self.shape.items()
         if kind == "dataset":
-            spec = DatasetSpec(count=given["count"], seed=given["seed"], limits=self.limit_set, yaw=YawMode.FREE)
+            spec = DatasetSpec(
+                count=given["count"], seed=given["seed"], limits=self.limit_set, families=(), boxes=path_families.BOXES,
+                yaw=YawMode.FREE,
+            )  # fmt: skip
             return row_path(spec, given["row"])
         return min_snap(_POINTS[kind](given))
 

@@ -24,9 +24,9 @@ def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **plannin
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate
-        from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+        from cfplan.preparation.plan_flight import plan_flight
 
-    planned = plan_flight(path_or_plan, limits, FlightOptions(**planning), steps)
+    planned = plan_flight(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
     if as_json:
         print_json(planned.to_dict())
     else:

@@ -12,6 +12,8 @@ from cfplan.errors import InputError
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from cfplan.learning.dataset_spec import DatasetSpec
+
 
 @click.group(short_help="Labelled paths for training.")
 def dataset() -> None:
@@ -42,23 +44,27 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
     return bounds
 
 
-@dataset.command(epilog="Example: cfplan dataset make datasets/hardware --count 10000 --limits hardware --workers 2")
+@dataset.command(epilog="Example: cfplan dataset make datasets/any --count 50000 --workers 2")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--count", type=int, required=True, help="Clean paths.")
-@click.option("--limits", required=True, help="Limit set: hardware (2 m/s) or simulation (5 m/s).")
+@click.option(
+    "--limits",
+    default="drawn",
+    show_default=True,
+    help="Limits and vehicle: drawn for each path, or a set, hardware (2 m/s) or simulation (5 m/s).",
+)
+@click.option("--safety", type=click.Path(path_type=Path), help="Vehicle and plan limits of this safety.yaml instead.")
 @click.option("--seed", type=int, default=0, show_default=True)
 @click.option(
     "--box",
     "boxes",
     callback=_boxes,
     multiple=True,
-    default=("10x10x10", "4.5x8x2"),
-    show_default=True,
-    help="Where waypoints are drawn, m; of several, paths take one each in turn.",
+    help="Draw waypoints in a box of these sides, m, as 4.5x8x2, instead of paths of all families; several take turns.",
 )
 @click.option("--waypoints", callback=_range, default="3-6", show_default=True, help="Least and most a path.")
 @click.option("--nodes", type=int, default=100, show_default=True, help="Grid intervals.")
-@click.option("--yaw", type=click.Choice(["fixed", "tangent", "free"]), default="free", show_default=True)
+@click.option("--yaw", type=click.Choice(["any", "fixed", "tangent", "free"]), default="any", show_default=True)
 @click.option("--epsilon", type=float, default=0.0, help="Perturb copies by at most this at every node, m.")
 @click.option("--copies", type=int, default=0, help="Perturbed copies of each path.")
 @click.option(
@@ -76,15 +82,9 @@ def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **wha
 
     The same options give the same rows with any number of workers; solves that fail are rows with a reason.
     """
-    from cfplan.geometry.yaw import YawMode
     from cfplan.learning.dataset import make_dataset
-    from cfplan.learning.dataset_spec import DatasetSpec, Relabel
-    from cfplan.safety.limit_sets import LIMIT_SETS
 
-    if what["limits"] not in LIMIT_SETS:
-        raise InputError(f"no limit set {what['limits']!r}", where="--limits", hint=f"one of {', '.join(LIMIT_SETS)}")
-    spec = DatasetSpec(**what | {"yaw": YawMode(what["yaw"]), "relabel": Relabel(what["relabel"])})
-
+    spec = _spec(what)
     with _progress(as_json) as progress:
         task = progress.add_task("labelling", total=spec.rows)
         make_dataset(
@@ -98,6 +98,32 @@ def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **wha
         print_json({"folder": str(folder), "rows": spec.rows})
     else:
         click.echo(f"{spec.rows} rows in {folder}; look at them with: cfplan dataset info {folder}")
+
+
+def _spec(what: dict[str, Any]) -> "DatasetSpec":
+    """Return the spec that the options make."""
+    from cfplan.geometry.path_families import USUAL
+    from cfplan.geometry.yaw import YawMode
+    from cfplan.learning.dataset_spec import DRAWN, GIVEN, DatasetSpec, Relabel
+    from cfplan.safety.limit_sets import LIMIT_SETS
+    from cfplan.safety.limits_file import load_limits
+
+    file, limits, yaw = what.pop("safety"), what["limits"], what["yaw"]
+    if limits not in (DRAWN, *LIMIT_SETS):
+        known = ", ".join((DRAWN, *LIMIT_SETS))
+        raise InputError(f"no limit set {limits!r}", where="--limits", hint=f"one of {known}; or --safety FILE")
+    if file is not None and limits != DRAWN:
+        raise InputError("limits are given twice", where="--safety", hint="leave --limits out")
+    given = {}
+    if file is not None:
+        read = load_limits(file)
+        given = {"limits": GIVEN, "airframe": read.airframe, "plan": read.plan}
+    return DatasetSpec(
+        **what | given | {
+            "families": () if what["boxes"] else USUAL, "yaw": None if yaw == "any" else YawMode(yaw),
+            "relabel": Relabel(what["relabel"]),
+        },
+    )  # fmt: skip
 
 
 def _progress(as_json: bool) -> "Progress":

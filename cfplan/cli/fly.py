@@ -79,9 +79,10 @@ def fly(
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
             from cfplan.cli.warm_up import compiling_paused
-            from cfplan.preparation.plan_flight import FlightOptions
             from cfplan.preparation.prepare_flight import prepare_flight
-        prepared = prepare_flight(path_or_plan, limits, FlightOptions(**planning), steps)
+        prepared = prepare_flight(
+            path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps
+        )
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             click.echo("not flown", err=True)
             return int(ExitCode.ENDED_BY_OPERATOR)

@@ -5,7 +5,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +15,7 @@ from cfplan.errors import InputError
 if TYPE_CHECKING:
     from cfplan.cli.output import Steps
     from cfplan.preparation.compiled_calls import Stage
+    from cfplan.preparation.plan_flight import FlightOptions
     from cfplan.safety.limits import Limits
 
 SAFETY_FILE = "safety.yaml"
@@ -43,6 +44,11 @@ def planning(command: Callable) -> Callable:
                 default="auto",
                 show_default=True,
                 help="auto, learned, expert, toppquad, convex or minsnap.",
+            ),
+            click.option(
+                "--model",
+                type=click.Path(path_type=Path),
+                help="Folder of the learned planner's model; else models/ beside the limits is looked into.",
             ),
             click.option("--nodes", type=click.IntRange(4), help="Grid intervals; else chosen from the path's length."),
             click.option(
@@ -103,6 +109,19 @@ def check_records_folder(root: Path) -> None:
             where=str(root),
             hint="name a folder that can be written with --records",
         ) from error
+
+
+def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path, **more: Any) -> "FlightOptions":
+    """Return the options of planning() with the folders to look for models in. Raises InputError: no such model."""
+    from cfplan.preparation.plan_flight import FlightOptions
+
+    rest = {name: value for name, value in planning.items() if name != "model"}
+    model: Path | None = planning["model"]
+    if model is not None and not model.is_dir():
+        raise InputError("no such folder", where=str(model), hint="name the folder of a model, see `cfplan train`")
+    beside = find_safety_file(given, path_file).resolve().parent / "models"
+    found = model or (beside if any(beside.glob("*/card.json")) else None)
+    return FlightOptions(**rest, **more, models=() if found is None else (found,))
 
 
 def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compile_to: "Stage | None" = None) -> "Limits":

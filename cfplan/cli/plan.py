@@ -29,9 +29,10 @@ def plan(
     limits = options.read_limits(safety_file, path_file, steps, compile_to=Stage.PLAN)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate
-        from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+        from cfplan.preparation.plan_flight import plan_flight
 
-    planned = plan_flight(path_file, limits, FlightOptions(**planning, only_shown=output is None), steps)
+    flight = options.flight_options(planning, safety_file, path_file, only_shown=output is None)
+    planned = plan_flight(path_file, limits, flight, steps)
     if output is not None:
         from cfplan.planning.plan_file import save_plan
 

@@ -20,10 +20,10 @@ def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning:
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
     with steps.waiting("loading planners and simulator"):
-        from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+        from cfplan.preparation.plan_flight import plan_flight
         from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, rehearse
 
-    planned = plan_flight(path_or_plan, limits, FlightOptions(**planning), steps)
+    planned = plan_flight(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
     encoded = encode_flight(planned, steps)
     rehearsed = rehearse(planned, encoded, steps)
     lost = find_link_loss(encoded, limits, steps, planned.link_loss)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Bidirectional LSTM, or the paper's encoder-decoder with attention.",
 )
-@click.option("--hidden", type=int, default=32, show_default=True, help="Size of each LSTM, in each direction.")
+@click.option("--hidden", type=int, default=40, show_default=True, help="Size of each LSTM, in each direction.")
 @click.option("--layers", type=int, default=2, show_default=True)
 @click.option("--window", type=int, default=64, show_default=True, help="Intervals that the network sees at once.")
 @click.option("--epochs", type=int, default=40, show_default=True)

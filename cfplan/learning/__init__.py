@@ -1,3 +1,13 @@
 """The learned planner: features, datasets, networks, training, model files and chaining."""
 
-__all__ = ["checkpoints", "dataset", "dataset_spec", "features", "learned", "model_files", "networks", "training"]
+__all__ = [
+    "checkpoints",
+    "dataset",
+    "dataset_spec",
+    "draws",
+    "features",
+    "learned",
+    "model_files",
+    "networks",
+    "training",
+]

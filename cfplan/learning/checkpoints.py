@@ -57,6 +57,8 @@ def resume(
 ) -> list[Epoch]:
     """Load the folder's checkpoint into network and optimiser, if there is one; return its log.
 
+    The number of epochs may be another: the learning rate then falls towards the new end.
+
     Raises:
         InputError: a damaged checkpoint, or that of another training.
     """
@@ -70,7 +72,7 @@ def resume(
             f"{name} {there[part].get(name)} there, {value} here"
             for part in ("options", "data")
             for name, value in identity[part].items()
-            if there[part].get(name) != value
+            if there[part].get(name) != value and name != "epochs"
         ]
         if different or there["features"] != identity["features"]:
             raise InputError(

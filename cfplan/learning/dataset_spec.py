@@ -10,9 +10,14 @@ from pathlib import Path
 
 from cfplan import __version__
 from cfplan.errors import InputError
+from cfplan.geometry.path_families import USUAL, Family
 from cfplan.geometry.yaw import YawMode
+from cfplan.safety.limit_sets import LIMIT_SETS, LimitSet
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import Airframe
 
 SPEC_FILE = "dataset.json"
+DRAWN, GIVEN = "drawn", "given"  # limits that are no set by name
 _MOST = 10_000_000  # paths, copies of one, rows of a shard
 _MOST_WAYPOINTS, _MOST_NODES = 1000, 100_000
 _REMEDY = "give another folder, or make the dataset again"
@@ -31,12 +36,16 @@ class DatasetSpec:
 
     count: int  # clean paths
     seed: int
-    limits: str  # name of a limit set, which names its vehicle too
-    boxes: tuple[tuple[float, float, float], ...] = ((10.0, 10.0, 10.0), (4.5, 8.0, 2.0))
-    """Sides, m, of where waypoints are drawn; paths take the boxes in turn."""
+    limits: str = DRAWN
+    """A limit set by name; `drawn`: limits and vehicle are drawn for each path; `given`: `airframe` and `plan`."""
+    airframe: Airframe | None = None
+    plan: PlanLimits | None = None
+    families: tuple[Family, ...] = USUAL  # that paths take in turn; with boxes, none
+    boxes: tuple[tuple[float, float, float], ...] = ()
+    """Sides, m, of where waypoints are drawn; paths take the boxes in turn, instead of families."""
     waypoints: tuple[int, int] = (3, 6)  # least and most
     nodes: int = 100  # grid intervals
-    yaw: YawMode = YawMode.FREE
+    yaw: YawMode | None = None  # None: drawn for each path
     epsilon: float = 0.0  # m, perturbation of the copies at each node
     copies: int = 0  # perturbed, of each path
     relabel: Relabel = Relabel.SOLVE
@@ -48,7 +57,10 @@ class DatasetSpec:
         wrong = [
             ("count", not 1 <= self.count <= _MOST, f"from 1 to {_MOST}"),
             ("seed", self.seed < 0, "at least 0"),
-            ("boxes", not self.boxes or not all(_is_box(box) for box in self.boxes), "of three lengths in m each"),
+            ("limits", self.limits not in (*LIMIT_SETS, DRAWN, GIVEN), f"one of {', '.join((*LIMIT_SETS, DRAWN))}"),
+            ("plan", (self.limits == GIVEN) != (None not in (self.plan, self.airframe)), "there with given limits"),
+            ("boxes", not all(_is_box(box) for box in self.boxes), "of three lengths in m each"),
+            ("families", bool(self.families) == bool(self.boxes), "there unless boxes are"),
             ("waypoints", not 2 <= low <= high <= _MOST_WAYPOINTS, f"2 to {_MOST_WAYPOINTS}, least first"),
             ("nodes", not 4 <= self.nodes <= _MOST_NODES, f"from 4 to {_MOST_NODES}"),
             ("copies", not 0 <= self.copies <= _MOST, f"from 0 to {_MOST}"),
@@ -63,6 +75,13 @@ class DatasetSpec:
                     where="dataset",
                     hint="see `cfplan dataset make --help`",
                 )
+
+    @property
+    def limit_set(self) -> LimitSet | None:
+        """Return the vehicle and the limits of all rows; None where they are drawn."""
+        if self.airframe is not None and self.plan is not None:
+            return LimitSet(GIVEN, self.airframe, self.plan)
+        return LIMIT_SETS.get(self.limits)
 
     @property
     def rows(self) -> int:

@@ -30,7 +30,7 @@ class Network(Protocol):
     """A network ready to answer."""
 
     def __call__(self, inputs: NDArray) -> NDArray:
-        """Map (W+1, INPUTS) float32 to (W+1, OUTPUTS) float32."""
+        """Map B windows at once, (B, W+1, INPUTS) float32, to (B, W+1, OUTPUTS) float32."""
 
 
 class Layer:
@@ -47,11 +47,13 @@ class Layer:
         )
 
     def __call__(self, inputs: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Map (T, I) to (T, directions · H); return also the last hidden and cell states, (directions, H)."""
+        """Map (B, T, I) to (B, T, directions · H); return also the last hidden and cell states, (directions, B, H)."""
         directions, hidden = self.recurrent.shape[:2]
-        out = np.empty((len(inputs), directions * hidden), np.float32)
-        h, c = np.zeros((directions, hidden), np.float32), np.zeros((directions, hidden), np.float32)
-        _run(out, inputs @ self.inward + self.bias, self.recurrent, h, c)
+        batch, steps = inputs.shape[:2]
+        out = np.empty((batch, steps, directions * hidden), np.float32)
+        h, c = np.zeros((2, directions, batch, hidden), np.float32)
+        projected = inputs.reshape(batch * steps, -1) @ self.inward + self.bias
+        _run(out, projected.reshape(batch, steps, -1), self.recurrent, h, c)
         return out, h, c
 
 
@@ -88,20 +90,20 @@ class CompiledEncoderDecoder:
         for layer in self.encoder:
             memory, h, c = layer(memory)
             states.append((h, c))
-        answer = np.zeros((1, len(self.bias)), np.float32)
-        out = np.empty((len(inputs), len(self.bias)), np.float32)
-        step = np.empty((1, memory.shape[1]), np.float32)
-        scale = np.float32(memory.shape[1] ** -0.5)
-        for n in range(len(inputs)):
+        batch, steps, hidden = memory.shape
+        answer = np.zeros((batch, 1, len(self.bias)), np.float32)
+        out = np.empty((batch, steps, len(self.bias)), np.float32)
+        step = np.empty((batch, 1, hidden), np.float32)
+        for n in range(steps):
             values = answer
             for layer, (h, c) in zip(self.decoder, states, strict=True):
                 _run(step, values @ layer.inward + layer.bias, layer.recurrent, h, c)
                 values = step.copy()
-            weights = memory @ (values[0] * scale)
-            weights = np.exp(weights - weights.max())
-            context = (weights / weights.sum()) @ memory
-            answer = np.concatenate([values[0], context])[None] @ self.head + self.bias
-            out[n] = answer[0]
+            weights = memory @ (values * np.float32(hidden**-0.5)).transpose(0, 2, 1)  # (B, T, 1)
+            weights = np.exp(weights - weights.max(axis=1, keepdims=True))
+            context = (weights / weights.sum(axis=1, keepdims=True)).transpose(0, 2, 1) @ memory
+            answer = np.concatenate([values, context], axis=2) @ self.head + self.bias
+            out[:, n] = answer[:, 0]
         return out
 
 
@@ -130,52 +132,59 @@ def _tanh(x: np.float32) -> np.float32:
     return above / (_B0 + y * (_B2 + y * (_B4 + y * _B6)))
 
 
+@njit(fastmath=True, error_model="numpy")
+def _add_recurrent(gates: NDArray, projected: NDArray, h: NDArray, weights: NDArray) -> None:
+    """Write projected + h @ weights to the gates, (4H,): eight rows of the weights, (H, 4H), at once."""
+    hidden = len(h)
+    for k in range(4 * hidden):
+        gates[k] = projected[k]
+    whole = hidden - hidden % 8
+    for j in range(0, whole, 8):
+        h0, h1, h2, h3, h4, h5, h6, h7 = h[j], h[j + 1], h[j + 2], h[j + 3], h[j + 4], h[j + 5], h[j + 6], h[j + 7]
+        w0, w1, w2, w3 = weights[j], weights[j + 1], weights[j + 2], weights[j + 3]
+        w4, w5, w6, w7 = weights[j + 4], weights[j + 5], weights[j + 6], weights[j + 7]
+        for k in range(4 * hidden):
+            gates[k] += (h0 * w0[k] + h1 * w1[k] + h2 * w2[k] + h3 * w3[k]) + (
+                h4 * w4[k] + h5 * w5[k] + h6 * w6[k] + h7 * w7[k]
+            )
+    for j in range(whole, hidden):
+        for k in range(4 * hidden):
+            gates[k] += h[j] * weights[j, k]
+
+
 def _run_interpreted(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, cell: NDArray) -> None:
-    steps, hidden = out.shape[0], last.shape[1]
+    steps, hidden = out.shape[1], last.shape[2]
     for direction, weights in enumerate(recurrent):
         h, c, column = last[direction], cell[direction], direction * hidden
         for t in range(steps) if direction == 0 else range(steps - 1, -1, -1):
-            gates = projected[t, 4 * column : 4 * (column + hidden)] + h @ weights
-            let_in, keep, _, let_out = (_HALF + _HALF * np.tanh(_HALF * gates)).reshape(4, hidden)
-            c[:] = keep * c + let_in * np.tanh(gates[2 * hidden : 3 * hidden])
+            gates = projected[:, t, 4 * column : 4 * (column + hidden)] + h @ weights
+            let_in, keep, _, let_out = (_HALF + _HALF * np.tanh(_HALF * gates)).reshape(-1, 4, hidden).swapaxes(0, 1)
+            c[:] = keep * c + let_in * np.tanh(gates[:, 2 * hidden : 3 * hidden])
             h[:] = let_out * np.tanh(c)
-            out[t, column : column + hidden] = h
+            out[:, t, column : column + hidden] = h
 
 
 @njit(interpreted=_run_interpreted, fastmath=True, error_model="numpy")
 def _run(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, cell: NDArray) -> None:
     """Run an LSTM layer over all steps; gates in torch's order: input, forget, cell, output."""
-    steps, hidden = out.shape[0], last.shape[1]
+    batch, steps, hidden = out.shape[0], out.shape[1], last.shape[2]
     gates = np.empty(4 * hidden, np.float32)
     for direction in range(recurrent.shape[0]):
-        h, c, weights = last[direction], cell[direction], recurrent[direction]
+        weights = recurrent[direction]
         column = direction * hidden
-        for n in range(steps):
-            t = n if direction == 0 else steps - 1 - n
-            for k in range(4 * hidden):
-                gates[k] = projected[t, 4 * column + k]
-            whole = hidden - hidden % 8
-            for j in range(0, whole, 8):
-                h0, h1, h2, h3, h4, h5, h6, h7 = (
-                    h[j], h[j + 1], h[j + 2], h[j + 3], h[j + 4], h[j + 5], h[j + 6], h[j + 7],
-                )  # fmt: skip
-                w0, w1, w2, w3 = weights[j], weights[j + 1], weights[j + 2], weights[j + 3]
-                w4, w5, w6, w7 = weights[j + 4], weights[j + 5], weights[j + 6], weights[j + 7]
-                for k in range(4 * hidden):
-                    gates[k] += (h0 * w0[k] + h1 * w1[k] + h2 * w2[k] + h3 * w3[k]) + (
-                        h4 * w4[k] + h5 * w5[k] + h6 * w6[k] + h7 * w7[k]
-                    )
-            for j in range(whole, hidden):
-                for k in range(4 * hidden):
-                    gates[k] += h[j] * weights[j, k]
-            for k in range(hidden):
-                let_in = _HALF + _HALF * _tanh(_HALF * gates[k])
-                keep = _HALF + _HALF * _tanh(_HALF * gates[hidden + k])
-                value = keep * c[k] + let_in * _tanh(gates[2 * hidden + k])
-                c[k] = value
-                h[k] = (_HALF + _HALF * _tanh(_HALF * gates[3 * hidden + k])) * _tanh(value)
-            for k in range(hidden):
-                out[t, column + k] = h[k]
+        for b in range(batch):
+            h, c = last[direction, b], cell[direction, b]
+            for n in range(steps):
+                t = n if direction == 0 else steps - 1 - n
+                _add_recurrent(gates, projected[b, t, 4 * column : 4 * (column + hidden)], h, weights)
+                for k in range(hidden):
+                    let_in = _HALF + _HALF * _tanh(_HALF * gates[k])
+                    keep = _HALF + _HALF * _tanh(_HALF * gates[hidden + k])
+                    value = keep * c[k] + let_in * _tanh(gates[2 * hidden + k])
+                    c[k] = value
+                    h[k] = (_HALF + _HALF * _tanh(_HALF * gates[3 * hidden + k])) * _tanh(value)
+                for k in range(hidden):
+                    out[b, t, column + k] = h[k]
 
 
 def tensor_shapes(architecture: str, hidden: int, layers: int) -> dict[str, tuple[int, ...]]:

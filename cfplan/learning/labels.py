@@ -1,6 +1,7 @@
 """Label a row of a dataset: a path from its seed, and the expert's solution."""
 
-from dataclasses import asdict
+import math
+from dataclasses import asdict, fields
 from functools import lru_cache
 from typing import Any
 
@@ -10,28 +11,46 @@ import pyarrow as pa
 from cfplan.errors import CfplanError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
-from cfplan.geometry.random_paths import perturbed, random_waypoints
+from cfplan.geometry.path_families import Family, family_path
+from cfplan.geometry.random_paths import generator, perturbed, random_waypoints
+from cfplan.geometry.yaw import YawMode
 from cfplan.learning.dataset_spec import DatasetSpec, Relabel
+from cfplan.learning.draws import draw_limit_set
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
-from cfplan.safety.limit_sets import LIMIT_SETS
+from cfplan.safety.limit_sets import LimitSet
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
+from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
+_LIMITS = 1  # stream of random numbers of limits, vehicles and yaw
 ACTIVE_SHARE = 0.98  # of a limit, from which it counts as active
 
 _NUMBERS = pa.list_(pa.float64())
+_TYPES = {
+    str(float): pa.float64(),
+    str(str): pa.string(),
+}  # of an airframe's and of limits' fields; the rest are several numbers
+
+
+def _fields_of(kind: Any) -> pa.DataType:
+    return pa.struct([(field.name, _TYPES.get(str(field.type), _NUMBERS)) for field in fields(kind)])
+
+
 SCHEMA = pa.schema(
     [
         ("row", pa.int64()),
         ("path", pa.int64()),  # number of the clean path
         ("copy", pa.int32()),  # 0 the clean path, then its perturbed copies
         ("seed", pa.int64()),
-        ("vehicle", pa.string()),
-        ("limits", pa.string()),  # the set's name; its numbers are in the file's metadata
+        ("family", pa.string()),  # of the path; "box" in one of the spec's boxes
+        ("airframe", _fields_of(Airframe)),
+        ("limits", _fields_of(PlanLimits)),
+        ("yaw_mode", pa.string()),
+        ("yaw_angle", pa.float64()),  # rad
         ("version", pa.string()),  # of cfplan
         ("breaks", _NUMBERS),  # (M+1,)
         ("coefficients", _NUMBERS),  # (M, D, 3), rows first
@@ -64,16 +83,31 @@ def make_rows(spec: DatasetSpec, rows: range) -> tuple[pa.Table, pa.Table]:
     Only `spec` and its number decide a row, so that any worker makes the same.
     """
     labelled = [_row(spec, row) for row in rows]
-    metadata = {"cfplan.limits": repr(asdict(LIMIT_SETS[spec.limits].limits)), "cfplan.version": spec.version}
-    table = pa.Table.from_pylist([row for row, _ in labelled], schema=SCHEMA.with_metadata(metadata))
+    table = pa.Table.from_pylist([row for row, _ in labelled], schema=SCHEMA)
     timing = [{"row": row["row"], "solve_seconds": seconds} for row, seconds in labelled]
     return table, pa.Table.from_pylist(timing, schema=TIMING_SCHEMA)
 
 
 def clean_path(spec: DatasetSpec, number: int) -> Path:
     """Return the path of that number, from the dataset's seed."""
+    if not spec.boxes:
+        return family_path(_family(spec, number), _seed(spec, number, 0))
     half = np.array(spec.boxes[number % len(spec.boxes)]) / 2
     return min_snap(random_waypoints(_seed(spec, number, 0), np.array([-half, half]), spec.waypoints))
+
+
+def row_limits(spec: DatasetSpec, number: int) -> tuple[LimitSet, YawMode, float]:
+    """Return the vehicle and limits, the yaw mode and its angle, rad, with which the path of that number is planned."""
+    random = generator(np.random.SeedSequence(spec.seed, spawn_key=(number, 0, _LIMITS)))
+    chosen = spec.limit_set or draw_limit_set(random)
+    if spec.yaw is not None:
+        return chosen, spec.yaw, 0.0
+    mode = random.choice(np.array([YawMode.FIXED, YawMode.TANGENT, YawMode.FREE]))
+    return chosen, YawMode(str(mode)), random.uniform(-math.pi, math.pi)
+
+
+def _family(spec: DatasetSpec, number: int) -> Family:
+    return spec.families[number % len(spec.families)]
 
 
 def row_path(spec: DatasetSpec, row: int) -> Path:
@@ -89,10 +123,12 @@ def _seed(spec: DatasetSpec, number: int, copy: int) -> np.random.SeedSequence:
 
 def _row(spec: DatasetSpec, row: int) -> tuple[dict[str, Any], float]:
     number, copy = divmod(row, 1 + spec.copies)
-    chosen = LIMIT_SETS[spec.limits]
+    chosen, mode, angle = row_limits(spec, number)
     content: dict[str, Any] = {
-        "row": row, "path": number, "copy": copy, "seed": spec.seed, "vehicle": chosen.airframe.name,
-        "limits": chosen.name, "version": spec.version, "nodes": spec.nodes,
+        "row": row, "path": number, "copy": copy, "seed": spec.seed,
+        "family": "box" if spec.boxes else _family(spec, number).value, "airframe": asdict(chosen.airframe),
+        "limits": asdict(chosen.limits), "yaw_mode": mode.value, "yaw_angle": angle, "version": spec.version,
+        "nodes": spec.nodes,
     }  # fmt: skip
     try:
         path = row_path(spec, row)
@@ -100,8 +136,8 @@ def _row(spec: DatasetSpec, row: int) -> tuple[dict[str, Any], float]:
         content |= {"breaks": path.breaks, "coefficients": path.coefficients.ravel()}
         content |= {"length": path.length, "end": path.end}
         kept = copy > 0 and spec.relabel is Relabel.KEEP
-        solution = _clean_solution(spec, number) if kept else _solve(spec, path)
-        content |= _label(path, solution, chosen.name)
+        solution = _clean_solution(spec, number) if kept else _solve(spec, number, path)
+        content |= _label(path, solution, chosen)
         seconds = float(solution.stats.get("solve_seconds", np.nan))
     except CfplanError as error:
         content |= {"status": "PATH", "reason": str(error)}
@@ -109,18 +145,18 @@ def _row(spec: DatasetSpec, row: int) -> tuple[dict[str, Any], float]:
     return {name: content.get(name) for name in SCHEMA.names}, seconds
 
 
-def _solve(spec: DatasetSpec, path: Path) -> Solution:
-    chosen = LIMIT_SETS[spec.limits]
-    return plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes=spec.nodes, yaw=spec.yaw))
+def _solve(spec: DatasetSpec, number: int, path: Path) -> Solution:
+    chosen, mode, angle = row_limits(spec, number)
+    return plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes=spec.nodes, yaw=mode, yaw_angle=angle))
 
 
 @lru_cache(maxsize=1)
 def _clean_solution(spec: DatasetSpec, number: int) -> Solution:
     """Return the clean path's label, cached for its copies, which are the next rows."""
-    return _solve(spec, clean_path(spec, number))
+    return _solve(spec, number, clean_path(spec, number))
 
 
-def _label(path: Path, solution: Solution, limits: str) -> dict[str, Any]:
+def _label(path: Path, solution: Solution, chosen: LimitSet) -> dict[str, Any]:
     profile = solution.profile
     label = {
         "status": solution.status.name,
@@ -130,7 +166,6 @@ def _label(path: Path, solution: Solution, limits: str) -> dict[str, Any]:
     }
     if solution.status is not Status.SOLVED or profile is None:
         return label
-    chosen = LIMIT_SETS[limits]
     trajectory = Trajectory(path, profile, chosen.airframe)
     certificate = certify(trajectory, chosen.limits)
     label |= {name: getattr(profile, name) for name in ("h", "dh", "ddh", "dddh", "yaw", "dyaw", "ddyaw")}

@@ -1,14 +1,15 @@
-"""The learned planner: a chain of windows over a path of any length, each in a millisecond.
+"""The learned planner: all windows of a path of any length at once, through one network for any limits and vehicle.
 
-The network answers for a window; its answers are smoothed into coefficients of the spline of h (smooth.py) and the
-first part of them is kept. The next window begins there, from the boundary state that the kept coefficients make, so
-that h, h' and h'' are continuous by construction. Each window costs the same, and only the result grows with the path.
+The network answers for windows that overlap; its answers are joined and smoothed into coefficients of the spline of h
+(smooth.py). Time and memory grow linearly with the path.
 
-The profile is the network's guess and keeps no limit for sure: repair and certificate make it a flight.
+The profile is the network's proposal and keeps no limit for sure: repair and certificate make it a flight.
 """
 
+import math
 import time
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,70 +18,83 @@ from cfplan.errors import InputError
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.features import (
+    INPUTS,
     LEAST_SHARE,
     REFERENCE,
-    Bounds,
-    bounds,
-    fill_yaw,
+    ScaledLimits,
+    fill_inputs,
     node_features,
     rests,
+    scaled_limits,
     start_coefficients,
     start_features,
     start_logs,
-    window_inputs,
 )
 from cfplan.learning.inference import Network
 from cfplan.learning.model_files import Model, find_model
 from cfplan.learning.smooth import Begin, smoothed
-from cfplan.learning.windows import chain, kept_intervals
+from cfplan.learning.windows import overlapped, shares, window_starts
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.profile import BoundaryState
-from cfplan.vehicle.profile_spline import spline_profile
+from cfplan.vehicle.profile_spline import coefficients_of, spline_profile
 from cfplan.vehicle.yaw_spline import YawSpline
 
 LEAST_NODES = 10
+SPACING = 0.2  # m between the nodes that the network is asked for: about what it was trained on
 BLEND_INTERVALS = 3.0  # over which the profile blends into a state given for the end
-LOWERING_WIDTH = 2.0  # nodes, over which lowering for tighter limits is smoothed
+
+
+class ProposedProfile(NamedTuple):
+    """What a network proposes for a path."""
+
+    coefficients: NDArray  # (N+3,) of the spline of h; not finite where the network fails
+    yaw: NDArray  # (N+1,) rad at the nodes: the track's where there is one
+
+
+class Question(NamedTuple):
+    """A path as a network is asked about it."""
+
+    path: Path
+    known: ScaledLimits
+    nodes: int  # intervals, at least the network's window
+    start: BoundaryState | None = None
+    end: BoundaryState | None = None
+    track: YawSpline | None = None  # None: yaw is the network's to choose
+    yaw_angle: float = 0.0  # rad, where it begins then
+
+
+class _Windows(NamedTuple):
+    """The windows of one path."""
+
+    inputs: NDArray  # (B, W+1, INPUTS)
+    starts: NDArray  # (B,)
+    reference: NDArray  # (N+1,) log rates, in units of time
 
 
 def plan_learned(task: PlanningTask, *, model: Model | None = None) -> Solution:
     """Plan by the network over the task's intervals, or over one window's where those are more.
 
-    Where limits are looser than the model's, the model's are kept; where they are tighter, the profile is lowered to
-    about what they allow, and repair does the rest.
+    On a finer grid than the network needs it is asked on a coarser one, and its answer laid over the grid.
 
     Raises:
-        InputError: fewer than ten nodes, or than the path needs, or no model for this vehicle and these limits.
+        InputError: fewer than ten nodes, or than the path needs, or no model.
     """
     began = time.perf_counter()
     if task.nodes < LEAST_NODES:
         raise InputError(
             f"{task.nodes} nodes; the learned planner needs {LEAST_NODES}", where="nodes", hint="100 is usual"
         )
-    path, airframe, limits = task.path, task.airframe, task.limits
-    model = model or find_model(airframe, limits)
+    model = model or find_model(task.airframe, task.limits, task.models)
     if model is None:
-        raise InputError(
-            f"no model for {airframe.name} within these limits",
-            where="models",
-            hint="train one with `cfplan train`, or take another planner",
-        )
+        raise InputError("no model", where="models", hint="train one with `cfplan train`, or take another planner")
     if task.nodes < model.window:
         task = replace(task, nodes=model.window)
     task.check_nodes()
     if task.refusal:
         return task.refusal
-    nodes, yaw, start, end = task.nodes, task.yaw, task.start, task.end
-    track = None
-    if yaw is not YawMode.FREE:
-        track = YawSpline.along(path, nodes, yaw, task.yaw_angle, start, end)
-    known, allowed = model.card.limits, model.limits_within(limits)
-    coefficients, turned = predict(
-        path, model.network, bounds(airframe, known), nodes, model.window, start=start, end=end,
-        track=track, yaw_angle=task.yaw_angle, allowed=bounds(airframe, allowed) if allowed != known else None,
-    )  # fmt: skip
-    if not (np.isfinite(coefficients).all() and np.isfinite(turned).all() and (coefficients[1:-1] > 0).all()):
+    coefficients, yaw = propose(task, model)
+    if not (np.isfinite(coefficients).all() and np.isfinite(yaw.yaw).all() and (coefficients[1:-1] > 0).all()):
         return Solution(Status.NOT_CONVERGED, None, f"the network {model.name} answered what is not a number")
     stats: dict[str, float | int | str] = {
         "solve_seconds": time.perf_counter() - began,
@@ -88,78 +102,103 @@ def plan_learned(task: PlanningTask, *, model: Model | None = None) -> Solution:
         "solver": "learned",
         "model": model.name,
     }
-    track = track or YawSpline.smoothed(turned, path.end / nodes, start, end)
-    begins = (part.first for part in chain(nodes, model.window, kept_intervals(model.window)))
-    joints = tuple(path.end / nodes * first for first in begins if first > 0)
-    return Solution(Status.SOLVED, spline_profile(coefficients, path.end, track), "", stats, joints)
+    return Solution(Status.SOLVED, spline_profile(coefficients, task.path.end, yaw), "", stats)
 
 
-def predict(
-    path: Path,
-    network: Network,
-    bound: Bounds,
-    nodes: int,
-    window: int,
-    *,
-    start: BoundaryState | None = None,
-    end: BoundaryState | None = None,
-    track: YawSpline | None = None,
-    yaw_angle: float = 0.0,
-    allowed: Bounds | None = None,
-) -> tuple[NDArray, NDArray]:
-    """Return (N+3,) coefficients of the spline of h, and (N+1,) yaw at the nodes, rad: the track's, else the network's.
+def propose(task: PlanningTask, model: Model) -> tuple[NDArray, YawSpline]:
+    """Return the (N+3,) coefficients of h that a model proposes, not finite where it fails, and yaw."""
+    path, nodes, start, end = task.path, task.nodes, task.start, task.end
+    asked = min(nodes, max(model.window, math.ceil(path.length / SPACING), len(path.breaks) - 1))
+    tracks = [
+        None if task.yaw is YawMode.FREE else YawSpline.along(path, count, task.yaw, task.yaw_angle, start, end)
+        for count in dict.fromkeys((asked, nodes))
+    ]
+    known = scaled_limits(task.airframe, task.limits)
+    question = Question(path, known, asked, start, end, tracks[0], task.yaw_angle)
+    ((coefficients, turned),) = predict([question], model.network, model.window)
+    yaw = tracks[-1]
+    if yaw is None:
+        places = np.linspace(0.0, asked, nodes + 1)
+        yaw = YawSpline.smoothed(np.interp(places, np.arange(asked + 1), turned), path.end / nodes, start, end)
+    if asked < nodes and np.isfinite(coefficients).all():
+        coefficients = _laid_over(coefficients, nodes, path, start, end)
+    return coefficients, yaw
 
-    `bound` is what the network was trained for, `allowed` is set where limits are tighter. The result is not finite
-    where the network fails. `nodes` is at least `window`.
-    """
+
+def _laid_over(
+    coefficients: NDArray, nodes: int, path: Path, start: BoundaryState | None, end: BoundaryState | None
+) -> NDArray:
+    """Return the (N+3,) coefficients of nearly the same h over more intervals; ends are kept as they are."""
+    count = len(coefficients) - 3
+    still = YawSpline(np.zeros(count + 1), np.zeros(count + 1), np.zeros(count))
     step = path.end / nodes
-    nodes_seen = node_features(path, 0.0, step, nodes + 1, bound)
+    found = spline_profile(coefficients, path.end, still).at(np.linspace(0.0, path.end, nodes + 1))
+    fine = coefficients_of(found.h, found.dh, found.ddh, step)
+    fine = np.maximum(fine, LEAST_SHARE * coefficients.min())
+    for there, state, s in ((fine, start, 0.0), (fine[::-1], end, path.end)):
+        if state is not None:
+            there[:3] = start_coefficients(state, step)[:: 1 if s == 0.0 else -1]
+        elif rests(path, s):
+            there[:4] = there[1]
+    return fine
+
+
+def predict(questions: list[Question], network: Network, window: int) -> list[ProposedProfile]:
+    """Return a proposal for each question; all windows of all of them go through the network at once."""
+    asked = [_windows(question, window) for question in questions]
+    answers = network(asked[0].inputs if len(asked) == 1 else np.concatenate([each.inputs for each in asked]))
+    ends = np.cumsum([len(each.starts) for each in asked])
+    return [
+        _proposal(question, each, answers[end - len(each.starts) : end])
+        for question, each, end in zip(questions, asked, ends, strict=True)
+    ]
+
+
+def _windows(question: Question, window: int) -> _Windows:
+    path, known, nodes, start, end, track, yaw_angle = question
+    step = path.end / nodes
+    table = node_features(path, nodes, known, track)
+    starts = window_starts(nodes, window)
+    inputs = np.empty((len(starts), window + 1, INPUTS), np.float32)
     rest_start, rest_end = start is None and rests(path, 0.0), end is None and rests(path, path.end)
-    logs = np.empty(nodes + 3)  # log √u/Δs
-    yaw = np.empty(nodes + 1) if track is None else track.yaw
-    angle, turning = (yaw_angle, 0.0) if start is None else (start.yaw, start.dyaw * step)
-    settled = np.zeros(3)
-    begin = Begin.REST if rest_start else Begin.FREE
+    first = (0.0, 0.0, 0.0)
     if start is not None:
-        begin, settled = Begin.KNOWN, np.array(start_logs(start, step))
-    for part in chain(nodes, window, kept_intervals(window)):
-        first, stop = part.first, part.first + part.keep
-        seen = nodes_seen[first : first + window + 1]
-        known = start_features(*settled) if begin is Begin.KNOWN else None
+        first = start_features(*(each + math.log(known.time) for each in start_logs(start, step)))
+    for b, place in enumerate(starts):
+        begins = b == 0
+        yaw, turning = (start.yaw, start.dyaw * step) if start and begins else (yaw_angle, 0.0)
         if track is not None:
-            angle, turning = track.yaw[first], track.dyaw[first] * step
-        answer = network(window_inputs(seen, begin is Begin.REST, part.last and rest_end, known, angle, turning))
-        rates = answer[:, 0] + seen[:, REFERENCE]
-        smooth = smoothed(rates, settled, int(begin), part.last and rest_end)
-        logs[first : first + window + 3] = smooth
-        begin, settled = Begin.KNOWN, smooth[part.keep : part.keep + 3]
-        if track is None:
-            fill_yaw(yaw[first : stop + 1], angle, answer)
-            angle, turning = yaw[stop], yaw[stop] - yaw[stop - 1]
-    if allowed is not None:
-        asked = node_features(path, 0.0, step, nodes + 1, allowed)[:, REFERENCE]
-        _lower(logs, nodes_seen[:, REFERENCE], asked, rest_start, rest_end)
+            yaw, turning = float(track.yaw[place]), float(track.dyaw[place]) * step
+        fill_inputs(
+            inputs[b], table[place : place + window + 1], begins and rest_start, b == len(starts) - 1 and rest_end,
+            begins and start is not None, first, yaw, turning, track is None, known.numbers,
+        )  # fmt: skip
+    return _Windows(inputs, starts, table[:, REFERENCE])
+
+
+def _proposal(question: Question, asked: _Windows, answers: NDArray) -> ProposedProfile:
+    path, known, nodes, start, end, track, yaw_angle = question
+    step, starts = path.end / nodes, asked.starts
+    counts = shares(starts, answers.shape[1] - 1)
+    rates = overlapped(starts, counts * answers[..., 0]) + asked.reference
+    rest_start, rest_end = start is None and rests(path, 0.0), end is None and rests(path, path.end)
+    begin, settled = Begin.REST if rest_start else Begin.FREE, np.zeros(3)
+    if start is not None:
+        begin, settled = Begin.KNOWN, np.array(start_logs(start, step)) + math.log(known.time)
+    logs = smoothed(rates, settled, int(begin), rest_end, known.smoothing)
     with np.errstate(over="ignore"):  # then they are not finite
-        coefficients = np.exp(2.0 * (logs + np.log(step)))
+        coefficients = np.exp(2.0 * (logs + math.log(step / known.time)))
     if start is not None:
         coefficients[:3] = start_coefficients(start, step)
     if end is not None:
         _blend_to(coefficients, end, step)
-    return coefficients, yaw
-
-
-def _lower(logs: NDArray, known: NDArray, asked: NDArray, rest_start: bool, rest_end: bool) -> None:
-    """Lower the profile by as much as the reference is lower, less what the profile lies under its own already."""
-    from scipy.ndimage import gaussian_filter1d  # slow to import
-
-    gap = np.maximum(known - asked - np.maximum(known - logs[1:-1], 0.0), 0.0)
-
-    gap = gaussian_filter1d(np.pad(gap, 1, mode="edge"), LOWERING_WIDTH, mode="nearest")
-    if rest_start:
-        gap[:4] = gap[:4].max()
-    if rest_end:
-        gap[-4:] = gap[-4:].max()
-    logs -= gap
+    if track is not None:
+        return ProposedProfile(coefficients, track.yaw)
+    turned = np.arctan2(answers[..., 2], answers[..., 1])
+    turns = np.diff(turned, axis=1)
+    turns -= 2.0 * math.pi * np.round(turns / (2.0 * math.pi))
+    total = np.cumsum(overlapped(starts, counts * np.pad(turns, ((0, 0), (1, 0)))))
+    return ProposedProfile(coefficients, (start.yaw if start else yaw_angle) + total - total[0])
 
 
 def _blend_to(coefficients: NDArray, end: BoundaryState, step: float) -> None:

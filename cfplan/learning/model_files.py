@@ -1,7 +1,8 @@
 """Model folders: weights.safetensors, and card.json with its provenance and what it may be used for.
 
-A card names its weights by their hash, and all that decides whether they may be used: the vehicle, the limits, the
-window, and the version of the features. A model that does not fit is an error, never a flight.
+A card names its weights by their hash, and all that decides whether they may be used: the window, the version of the
+features, and the ranges of limits and vehicles that were learned from. Outside of those a model may propose badly, and
+the plan says so; what flies is certified either way.
 """
 
 import hashlib
@@ -9,7 +10,7 @@ import json
 import math
 import sysconfig
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,15 +20,16 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InputError
 from cfplan.learning import features
+from cfplan.learning.features import LOGARITHMS, NUMBERS, ScaledLimits, scaled_limits
 from cfplan.learning.inference import NETWORKS, Network, tensor_shapes
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 
 WEIGHTS, CARD = "weights.safetensors", "card.json"
-FORMAT = 1
+FORMAT = 2
 LARGEST = 10_000  # layers, hidden numbers of each, and intervals of a window
 HEAVIEST = 1e6  # weight; trained ones are a few
-TIGHTEST = 0.5  # of a model's limit: for tighter ones repair would do more than the model
+FURTHEST = 4.0  # beyond a range, in its own widths, that counts: what is further away is as bad
 _RETRAIN = "train it again with `cfplan train`"
 _RESTORE = "restore both files from where the model came, or train it again with `cfplan train`"
 
@@ -43,8 +45,7 @@ class Card:
     window: int  # intervals
     features: int  # version of features.py
     weights_sha256: str
-    airframe: Airframe
-    limits: PlanLimits
+    ranges: dict[str, tuple[float, float]]  # of features.NUMBERS that were learned from
     data: dict[str, Any]  # the dataset's spec, and how many of its rows were learned from
     training: dict[str, Any]  # the command and its options
     scores: dict[str, float]  # on paths that were not learned from
@@ -69,21 +70,19 @@ class Model:
         """Return the intervals of a window."""
         return self.card.window
 
-    def limits_within(self, limits: PlanLimits) -> PlanLimits:
-        """Return these limits, but the model's own where its own are tighter."""
-        both = ((name, getattr(self.card.limits, name), getattr(limits, name)) for name in PlanLimits.__slots__)
-        return PlanLimits(**{name: (max if name.endswith("_min") else min)(own, other) for name, own, other in both})
-
-    def differences(self, limits: PlanLimits) -> tuple[str, ...]:
-        """Return how these limits differ from those that the model was trained with, a sentence each."""
+    def outside(self, airframe: Airframe, limits: PlanLimits) -> tuple[str, ...]:
+        """Return how vehicle and limits lie outside of what the model has learned from, a sentence each."""
+        known = scaled_limits(airframe, limits)
         sentences = []
-        for name, own in asdict(self.card.limits).items():
-            wanted = getattr(limits, name)
-            if math.isclose(own, wanted, rel_tol=1e-9):
+        for k, (name, (low, high)) in enumerate(self.card.ranges.items()):
+            here = float(known.numbers[k])
+            if low <= here <= high:
                 continue
-            tighter = wanted > own if name.endswith("_min") else wanted < own
-            meaning = "tighter: repair keeps it" if tighter else "looser: the model's own is kept"
-            sentences.append(f"{name} is {wanted:.4g}, the model {self.name} was trained with {own:.4g} ({meaning})")
+            shown = [math.exp(value) if k < LOGARITHMS else value for value in (here, low, high)]
+            sentences.append(
+                f"{name} is {shown[0]:.3g} in units of v²/g and v/g, the model {self.name} has learned from "
+                f"{shown[1]:.3g} to {shown[2]:.3g}: its proposal may be poor"
+            )
         return tuple(sentences)
 
 
@@ -132,11 +131,11 @@ def load_card(folder: Path) -> Card:
     return card
 
 
-def load_model(folder: Path, airframe: Airframe | None = None) -> Model:
+def load_model(folder: Path) -> Model:
     """Load a model and check it: the card's hash, and the names, shapes and finiteness of the weights.
 
     Raises:
-        InputError: damaged or foreign weights, a card of others, or a model for another vehicle than `airframe`.
+        InputError: damaged or foreign weights, or a card of others.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load
@@ -166,23 +165,7 @@ def load_model(folder: Path, airframe: Airframe | None = None) -> Model:
         )
     if not all(values.dtype == np.float32 and (np.abs(values) < HEAVIEST).all() for values in weights.values()):
         raise InputError(f"some weights are not finite 32-bit numbers below {HEAVIEST:g}", where=where, hint=_RESTORE)
-    if airframe is not None and (other := other_vehicle(card, airframe)):
-        raise InputError(
-            f"a model for another vehicle: {other}",
-            where=str(folder),
-            hint="train one for this vehicle, or take another planner",
-        )
     return Model(card, NETWORKS[card.architecture](weights))
-
-
-def other_vehicle(card: Card, airframe: Airframe) -> str:
-    """Return how an airframe differs from the model's; empty if it is the same."""
-    differs = [
-        f"{field.name} {getattr(card.airframe, field.name)} there, {getattr(airframe, field.name)} here"
-        for field in fields(Airframe)
-        if field.name not in ("name", "source") and getattr(card.airframe, field.name) != getattr(airframe, field.name)
-    ]
-    return f"{card.airframe.name} there, {airframe.name} here: {'; '.join(differs)}" if differs else ""
 
 
 @lru_cache(maxsize=1)
@@ -194,39 +177,42 @@ def models_folder() -> Path:
     return Path(sysconfig.get_path("data")) / "share" / "cfplan" / "models"
 
 
-def find_model(airframe: Airframe, limits: PlanLimits, folder: Path | None = None) -> Model | None:
-    """Load the model for this vehicle that is nearest to these limits.
+def find_model(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...] = ()) -> Model | None:
+    """Load the model that knows this vehicle and these limits best.
 
-    Searched is a folder, else the models that come with cfplan. None if none is for this vehicle, or if a limit is less
-    than half of the model's.
+    `folders` are folders of models, or that of a model, which is then taken; last come the models of cfplan. Taken is
+    a model in whose ranges they lie, from the first folder that has one, the one with the narrowest ranges; where there
+    is none, the nearest. None if there is no model at all.
 
     Raises:
-        InputError: a model that fits is damaged.
+        InputError: a model there is damaged, or a folder holds none.
     """
-    return _find(airframe, limits, folder or models_folder())
+    return _find(airframe, limits, (*folders, models_folder()))
 
 
 @lru_cache(maxsize=8)
-def _find(airframe: Airframe, limits: PlanLimits, folder: Path) -> Model | None:
-    fitting = []
-    for file in sorted(folder.glob(f"*/{CARD}")):
-        card = load_card(file.parent)
-        distance = _distance(card.limits, limits)
-        if not other_vehicle(card, airframe) and distance < math.inf:
-            fitting.append((distance, file.parent))
-    return load_model(min(fitting)[1]) if fitting else None
+def _find(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...]) -> Model | None:
+    known, candidates = scaled_limits(airframe, limits), []
+    for place, folder in enumerate(folders):
+        if (folder / CARD).is_file():
+            return load_model(folder)
+        files = sorted(folder.glob(f"*/{CARD}"))
+        if not files and folder != models_folder():
+            raise InputError("no model there", where=str(folder), hint="train one with `cfplan train`")
+        for file in files:
+            card = load_card(file.parent)
+            far = _distance(card, known)
+            width = sum(high - low for low, high in card.ranges.values())
+            candidates.append((far, place, width, file.parent))
+    return load_model(min(candidates)[-1]) if candidates else None
 
 
-def _distance(own: PlanLimits, wanted: PlanLimits) -> float:
-    """Return how far limits are from a model's; infinite where the model is of no use for them."""
+def _distance(card: Card, known: ScaledLimits) -> float:
+    """Return how far numbers lie outside of a model's ranges; 0 within."""
     total = 0.0
-    for name in ("speed", "acceleration", "angular_velocity", "angular_acceleration", "tilt", "motor_thrust_max"):
-        known, asked = getattr(own, name), getattr(wanted, name)
-        if known == asked:
-            continue
-        if asked < TIGHTEST * known and known < math.inf:
-            return math.inf
-        total += min(abs(math.log(asked / known)), 1.0) if known < math.inf else 1.0
+    for here, (low, high) in zip(known.numbers, card.ranges.values(), strict=True):
+        width = max(high - low, 1e-3)
+        total += min(max(low - here, here - high, 0.0) / width, FURTHEST)
     return total
 
 
@@ -235,14 +221,12 @@ def _card(text: Mapping[str, Any]) -> Card:
     from pydantic import TypeAdapter
 
     card = TypeAdapter(Card).validate_python(text)
-    sizes = {"hidden": card.hidden, "layers": card.layers, "window": card.window}
-    figures = asdict(card.airframe) | asdict(card.limits)
-    for name, value in (sizes | figures).items():
-        for number in value if isinstance(value, tuple) else (value,):
-            if not isinstance(number, str) and not number >= (1 if name in sizes else 0):
-                raise ValueError(f"{name} is {number}")
-            if name in sizes and number > LARGEST:
-                raise ValueError(f"{name} is {number}, more than {LARGEST}")
-    if not all(value > 0 for name, value in asdict(card.limits).items() if not name.endswith("_min")):
-        raise ValueError("a limit is 0")
+    for name, value in {"hidden": card.hidden, "layers": card.layers, "window": card.window}.items():
+        if not 1 <= value <= LARGEST:
+            raise ValueError(f"{name} is {value}, not from 1 to {LARGEST}")
+    if tuple(card.ranges) != NUMBERS:
+        raise ValueError(f"ranges are not of {', '.join(NUMBERS)}")
+    for name, (low, high) in card.ranges.items():
+        if not -math.inf < low <= high < math.inf:
+            raise ValueError(f"the range of {name} is {low} to {high}")
     return card

@@ -1,6 +1,6 @@
-"""Smooth a network's answer into the coefficients of a cubic B-spline, one window at a time.
+"""Smooth a network's answers into the coefficients of a cubic B-spline.
 
-A window's answers are joined to the three coefficients that are settled already, or to a rest, and smoothed by the
+Answers are joined to the three coefficients that are settled already, or to a rest, and smoothed by the
 least sum of squared changes and squared third differences of log √u. The weight of the second depends on how long an
 interval takes, so that motion is smoothed over the same time on any grid. Where the path rests, four coefficients are
 equal, so that h stays constant over the first or last interval (see planners/expert/expert.py).
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from cfplan.machine_code import njit
 from cfplan.vehicle.profile_spline import weights_at
 
-DURATION = 0.07  # s, over which answers are smoothed
 MAX_STIFFNESS = 1e6  # weight of third differences against changes
 _BAND = 3  # width of the normal equations
 
@@ -28,8 +27,11 @@ class Begin(IntEnum):
 
 
 @njit(error_model="numpy")
-def smoothed(rates: NDArray, settled: NDArray, begin: int, rest_end: bool, duration: float = DURATION) -> NDArray:
-    """Return (W+3,) log √u/Δs at nodes -1 … W+1 from answers, (W+1,), and the settled ones, (3,)."""
+def smoothed(rates: NDArray, settled: NDArray, begin: int, rest_end: bool, duration: float) -> NDArray:
+    """Return (W+3,) log √u/Δs at nodes -1 … W+1 from answers, (W+1,), and the settled ones, (3,).
+
+    They are smoothed over `duration`, in the unit of time of the rates.
+    """
     count = len(rates) + 2
     first = 3 if begin == 0 else 0
     last = count - 4 if rest_end else count - 1

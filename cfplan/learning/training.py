@@ -1,7 +1,8 @@
 """Train a network by imitation: from a dataset of the expert's profiles to a model folder.
 
 Every epoch draws its windows by its own seed and ends with a checkpoint, so that a training that was killed resumes
-with the same result. Under torchrun each process takes its share of the windows, and the first one writes.
+with the same result; the best network so far is a model in the folder at any time. Under torchrun each process takes
+its share of the windows, and the first one writes.
 """
 
 import json
@@ -24,13 +25,13 @@ from cfplan import __version__
 from cfplan.errors import InputError
 from cfplan.learning import features, inference
 from cfplan.learning.checkpoints import Epoch, draw_curves, resume, save_checkpoint
-from cfplan.learning.learned import predict
-from cfplan.learning.model_files import Card, save_model
+from cfplan.learning.learned import Question, predict
+from cfplan.learning.model_files import Card, load_card, save_model
 from cfplan.learning.networks import Architecture, build
 from cfplan.learning.smooth import travel_time
 from cfplan.learning.training_set import Labels, TrainingSet, draw, read_training_set, split
 from cfplan.learning.windows import WINDOW
-from cfplan.safety.limit_sets import LIMIT_SETS
+from cfplan.vehicle.yaw_spline import YawSpline
 
 CURVES = "curves.png"
 CHUNK = 4096  # windows drawn at once
@@ -48,7 +49,7 @@ class Options:
     """Options of a training: with the dataset they decide its result."""
 
     architecture: Architecture = Architecture.BILSTM
-    hidden: int = 32
+    hidden: int = 40
     layers: int = 2
     window: int = WINDOW
     epochs: int = 40
@@ -99,6 +100,8 @@ def train(
         run = _Run(training_set, folder, options, rank, world, place)
         try:
             for epoch in run.epochs():
+                if rank == 0 and run.improved:
+                    run.save(command)
                 on_epoch(epoch)
             return run.finish(command) if rank == 0 else None
         except OSError as error:
@@ -153,10 +156,23 @@ class _Run:
             if self.world > 1:
                 distributed.barrier()
 
+    @property
+    def improved(self) -> bool:
+        """Return whether the last epoch is the best so far."""
+        return self.log[-1].unseen_loss <= min(epoch.unseen_loss for epoch in self.log)
+
     def finish(self, command: str) -> Card:
-        """Write the model and the picture of its log; return its card."""
+        """Draw the picture of the log; return the card of the best network."""
+        draw_curves(self.log, self.folder / CURVES)
+        try:
+            card = load_card(self.folder)
+        except InputError:  # a checkpoint alone was left
+            return self.save(command)
+        return card
+
+    def save(self, command: str) -> Card:
+        """Write the network as a model; return its card."""
         spec, last, options = self.seen.spec, self.log[-1], self.options
-        chosen = LIMIT_SETS[spec.limits]
         card = Card(
             name=self.folder.name,
             architecture=str(options.architecture),
@@ -165,8 +181,7 @@ class _Run:
             window=options.window,
             features=features.VERSION,
             weights_sha256="",
-            airframe=chosen.airframe,
-            limits=chosen.limits,
+            ranges=self._ranges(),
             data=_plain(spec) | {"learned_from": len(self.seen.rows), "judged_on": len(self.unseen.rows)},
             training={"command": command, "seconds": round(sum(epoch.seconds for epoch in self.log), 1)}
             | _plain(options),
@@ -177,9 +192,15 @@ class _Run:
             date=datetime.now(UTC).isoformat(timespec="seconds"),
             version=__version__,
         )
-        card = save_model(self.folder, card, self._weights())
-        draw_curves(self.log, self.folder / CURVES)
-        return card
+        return save_model(self.folder, card, self._weights())
+
+    def _ranges(self) -> dict[str, tuple[float, float]]:
+        """Return the range of each number without dimension that was learned from."""
+        numbers = self.seen.labels.numbers
+        return {
+            name: (round(float(low), 6), round(float(high), 6))
+            for name, low, high in zip(features.NUMBERS, numbers.min(axis=0), numbers.max(axis=0), strict=True)
+        }
 
     def _learn(self, number: int) -> float:
         options = self.options
@@ -210,10 +231,10 @@ class _Run:
     def _windows(self, training_set: TrainingSet, rows: NDArray, *stream: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         random = np.random.default_rng([self.options.seed, *stream])
         labels = training_set.labels
-        batch = draw(labels, training_set.bound, rows, self.options.window, random)
+        batch = draw(labels, rows, self.options.window, random)
         if self.options.epsilon > 0.0 and training_set is self.seen:
             other = draw(
-                self._noisy(stream[1]), training_set.bound, rows, self.options.window,
+                self._noisy(stream[1]), rows, self.options.window,
                 np.random.default_rng([self.options.seed, *stream]),
             )  # fmt: skip
             batch.inputs[::2] = other.inputs[::2]
@@ -244,10 +265,21 @@ class _Run:
         """Return the relative error of travel time on each unseen path, planned whole as for a flight."""
         network = inference.NETWORKS[str(self.options.architecture)](self._weights())
         unseen, window = self.unseen, self.options.window
-        nodes = max(window, unseen.spec.nodes)
+        nodes, labels = unseen.spec.nodes, unseen.labels
+        if nodes < window:
+            return np.full(len(unseen.paths), np.nan)
+        questions = [
+            Question(
+                path, known, nodes, track=None if chooses else YawSpline(yaw[0], yaw[1], yaw[2, :-1]),
+                yaw_angle=float(yaw[0, 0]),
+            )
+            for path, known, chooses, yaw in zip(
+                unseen.paths, unseen.scaled, labels.chooses, labels.yaw, strict=True
+            )
+        ]  # fmt: skip
         found = [
-            travel_time(predict(path, network, unseen.bound, nodes, window, yaw_angle=yaw)[0], path.end / nodes)
-            for path, yaw in zip(unseen.paths, unseen.labels.yaw[:, 0, 0], strict=True)
+            travel_time(proposal.coefficients, question.path.end / nodes)
+            for question, proposal in zip(questions, predict(questions, network, window), strict=True)
         ]
         return np.array(found) / unseen.travel_time - 1.0
 

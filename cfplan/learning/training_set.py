@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import perturbed
+from cfplan.geometry.yaw import YawMode
 from cfplan.learning.dataset import read_dataset
 from cfplan.learning.dataset_spec import DatasetSpec
 from cfplan.learning.features import (
@@ -22,34 +23,35 @@ from cfplan.learning.features import (
     INPUTS,
     OUTPUTS,
     REFERENCE,
-    Bounds,
-    bounds,
+    ScaledLimits,
     coefficient_logs,
     fill_inputs,
     fill_node_features,
+    scaled_limits,
     start_features,
 )
 from cfplan.machine_code import njit
 from cfplan.planners.solution import Status
-from cfplan.safety.limit_sets import LIMIT_SETS
+from cfplan.safety.limits import PlanLimits
+from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import h_within, yaw_within
 
 MIN_SPEED_FACTOR = 0.97  # at which a label must be certified to be learned from
 # m: the few longer paths are excursions of min-snap to hundreds of metres, and long flights are chains of windows
 MAX_LENGTH = 100.0
-CLOSEST = 0.08  # m of path between the nodes of the closest windows
-WIDEST = 1.05  # spacing of the widest windows, over the label's
+CLOSEST = 0.12  # m of path between the nodes of the closest windows
+WIDEST = 2.0  # spacing of the widest windows, over the label's: as when a short path is one window
 AT_START, AT_END = 0.25, 0.25  # shares of windows that begin, or end, where the path does
-UNKNOWN = 0.05  # share of windows inside a path whose start state is withheld
+UNKNOWN = 0.8  # share of windows inside a path whose start state is withheld
 START_NOISE = (0.01, 0.01, 0.005)  # standard deviations of the noise on the start state: rate, slope, bend
-TAIL = 16  # nodes at the end of a window inside a path, whose speed depends on what lies behind the window
+TAIL = 16  # nodes next to a window's end inside a path, whose speed depends on what lies beyond
 TAIL_WEIGHT = 0.1  # of the last of them in the loss
 UNSEEN_SHARE, MAX_UNSEEN = 0.1, 500  # of the paths, held out for validation
 SPLIT_STREAM = 0  # number of this stream of a seed's random numbers
 
 
 class Labels(NamedTuple):
-    """R labelled paths in flat arrays, as compiled loops take them."""
+    """R labelled paths in flat arrays, as compiled loops take them; each path in the units of its own limits."""
 
     pieces: NDArray  # (R+1,) where each path's coefficients begin
     breaks: NDArray  # (sum of pieces + R,) path by path
@@ -57,6 +59,9 @@ class Labels(NamedTuple):
     length: NDArray  # (R,) m
     h: NDArray  # (R, 4, N+1) h, h', h'', h'''
     yaw: NDArray  # (R, 3, N+1) ψ, ψ', ψ''
+    chooses: NDArray  # (R,) whether yaw is the network's to choose
+    bounds: NDArray  # (R, BOUNDS), see features.ScaledLimits
+    numbers: NDArray  # (R, NUMBERS)
 
 
 class Batch(NamedTuple):
@@ -70,27 +75,27 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingSet:
-    """The usable rows of a dataset, and the bounds that their labels keep."""
+    """The usable rows of a dataset."""
 
     spec: DatasetSpec
-    bound: Bounds
     rows: NDArray  # (R,) numbers of the rows
     paths: tuple[Path, ...]
+    scaled: tuple[ScaledLimits, ...]
     labels: Labels
     travel_time: NDArray  # (R,) s
 
     def part(self, chosen: NDArray) -> "TrainingSet":
         """Return some of the rows, by index."""
-        paths = tuple(self.paths[i] for i in chosen)
-        h, yaw, length = self.labels.h[chosen], self.labels.yaw[chosen], self.labels.length[chosen]
-        labels = Labels(*_joined(paths), length, h, yaw)
-        return replace(self, rows=self.rows[chosen], paths=paths, labels=labels, travel_time=self.travel_time[chosen])
+        paths, known = tuple(self.paths[i] for i in chosen), tuple(self.scaled[i] for i in chosen)
+        labels = Labels(*_joined(paths, known), *(values[chosen] for values in self.labels[3:]))
+        travel_time = self.travel_time[chosen]
+        return replace(self, rows=self.rows[chosen], paths=paths, scaled=known, labels=labels, travel_time=travel_time)
 
     def noisy(self, epsilon: float, seed: np.random.SeedSequence) -> Labels:
         """Return the labels with every path perturbed by at most epsilon, m: noise injection, the answers kept."""
         seeds = seed.spawn(len(self.paths))
         paths = tuple(perturbed(path, epsilon, own) for path, own in zip(self.paths, seeds, strict=True))
-        return Labels(*_joined(paths), *self.labels[3:])
+        return Labels(*_joined(paths, self.scaled), *self.labels[3:])
 
 
 def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> TrainingSet:
@@ -100,8 +105,6 @@ def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> Tr
         InputError: no dataset, a damaged one, or no row that was solved and certified.
     """
     spec, rows = read_dataset(folder)
-    if spec.limits not in LIMIT_SETS:
-        raise InputError(f"unknown limit set {spec.limits!r}", where=str(folder), hint="make the dataset again")
     usable = rows.filter(
         (pa.compute.field("status") == Status.SOLVED.name)
         & (pa.compute.field("certified_share") >= MIN_SPEED_FACTOR)
@@ -118,11 +121,26 @@ def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> Tr
     paths = _paths(usable, folder)
     h = np.stack([_column(usable, name, spec.nodes, folder) for name in ("h", "dh", "ddh", "dddh")], axis=1)
     yaw = np.stack([_column(usable, name, spec.nodes, folder) for name in ("yaw", "dyaw", "ddyaw")], axis=1)
-    chosen = LIMIT_SETS[spec.limits]
-    return TrainingSet(
-        spec, bounds(chosen.airframe, chosen.limits), usable["row"].to_numpy(), paths,
-        Labels(*_joined(paths), length, h, yaw), travel_time,
-    )  # fmt: skip
+    known, chooses = _scaled(usable, folder), usable["yaw_mode"].to_numpy() == YawMode.FREE.value
+    h *= np.array([each.time**2 for each in known])[:, None, None]
+    bounds, numbers = np.stack([each.bounds for each in known]), np.stack([each.numbers for each in known])
+    labels = Labels(*_joined(paths, known), length, h, yaw, chooses, bounds, numbers)
+    return TrainingSet(spec, usable["row"].to_numpy(), paths, known, labels, travel_time)
+
+
+def _scaled(rows: pa.Table, folder: FilePath) -> tuple[ScaledLimits, ...]:
+    found = []
+    columns = (rows[name].to_pylist() for name in ("row", "airframe", "limits"))
+    for row, airframe, limits in zip(*columns, strict=True):
+        try:
+            vehicle = Airframe(**airframe | {name: tuple(airframe[name]) for name in ("inertia", "drag")})
+            known = scaled_limits(vehicle, PlanLimits(**limits))
+        except (ValueError, TypeError, ArithmeticError) as error:
+            raise _damaged(f"limits or vehicle of row {row}: {error}", folder) from None
+        if not (np.isfinite(known.numbers).all() and np.isfinite(known.bounds).all() and (known.bounds > 0.0).all()):
+            raise _damaged(f"limits or vehicle of row {row} are not those of a flight", folder)
+        found.append(known)
+    return tuple(found)
 
 
 def _column(rows: pa.Table, name: str, nodes: int, folder: FilePath) -> NDArray:
@@ -164,12 +182,13 @@ def _damaged(why: str, folder: FilePath) -> InputError:
     return InputError(f"damaged: {why}", where=str(folder), hint="make the dataset again with `cfplan dataset make`")
 
 
-def _joined(paths: tuple[Path, ...]) -> tuple[NDArray, NDArray, NDArray]:
+def _joined(paths: tuple[Path, ...], known: tuple[ScaledLimits, ...]) -> tuple[NDArray, NDArray, NDArray]:
     pieces = np.cumsum([0] + [len(path.coefficients) for path in paths])
     powers = max(path.coefficients.shape[1] for path in paths)
     coefficients = np.zeros((pieces[-1], powers, 3))
-    for path, first in zip(paths, pieces, strict=False):
-        coefficients[first : first + len(path.coefficients), : path.coefficients.shape[1]] = path.coefficients
+    for path, first, units in zip(paths, pieces, known, strict=False):
+        there = coefficients[first : first + len(path.coefficients), : path.coefficients.shape[1]]
+        there[:] = path.coefficients / units.length
     return pieces, np.concatenate([path.breaks for path in paths]), coefficients
 
 
@@ -187,7 +206,6 @@ def split(training_set: TrainingSet, seed: int) -> tuple[TrainingSet, TrainingSe
 
 def draw(
     labels: Labels,
-    bound: Bounds,
     rows: NDArray,
     window: int,
     random: np.random.Generator,
@@ -211,28 +229,43 @@ def draw(
         np.empty((count, window + 1, INPUTS), np.float32), np.empty((count, window + 1, OUTPUTS), np.float32),
         np.empty((count, window + 1), np.float32), np.empty((count, window + 1), np.float32),
     )  # fmt: skip
-    _fill(*batch, labels, bound, rows, first, share, knows, noise)
+    _fill(*batch, labels, rows, first, share, knows, noise)
     return batch
 
 
 @njit(error_model="numpy")
 def _fill(
-    inputs: NDArray, targets: NDArray, weights: NDArray, times: NDArray, labels: Labels, bound: Bounds, rows: NDArray,
+    inputs: NDArray, targets: NDArray, weights: NDArray, times: NDArray, labels: Labels, rows: NDArray,
     first: NDArray, share: NDArray, knows: NDArray, noise: NDArray,
 ) -> None:  # fmt: skip
     count = inputs.shape[1]
     grid = labels.h.shape[2] - 1
-    table = np.empty((count, COLUMNS))
+    table, turns, yaws = np.empty((count, COLUMNS)), np.empty((count, 2)), np.empty(count)
     for b in range(len(rows)):
         row = rows[b]
         low, high = labels.pieces[row], labels.pieces[row + 1]
         breaks = labels.breaks[low + row : high + row + 1]
         end = breaks[-1]
         step = share[b] * end
-        fill_node_features(table, breaks, labels.coefficients[low:high], first[b] * end, step, bound)
+        chooses = labels.chooses[row]
+        for n in range(count):
+            place = min((first[b] + n * share[b]) * grid, grid * 1.0)
+            i = min(int(place), grid - 1)
+            psi, dpsi, ddpsi = yaw_within(
+                (place - i) * end / grid, labels.yaw[row, 0, i], labels.yaw[row, 1, i], labels.yaw[row, 2, i]
+            )
+            yaws[n] = psi
+            turns[n, 0], turns[n, 1] = dpsi * step, ddpsi * step * step
+        yaw, turning = yaws[0], turns[0, 0]
+        if chooses:
+            turns[:] = 0.0
+        fill_node_features(
+            table, breaks, labels.coefficients[low:high], first[b] * end, step, labels.bounds[row], turns
+        )
         rest_start, rest_end = first[b] <= 0.0, first[b] + (count - 1) * share[b] >= 1.0 - 1e-9
-        total = yaw = turning = 0.0
+        total = 0.0
         start = (0.0, 0.0, 0.0)
+        known = knows[b] and not rest_start
         for n in range(count):
             place = min((first[b] + n * share[b]) * grid, grid * 1.0)
             i = min(int(place), grid - 1)
@@ -244,20 +277,16 @@ def _fill(
                 start = start_features(*coefficient_logs(h, slope, bend, step))
                 start = (start[0] + noise[b, 0], start[1] + noise[b, 1], start[2] + noise[b, 2])
             rate = coefficient_logs(h, slope, bend, step)[1]
-            psi, dpsi, _ = yaw_within(x, labels.yaw[row, 0, i], labels.yaw[row, 1, i], labels.yaw[row, 2, i])
             targets[b, n, 0] = rate - table[n, REFERENCE]
-            if n == 0:
-                yaw, turning = psi, dpsi * step
-            targets[b, n, 1] = np.cos(psi - yaw)
-            targets[b, n, 2] = np.sin(psi - yaw)
+            targets[b, n, 1] = np.cos(yaws[n] - yaw) if chooses else 1.0
+            targets[b, n, 2] = np.sin(yaws[n] - yaw) if chooses else 0.0
             duration = np.exp(-rate) * (0.5 if n in (0, count - 1) else 1.0)
             times[b, n] = duration
             total += duration
             fading = 0 if rest_end else max(0, n + 1 + TAIL - count)
+            if not (known or rest_start):
+                fading = max(fading, TAIL - n)
             weights[b, n] = 1.0 - (1.0 - TAIL_WEIGHT) * fading / TAIL
-        known = knows[b] and not rest_start
-        if not known:
-            start, turning = (0.0, 0.0, 0.0), 0.0
-        fill_inputs(inputs[b], table, rest_start, rest_end, known, start, yaw, turning)
+        fill_inputs(inputs[b], table, rest_start, rest_end, known, start, yaw, turning, chooses, labels.numbers[row])
         for n in range(count):
             times[b, n] /= total

@@ -1,38 +1,39 @@
-"""Chaining: windows of a fixed number of intervals, joined by boundary states, cover a path of any length.
+"""Windows: a path of any length as overlapping windows of as many intervals each, all answered at once.
 
-Each window begins in the state in which the kept part of the one before ends. The expert chains its windows, of
-variable length, likewise: see planners/expert/windows.py.
+Near its ends a window does not see what its answers depend on: there they count less, and where windows overlap the
+answers pass over from the one to the other.
 """
 
-from collections.abc import Iterator
-from typing import NamedTuple
+import numpy as np
+from numpy.typing import NDArray
 
 WINDOW = 64  # intervals of a window
-KEPT_SHARE = 0.75  # of a window, where the path goes on: the rest looks further ahead than braking takes
+OVERLAP_SHARE = 0.375  # of a window, that the next one has too, at least
+UNSEEN_SHARE = 0.25  # of that overlap, next to a window's end, where its answers do not count
+_LEAST = 1e-6  # weight, so that some window counts everywhere
 
 
-class Window(NamedTuple):
-    """The place of a window on a path's grid, and how much of it is kept."""
-
-    first: int  # node at which it begins
-    keep: int  # intervals that are kept; the next window begins there
-    last: bool  # whether it ends where the path ends
-
-
-def kept_intervals(window: int) -> int:
-    """Return the intervals of a window that are kept where the path goes on."""
-    return max(1, round(KEPT_SHARE * window))
+def window_starts(nodes: int, window: int) -> NDArray:
+    """Return the first nodes of the windows, (B,), over `nodes` intervals, which are at least `window`."""
+    most = window - round(OVERLAP_SHARE * window)
+    count = 1 + -(-(nodes - window) // most)
+    return np.round(np.linspace(0, nodes - window, count)).astype(np.int64)
 
 
-def chain(nodes: int, window: int, keep: int) -> Iterator[Window]:
-    """Yield the windows over `nodes` intervals, which are at least `window`.
+def shares(starts: NDArray, window: int) -> NDArray:
+    """Return (B, W+1): how much each window's answers count at its nodes; at every node they add up to 1."""
+    overlap = OVERLAP_SHARE * window
+    rise = (np.arange(window + 1) / overlap - UNSEEN_SHARE) / (1.0 - 2.0 * UNSEEN_SHARE)
+    rise = np.clip(rise, _LEAST, 1.0)
+    out = np.ones((len(starts), window + 1))
+    out[1:] *= rise
+    out[:-1] *= rise[::-1]
+    total = overlapped(starts, out)
+    return out / total[starts[:, None] + np.arange(window + 1)]
 
-    Each begins where the kept part of the one before ends. The last one ends where the path ends, so the one before it
-    keeps less.
-    """
-    first = 0
-    while first + window < nodes:
-        following = min(first + keep, nodes - window)
-        yield Window(first, following - first, False)
-        first = following
-    yield Window(first, window, True)
+
+def overlapped(starts: NDArray, values: NDArray) -> NDArray:
+    """Return (N+1,): the sum of the windows' values, (B, W+1), at every node."""
+    window = values.shape[1] - 1
+    places = starts[:, None] + np.arange(window + 1)
+    return np.bincount(places.ravel(), weights=values.ravel(), minlength=int(starts[-1]) + window + 1)

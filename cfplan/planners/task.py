@@ -1,6 +1,7 @@
 """PlanningTask: what every planner is asked, checked once where it is made."""
 
 import math
+import pathlib
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, field
 
@@ -36,6 +37,7 @@ class PlanningTask:
     end: BoundaryState | None = None
     speed_caps: SpeedCaps | None = None  # along the path, besides the limit on speed
     deadline: Deadline = field(default=NEVER, compare=False, repr=False)  # by which to answer, if only with a reason
+    models: tuple[pathlib.Path, ...] = ()  # of the learned planner: folders of models, or one of a model itself
     refusal: Solution | None = field(init=False, compare=False, repr=False)
     """The answer of a planner that keeps all limits and boundary states, where no search is needed to see that none
     can be kept: the limits exclude hovering, or a boundary state breaks them. Other planners may answer otherwise."""

@@ -20,7 +20,7 @@ from cfplan.geometry.continued import continued_min_snap
 from cfplan.geometry.min_snap import centripetal_times
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
-from cfplan.learning.features import REFERENCE, Bounds, bounds, node_features
+from cfplan.learning.features import REFERENCE, ScaledLimits, node_features, scaled_limits
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import check_endurance
@@ -80,8 +80,8 @@ def continue_plan(
     points = np.asarray(waypoints, dtype=float)
     continued_min_snap(joint.derivatives, points)  # refuses what are no waypoints
     _check_waypoints(points, limits)
-    bound = bounds(limits.airframe, limits.plan)
-    ways = sorted(_ways(joint, trajectory, points, times), key=lambda way: _least_time(way.path, bound))
+    known = scaled_limits(limits.airframe, limits.plan)
+    ways = sorted(_ways(joint, trajectory, points, times), key=lambda way: _least_time(way.path, known))
     failure, tries = "", 0
     for way in ways:
         try:
@@ -155,10 +155,9 @@ def _slowing_to(speed: float, way: _Way) -> SpeedCaps:
     return SpeedCaps.of(s, np.maximum(falling, speed))
 
 
-def _least_time(path: Path, bound: Bounds) -> float:
+def _least_time(path: Path, known: ScaledLimits) -> float:
     """Return about how long a path takes at least, s, by what its derivatives allow place by place."""
-    step = path.end / _NODES
-    return float(np.exp(-node_features(path, 0.0, step, _NODES + 1, bound)[:, REFERENCE]).sum())
+    return known.time * float(np.exp(-node_features(path, _NODES, known, None)[:, REFERENCE]).sum())
 
 
 def with_room(limits: PlanLimits, airframe: Airframe, room: float = ROOM) -> PlanLimits:

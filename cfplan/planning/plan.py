@@ -1,6 +1,7 @@
 """plan(): from a path and limits to a certified trajectory, with a record of how it was found."""
 
 import math
+import pathlib
 import time
 
 from cfplan.deadline import NEVER, Deadline
@@ -38,10 +39,12 @@ def plan(
     start: BoundaryState | None = None,
     end: BoundaryState | None = None,
     deadline: Deadline = NEVER,
+    models: tuple[pathlib.Path, ...] = (),
 ) -> Plan:
     """Return the fastest certified flight along the path that the planner finds.
 
-    "auto" asks several and takes the fastest of their flights, as policy.POLICIES says.
+    "auto" asks the learned planner, and the expert where that falls short, as policy.POLICIES says. `models` are
+    folders in which models are looked for before those that come with cfplan.
     `speed_factor` slows the whole result: the same motion at that factor of its speed, so that accelerations fall with
     its square. Where a boundary state is given, nothing may be slowed, or it would no longer hold.
 
@@ -57,10 +60,10 @@ def plan(
     check_space(path, limits.space)
     check_endurance(path.length / limits.plan.speed / speed_factor, limits, "at least ")
     task = PlanningTask(
-        path, airframe, limits.plan, yaw=yaw, yaw_angle=yaw_angle, start=start, end=end,
+        path, airframe, limits.plan, yaw=yaw, yaw_angle=yaw_angle, start=start, end=end, models=models,
         deadline=deadline.earlier(ANSWERING * deadline.left) if deadline.left < math.inf else NEVER,
     )  # fmt: skip
-    best, bound, notes, left_out = choose(planner, task, nodes, limits.space)
+    best, notes, left_out = choose(planner, task, nodes, limits.space)
     repaired = flown = best.repaired
     if changed := repaired.describe():
         notes += (f"{best.planner}'s profile was {changed}",)
@@ -79,7 +82,6 @@ def plan(
         speed_factor=speed_factor,
         seconds=time.perf_counter() - begun,
         notes=notes,
-        lower_bound=bound,
         joints=best.joints,
         left_out=left_out,
     )

@@ -51,7 +51,6 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
         "speed_share": plan.speed_factor,
         "seconds": plan.seconds,
         "notes": list(plan.notes),
-        "lower_bound": plan.lower_bound,
         "joints": list(plan.joints),
         "slowing": None if plan.slowing is None else asdict(plan.slowing),
         "provenance": dict(provenance or {}),
@@ -135,7 +134,6 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
         speed_factor=float(metadata["speed_share"]),
         seconds=float(metadata["seconds"]),
         notes=tuple(map(str, metadata["notes"])),
-        lower_bound=None if metadata["lower_bound"] is None else float(metadata["lower_bound"]),
         joints=joints,
         slowing=slowing,
     )

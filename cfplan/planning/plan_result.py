@@ -48,8 +48,6 @@ class Plan:
     speed_factor: float  # on that speed, as asked for; 1: not slowed
     seconds: float  # s that planning took, all tries and certificates included
     notes: tuple[str, ...]  # what a reader should know, one sentence each
-    lower_bound: float | None = None
-    """s, below which no flight keeps the limits of speed, acceleration and collective thrust; None: not computed"""
     joints: tuple[float, ...] = ()  # s, where the windows of a long profile meet
     slowing: LocalSlowing | None = None  # None: nowhere slower than the limits allow
     left_out: str = ""  # what planning had no time for; empty where its budget was enough

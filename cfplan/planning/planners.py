@@ -1,6 +1,7 @@
 """The planners by name: where each is found, on which grid it plans, and whether its profiles are refined."""
 
 import difflib
+from enum import StrEnum
 from importlib import import_module
 from types import MappingProxyType
 from typing import NamedTuple
@@ -16,23 +17,30 @@ FEWEST_NODES, MOST_NODES = 60, 3000
 NODES_PER_PIECE = 4  # of a path, at least
 
 
+class Finish(StrEnum):
+    """What becomes of a planner's profile."""
+
+    REFINED = "refined"  # a proposal: refined to the optimum, whether it passes or not
+    REPAIRED = "repaired"  # it stays where it passes, else it is refined
+    SLOWED = "slowed"  # as a whole where it does not pass
+
+
 class PlannerEntry(NamedTuple):
     """What planning knows of a planner before it is imported."""
 
     function: str  # module:name
-    refined: bool  # a profile that does not pass is refined; else it is only slowed as a whole
+    finished: Finish
     nodes_per_metre: int = 10
     most_nodes: int = MOST_NODES
 
 
 PLANNERS = MappingProxyType(
     {
-        # trained on wide grids; refining costs by the node
-        "learned": PlannerEntry("cfplan.learning.learned:plan_learned", True, nodes_per_metre=5, most_nodes=30_000),
-        "expert": PlannerEntry("cfplan.planners.expert.expert:plan_expert", True),
-        "toppquad": PlannerEntry("cfplan.planners.baselines.toppquad:plan_toppquad", False),
-        "convex": PlannerEntry("cfplan.planners.baselines.convex:plan_convex", True),
-        "minsnap": PlannerEntry("cfplan.planners.baselines.min_snap:plan_min_snap", False),
+        "learned": PlannerEntry("cfplan.learning.learned:plan_learned", Finish.REFINED, most_nodes=30_000),
+        "expert": PlannerEntry("cfplan.planners.expert.expert:plan_expert", Finish.REPAIRED),
+        "toppquad": PlannerEntry("cfplan.planners.baselines.toppquad:plan_toppquad", Finish.SLOWED),
+        "convex": PlannerEntry("cfplan.planners.baselines.convex:plan_convex", Finish.REFINED),
+        "minsnap": PlannerEntry("cfplan.planners.baselines.min_snap:plan_min_snap", Finish.SLOWED),
     }
 )
 

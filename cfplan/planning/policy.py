@@ -9,16 +9,16 @@ import numpy as np
 
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
 from cfplan.learning.model_files import find_model
-from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.solution import Solution
-from cfplan.planners.task import PlanningTask
-from cfplan.planning.planners import AUTO, PLANNERS, default_nodes, find_planner
-from cfplan.planning.repair import Repaired, repair, slow
+from cfplan.planners.task import NODES_PER_PIECE, PlanningTask
+from cfplan.planning.planners import AUTO, PLANNERS, Finish, default_nodes, find_planner
+from cfplan.planning.repair import Repaired, refine, repair, slow
 from cfplan.safety.space import Space
 
 GOOD_SPEED_FACTOR = 0.97  # a profile that repair slows further than this is worth a try on the next grid
 SAME_STATE = 1e-6  # of h, yaw and their derivatives, or of one, within which a boundary state is met
-EXPERT_GAP = 0.1  # of the flight over the proven bound, above which the expert is asked too
+
+FINISH = MappingProxyType({Finish.REFINED: refine, Finish.REPAIRED: repair, Finish.SLOWED: slow})
 
 
 class Found(NamedTuple):
@@ -39,7 +39,6 @@ class Choice(NamedTuple):
     """The fastest flight that a policy found."""
 
     best: Found
-    bound: float | None  # s, proven: no flight takes less; None where the policy needs no bound
     notes: tuple[str, ...]  # what a reader should know, one sentence each
     left_out: str = ""  # what there was no time for; empty where the deadline did not pass
 
@@ -51,39 +50,41 @@ class Due(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def always(_task: PlanningTask, _found: Sequence[Found], _bound: float | None) -> Due:
+def always(_task: PlanningTask, _found: Sequence[Found]) -> Due:
     """Take the step."""
     return Due(True)
 
 
-def a_model_fits(task: PlanningTask, _found: Sequence[Found], _bound: float | None) -> Due:
-    """Take the step if a network was trained for this vehicle and these limits."""
+def a_model_knows(task: PlanningTask, _found: Sequence[Found]) -> Due:
+    """Take the step if there is a model that has learned from vehicles and limits like these."""
+    if task.refusal:
+        return Due(False)
     try:
-        model = find_model(task.airframe, task.limits)
+        model = find_model(task.airframe, task.limits, task.models)
     except InputError as error:
         return Due(False, (f"no learned plan: {error}",))
     if model is None:
-        return Due(False, ("no model is for this vehicle and these limits: `cfplan train` makes one",))
-    return Due(True, tuple(model.differences(task.limits)))
+        return Due(False, ("no model was found: `cfplan train` makes one",))
+    outside = model.outside(task.airframe, task.limits)
+    return Due(not outside, outside)
 
 
-def far_above_bound(_task: PlanningTask, found: Sequence[Found], bound: float | None) -> Due:
-    """Take the step unless a flight was found that needed no slowing and takes little more than the proven bound."""
-    best = min(found, key=lambda one: one.duration, default=None)
-    if best is None or bound is None:
-        return Due(True, ("the expert was asked too: the other planners found nothing",))
-    gap = best.duration / bound - 1.0
-    if best.repaired.speed_factor == 1.0 and gap <= EXPERT_GAP:
-        return Due(False)
-    return Due(True, (f"the expert was asked too: {gap:.1%} above the bound",))
+def nothing_finished(_task: PlanningTask, found: Sequence[Found]) -> Due:
+    """Take the step unless a flight was found that was refined to its end and needed no slowing as a whole."""
+    return Due(not any(_finished(one.repaired) for one in found))
+
+
+def _finished(repaired: Repaired) -> bool:
+    return repaired.speed_factor == 1.0 and not repaired.failed
 
 
 class Step(NamedTuple):
     """One line of a policy."""
 
     planners: tuple[str, ...]  # asked in turn until one finds a profile
-    when: Callable[[PlanningTask, Sequence[Found], float | None], Due] = always
-    grids: tuple[int, ...] = (1,)  # factors on the first planner's nodes, in turn until its profile is hardly slowed
+    when: Callable[[PlanningTask, Sequence[Found]], Due] = always
+    grids: tuple[float, ...] = (1,)  # factors on the first planner's nodes, in turn until its profile is hardly slowed
+    finishes: bool = False  # whether grids are tried until a profile needs no slowing at all
 
 
 # Convex and min-snap hardly ever fail, so every policy ends with one of them. Of all that was found the fastest is
@@ -91,9 +92,9 @@ class Step(NamedTuple):
 POLICIES = MappingProxyType(
     {
         AUTO: (
-            Step(("learned",), when=a_model_fits),
-            Step(("convex",)),
-            Step(("expert", "minsnap"), when=far_above_bound, grids=(1, 2)),
+            Step(("learned",), when=a_model_knows, grids=(1, 0.5), finishes=True),
+            Step(("expert", "minsnap"), when=nothing_finished, grids=(1, 2)),
+            Step(("convex",), when=nothing_finished),
         ),
         "learned": (Step(("learned", "expert", "convex", "minsnap")),),
         "expert": (Step(("expert", "convex", "minsnap"), grids=(1, 2)),),
@@ -114,7 +115,6 @@ def choose(policy: str, task: PlanningTask, nodes: int | None, space: Space) -> 
         InfeasibleError: no planner finds a flight; says why of each.
         InputError: the learned planner is asked and there is no model, or there are too few nodes.
     """
-    bound = lower_bound(task) if policy == AUTO else None
     found: list[Found] = []
     notes: list[str] = []
     skipped: list[str] = []
@@ -122,7 +122,7 @@ def choose(policy: str, task: PlanningTask, nodes: int | None, space: Space) -> 
         if found and task.deadline.passed:
             skipped.append(f"{step.planners[0]} not asked")
             continue
-        due = step.when(task, found, bound)
+        due = step.when(task, found)
         notes += due.notes
         if due.due:
             one, failures = _take(step, task, nodes, space)
@@ -134,10 +134,7 @@ def choose(policy: str, task: PlanningTask, nodes: int | None, space: Space) -> 
             hint = "give planning more time (--budget), or the path fewer waypoints"
         raise InfeasibleError(f"no plan. {'; '.join(notes)}", hint=hint)
     best = min(found, key=lambda one: one.duration)
-    if bound is not None:
-        times = ", ".join(f"{one.planner} {one.duration:.3f} s" for one in found)
-        notes.append(f"{times}; the proven bound is {bound:.3f} s, the plan {best.duration / bound - 1:.1%} above it")
-    return Choice(best, bound, tuple(notes), _left_out(best, skipped) if task.deadline.passed else "")
+    return Choice(best, tuple(notes), _left_out(best, skipped) if task.deadline.passed else "")
 
 
 def _left_out(best: Found, skipped: Sequence[str]) -> str:
@@ -153,12 +150,14 @@ def _take(step: Step, task: PlanningTask, nodes: int | None, space: Space) -> tu
         own_nodes = default_nodes(task.path, planner) if nodes is None else nodes
         found: list[Found] = []
         for factor in step.grids if place == 0 and nodes is None else (1,):
-            answer = ask(planner, replace(task, nodes=factor * own_nodes), space)
+            enough = min(own_nodes, NODES_PER_PIECE * (len(task.path.breaks) - 1))
+            answer = ask(planner, replace(task, nodes=max(round(factor * own_nodes), enough)), space)
             if isinstance(answer, str):
                 notes.append(answer)
                 continue
             found.append(answer)
-            if answer.repaired.speed_factor >= GOOD_SPEED_FACTOR or task.deadline.passed:
+            hardly = answer.repaired.speed_factor >= GOOD_SPEED_FACTOR
+            if (_finished(answer.repaired) if step.finishes else hardly) or task.deadline.passed:
                 break
         if found:
             return min(found, key=lambda one: one.duration), notes
@@ -172,7 +171,7 @@ def ask(planner: str, task: PlanningTask, space: Space) -> Found | str:
         return _failure(planner, task.nodes, solution)
     nodes = len(solution.profile.s) - 1
     try:
-        repaired = (repair if PLANNERS[planner].refined else slow)(task, solution.profile, space)
+        repaired = FINISH[PLANNERS[planner].finished](task, solution.profile, space)
     except (InfeasibleError, NotCertifiedError) as error:
         return f"{planner} with {nodes} nodes: {error}"
     if missed := _missed_boundary(task, repaired):

@@ -66,12 +66,17 @@ def repair(task: PlanningTask, profile: SpeedProfile, space: Space | None = None
         NotCertifiedError: the profile is not finite, not smooth, or h is not positive.
     """
     path, airframe, limits, caps = task.path, task.airframe, task.limits, task.speed_caps
-    before = duration_of(profile)
     if not violates_at_nodes(path, profile, airframe, limits, caps):
         trajectory = Trajectory(path, profile, airframe)
         certificate = certify(trajectory, limits, space, caps)
         if certificate.passed:
             return Repaired(trajectory, certificate, 1.0, trajectory.duration)
+    return refine(task, profile, space)
+
+
+def refine(task: PlanningTask, profile: SpeedProfile, space: Space | None = None) -> Repaired:
+    """Return the certified trajectory to which refining leads, to the optimum near the profile. Raises as repair()."""
+    limits, caps, before = task.limits, task.speed_caps, duration_of(profile)
     refined = _refined(task, profile, space)
     if refined.certificate and (refined.certificate.passed or _nearly_passes(refined.certificate)):
         slowed = slow_until_certified(refined.trajectory, limits, space, refined.certificate, caps, task.deadline)

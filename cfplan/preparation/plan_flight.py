@@ -38,6 +38,7 @@ class FlightOptions:
     speed_factor: float | None = None  # of the speed that the limits allow; None takes the path file's
     stream_for: float = 0.0  # s of setpoints at least; behind the end of the path they hover
     budget: float | None = None  # s that planning and giving way may take; None chooses it by the path's length
+    models: tuple[Path, ...] = ()  # folders of models to look in first
     only_shown: bool = False  # whether the plan will neither fly nor be kept, so that it need not wait for compiling
 
 
@@ -108,6 +109,7 @@ def plan_flight(
             yaw_angle=path_file.yaw_angle,
             speed_factor=path_file.speed if options.speed_factor is None else options.speed_factor,
             deadline=deadline,
+            models=options.models,
         )
         left = deadline.left
         results.append(f"{planned.trajectory.duration:.2f} s of flight by {planned.planner}")
@@ -117,7 +119,7 @@ def plan_flight(
             results.warn(f"the budget of time is spent: {planned.left_out}")
         results.details += planned.notes
     with step(on_step, "bound") as results:
-        bound = planned.lower_bound or lower_bound(PlanningTask(planned.path, planned.airframe, limits.plan))
+        bound = lower_bound(PlanningTask(planned.path, planned.airframe, limits.plan))
         more = planned.trajectory.duration * planned.speed_factor / bound - 1
         whose = "this one takes" if planned.speed_factor == 1.0 else "at full speed this one would take"
         results.append(f"no flight takes less than {bound:.2f} s; {whose} {100 * more:.1f} % more")

@@ -267,7 +267,7 @@ def _model(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     from cfplan.learning.model_files import save_model
     from tests.learning.conftest import card, weights
 
-    save_model(folder / "model", card(airframe=load_limits(SAFETY).airframe), weights())
+    save_model(folder / "model", card(), weights())
     _use_model(folder)
     return json.loads((folder / "model" / "card.json").read_bytes()), weights()
 
@@ -334,9 +334,9 @@ def _use_model(folder: Path) -> None:
 
     limits = load_limits(SAFETY)
     _find.cache_clear()
-    _find(limits.airframe, limits.plan, folder)
-    model = load_model(folder / "model", limits.airframe)
-    model.differences(limits.plan)
+    _find(limits.airframe, limits.plan, (folder,))
+    model = load_model(folder / "model")
+    model.outside(limits.airframe, limits.plan)
     plan_learned(PlanningTask(load_path_file(LINE).path, limits.airframe, limits.plan), model=model)
 
 
@@ -382,7 +382,7 @@ def _use_dataset(folder: Path) -> None:
     describe(folder)
     found = read_training_set(folder)
     known, _ = split(found, 0)
-    draw(known.labels, known.bound, np.arange(min(8, len(known.rows))), 24, np.random.default_rng(0))
+    draw(known.labels, np.arange(min(8, len(known.rows))), 24, np.random.default_rng(0))
 
 
 FILES = {

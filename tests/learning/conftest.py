@@ -14,8 +14,15 @@ from cfplan.safety.limit_sets import LIMIT_SETS
 
 HARDWARE = LIMIT_SETS["hardware"]
 TINY = DatasetSpec(
-    count=16, seed=5, limits="hardware", boxes=((4.5, 8.0, 2.0),), waypoints=(3, 4), nodes=40, yaw=YawMode.FIXED
-)
+    count=16, seed=5, limits="hardware", families=(), boxes=((4.5, 8.0, 2.0),), waypoints=(3, 4), nodes=40,
+    yaw=YawMode.FIXED,
+)  # fmt: skip
+RANGES = {
+    name: (float(here) - 1.0, float(here) + 1.0)
+    for name, here in zip(
+        features.NUMBERS, features.scaled_limits(HARDWARE.airframe, HARDWARE.limits).numbers, strict=True
+    )
+}
 
 
 @pytest.fixture(scope="session")
@@ -29,11 +36,11 @@ def tiny(tmp_path_factory):
 
 
 def card(**changes) -> Card:
-    """A card for the hardware set."""
+    """A card that knows the hardware set, and what is within a factor e of it."""
     known = {
         "name": "fallow", "architecture": "bilstm", "hidden": 8, "layers": 1, "window": 24,
-        "features": features.VERSION, "weights_sha256": "", "airframe": HARDWARE.airframe,
-        "limits": HARDWARE.limits, "data": {}, "training": {}, "scores": {}, "date": "2026-01-01", "version": "0.1.0",
+        "features": features.VERSION, "weights_sha256": "", "ranges": RANGES, "data": {}, "training": {},
+        "scores": {}, "date": "2026-01-01", "version": "0.1.0",
     }  # fmt: skip
     return Card(**known | changes)
 

@@ -12,16 +12,20 @@ import pytest
 
 from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.path import Path as Curve
+from cfplan.geometry.path_families import Family
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import dataset
 from cfplan.learning.dataset import SchedulerError, describe, label_shard, make_dataset, read_dataset, read_timing
 from cfplan.learning.dataset_spec import DatasetSpec, Relabel, load_spec
-from cfplan.learning.labels import row_path
+from cfplan.learning.labels import row_limits, row_path
+from cfplan.safety.feasibility import infeasible_limit
+from cfplan.vehicle.airframes import AIRFRAMES
 
 SMALL = DatasetSpec(
     count=6,
     seed=3,
     limits="hardware",
+    families=(),
     boxes=((4.5, 8.0, 2.0),),
     waypoints=(2, 3),
     nodes=40,
@@ -49,13 +53,79 @@ def test_rows_hold_path_grid_label_and_provenance(made):
     assert rows["row"].to_pylist() == list(range(6))
     for row in rows.to_pylist():
         assert row["status"] == "SOLVED"
-        assert row["vehicle"] == "crazyflie-2.1+"
+        assert row["airframe"]["name"] == "crazyflie-2.1+"
+        assert row["limits"]["speed"] == 2.0
+        assert (row["family"], row["yaw_mode"], row["yaw_angle"]) == ("box", "fixed", 0.0)
         assert row["seed"] == 3
         assert len(row["h"]) == len(row["yaw"]) == row["nodes"] + 1 == 41
         assert 0 < row["certified_share"] <= 1
         stored = Curve(np.array(row["breaks"]), np.array(row["coefficients"]).reshape(len(row["breaks"]) - 1, -1, 3))
         s = np.linspace(0, row["end"], 17)
         np.testing.assert_array_equal(stored(s), row_path(SMALL, row["row"])(s))
+
+
+def test_limits_vehicles_and_paths_are_drawn_by_seed_and_number():
+    """Whatever else is made: any worker draws the same for a row."""
+    spec = DatasetSpec(count=300, seed=4)
+    drawn = [row_limits(spec, number) for number in range(300)]
+    assert drawn[:20] == [row_limits(replace(spec, count=20), number) for number in range(20)]
+    assert drawn != [row_limits(replace(spec, seed=5), number) for number in range(300)]
+    limits = [chosen.limits for chosen, _, _ in drawn]
+    speeds = np.array([each.speed for each in limits])
+    assert speeds.min() < 0.5
+    assert speeds.max() > 6.0
+    assert {mode for _, mode, _ in drawn} == set(YawMode)
+    masses = {chosen.airframe.mass for chosen, _, _ in drawn}
+    assert {airframe.mass for airframe in AIRFRAMES.values()} < masses
+    assert len(masses) > 150
+    for chosen, _, _ in drawn:
+        assert not infeasible_limit(chosen.airframe, chosen.limits)
+        if chosen.airframe.name == "made up":
+            jx, jy, jz = sorted(chosen.airframe.inertia)
+            assert jz <= jx + jy  # as of a rigid body
+
+
+def test_every_family_makes_paths_that_can_be_flown():
+    spec = DatasetSpec(count=120, seed=2)
+    bad = 0
+    for number in range(120):
+        try:
+            row_path(spec, number).check()
+        except InputError:
+            bad += 1
+    assert bad <= 3
+
+
+def test_drawn_rows_hold_what_they_were_planned_for(tmp_path):
+    """Each label keeps its own row's limits on speed and acceleration, by the path's derivatives."""
+    make_dataset(tmp_path, DatasetSpec(count=12, seed=11, nodes=60))
+    rows = read_dataset(tmp_path)[1].to_pylist()
+    assert {row["family"] for row in rows} == set(Family)
+    solved = [row for row in rows if row["status"] == "SOLVED" and row["certified_share"] == 1.0]
+    assert len(solved) >= 9
+    for row in solved:
+        path = Curve(np.array(row["breaks"]), np.array(row["coefficients"]).reshape(len(row["breaks"]) - 1, -1, 3))
+        s, h = np.linspace(0, row["end"], 61), np.array(row["h"])
+        speed = np.linalg.norm(path(s, 1), axis=1) * np.sqrt(h)
+        bends = path(s, 2) * h[:, None] + 0.5 * path(s, 1) * np.array(row["dh"])[:, None]
+        assert speed.max() <= row["limits"]["speed"] * (1 + 1e-6)
+        assert np.linalg.norm(bends, axis=1).max() <= row["limits"]["acceleration"] * (1 + 1e-6)
+        assert max(speed.max() / row["limits"]["speed"], len(row["active_limits"]) / 10) > 0.05
+
+
+def test_limits_of_a_safety_file_are_kept_in_the_spec(tmp_path, limits):
+    spec = replace(SMALL, count=1, limits="given", airframe=limits.airframe, plan=replace(limits.plan, speed=1.5))
+    make_dataset(tmp_path, spec)
+    assert load_spec(tmp_path) == spec
+    (row,) = read_dataset(tmp_path)[1].to_pylist()
+    assert row["limits"]["speed"] == 1.5
+
+
+def test_unlimited_turning_survives_the_spec(tmp_path, limits):
+    free = replace(limits.plan, angular_acceleration=np.inf)
+    spec = replace(SMALL, limits="given", airframe=limits.airframe, plan=free)
+    spec.save(tmp_path)
+    assert load_spec(tmp_path) == spec
 
 
 def test_travel_time_is_that_of_the_profile(made):

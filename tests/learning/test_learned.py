@@ -12,9 +12,9 @@ from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import learned
-from cfplan.learning.features import REFERENCE, bounds, start_features, start_logs
-from cfplan.learning.learned import plan_learned, predict
-from cfplan.learning.windows import chain, kept_intervals
+from cfplan.learning.features import COLUMNS, REFERENCE, scaled_limits, start_features, start_logs
+from cfplan.learning.learned import Question, plan_learned, predict
+from cfplan.learning.windows import window_starts
 from cfplan.planners.solution import Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.limit_sets import LIMIT_SETS
@@ -65,8 +65,8 @@ def test_fewer_than_ten_nodes_are_refused(model, nodes):
 
 
 def test_no_model_is_a_named_error(monkeypatch, tmp_path):
-    monkeypatch.setattr(learned, "find_model", lambda airframe, limits: None)
-    with pytest.raises(InputError, match="no model for") as error:
+    monkeypatch.setattr(learned, "find_model", lambda airframe, limits, folders: None)
+    with pytest.raises(InputError, match="no model") as error:
         plan(None)
     assert "cfplan train" in error.value.hint
 
@@ -77,7 +77,7 @@ def test_what_is_not_a_number_is_no_profile(model, bad):
 
     def broken(inputs):
         answers = network(inputs)
-        answers[5, 0] = bad
+        answers[0, 5, 0] = bad
         return answers
 
     solution = plan(replace(model, network=broken))
@@ -86,24 +86,45 @@ def test_what_is_not_a_number_is_no_profile(model, bad):
     assert "fallow" in solution.reason
 
 
-def test_each_window_begins_where_the_one_before_was_left(model):
-    """What a window is told of its start is the state of the profile there."""
+def test_all_windows_of_a_path_are_asked_for_at_once_and_the_first_is_told_the_start(model):
     heard = []
 
     def listening(inputs):
-        heard.append(inputs[0].copy())
+        heard.append(inputs.copy())
         return model.network(inputs)
 
+    path, nodes = long_path(14), 200
+    state = BoundaryState(h=0.8, dh=0.3, ddh=-0.2, yaw=0.2, dyaw=0.0)
+    plan(replace(model, network=listening), path, nodes=nodes, start=state)
+    (seen,) = heard
+    asked = math.ceil(path.length / learned.SPACING)
+    assert len(seen) == len(window_starts(asked, model.window)) > 3
+    begins, ends, known = (seen[:, 0, COLUMNS + k].tolist() for k in range(3))
+    assert (sum(begins), ends[-1], sum(ends)) == (0, 1, 1)
+    assert (known[0], sum(known)) == (1, 1)
+    rate, slope, bend = start_features(*start_logs(state, path.end / asked))
+    units = scaled_limits(CHOSEN.airframe, CHOSEN.limits)
+    reference = seen[0, 0, REFERENCE] - seen[0, 0, COLUMNS + 10]
+    expected = [rate + math.log(units.time) - reference, slope, bend]
+    np.testing.assert_allclose(seen[0, 0, COLUMNS + 3 : COLUMNS + 6], expected, atol=1e-4)
+
+
+def test_a_grid_finer_than_the_network_needs_has_the_same_motion(model):
     path = long_path(14)
-    nodes = 200
-    solution = plan(replace(model, network=listening), path, nodes=nodes)
-    profile, step = solution.profile, path.end / nodes
-    windows = list(chain(nodes, model.window, kept_intervals(model.window)))
-    assert len(heard) == len(windows) > 5
-    for seen, window in zip(heard[1:], windows[1:], strict=True):
-        state = profile.boundary(window.first)
-        rate, slope, bend = start_features(*start_logs(state, step))
-        np.testing.assert_allclose(seen[20:23], [rate - seen[REFERENCE], slope, bend], atol=1e-4)
+    coarse, fine = (plan(model, path, nodes=nodes).profile for nodes in (math.ceil(path.length / 0.2), 700))
+    at = fine.at(coarse.s[2:-2])
+    np.testing.assert_allclose(at.h, coarse.h[2:-2], rtol=0.02)
+    Trajectory(path, fine, CHOSEN.airframe)
+
+
+def test_many_paths_at_once_are_each_as_alone(model):
+    known = scaled_limits(CHOSEN.airframe, CHOSEN.limits)
+    asked = [Question(long_path(turns), known, nodes) for turns, nodes in ((4, 30), (9, 60), (5, 100))]
+    together = predict(asked, model.network, model.window)
+    for question, found in zip(asked, together, strict=True):
+        (alone,) = predict([question], model.network, model.window)
+        np.testing.assert_allclose(found.coefficients, alone.coefficients, rtol=1e-5)
+        np.testing.assert_allclose(found.yaw, alone.yaw, atol=1e-5)
 
 
 def test_a_start_state_is_met_exactly(model):
@@ -151,32 +172,39 @@ def test_free_yaw_is_the_networks_and_continuous(model):
     np.testing.assert_allclose(before.dyaw, profile.dyaw[1:], atol=1e-9)
 
 
-def test_tighter_limits_lower_the_profile_and_looser_ones_leave_it(model):
-    own = plan(model).profile
-    for change, compare in (({"speed": 3.0, "tilt": 1.0}, np.equal), ({"speed": 1.2}, np.less_equal)):
-        limits = replace(CHOSEN.limits, **change)
-        found = plan_learned(PlanningTask(PATH, CHOSEN.airframe, limits), model=model).profile
-        assert compare(found.h, own.h).all()
-    speed = np.linalg.norm(PATH(found.s, 1), axis=1) * np.sqrt(found.h)
-    before = np.linalg.norm(PATH(own.s, 1), axis=1) * np.sqrt(own.h)
-    assert speed.max() < 0.75 * before.max()
-    Trajectory(PATH, found, CHOSEN.airframe)
+def test_limits_and_vehicle_scale_the_proposal(model):
+    """In a world four times as long and twice as slow the network proposes the same motion, on any weights."""
+    limits, airframe = CHOSEN.limits, CHOSEN.airframe
+    larger = replace(
+        limits, speed=2 * limits.speed, angular_velocity=limits.angular_velocity / 2,
+        angular_acceleration=limits.angular_acceleration / 4,
+    )  # fmt: skip
+    vehicle = replace(
+        airframe, inertia=tuple(4 * j for j in airframe.inertia), drag=tuple(d / 2 for d in airframe.drag)
+    )
+    path = min_snap(4.0 * PATH(PATH.breaks))
+    here, there = (
+        predict([Question(each, scaled_limits(*who), 100)], model.network, model.window)[0].coefficients
+        for each, who in ((PATH, (airframe, limits)), (path, (vehicle, larger)))
+    )
+    # s is four times as long and time twice: h = (ds/dt)² is four times
+    np.testing.assert_allclose(there, 4.0 * here, rtol=1e-3)
 
 
 def test_work_grows_with_the_path_and_no_faster(model):
     """Counted in windows, for paths of one kind."""
-    bound = bounds(CHOSEN.airframe, CHOSEN.limits)
     counts = []
     for nodes in (240, 2400):
         calls = []
 
         def counting(inputs, calls=calls):
-            calls.append(len(inputs))
+            calls.append(inputs.shape)
             return model.network(inputs)
 
-        predict(long_path(12), counting, bound, nodes, model.window)
-        assert set(calls) == {model.window + 1}
-        counts.append(len(calls))
+        predict([Question(long_path(12), scaled_limits(CHOSEN.airframe, CHOSEN.limits), nodes)], counting, model.window)
+        ((windows, count, _),) = calls
+        assert count == model.window + 1
+        counts.append(windows)
     assert counts[1] <= 11 * counts[0]
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,21 +11,22 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cfplan.errors import InputError
-from cfplan.learning.features import INPUTS
+from cfplan.learning import model_files
+from cfplan.learning.features import INPUTS, NUMBERS, scaled_limits
 from cfplan.learning.inference import NETWORKS
 from cfplan.learning.model_files import (
     CARD,
     WEIGHTS,
     Model,
     find_model,
-    load_card,
     load_model,
     models_folder,
     save_model,
 )
 from cfplan.safety.limit_sets import LIMIT_SETS
+from tests.learning.conftest import RANGES
 
-HARDWARE, SIMULATION = LIMIT_SETS["hardware"], LIMIT_SETS["simulation"]
+HARDWARE = LIMIT_SETS["hardware"]
 
 
 def edit(folder, **changes):
@@ -32,9 +34,9 @@ def edit(folder, **changes):
     (folder / CARD).write_text(json.dumps(content | changes))
 
 
-def refusal(folder, airframe=None) -> InputError:
+def refusal(folder) -> InputError:
     with pytest.raises(InputError) as error:
-        load_model(folder, airframe)
+        load_model(folder)
     assert error.value.where
     assert error.value.hint
     assert "\n" not in str(error.value)
@@ -42,16 +44,10 @@ def refusal(folder, airframe=None) -> InputError:
 
 
 def test_what_was_saved_is_loaded(saved, make_card, make_weights):
-    model = load_model(saved, HARDWARE.airframe)
+    model = load_model(saved)
     assert replace(model.card, weights_sha256="") == make_card()
-    inputs = np.random.default_rng(0).normal(size=(25, INPUTS)).astype(np.float32)
+    inputs = np.random.default_rng(0).normal(size=(2, 25, INPUTS)).astype(np.float32)
     np.testing.assert_array_equal(model.network(inputs), NETWORKS["bilstm"](make_weights())(inputs))
-
-
-def test_unlimited_angular_acceleration_survives_the_card(tmp_path, make_card, make_weights):
-    free = replace(SIMULATION.limits, angular_acceleration=math.inf)
-    save_model(tmp_path, make_card(airframe=SIMULATION.airframe, limits=free), make_weights())
-    assert load_card(tmp_path).limits.angular_acceleration == math.inf
 
 
 def test_missing_files_are_named(tmp_path, saved):
@@ -99,8 +95,8 @@ def test_a_file_that_is_no_weights_file_is_refused(saved):
 def test_cards_of_another_time_ask_for_training(saved):
     edit(saved, features=99)
     assert "cfplan train" in refusal(saved).hint
-    edit(saved, format=2)
-    assert "format 2" in refusal(saved).what
+    edit(saved, format=1)
+    assert "format 1" in refusal(saved).what
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -112,60 +108,57 @@ def test_anything_that_is_no_card_is_one_line(saved, content):
 
 @pytest.mark.parametrize(
     "change",
-    [{"hidden": "many"}, {"limits": {}}, {"airframe": None}, {"scores": [1]}, {"limits": {"speed": "fast"}}],
+    [
+        {"hidden": "many"},
+        {"hidden": 0},
+        {"window": 10**6},
+        {"scores": [1]},
+        {"ranges": {}},
+        {"ranges": {"acceleration": [0, 1]}},
+        {"ranges": dict.fromkeys(NUMBERS, (2, 1))},
+        {"ranges": dict.fromkeys(NUMBERS, (0, math.nan))},
+        {"ranges": dict.fromkeys(NUMBERS, ("low", "high"))},
+    ],
 )
 def test_a_card_with_wrong_contents_is_refused(saved, change):
     edit(saved, **change)
     assert "not a model card" in refusal(saved).what
 
 
-def test_a_model_for_another_vehicle_is_refused_naming_the_difference(saved):
-    heavier = replace(HARDWARE.airframe, mass=0.045)
-    error = refusal(saved, heavier)
-    assert "another vehicle" in error.what
-    assert "mass" in error.what
-    load_model(saved, replace(HARDWARE.airframe, name="mine"))
+def test_what_lies_outside_of_what_was_learned_from_is_said_in_one_sentence_each(model):
+    assert model.outside(HARDWARE.airframe, HARDWARE.limits) == ()
+    heavier = replace(HARDWARE.airframe, mass=0.033)
+    assert model.outside(heavier, HARDWARE.limits) == ()
+    (said,) = model.outside(HARDWARE.airframe, replace(HARDWARE.limits, tilt=1.6))
+    assert "tilt is 1.6" in said
+    assert "fallow" in said
+    (said,) = model.outside(HARDWARE.airframe, replace(HARDWARE.limits, acceleration=20.0))
+    assert re.search(r"acceleration is 2\.04 .* 0\.188 to 1\.39", said)
 
 
-def test_what_differs_in_limits_is_said(model):
-    assert model.differences(HARDWARE.limits) == ()
-    tighter, looser = model.differences(replace(HARDWARE.limits, speed=1.5, motor_thrust_min=0.0))
-    assert "speed is 1.5" in tighter
-    assert "repair" in tighter
-    assert "the model's own is kept" in looser
+def test_the_model_that_knows_limits_and_vehicle_is_found(tmp_path, monkeypatch, make_card, make_weights):
+    """The narrowest of those that know them, the nearest where none does; a folder given first comes first."""
+    wide = {name: (low - 1.0, high + 1.0) for name, (low, high) in RANGES.items()}
+    faster = replace(HARDWARE.limits, speed=8.0)
+    numbers = scaled_limits(HARDWARE.airframe, faster).numbers
+    fast = {name: (float(here) - 1.0, float(here) + 1.0) for name, here in zip(NUMBERS, numbers, strict=True)}
+    for name, ranges in (("narrow", RANGES), ("wide", wide), ("fast", fast)):
+        save_model(tmp_path / "some" / name, make_card(name=name, ranges=ranges), make_weights())
+    save_model(tmp_path / "own" / "mine", make_card(name="mine", ranges=wide), make_weights())
 
+    monkeypatch.setattr(model_files, "models_folder", lambda: tmp_path / "none that come with cfplan")
 
-def test_limits_are_used_as_far_as_the_model_knows(model):
-    asked = replace(HARDWARE.limits, speed=3.0, acceleration=4.0, motor_thrust_min=0.0)
-    within = model.limits_within(asked)
-    assert within.speed == HARDWARE.limits.speed
-    assert within.acceleration == 4.0
-    assert within.motor_thrust_min == HARDWARE.limits.motor_thrust_min
-
-
-def test_a_model_without_a_limit_serves_where_there_is_one_and_the_other_way_round(tmp_path, make_card, make_weights):
-    free = replace(HARDWARE.limits, angular_acceleration=math.inf)
-    for name, known, asked in (("free", free, HARDWARE.limits), ("bound", HARDWARE.limits, free)):
-        save_model(tmp_path / name / "only", make_card(name=name, limits=known), make_weights())
-        model = find_model(HARDWARE.airframe, asked, tmp_path / name)
-        assert model is not None
-        assert model.name == name
-
-
-def test_the_nearest_model_for_the_vehicle_is_found(tmp_path, make_card, make_weights):
-    faster = replace(HARDWARE.limits, speed=3.0)
-    for name, limits in (("slow", HARDWARE.limits), ("fast", faster)):
-        save_model(tmp_path / name, make_card(name=name, limits=limits), make_weights())
-
-    def found(airframe, limits) -> str | None:
-        model = find_model(airframe, limits, tmp_path)
+    def found(limits, *folders) -> str | None:
+        model = find_model(HARDWARE.airframe, limits, tuple(tmp_path / folder for folder in folders))
         return model.name if isinstance(model, Model) else None
 
-    assert found(HARDWARE.airframe, HARDWARE.limits) == "slow"
-    assert found(HARDWARE.airframe, replace(faster, speed=2.9)) == "fast"
-    assert found(HARDWARE.airframe, replace(faster, speed=0.5)) is None
-    assert found(SIMULATION.airframe, HARDWARE.limits) is None
-    assert find_model(HARDWARE.airframe, HARDWARE.limits, tmp_path / "nothing") is None
+    assert found(HARDWARE.limits, "some") == "narrow"
+    assert found(faster, "some") == "fast"
+    assert found(replace(HARDWARE.limits, speed=20.0), "some") == "fast"
+    assert found(HARDWARE.limits, "own", "some") == "mine"
+    assert found(HARDWARE.limits, "some/wide") == "wide"
+    with pytest.raises(InputError, match="no model there"):
+        found(HARDWARE.limits, "nothing")
 
 
 def test_models_are_beside_the_package_in_a_checkout():

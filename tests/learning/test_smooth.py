@@ -41,11 +41,11 @@ def test_it_is_the_least_sum_of_squares(begin, rest_end):
 
 
 def test_what_is_settled_stays():
-    np.testing.assert_array_equal(smoothed(rough(), SETTLED, int(Begin.KNOWN), False)[:3], SETTLED)
+    np.testing.assert_array_equal(smoothed(rough(), SETTLED, int(Begin.KNOWN), False, 0.07)[:3], SETTLED)
 
 
 def test_h_is_constant_next_to_a_rest():
-    u = np.exp(2 * smoothed(rough(), SETTLED, int(Begin.REST), True))
+    u = np.exp(2 * smoothed(rough(), SETTLED, int(Begin.REST), True, 0.07))
     zeros = np.zeros(21)
     profile = spline_profile(u, 3.0, YawSpline(zeros, zeros, zeros[1:]))
     for values, at in ((profile.dh, [0, 1]), (profile.ddh, [0, 1]), (profile.dddh, [0])):

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -23,7 +24,7 @@ from cfplan.learning.training import CURVES, Options, loss, train
 from cfplan.learning.training_set import read_training_set, split
 from cfplan.vehicle.timing import measure
 
-SMALL = Options(hidden=6, layers=1, window=16, epochs=3, windows=16, batch=8)
+SMALL = Options(hidden=6, layers=1, window=16, epochs=3, windows=16, batch=8, rate=1e-2)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,8 @@ def test_a_model_folder_holds_all_that_was_promised(trained, tiny):
     assert card.data["seed"] == load_spec(tiny).seed
     assert card.data["learned_from"] + card.data["judged_on"] == 16
     assert set(card.scores) == {"unseen_loss", "time_error", "time_error_mean", "time_error_p95"}
-    assert json.loads((folder / "card.json").read_text())["limits"]["speed"] == 2.0
+    ranges = json.loads((folder / "card.json").read_text())["ranges"]
+    assert ranges["tilt"] == pytest.approx([math.radians(30)] * 2)
     assert (folder / CURVES).read_bytes().startswith(b"\x89PNG")
     assert [row["epoch"] for row in log_of(folder)] == ["1", "2", "3"]
     assert {file.name for file in folder.iterdir()} == {"weights.safetensors", "card.json", CHECKPOINT, LOG, CURVES}
@@ -75,7 +77,7 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(trained, tiny, tmp_path
     monkeypatch.setattr(training._Run, "_learn", killed)
     with pytest.raises(KeyboardInterrupt):
         train(tiny, tmp_path, SMALL)
-    assert not (tmp_path / "weights.safetensors").exists()
+    assert load_model(tmp_path).card.scores["unseen_loss"] > 0.0  # the best so far
     monkeypatch.undo()
     heard = []
     train(tiny, tmp_path, SMALL, on_epoch=heard.append)
@@ -91,8 +93,17 @@ def test_a_finished_training_is_not_begun_again(trained, tiny):
 
 
 def test_another_training_in_the_folder_is_refused_naming_what_differs(trained, tiny):
-    with pytest.raises(InputError, match=r"hidden 6 there, 7 here; epochs 3 there, 9 here"):
-        train(tiny, trained[0], replace(SMALL, hidden=7, epochs=9))
+    with pytest.raises(InputError, match=r"hidden 6 there, 7 here; batch 8 there, 9 here"):
+        train(tiny, trained[0], replace(SMALL, hidden=7, batch=9))
+
+
+def test_a_training_goes_on_for_more_epochs_and_ends_with_its_best_network(trained, tiny, tmp_path):
+    folder = tmp_path / "longer"
+    shutil.copytree(trained[0], folder)
+    card = train(tiny, folder, replace(SMALL, epochs=5))
+    losses = [float(row["unseen_loss"]) for row in log_of(folder)]
+    assert len(losses) == 5
+    assert card.scores["unseen_loss"] == pytest.approx(min(losses), rel=1e-3)
 
 
 @pytest.mark.parametrize("damage", [b"", b"nonsense"])

@@ -8,7 +8,7 @@ import pytest
 from cfplan.errors import InputError
 from cfplan.learning.dataset import read_dataset
 from cfplan.learning.features import COLUMNS, REFERENCE
-from cfplan.learning.training_set import START_NOISE, draw, read_training_set
+from cfplan.learning.training_set import START_NOISE, UNKNOWN, WIDEST, draw, read_training_set
 
 
 @pytest.fixture(scope="module")
@@ -17,18 +17,20 @@ def training_set(tiny):
 
 
 def batch(training_set, rows, seed=0):
-    return draw(training_set.labels, training_set.bound, np.array(rows), 24, np.random.default_rng(seed))
+    return draw(training_set.labels, np.array(rows), 24, np.random.default_rng(seed))
 
 
 def test_targets_and_reference_give_the_label_back(training_set, tiny):
     """These labels have one speed: every coefficient of the spline is that h."""
     _, rows = read_dataset(tiny)
     found = batch(training_set, np.arange(16))
-    rates = found.inputs[:, :, REFERENCE] + found.targets[:, :, 0]  # log √u/Δs
+    mean_step = found.inputs[:, :, COLUMNS + 10]  # log, in units of length
+    rates = found.inputs[:, :, REFERENCE] - mean_step + found.targets[:, :, 0]  # log √u/Δs, in units of time
     for row, label in enumerate(rows.to_pylist()):
         np.testing.assert_allclose(rates[row], rates[row][0], atol=1e-4)
-        step = np.sqrt(label["h"][0]) / np.exp(rates[row][0])
-        assert 0 < step <= 1.06 * label["end"] / 40
+        time = training_set.scaled[row].time
+        step = np.sqrt(label["h"][0]) * time / np.exp(rates[row][0])
+        assert 0 < step <= WIDEST * 1.01 * label["end"] / 40
 
 
 def test_times_are_the_shares_of_the_window(training_set):
@@ -42,7 +44,7 @@ def test_windows_lie_at_both_ends_and_between(training_set):
     at_start, at_end, knows = flags.mean(axis=0)
     assert 0.2 < at_start < 0.45
     assert 0.2 < at_end < 0.45
-    assert 0.5 < knows < 1.0 - at_start + 1e-6
+    assert knows == pytest.approx((1.0 - UNKNOWN) * (1.0 - at_start), abs=0.06)
     assert not (flags[:, 0] * flags[:, 2]).any(), "a rest has no state to tell"
 
 
@@ -56,10 +58,11 @@ def test_the_start_is_told_a_little_wrong(training_set):
 
 def test_the_tail_inside_a_path_counts_little(training_set):
     found = batch(training_set, np.tile(np.arange(16), 5))
-    inside = found.inputs[:, 0, COLUMNS + 1] == 0.0
-    assert np.all(found.weights[~inside] == 1.0)
-    assert np.all(found.weights[inside, -1] < 0.2)
-    assert np.all(found.weights[inside, 0] == 1.0)
+    begins, ends, known = (found.inputs[:, 0, COLUMNS + k] == 1.0 for k in range(3))
+    assert np.all(found.weights[begins & ends] == 1.0)
+    assert np.all(found.weights[~ends, -1] < 0.2)
+    assert np.all(found.weights[begins | known, 0] == 1.0)
+    assert np.all(found.weights[~begins & ~known, 0] < 0.2)
 
 
 def test_the_same_seed_draws_the_same_windows(training_set):
@@ -76,15 +79,20 @@ def test_the_same_seed_draws_the_same_windows(training_set):
 def test_noise_moves_paths_by_at_most_epsilon_and_keeps_the_answers(training_set):
     noisy = training_set.noisy(0.01, np.random.SeedSequence(1))
     rows = np.arange(16)
-    clean = draw(training_set.labels, training_set.bound, rows, 24, np.random.default_rng(0))
-    moved = draw(noisy, training_set.bound, rows, 24, np.random.default_rng(0))
+    clean = draw(training_set.labels, rows, 24, np.random.default_rng(0))
+    moved = draw(noisy, rows, 24, np.random.default_rng(0))
     np.testing.assert_array_equal(noisy.h, training_set.labels.h)
-    np.testing.assert_allclose(
-        clean.targets[:, :, 0] + clean.inputs[:, :, REFERENCE], moved.targets[:, :, 0] + moved.inputs[:, :, REFERENCE],
-        atol=1e-4,
-    )  # fmt: skip
-    heights = np.abs(clean.inputs[:, :, 2] - moved.inputs[:, :, 2])
-    assert 0 < heights.max() <= 0.02  # both ends of a difference moved
+
+    def rates(batch):
+        return batch.targets[:, :, 0] + batch.inputs[:, :, REFERENCE] - batch.inputs[:, :, COLUMNS + 10]
+
+    np.testing.assert_allclose(rates(clean), rates(moved), atol=1e-4)
+    unit = training_set.scaled[0].length
+
+    def heights(batch):
+        return batch.inputs[:, :, 2] * np.exp(batch.inputs[:, :, COLUMNS + 10]) * unit  # m
+
+    assert 0 < np.abs(heights(clean) - heights(moved)).max() <= 0.021  # both ends of a difference moved
 
 
 def test_what_is_longer_than_a_flight_is_not_learned_from(tiny, training_set):

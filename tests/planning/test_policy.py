@@ -16,7 +16,7 @@ def test_every_planner_and_auto_have_a_policy():
 def test_a_planner_that_is_asked_for_is_asked_first_and_always(name):
     (step,) = POLICIES[name]
     assert step.planners[0] == name
-    assert step.when(None, (), None).due
+    assert step.when(None, ()).due
 
 
 @pytest.mark.parametrize("policy", POLICIES)

@@ -42,20 +42,31 @@ WARM_START = (
     Start(Search(barrier=0.05, push=1e-3, iterations=40)),
     *COLD_START,
 )
-# Refining stops early, within about 0.3 % of the optimum: at a barrier of EARLY_STOP for each second that an interval
+# Refining stops early, within about 0.02 % of the optimum: at a barrier of EARLY_STOP for each second that an interval
 # takes. What then remains of the constraints is a fraction of the margin that they are tightened by; whole steps leave
 # less than a tenth of the gradient.
-EARLY_STOP, EARLY_FEASIBILITY, EARLY_GRADIENT, EARLY_LEFT_BY_STEP = 1.25, 2e-4, 0.05, 0.2
+EARLY_STOP, EARLY_FEASIBILITY, EARLY_GRADIENT, EARLY_LEFT_BY_STEP = 0.15, 2e-4, 0.05, 0.2
+
+# Times that barrier, further inside the bounds and 0.3 % from the optimum: where the search does not end otherwise, and
+# under caps, which giving way finds step by step: from profiles at their limits it finds lower ones.
+EARLIER = 8.0
 
 
-def refining_starts(interval: float) -> Sequence[Start]:
+def refining_starts(interval: float, *, capped: bool = False) -> Sequence[Start]:
     """Return the searches that refine a near-feasible profile whose intervals take this long, s."""
-    return _early(EARLY_STOP * interval, push=1e-2, iterations=40), *COLD_START
+    if capped:
+        return _early(EARLIER * EARLY_STOP * interval, push=1e-2, iterations=40), *COLD_START
+    return (
+        _early(EARLY_STOP * interval, push=1e-2, iterations=40),
+        _early(EARLIER * EARLY_STOP * interval, push=1e-2, iterations=40),
+        *COLD_START,
+    )
 
 
-def refining_restarts(interval: float) -> Sequence[Start]:
+def refining_restarts(interval: float, *, capped: bool = False) -> Sequence[Start]:
     """Return the same from the solution of a problem almost the same."""
-    return _early(EARLY_STOP * interval, push=3e-3, iterations=20), *WARM_START
+    stop = EARLIER * EARLY_STOP if capped else EARLY_STOP
+    return _early(stop * interval, push=3e-3, iterations=20), *WARM_START
 
 
 def _early(barrier: float, push: float, iterations: int) -> Start:
