@@ -272,3 +272,16 @@ def test_random_requests_keep_every_limit_over_the_flown_sequence(held, mission,
     assert walls.max() < 0.05  # m, beyond the margin before the walls
     assert flight.truth.off_in_air[-1] == 0
     assert_is_one_motion(flight, planner.held.flown, limits, 100_000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10, 20))
+def test_a_minute_of_random_requests_is_one_certified_motion(held, mission, limits, seed):
+    flight, planner, count = fly_random(held, mission, limits, seed, 60.0)
+    assert flight.outcome.exit_code is ExitCode.OK
+    assert sum(count.values()) > 200
+    assert len(planner.plans) > 100
+    assert flight.outcome.deviation.max < 0.1
+    assert limits.space.beyond(flight.truth.position)[:, :2].max() < 0.05
+    assert flight.truth.off_in_air[-1] == 0
+    assert_is_one_motion(flight, planner.held.flown, limits, 100_000)
