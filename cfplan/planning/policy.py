@@ -28,6 +28,7 @@ class Found(NamedTuple):
     planner: str
     nodes: int  # intervals of the profile
     joints: tuple[float, ...]  # s, where the windows of the profile meet
+    grid: float = 1.0  # factor on the planner's own number of nodes
 
     @property
     def duration(self) -> float:
@@ -70,8 +71,8 @@ def a_model_knows(task: PlanningTask, _found: Sequence[Found]) -> Due:
 
 
 def nothing_finished(_task: PlanningTask, found: Sequence[Found]) -> Due:
-    """Take the step unless a flight was found that was refined to its end and needed no slowing as a whole."""
-    return Due(not any(_finished(one.repaired) for one in found))
+    """Take the step unless a flight was found that was refined to its end, on a whole grid, and needed no slowing."""
+    return Due(not any(_finished(one.repaired) and one.grid >= 1.0 for one in found))
 
 
 def _finished(repaired: Repaired) -> bool:
@@ -155,7 +156,7 @@ def _take(step: Step, task: PlanningTask, nodes: int | None, space: Space) -> tu
             if isinstance(answer, str):
                 notes.append(answer)
                 continue
-            found.append(answer)
+            found.append(answer._replace(grid=factor))
             hardly = answer.repaired.speed_factor >= GOOD_SPEED_FACTOR
             if (_finished(answer.repaired) if step.finishes else hardly) or task.deadline.passed:
                 break
