@@ -117,8 +117,8 @@ def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path
 
     rest = {name: value for name, value in planning.items() if name != "model"}
     model: Path | None = planning["model"]
-    if model is not None and not model.is_dir():
-        raise InputError("no such folder", where=str(model), hint="name the folder of a model, see `cfplan train`")
+    if model is not None and not (model / "card.json").is_file():
+        raise InputError("no model there", where=str(model), hint="name the folder of a model, see `cfplan train`")
     beside = find_safety_file(given, path_file).resolve().parent / "models"
     found = model or (beside if any(beside.glob("*/card.json")) else None)
     return FlightOptions(**rest, **more, models=() if found is None else (found,))
