@@ -29,49 +29,50 @@ def _remember_verbose(context: click.Context, _: click.Parameter, verbose: bool)
     context.meta[VERBOSE] = verbose
 
 
+_PLANNING = (
+    click.option(
+        "--safety",
+        "safety_file",
+        type=click.Path(path_type=Path),
+        help=f"Limits to keep; else the nearest {SAFETY_FILE} in or above this folder, or above the path file.",
+    ),
+    click.option(
+        "--planner",
+        default="auto",
+        show_default=True,
+        help="auto, learned, expert, toppquad, convex or minsnap.",
+    ),
+    click.option(
+        "--model",
+        type=click.Path(path_type=Path),
+        help="Folder of the learned planner's model; else models/ beside the limits is looked into.",
+    ),
+    click.option("--nodes", type=click.IntRange(4), help="Grid intervals; else chosen from the path's length."),
+    click.option(
+        "--budget",
+        type=click.FloatRange(0, min_open=True),
+        help="s of the processor that planning may take.  [default: 5, and 0.02 a metre]",
+    ),
+    click.option(
+        "--speed",
+        "speed_factor",
+        type=click.FloatRange(0, 1, min_open=True),
+        help="Factor on the allowed speed; else the path file's, else 1.",
+    ),
+    click.option(
+        "-v",
+        "--verbose",
+        is_flag=True,
+        expose_value=False,
+        callback=_remember_verbose,
+        help="Say more of each step, as what every planner found.",
+    ),
+)
+
+
 def planning(command: Callable) -> Callable:
     """Add the options of every command that plans."""
-    for option in reversed(
-        (
-            click.option(
-                "--safety",
-                "safety_file",
-                type=click.Path(path_type=Path),
-                help=f"Limits to keep; else the nearest {SAFETY_FILE} in or above this folder, or above the path file.",
-            ),
-            click.option(
-                "--planner",
-                default="auto",
-                show_default=True,
-                help="auto, learned, expert, toppquad, convex or minsnap.",
-            ),
-            click.option(
-                "--model",
-                type=click.Path(path_type=Path),
-                help="Folder of the learned planner's model; else models/ beside the limits is looked into.",
-            ),
-            click.option("--nodes", type=click.IntRange(4), help="Grid intervals; else chosen from the path's length."),
-            click.option(
-                "--budget",
-                type=click.FloatRange(0, min_open=True),
-                help="s of the processor that planning may take.  [default: 5, and 0.02 a metre]",
-            ),
-            click.option(
-                "--speed",
-                "speed_factor",
-                type=click.FloatRange(0, 1, min_open=True),
-                help="Factor on the allowed speed; else the path file's, else 1.",
-            ),
-            click.option(
-                "-v",
-                "--verbose",
-                is_flag=True,
-                expose_value=False,
-                callback=_remember_verbose,
-                help="Say more of each step, as what every planner found.",
-            ),
-        )
-    ):
+    for option in reversed(_PLANNING):
         command = option(command)
     return command
 

@@ -38,12 +38,13 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         import numpy as np
 
         from cfplan.errors import CfplanError
-        from cfplan.flight.setpoints.encoding import encode_trajectory
+        from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
+        from cfplan.flight.setpoints.stops import encode_stops
         from cfplan.geometry.min_snap import min_snap
         from cfplan.planning.plan import plan
         from cfplan.safety.limits_file import load_limits
         from cfplan.simulation.glitches import glitch_at_every_setpoint
-        from cfplan.simulation.link_loss import simulate_link_loss
+        from cfplan.simulation.link_loss import link_loss_at_every_setpoint, link_loss_within_stops
 
         limits = load_limits(safety_file)
         middle = (np.array(limits.space.low) + limits.space.high) / 2
@@ -52,8 +53,11 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         with suppress(CfplanError):  # there may be no model for this vehicle
             plan(path, limits.airframe, limits, planner="learned", nodes=NODES)
         planned = plan(path, limits.airframe, limits, planner="expert", nodes=NODES)  # exceeds limits between nodes
-        begin = encode_trajectory(planned.trajectory).payloads[:2]
-        simulate_link_loss(begin, limits)
+        encoded = encode_trajectory(planned.trajectory, space=limits.space)
+        begin, first = encoded.payloads[:2], np.array([0])
+        lost = link_loss_at_every_setpoint(begin, limits)
+        stop = encode_stops(encoded.motion, RATE, rows=first, gains=encoded.gains, space=encoded.space)
+        link_loss_within_stops(stop, lost.snapshots[:, first], limits, np.array([stop.shape[1] - 1]))
         glitch_at_every_setpoint(begin, limits)
         if last >= Stage.REHEARSAL:
             from cfplan.preparation.plan_flight import PlannedFlight

@@ -188,7 +188,7 @@ def link_loss_within_stops(
         return swept[:, within].reshape(-1, 2, 3)
 
     with ThreadPoolExecutor() as pool:  # a motor lag each
-        boxes = list(pool.map(one, _bodies(limits), starts))
+        boxes = list(pool.map(one, _bodies(limits), np.ascontiguousarray(starts)))  # compiled for one layout
     times, places = np.tile(within / rate, len(stops)), rows[:, within, 0:3].reshape(-1, 3)
     return _judge(times, places, boxes, limits, [np.empty((0, SNAPSHOT_SIZE))] * len(boxes))
 

@@ -5,7 +5,6 @@ well, with all the time that it wants.
 """
 
 import multiprocessing
-import resource
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +23,7 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.safety.space import Space
 from cfplan.studies.adversarial_paths import FAMILIES, AdversarialPath, adversarial_path
+from cfplan.studies.machine import process_memory
 from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
 
 PATIENCE = 5.0  # budgets after which a path counts as hanging
@@ -166,8 +166,7 @@ def _trial(seed: int, limits: Limits, compare_every: int) -> HardPlan:
         trial = replace(trial, status=HANGS)
     except Exception as error:
         trial = replace(trial, reason=repr(error))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1.024e-3
-    trial = replace(trial, seconds=time.process_time() - begun, memory=peak)
+    trial = replace(trial, seconds=time.process_time() - begun, memory=process_memory("VmHWM"))
     if trial.status == CERTIFIED and compare_every and seed % compare_every == 0:
         signal.setitimer(signal.ITIMER_PROF, 20 * PATIENCE * trial.budget)
         with suppress(CfplanError, _HangsError):

@@ -21,6 +21,7 @@ from cfplan.planners.task import PlanningTask
 from cfplan.planning.planners import default_nodes
 from cfplan.planning.repair import Repaired, repair
 from cfplan.safety.limit_sets import LimitSet
+from cfplan.studies.machine import process_memory
 from cfplan.studies.result import Column, StudyResult, Table, detail_table
 from cfplan.studies.scaling import path_of_length
 from cfplan.studies.trials import find_box, find_limit_set
@@ -147,9 +148,9 @@ def _measure(path: Path, seed: int, chosen: LimitSet) -> LongPlan:
     try:
         path.check()
         _forget_peak()
-        before = _memory("VmRSS")
+        before = process_memory("VmRSS")
         found, values["seconds"] = _planned(path, chosen)
-        values |= {"kept": _memory("VmRSS") - before, "peak": _memory("VmHWM") - before}
+        values |= {"kept": process_memory("VmRSS") - before, "peak": process_memory("VmHWM") - before}
         values |= {"speed_factor": found.speed_factor, "flight": found.trajectory.duration}
         values["worst_share"] = found.certificate.worst.share
         expert = plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes), window=WindowSize(nodes, 0))
@@ -183,15 +184,6 @@ def _planned(path: Path, chosen: LimitSet) -> tuple[Repaired, tuple[float, float
     repaired = time.process_time()
     check_bytes(encode_trajectory(found.trajectory), found.trajectory, chosen.limits)
     return found, (planned - begun, repaired - planned, time.process_time() - repaired)
-
-
-def _memory(name: str) -> float:
-    """Return the MB of this process as Linux counts them; NaN elsewhere."""
-    try:
-        status = File("/proc/self/status").read_text()
-    except OSError:
-        return np.nan
-    return next((1e-3 * int(line.split()[1]) * 1.024 for line in status.splitlines() if line.startswith(name)), np.nan)
 
 
 def _forget_peak() -> None:

@@ -1,5 +1,6 @@
 """Describe the machine that measures, and keep it to one thread. Imports nothing heavy: call one_thread first."""
 
+import math
 import os
 import platform
 import sys
@@ -67,3 +68,15 @@ def _processor() -> str:
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()
+
+
+def process_memory(name: str) -> float:
+    """Return VmRSS, what this process uses now, or VmHWM, its peak, in MB as Linux counts them; NaN elsewhere.
+
+    Unlike getrusage, VmHWM does not begin with the peak of the process that started this one.
+    """
+    try:
+        status = Path("/proc/self/status").read_text()
+    except OSError:
+        return math.nan
+    return next((1.024e-3 * int(line.split()[1]) for line in status.splitlines() if line.startswith(name)), math.nan)

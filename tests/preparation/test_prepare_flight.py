@@ -112,7 +112,7 @@ def test_a_plan_file_gives_the_same_bytes_as_its_path_file(limits, tmp_path, ste
     save_plan(prepared.plan, tmp_path / "plan.parquet")
     again = prepare_flight(tmp_path / "plan.parquet", limits, on_step=steps)
     *before, stops = AFTER_PLANNING
-    assert steps.names(*ENDED_WELL) == ["plan", *before, "glitches", stops]
+    assert steps.names(*ENDED_WELL) == ["plan", *before, "glitches", "link loss of stops", stops]
     np.testing.assert_array_equal(again.mission.payloads, prepared.mission.payloads)
     np.testing.assert_array_equal(again.mission.stops, prepared.mission.stops)
     assert again.planned.lower_bound is None
