@@ -60,6 +60,11 @@ class Estimate:
     acceleration: Triple
     quaternion: Quaternion
 
+    def position_at(self, time: float) -> Triple:
+        """Return the position, m, a moment earlier or later, s, at the same velocity."""
+        (x, y, z), (vx, vy, vz), ahead = self.position, self.velocity, time - self.time
+        return x + ahead * vx, y + ahead * vy, z + ahead * vz
+
 
 @dataclass(frozen=True, slots=True)
 class VehicleStatus:

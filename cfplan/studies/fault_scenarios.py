@@ -78,6 +78,7 @@ SCENARIOS: tuple[Scenario, ...] = (
     _poses("frozen pose for 0.3 s", FaultKind.FREEZE, Rung.BRAKE, 0.3),
     _poses("same frame again for 1 s", FaultKind.REPEAT, Rung.LAND, 1.0),
     _poses("pose 5 cm off for 1 s", FaultKind.JUMP, Rung.NONE, 1.0, 0.05),
+    _poses("pose 35 cm off for 0.7 s", FaultKind.JUMP, Rung.LAND, 0.7, 0.35),
     _poses("pose 1 m off for 1 s", FaultKind.JUMP, Rung.LAND, 1.0, 1.0),
     _poses("pose 1 m off for good", FaultKind.JUMP, Rung.LAND, FOR_GOOD, 1.0),
     _poses("yaw turned by 180° for 1 s", FaultKind.FLIP, Rung.LAND, 1.0, pi),

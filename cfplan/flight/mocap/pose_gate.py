@@ -7,8 +7,11 @@ import math
 
 from cfplan.flight.mocap.pose_faults import MotionBounds, angle_between, is_finite, is_frozen, is_rotation
 from cfplan.flight.mocap.poses import Pose
+from cfplan.flight.telemetry import Triple
 
 _BOUNDS = MotionBounds(speed=6.0, turn=0.5, turn_rate=25.0)  # beyond what a vehicle can do
+_GAP = 0.1  # s without a good pose, after which the vehicle's own estimate tells where the next one must be
+_DRIFT = 0.5  # m/s², by which that estimate may go wrong meanwhile
 
 
 class PoseGate:
@@ -21,9 +24,13 @@ class PoseGate:
         self._jump = jump
         self.last: Pose | None = None  # the last good one
 
-    def fault(self, pose: Pose) -> str:
-        """Return why a pose must not be forwarded; empty for a good one, which is remembered."""
-        why = self._fault(pose)
+    def fault(self, pose: Pose, believed: Triple | None = None) -> str:
+        """Return why a pose must not be forwarded; empty for a good one, which is remembered.
+
+        `believed`, m, is where the vehicle itself believes that it was then; None where it does not tell. After a gap a
+        pose must agree with that: poses that jumped, and stay away, look as if the vehicle had flown there unseen.
+        """
+        why = self._fault(pose) or self._disbelieved(pose, believed)
         if not why:
             self.last = pose
         return why
@@ -48,3 +55,10 @@ class PoseGate:
         if turned > _BOUNDS.turn_within(elapsed):
             return f"turned {math.degrees(turned):.0f}°"
         return ""
+
+    def _disbelieved(self, pose: Pose, believed: Triple | None) -> str:
+        gap = pose.time - self.last.time if self.last is not None else 0.0
+        if believed is None or gap < _GAP:
+            return ""
+        off = math.dist(pose.position, believed)
+        return f"{off:.2f} m from the estimate" if off > self._jump + _DRIFT / 2.0 * gap**2 else ""

@@ -25,7 +25,7 @@ from cfplan.flight.pilot.proposals import NO_PROPOSALS, ProposalSource
 from cfplan.flight.pilot.stream import Stream, stream_of
 from cfplan.flight.radio.link import Link
 from cfplan.flight.setpoints.commitment import Commitment, splice
-from cfplan.flight.telemetry import Level, PoseReceived, Triple
+from cfplan.flight.telemetry import Estimate, Level, PoseReceived, Triple
 from cfplan.vehicle.rotations import yaw_of
 
 TRIES = 3
@@ -85,6 +85,7 @@ class FlightLoop:
         self.pose_fault = ""  # why the last pose was not good
         self._forwarded = math.inf  # s, the time of the last pose that was forwarded
         self._source_fault = ""
+        self._log_since = -math.inf  # s, since when the vehicle's log has come without a gap, in flight
         self._kept_alive = -math.inf  # s, when the vehicle's watchdog was last sent a keep-alive packet
         self.recent: deque[Pose] = deque()  # the good poses of the last second
         self.waking: deque[float] = deque(maxlen=200)  # s by which the last ticks were late
@@ -209,11 +210,13 @@ class FlightLoop:
 
     def _forward_poses(self) -> None:
         newest, estimate = None, self.link.estimate
-        if self.airborne and estimate is not None and self.now() - estimate.time <= self.limits.pose.age_warning:
+        if not self.airborne or estimate is None or self.now() - estimate.time > self.limits.pose.age_warning:
+            estimate, self._log_since = None, self.now()
+        else:
             self._source.tell_attitude(estimate.quaternion)
         for pose in self._source.poses():
             self.history.report(PoseReceived(pose.time, pose.received, pose.position, pose.quaternion))
-            fault = self._pose_gate.fault(pose)
+            fault = self._pose_gate.fault(pose, self._believed(estimate, pose.time))
             if fault != self.pose_fault:
                 self.pose_fault = fault
                 self.history.say(Level.WARNING, f"pose: {fault}" if fault else "pose: good again")
@@ -231,6 +234,16 @@ class FlightLoop:
             self._forwarded = newest.time
         while len(self.recent) > 1 and self.recent[0].time < self.recent[-1].time - _RECENT:
             self.recent.popleft()
+
+    def _believed(self, estimate: Estimate | None, time: float) -> Triple | None:
+        """Return where the vehicle believes that it was, m; None unless its log has come since before the last pose.
+
+        Where the radio was dead meanwhile, poses that waited in it came late and spoilt its estimate.
+        """
+        last = self._pose_gate.last
+        if estimate is None or last is None or last.time < self._log_since:
+            return None
+        return estimate.position_at(time)
 
     def _note_deviation(self, pose: Pose) -> None:
         moment = pose.time - self.mission.lead

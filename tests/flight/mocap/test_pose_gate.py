@@ -52,3 +52,15 @@ def test_the_sign_of_a_quaternion_means_nothing(gate):
 
 def test_after_a_dropout_a_vehicle_may_have_gone_far(gate):
     assert not gate.fault(pose(1.5, 1.0))
+
+
+def test_after_a_dropout_a_pose_must_agree_with_what_the_vehicle_believes(gate):
+    jumped, back = pose(1.4, 1.0), pose(1.41, 0.6)
+    assert "0.40 m from the estimate" in gate.fault(jumped, believed=(0.6, 0.0, 1.0))
+    assert gate.last == pose(1.0)
+    assert not gate.fault(back, believed=(0.62, 0.0, 1.0))
+    assert not gate.fault(pose(1.42, 0.61), believed=(5.0, 0.0, 1.0))  # there is no dropout any more
+
+
+def test_what_the_vehicle_believes_may_drift_in_a_long_dropout(gate):
+    assert not gate.fault(pose(3.0, 0.9), believed=(0.0, 0.0, 1.0))
