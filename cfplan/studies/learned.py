@@ -86,7 +86,7 @@ FIGURES = (
     ),
     Column("convex_slowed", "convex, slowed, against learned: median", "%", "+.2f"),
     Column(
-        "bytes_refused", "bytes refused", goal="0", meaning="a packet cannot say it: places beyond 32.7 m, or a thrust that leans too far"
+        "bytes_refused", "bytes refused", goal="0", meaning="beyond 32.7 m, or a thrust that leans too far"
     ),
     Column("flown"),
     Column(
