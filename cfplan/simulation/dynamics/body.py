@@ -6,7 +6,9 @@ Everything runs inside numba, so state and parameters are flat arrays:
     state (17,)   position 0:3 m, velocity 3:6 m/s, quaternion 6:10 body→world x y z w,
                   body rate 10:13 rad/s in body axes, thrust of each motor 13:17 N
 
-The floor is inelastic and holds: a body on it that the rotors do not lift stands still and level.
+The floor is inelastic and holds: a body on it that the rotors do not lift stays where it is and tips over, back onto
+its feet or, if it came down steeper than `TIPPING_ANGLE`, onto its back, where it stays. It turns at a finite rate, so
+that its gyroscopes feel it.
 """
 
 import numpy as np
@@ -18,6 +20,11 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import about_z, axes_of, product, yaw_of
 
 TIME_STEP = 0.001  # s
+
+# About what a Crazyflie's feet, 32 mm from its centre and 10 mm below it, and gravity make of a fall onto an edge.
+TIPPING_ANGLE = np.radians(75.0)  # rad from upright: beyond it, over onto the back
+TIPPING_RATE = 10.0  # rad/s
+_LEVEL = 1e-9  # rad
 
 POSITION = slice(0, 3)
 VELOCITY = slice(3, 6)
@@ -86,7 +93,7 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes_of(state[6], state[7], state[8], state[9])
     on_floor = state[2] <= body[FLOOR]
     if on_floor and state[5] <= 0.0 and thrust * zz <= body[MASS] * GRAVITY:
-        _rest(state, body[FLOOR])
+        _rest(state, body)
         return
 
     torque_x = body[_ARM] * (-push_0 - push_1 + push_2 + push_3)
@@ -110,7 +117,7 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
         state[axis] += step * state[3 + axis]
     _turn(state, step)
     if state[2] < body[FLOOR]:
-        _rest(state, body[FLOOR])
+        _rest(state, body)
 
 
 @register_jitable(forceinline=True)
@@ -142,11 +149,21 @@ def _turn(state: NDArray, step: float) -> None:
 
 
 @njit(allocates=False)
-def _rest(state: NDArray, floor: float) -> None:
-    """Stand on the floor: still and level, yaw kept."""
-    state[2] = floor
+def _rest(state: NDArray, body: NDArray) -> None:
+    """Lie on the floor for a step: in place, tipping over the shorter way; standing, exactly level, yaw kept."""
+    state[2] = body[FLOOR]
     state[3:6] = 0.0
     state[10:13] = 0.0
-    half = 0.5 * yaw_of(state[6:10])
-    state[6:8] = 0.0
-    state[8], state[9] = np.sin(half), np.cos(half)
+    (_, _, up_x), (_, _, up_y), (_, _, up_z) = axes_of(state[6], state[7], state[8], state[9])
+    across = np.sqrt(up_x * up_x + up_y * up_y)
+    tilt = np.arctan2(across, up_z)
+    if tilt < _LEVEL:
+        half = 0.5 * yaw_of(state[6:10])
+        state[6:8] = 0.0
+        state[8], state[9] = np.sin(half), np.cos(half)
+    elif np.pi - tilt > _LEVEL:
+        # About the horizontal axis that brings the body's z axis up, in body axes.
+        turn = tilt if tilt < TIPPING_ANGLE else tilt - np.pi
+        rate = min(max(turn / body[STEP], -TIPPING_RATE), TIPPING_RATE)
+        state[10], state[11] = -rate * up_y / across, rate * up_x / across
+        _turn(state, body[STEP])

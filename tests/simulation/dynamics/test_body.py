@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from rotorpy.vehicles.multirotor import Multirotor
 from scipy.spatial.transform import Rotation
 
@@ -126,15 +127,39 @@ def test_it_rests_on_the_floor_until_the_rotors_lift_it():
     assert fly(start, np.full(4, 1.1 * frame.hover_thrust), body, 2.0)[2] > 0.1
 
 
-def test_a_tilted_fall_ends_still_and_level_on_the_floor():
-    start = at_rest([0, 0, 0.5])
-    start[QUATERNION] = Rotation.from_euler("ZYX", [50, 20, 10], degrees=True).as_quat()
-    start[VELOCITY] = 1.0, 0.0, 0.0
-    state = fly(start, np.zeros(4), pack_body(airframe()), 1.0)
+def dropped(euler: list[float], seconds: float = 1.0) -> tuple[NDArray, Rotation]:
+    """Return how a body lies that fell onto the floor so turned (ZYX, degrees), and the turn that its gyros felt."""
+    body = pack_body(airframe())
+    state = at_rest([0, 0, 0.1])
+    state[QUATERNION] = Rotation.from_euler("ZYX", euler, degrees=True).as_quat()
+    state[VELOCITY] = 1.0, 0.0, 0.0
+    felt = Rotation.from_quat(state[QUATERNION])
+    for _ in range(round(seconds / TIME_STEP)):
+        state = fly(state, np.zeros(4), body, TIME_STEP)
+        felt *= Rotation.from_rotvec(TIME_STEP * state[BODY_RATE])
+    return state, felt
+
+
+@pytest.mark.parametrize("euler", [[50, 20, 10], [-120, 0, 70], [0, -74, 0], [10, 0, 0.01]])
+def test_a_tilted_fall_ends_still_and_level_on_the_floor(euler):
+    state, felt = dropped(euler)
     assert state[2] == 0.0
     assert state[VELOCITY] == pytest.approx(0.0)
-    yaw, pitch, roll = Rotation.from_quat(state[QUATERNION]).as_euler("ZYX", degrees=True)
-    assert (yaw, pitch, roll) == pytest.approx((50, 0, 0), abs=1e-9)
+    assert state[BODY_RATE] == pytest.approx(0.0)
+    _, pitch, roll = Rotation.from_quat(state[QUATERNION]).as_euler("ZYX", degrees=True)
+    assert (pitch, roll) == pytest.approx((0, 0), abs=1e-9)
+    assert (felt.inv() * Rotation.from_quat(state[QUATERNION])).magnitude() < 1e-6
+
+
+@pytest.mark.parametrize("euler", [[50, 80, 0], [0, 0, 120], [-20, 10, 180], [0, -100, 0]])
+def test_a_body_that_falls_on_its_side_or_back_stays_on_its_back(euler):
+    state, felt = dropped(euler)
+    assert state[2] == 0.0
+    up = Rotation.from_quat(state[QUATERNION]).apply([0, 0, 1])
+    assert up == pytest.approx([0, 0, -1], abs=1e-6)
+    assert (felt.inv() * Rotation.from_quat(state[QUATERNION])).magnitude() < 1e-6
+    still = fly(state, np.full(4, airframe().motor_thrust_max), pack_body(airframe()), 1.0)
+    assert still[: MOTORS.start] == pytest.approx(state[: MOTORS.start])  # its rotors press it down
 
 
 def test_the_rotation_matrix_is_that_of_scipy():
