@@ -68,6 +68,31 @@ def test_a_vehicle_that_is_late_on_its_path_is_off_its_setpoint_and_that_ends_th
     assert "from the setpoint" in flown.reason
 
 
+@pytest.mark.parametrize("dead", [0.6, 1.0, 1.4, 1.8])
+@pytest.mark.parametrize("between", [0.0, 0.001, 0.005])  # a setpoint is in the air, a pose is, neither
+@pytest.mark.parametrize("poses_too", [True, False])
+def test_a_vehicle_whose_radio_was_dead_stays_where_it_is_when_that_returns(line, dead, between, poses_too):
+    faults = [RadioFault(RadioFaultKind.DEAD, 0.0, dead)]
+    if poses_too:
+        faults.append(ViconFault(FaultKind.CLOSE, dead - 0.2, 2.0))
+    scenario = Scenario("radio dead", Rung.LAND, tuple(faults), Phase.STREAM, 1.5 + between)
+    truth = (flown := fly_stepped(scenario, line)).truth
+    returned = truth.time >= flown.struck + dead
+    places = truth.position[returned][:, :2]
+    assert np.linalg.norm(places - places[0], axis=1).max() < (0.5 if dead > 0.8 else 0.7)
+    assert judge(scenario, flown, line, readable=True).landed
+
+
+@pytest.mark.parametrize("stall", [0.7, 1.2, 1.7])
+def test_a_vehicle_whose_pilot_stood_still_lands_where_it_is(line, stall):
+    scenario = Scenario("stall", Rung.BRAKE, (), Phase.STREAM, 1.5, stall=stall)
+    truth = (flown := fly_stepped(scenario, line)).truth
+    woken = truth.time >= flown.struck + stall
+    places = truth.position[woken][:, :2]
+    assert np.linalg.norm(places - places[0], axis=1).max() < 0.5
+    assert judge(scenario, flown, line, readable=True).landed
+
+
 def test_two_swapped_bodies_never_let_the_vehicle_climb_away(line):
     (swapped,) = (row for row in SCENARIOS if row.name == "two bodies swapped")
     truth = fly_stepped(swapped, line).truth

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from cfplan.flight.clock import REAL_CLOCK, Clock
+from cfplan.flight.firmware import Timeouts
 from cfplan.flight.mocap.pose_gate import PoseGate
 from cfplan.flight.mocap.pose_predictor import PosePredictor
 from cfplan.flight.mocap.poses import Pose, PoseSource
@@ -25,12 +26,16 @@ from cfplan.flight.pilot.proposals import NO_PROPOSALS, ProposalSource
 from cfplan.flight.pilot.stream import Stream, stream_of
 from cfplan.flight.radio.link import Link
 from cfplan.flight.setpoints.commitment import Commitment, splice
+from cfplan.flight.setpoints.encoding import encode_motion
+from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.telemetry import Estimate, Level, PoseReceived, Triple
 from cfplan.vehicle.rotations import yaw_of
 
 TRIES = 3
 _KEEP_ALIVE_PERIOD = 0.1  # s; the vehicle's watchdog stops the motors after 1 s without a keep-alive packet
 _RECENT = 1.0  # s of good poses that are kept
+_LEFT_ALONE_AFTER = Timeouts().level_out  # s without a setpoint
+_BRAKES_IN = 0.2  # s of its speed, by which a vehicle that levels out stops beyond where it is
 _STREAMS = 8  # that are remembered: a pose that comes late is judged by the stream of its time
 
 
@@ -81,6 +86,9 @@ class FlightLoop:
         self.commitment = Commitment(0, mission.payloads, mission.stops)
         self.plan = stream_of(self.commitment, mission.rate)
         self.stream: Stream | None = None  # what each tick sends
+        self.left_alone = False
+        """The vehicle had no setpoint for so long that it left its stream by itself; until `hold_where_it_is`."""
+        self._sent_at = math.inf  # s, when the last setpoint was sent
         self._begun: deque[Stream] = deque(maxlen=_STREAMS)  # the last streams, each with its start
         self.pose_fault = ""  # why the last pose was not good
         self._forwarded = math.inf  # s, the time of the last pose that was forwarded
@@ -183,6 +191,35 @@ class FlightLoop:
         position, velocity, _, quaternion, _ = self.stream.state(self.stream.index(self.now()))
         return position, velocity, yaw_of(quaternion)
 
+    # A vehicle that was left alone: its radio was dead, or this computer stood still.
+
+    def hold_where_it_is(self) -> bool:
+        """Send a hover near where the vehicle is; return whether it is heard, so that this reaches it.
+
+        That is by the poses, by its own estimate if those do not come, or else where it was seen last.
+        """
+        now, estimate, space = self.now(), self.link.estimate, self.limits.space
+        position, velocity, yaw = self.seen()
+        heard = estimate is not None and now - estimate.time < self.limits.pose.age_warning
+        if now - self.pose().time > self.limits.pose.age_brake:
+            velocity = 0.0, 0.0, 0.0
+            if estimate is not None and heard:
+                position, velocity, yaw = estimate.position, estimate.velocity, yaw_of(estimate.quaternion)
+        inside, (x, y, z) = space.margin, position
+        x = min(max(x + _BRAKES_IN * velocity[0], space.low[0] + inside), space.high[0] - inside)
+        y = min(max(y + _BRAKES_IN * velocity[1], space.low[1] + inside), space.high[1] - inside)
+        place, rate = (x, y, min(z, space.high[2] - inside)), self.mission.rate
+        motion = hover_to_hover(place, yaw, place, yaw, 1.0 / rate, rate)
+        self.begin(Stream(encode_motion(motion, motion.acceleration, space=space), rate))
+        self.left_alone = not heard
+        return heard
+
+    def _note_left_alone(self, now: float) -> None:
+        link = self.link
+        if self.airborne and self.stream is not None and link.estimate is not None and link.status is not None:
+            silent = now - max(link.estimate.time, link.status.time)
+            self.left_alone |= max(silent, now - self._sent_at) > _LEFT_ALONE_AFTER
+
     # Ticks.
 
     def tick(self) -> float:
@@ -190,9 +227,11 @@ class FlightLoop:
         due = self._deadlines.wait()
         now = self.now()
         stream = self.stream
+        self._note_left_alone(now)
         if stream is not None:
             index = stream.index(now)
             self.link.send(stream.packet(index))
+            self._sent_at = now
             if self.history.first_setpoint:
                 self.history.report(stream.sent(index, now, due))
             if stream is self.plan and now < stream.end:

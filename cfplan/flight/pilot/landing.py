@@ -32,6 +32,7 @@ _BLIND_FOR = 3.0  # s without poses after which the motors stop, as the estimate
 _CLEAR = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
 _SEEN_FOR = 0.1  # s of good poses after which they are believed again
 _MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
+_LOOK_AGAIN = 0.05  # s
 _LATEST_ESTIMATE = 0.1  # s
 _IDLE_FOR = 0.2  # s without any thrust, which no descent asks for
 
@@ -64,6 +65,7 @@ class Landing:
         """Descend from where the vehicle is asked to be, and stop its motors. Raises AbortRaised if they do not."""
         self.begin()
         while not self._stands:
+            self._find()
             if self._loop.blind:
                 self._descend_blindly()
             else:
@@ -72,6 +74,12 @@ class Landing:
             raise AbortRaised(safety_abort(Rung.CUT, "the vehicle does not land"))
         self._loop.touch_down()
 
+    def _find(self) -> None:
+        """Ask a vehicle that was left alone to stay where it is, until it is heard again."""
+        loop = self._loop
+        while loop.left_alone and not loop.hold_where_it_is():
+            loop.pause(_LOOK_AGAIN)
+
     def _descend(self) -> None:
         """Sink until the vehicle stands, or poses are gone; from the pose if those have only come back."""
         loop = self._loop
@@ -79,8 +87,8 @@ class Landing:
         pace = gentle(_CRUISE * loop.limits.ground.land_speed)
         self._sink(loop.seen() if self._was_blind else loop.asked(), pace, lowest)
         self._was_blind = False
-        loop.until(lambda: self._stands_by_poses() or self._sunk() or loop.blind, math.inf)
-        if not loop.blind:
+        loop.until(lambda: self._stands_by_poses() or self._sunk() or loop.blind or loop.left_alone, math.inf)
+        if not (loop.blind or loop.left_alone):
             self._conclude(self._stands_by_poses())
 
     def _descend_blindly(self) -> None:
@@ -99,8 +107,8 @@ class Landing:
         def over() -> bool:
             return self._sunk() or loop.blind_for > _BLIND_FOR
 
-        loop.until(lambda: self._stands_by_estimate() or over() or seen(), math.inf)
-        if not seen():
+        loop.until(lambda: self._stands_by_estimate() or over() or seen() or loop.left_alone, math.inf)
+        if not (seen() or loop.left_alone):
             self._conclude(self._stands_by_estimate())
 
     def _sink(self, begin: tuple[Triple, Triple, float], pace: Pace, lowest: float) -> None:

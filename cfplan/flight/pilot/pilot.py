@@ -234,10 +234,11 @@ class Pilot:
             reasons.append(abort.text)
 
     def _brake(self) -> None:
+        loop = self._loop
         self._stop()
-        if not self._landing.begun:
+        if not (self._landing.begun or loop.left_alone):
             self._history.enter(Phase.HOLD)
-            self._loop.pause(_BRAKE_HOLD)
+            loop.until(lambda: loop.left_alone, _BRAKE_HOLD)
         self._landing.land()
 
     def _stop_and_land(self) -> None:
@@ -245,9 +246,12 @@ class Pilot:
         self._landing.land()
 
     def _stop(self) -> None:
-        """Brake along the path to a hover, or finish a stop that has begun; sink besides where poses are gone."""
+        """Brake along the path to a hover, or finish a stop that has begun; sink besides where poses are gone.
+
+        A vehicle that was left alone is no longer on its path.
+        """
         loop, left = self._loop, self._loop.stream
-        if left is None or self._landing.begun:
+        if left is None or self._landing.begun or loop.left_alone:
             return
         if left.stop_from is not None:
             stop = left.stop_from(self._present_index(left))
@@ -255,10 +259,10 @@ class Pilot:
             if left is loop.plan:
                 self._history.stopped_at = started.start
         end = loop.stream.end if loop.stream is not None else 0.0
-        loop.until(lambda: loop.now() > end or loop.blind, math.inf)
-        if loop.now() < end:
+        loop.until(lambda: loop.now() > end or loop.blind or loop.left_alone, math.inf)
+        if loop.now() < end and not loop.left_alone:
             self._landing.sink_while_stopping()
-            loop.until(lambda: loop.now() > end, math.inf)
+            loop.until(lambda: loop.now() > end or loop.left_alone, math.inf)
 
     def _present_index(self, stream: Stream) -> int:
         """Return the setpoint to stop from: the present one, or the nearest before it if the vehicle fell behind."""

@@ -1,3 +1,3 @@
-"""The link to the vehicle: URIs, the Crazyradio, its lock, connecting, parameters and logs."""
+"""The link to the vehicle: URIs, the Crazyradio, its lock, connecting, perishable packets, parameters and logs."""
 
-__all__ = ["connection", "crazyradio", "link", "supervisor_bits", "uri"]
+__all__ = ["connection", "crazyradio", "link", "perishable", "supervisor_bits", "uri"]

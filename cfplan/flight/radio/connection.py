@@ -1,6 +1,5 @@
 """Connect to a Crazyflie within bounded time, or fail with a hint."""
 
-import contextlib
 import os
 import queue
 import threading
@@ -12,6 +11,7 @@ from cfplan.errors import LinkError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.radio.crazyradio import usb_hint
 from cfplan.flight.radio.link import Link
+from cfplan.flight.radio.perishable import PerishableQueue, empty_air
 from cfplan.flight.radio.radio_lock import lock_radio
 from cfplan.flight.radio.uri import EXAMPLES
 from cfplan.flight.telemetry import Telemetry
@@ -64,7 +64,8 @@ def connect(
     def open_link() -> None:
         crazyflie.open_link(uri)
         if crazyflie.link is not None:
-            crazyflie.link = _Serialized(crazyflie.link)
+            empty_air(crazyflie.link, clock.now)
+            crazyflie.link = _Serialized(crazyflie.link, clock)
 
     threading.Thread(target=open_link, daemon=True).start()
     try:
@@ -133,9 +134,11 @@ class _Serialized:
     that long would be taken for a fresh one.
     """
 
-    def __init__(self, driver: Any):
+    def __init__(self, driver: Any, clock: Clock = REAL_CLOCK):
         self._driver, self._lock = driver, threading.Lock()
         self.needs_resending = driver.needs_resending
+        waiting = getattr(driver, "out_queue", None)
+        self._queue = PerishableQueue(waiting, clock.now) if isinstance(waiting, queue.Queue) else None
 
     def send_packet(self, packet: Any) -> None:
         """Send a packet for cflib itself."""
@@ -147,10 +150,8 @@ class _Serialized:
 
     def send_soon(self, packet: Any) -> None:
         """Send a packet that is soon out of date; drop it if the radio is busy."""
-        waiting = getattr(self._driver, "out_queue", None)
-        if isinstance(waiting, queue.Queue):
-            with contextlib.suppress(queue.Full):
-                waiting.put(packet, timeout=PATIENCE)
+        if self._queue is not None:
+            self._queue.put(packet, PATIENCE)
         else:
             self.send_packet(packet)
 

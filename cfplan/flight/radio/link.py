@@ -14,12 +14,12 @@ import numpy as np
 
 from cfplan.errors import LinkError
 from cfplan.flight.clock import REAL_CLOCK, Clock
-from cfplan.flight.setpoints.packets import decompress_quaternion
+from cfplan.flight.radio.perishable import EXTERNAL_POSE, LOCALIZATION_PORT
+from cfplan.flight.setpoints.packets import CRTP_PORT, decompress_quaternion
 from cfplan.flight.telemetry import Estimate, Telemetry, Triple, VehicleStatus
 from cfplan.vehicle.airframe import GRAVITY
 
-HIGH_LEVEL_PORT, GENERIC_PORT, LOCALIZATION_PORT, SUPERVISOR_PORT, PLATFORM_PORT = 8, 7, 6, 9, 13
-EXTERNAL_POSE = 8
+HIGH_LEVEL_PORT, GENERIC_PORT, SUPERVISOR_PORT, PLATFORM_PORT = 8, CRTP_PORT, 9, 13
 
 _MILLI = 1e-3
 _CLOCK_DRIFT = 5e-4  # by which the vehicle's clock may differ

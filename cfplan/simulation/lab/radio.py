@@ -2,7 +2,8 @@
 
 A Crazyradio sends one packet, gets at most one back with the acknowledgement, and repeats both until it has got it
 (cflib's safelink). Loss therefore costs time and nothing else, until one side's queue is full: the computer's holds
-the packet in the air and one more, the vehicle's 120. What a dead radio held comes out when it returns, and is old.
+the packet in the air and one more, the vehicle's 120. What a dead radio held comes out when it returns, and is old;
+but setpoints and poses that wait for long do not come, as the pilot's link sees to (`flight/radio/perishable.py`).
 """
 
 from collections import deque
@@ -14,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from cfplan.errors import InputError
+from cfplan.flight.radio.perishable import KEEPS_FOR, is_perishable
 from cfplan.simulation.timed_fault import TimedFault
 
 TRANSACTION = 0.001  # s a transmission and its acknowledgement: 1,000 a second, as cflib gets
@@ -49,7 +51,8 @@ class Radio:
         self._chance = np.random.default_rng(seed)
         self._next = now
         self._faults: list[tuple[float, float, RadioFault]] = []
-        self._up: deque[bytes] = deque()
+        self._now = now  # s, of the last step
+        self._up: deque[tuple[float, bytes]] = deque()  # each with when, s, it was sent
         self._down: deque[bytes] = deque()
         self._on_way_up: deque[tuple[float, bytes]] = deque()
         self._on_way_down: deque[tuple[float, bytes]] = deque()
@@ -65,16 +68,23 @@ class Radio:
         return len(self._up) >= COMPUTER_QUEUE
 
     @property
+    def stuck(self) -> bool:
+        """Return whether what waits in the computer's queue has perished there."""
+        return self.full and self._perished(*self._up[-1], self._now)
+
+    @property
     def busy(self) -> bool:
         """Return whether any packet is on its way."""
         return bool(self._up or self._down or self._on_way_up or self._on_way_down)
 
     def send(self, packet: bytes) -> None:
-        """Send a packet from the computer; it is dropped if the queue is full."""
+        """Send a packet from the computer; if the queue is full, one of both is dropped: what has perished, or this."""
         if self.full:
             self.dropped += 1
+            if self.stuck:
+                self._up[-1] = self._now, packet
         else:
-            self._up.append(packet)
+            self._up.append((self._now, packet))
 
     def answer(self, packet: bytes) -> None:
         """Send a packet from the vehicle; it is dropped if the queue is full."""
@@ -85,6 +95,7 @@ class Radio:
 
     def step(self, now: float) -> tuple[list[bytes], list[bytes]]:
         """Return the packets that have reached the vehicle by now, and those that have reached the computer."""
+        self._now = max(self._now, now)
         if not (self._up or self._down):
             if now > self._next:
                 self._next = now
@@ -105,9 +116,16 @@ class Radio:
                 return
             due += delay.strength if delay is not None else 0.0
         if self._up:
-            self._on_way_up.append((due, self._up.popleft()))
+            sent, packet = self._up.popleft()
+            if not self._perished(sent, packet, time):
+                self._on_way_up.append((due, packet))
         if self._down:
             self._on_way_down.append((due, self._down.popleft()))
+
+    @staticmethod
+    def _perished(sent: float, packet: bytes, now: float) -> bool:
+        """Return whether a packet is not worth sending any more."""
+        return now - sent > KEEPS_FOR and is_perishable(packet[0], packet[1:])
 
     def _acting(self, kind: RadioFaultKind, time: float) -> RadioFault | None:
         for begin, end, fault in self._faults:

@@ -48,7 +48,7 @@ class SteppedLink(Link):
     def send_soon(self, packet: Any) -> None:
         """Send a packet as the radio's driver does: wait briefly for its queue, then drop the packet."""
         until = self._lab.now + PATIENCE
-        while self._lab.radio.full and self._lab.now < until:
+        while self._lab.radio.full and not self._lab.radio.stuck and self._lab.now < until:
             self._lab.clock.sleep(_STEP)
         self._lab.radio.send(bytes((packet.header,)) + bytes(packet.data))
 

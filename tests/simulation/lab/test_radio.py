@@ -3,6 +3,7 @@
 import pytest
 
 from cfplan.errors import InputError
+from cfplan.flight.radio.perishable import KEEPS_FOR
 from cfplan.simulation.lab.radio import COMPUTER_QUEUE, Radio, RadioFault, RadioFaultKind
 
 LOSS, DELAY, DEAD = RadioFaultKind.LOSS, RadioFaultKind.DELAY, RadioFaultKind.DEAD
@@ -60,6 +61,15 @@ def test_a_dead_radio_keeps_what_it_had_and_turns_the_rest_away():
              if got == packet and now - 0.01 * number > 0.1]  # fmt: skip
     assert len(stale) == COMPUTER_QUEUE
     assert radio.dropped > 40
+
+
+def test_setpoints_and_poses_that_a_dead_radio_held_do_not_come_out():
+    radio = Radio(0.0)
+    radio.inject(RadioFault(DEAD, start=0.5, duration=0.5), 0.0)
+    poses = [b"\x6d\x08" + number for number in numbered(200)]  # port 6, channel 1, a pose
+    found = passed(radio, poses)
+    assert max(now - 0.01 * poses.index(packet) for now, packet in found) < KEEPS_FOR + 0.02
+    assert not any(0.52 < 0.01 * poses.index(packet) < 0.93 for _, packet in found)
 
 
 def test_the_vehicles_queue_holds_a_hundred_and_twenty():
