@@ -13,6 +13,14 @@ settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25° for 1.5 s.
 those with which that tilt does good: it brakes what speed will be left, v_left = 0.41 v + 0.089 s · a(t + 0.15 s),
 horizontally, as the vehicle first holds its last place for half a second; and within 1.5 m of a wall it leans away from
 that wall, the more the nearer, so that an attitude that the vehicle has wrong does not carry it there.
+
+Two bounds leave more of the rate as a rate: φ grows to 90° as |Δ| nears 7 rad/s, so at most TRADED_RATE_MAX is traded;
+and z(q') may not lean beyond LEAN_MAX, where little of the thrust carries the vehicle and the controller's heading is
+hardly defined. With n the direction of φ × z in body axes, u the vertical in them, and both in the plane of z and n,
+
+    z(q')·u = u_n sin φ + u_z cos φ >= cos LEAN_MAX    ⟺    φ <= atan2(u_n, u_z) + acos(cos LEAN_MAX / |(u_n, u_z)|)
+
+which changes steadily along a motion. Where the attitude to fly leans as far itself, only what rights it is traded.
 """
 
 import math
@@ -26,7 +34,7 @@ from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.machine_code import njit
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import heading_of, product, yaw_of
+from cfplan.vehicle.rotations import heading_of, matrices_of, product, yaw_of
 
 BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ahead of the setpoint
 SPEED_LEFT = 0.41  # share of the velocity that is left when the firmware begins to level out
@@ -38,6 +46,8 @@ WALL_REACH = 1.5  # m from a wall, within which level-out leans away from it
 WALL_STIFFNESS = 0.35  # 1/s², acceleration away from a wall for each m nearer than that
 WALL_PULL_MAX = 0.45  # m/s²; 2.6° of tilt
 TRADED_RATE_MAX = 4.5  # rad/s; what exceeds it is sent as a rate, as φ grows to 90° at 7 rad/s
+LEAN_MAX = math.radians(65.0)  # of the thrust that is sent; plans under the shipped limits reach 45°
+_LEAST_LIFT = math.cos(LEAN_MAX)
 _QUANTUM = 1e-3  # rad/s, of rates in a packet
 _LONGEST_GAP = 0.05  # s between setpoints, after which they are read anew
 _ROWS_AHEAD = 2  # of 10 ms, that rates are sent ahead
@@ -92,7 +102,7 @@ def harmless_rates(
     gains: AttitudeGains = FIRMWARE_GAINS,
     space: Space | None = None,
 ) -> NDArray:
-    """Return the roll and pitch rates to send, (N, 2) rad/s: those that do good, and what exceeds TRADED_RATE_MAX.
+    """Return the roll and pitch rates to send, (N, 2) rad/s: those that do good, and what must not be traded.
 
     The check of the bytes compares with these, so they are computed apart from trade_rates, from a(t) to tilt to rate.
     """
@@ -112,8 +122,14 @@ def harmless_rates(
     rate = np.minimum(gains.full_rate * np.sin(np.arctan2(size, GRAVITY)), BRAKE_RATE_MAX)
     good = (rate / size)[:, None] * np.stack([-pull[:, 1], pull[:, 0]], axis=1)
     traded = motion.body_rate[:, :2] - good
-    most = TRADED_RATE_MAX / np.maximum(np.linalg.norm(traded, axis=1), TRADED_RATE_MAX)
-    return np.asarray(motion.body_rate[:, :2] - most[:, None] * traded)
+    size = np.linalg.norm(traded, axis=1)
+    up = matrices_of(motion.quaternion)[:, 2]  # the vertical in body axes
+    aside = np.sum(up[:, :2] * np.stack([traded[:, 1], -traded[:, 0]], axis=1), axis=1) / np.maximum(size, 1e-12)
+    upright = np.arctan2(aside, up[:, 2])  # the turn after which the axis leans least, by acos(reached)
+    reached = np.hypot(aside, up[:, 2])
+    widest = np.clip(upright + np.arccos(np.minimum(math.cos(LEAN_MAX) / reached, 1.0)), 0.0, np.pi / 2)
+    most = np.minimum(TRADED_RATE_MAX, gains.full_rate * np.sin(widest))
+    return np.asarray(motion.body_rate[:, :2] - (np.minimum(size, most) / np.maximum(size, 1e-12))[:, None] * traded)
 
 
 def turns_for(rate: NDArray, gains: AttitudeGains = FIRMWARE_GAINS) -> NDArray:
@@ -196,7 +212,8 @@ def _traded(
         good_x, good_y = _good_rate(position[n], velocity[n], acceleration_ahead[n], quaternion[n], walls, full_rate)
         dx, dy = wx - good_x, wy - good_y
         size = math.sqrt(dx * dx + dy * dy)
-        share = TRADED_RATE_MAX / size if size > TRADED_RATE_MAX else 1.0
+        most = min(TRADED_RATE_MAX, _most_by_lean(quaternion[n], dx, dy, size, full_rate))
+        share = most / size if size > most else 1.0
         rates[n, 0] = math.floor((wx - share * dx) / _QUANTUM + 0.5) * _QUANTUM
         rates[n, 1] = math.floor((wy - share * dy) / _QUANTUM + 0.5) * _QUANTUM
 
@@ -217,6 +234,22 @@ def _traded(
         accelerations[n, 1] = scale * (y * z - x * w)
         accelerations[n, 2] = thrust - scale * (x * x + y * y) - GRAVITY
     return rates, attitudes, accelerations
+
+
+@njit(error_model="numpy")
+def _most_by_lean(quaternion: NDArray, dx: float, dy: float, size: float, full_rate: float) -> float:
+    """Return how much of a rate along (dx, dy), of that size, rad/s, may be traded until the thrust leans too far."""
+    if size == 0.0:
+        return full_rate
+    x, y, z, w = quaternion
+    square = x * x + y * y + z * z + w * w
+    aside = 2.0 * ((x * z - y * w) * dy - (y * z + x * w) * dx) / (size * square)
+    lift = 1.0 - 2.0 * (x * x + y * y) / square
+    reached = math.sqrt(aside * aside + lift * lift)
+    turn = math.atan2(aside, lift)
+    if reached > _LEAST_LIFT:
+        turn += math.acos(_LEAST_LIFT / reached)
+    return full_rate * math.sin(min(max(turn, 0.0), 0.5 * math.pi))
 
 
 @njit(error_model="numpy")

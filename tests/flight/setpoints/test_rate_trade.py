@@ -2,14 +2,16 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
+from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import (
     BRAKE_RATE_MAX,
+    LEAN_MAX,
     TRADED_RATE_MAX,
     AttitudeGains,
     ahead,
@@ -17,6 +19,11 @@ from cfplan.flight.setpoints.rate_trade import (
     trade_rates,
     turns_for,
 )
+from cfplan.planners.baselines.convex import plan_convex
+from cfplan.planners.task import PlanningTask
+from cfplan.planning.repair import repair
+from cfplan.safety.limit_sets import BOXES, LIMIT_SETS
+from cfplan.studies.trials import random_path
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import rotations_of
 
@@ -72,6 +79,63 @@ def test_the_tilt_at_which_level_out_settles_brakes_the_speed_left(direction, sp
     settled = Rotation.from_euler("z", yaw) * Rotation.from_matrix(rotations_of(turns_for(sent.body_rate[:, :2]))[0])
     axis = settled.apply([0.0, 0.0, 1.0])
     assert GRAVITY * axis[:2] / axis[2] == pytest.approx(-0.41 * velocity[:2], abs=2e-3)
+
+
+tilts = st.floats(0.0, np.radians(62.0))
+angles = st.floats(-np.pi, np.pi)
+
+
+def leaning(tilt, direction, yaw, rate) -> FullStateSetpoints:
+    """A motion at rest whose attitude leans by `tilt`."""
+    lean = Rotation.from_rotvec(tilt * np.array([np.cos(direction), np.sin(direction), 0.0]))
+    return motion_of((0.0, 0.0, 0.0), rate, rotvec=(lean * Rotation.from_euler("z", yaw)).as_rotvec())
+
+
+def lean_of(sent: FullStateSetpoints) -> float:
+    force = sent.acceleration[0] + GRAVITATION
+    return float(np.arccos(force[2] / np.linalg.norm(force)))
+
+
+@given(tilts, angles, angles, vectors)
+def test_thrust_that_is_sent_does_not_lean_too_far_and_nothing_else_is_held_back(tilt, direction, yaw, rate):
+    motion = leaning(tilt, direction, yaw, rate)
+    sent = trade_rates(motion, np.zeros((1, 3)))
+    assert lean_of(sent) <= LEAN_MAX + 1e-3
+    assert sent.body_rate[:, :2] == pytest.approx(harmless_rates(motion, np.zeros((1, 3))), abs=0.51e-3)
+    kept = np.linalg.norm(sent.body_rate[0, :2])
+    if lean_of(sent) < LEAN_MAX - 1e-3:
+        assert kept == pytest.approx(max(np.linalg.norm(rate[:2]) - TRADED_RATE_MAX, 0.0), abs=1e-3)
+
+
+@given(tilts, angles, angles, vectors, vectors)
+def test_rates_that_are_sent_change_steadily_with_the_motion(tilt, direction, yaw, rate, onward):
+    """From one motion to another in small steps no rate jumps, also where the bounds of the trade begin to act."""
+    share = np.linspace(0.0, 1.0, 20_000)[:, None]
+    axis = np.concatenate([np.cos(direction + share), np.sin(direction + share), 0.0 * share], axis=1)
+    turn = Rotation.from_rotvec(tilt * axis) * Rotation.from_euler("z", yaw)
+    none = np.zeros((len(share), 3))
+    motion = FullStateSetpoints(
+        position=none, velocity=none, acceleration=9.0 * turn.as_matrix()[:, :, 2] - GRAVITATION,
+        quaternion=turn.as_quat(), body_rate=rate + share * (onward - rate),
+    )  # fmt: skip
+    assert np.abs(np.diff(trade_rates(motion, none).body_rate, axis=0)).max() < 0.1
+
+
+def test_an_attitude_that_leans_as_far_itself_is_only_righted():
+    """Roll by a rate that turns it on stays a rate; one that rights it is traded as ever."""
+    on, back = (leaning(LEAN_MAX + 0.02, 0.0, 0.0, (rate, 0.0, 0.0)) for rate in (2.0, -2.0))
+    assert trade_rates(on, np.zeros((1, 3))).body_rate[0] == pytest.approx([2.0, 0.0, 0.0])
+    assert trade_rates(back, np.zeros((1, 3))).body_rate[0] == pytest.approx([0.0, 0.0, 0.0])
+
+
+@settings(max_examples=12)
+@given(st.sampled_from(sorted(BOXES)), st.integers(0, 100_000))
+def test_bytes_of_fast_plans_along_random_paths_pass(box, seed):
+    """At 5 m/s and 60° of tilt the whole of the rates does not fit into the attitude."""
+    fast = LIMIT_SETS["simulation"]
+    task = PlanningTask(random_path(seed, box), fast.airframe, fast.limits, 40)
+    trajectory = repair(task, plan_convex(task).profile).trajectory
+    check_bytes(encode_trajectory(trajectory), trajectory, fast.limits)
 
 
 def test_a_hover_sends_no_rates():
