@@ -44,6 +44,7 @@ def motion_of(velocity, rate, thrust=9.0, rotvec=(0.3, -0.2, 1.0)) -> FullStateS
 vectors = arrays(float, 3, elements=st.floats(-5.0, 5.0))
 
 
+@settings(deadline=None)
 @given(vectors, vectors, st.floats(3.0, 15.0), arrays(float, 3, elements=st.floats(-1.0, 1.0)), vectors)
 def test_torque_and_thrust_are_those_of_the_motion(velocity, rate, thrust, rotvec, coming):
     """Twice kR times the sine of the turn, and kw times the rates: written out, not as the trade computes them."""
@@ -61,6 +62,7 @@ def test_torque_and_thrust_are_those_of_the_motion(velocity, rate, thrust, rotve
     assert sent.body_rate[0, 2] == rate[2]
 
 
+@settings(deadline=None)
 @given(vectors, vectors, vectors)
 def test_rates_are_what_brakes_and_what_exceeds_the_most(velocity, rate, coming):
     motion = motion_of(velocity, rate)
@@ -71,6 +73,7 @@ def test_rates_are_what_brakes_and_what_exceeds_the_most(velocity, rate, coming)
     assert np.linalg.norm(sent[0, :2]) <= BRAKE_RATE_MAX + excess + 1e-3
 
 
+@settings(deadline=None)
 @given(st.floats(-np.pi, np.pi), st.floats(0.1, 1.0), st.floats(-np.pi, np.pi))
 def test_the_tilt_at_which_level_out_settles_brakes_the_speed_left(direction, speed, yaw):
     """That tilt turns the torque of the rate off: asin of the rate over 7 rad/s, about the axis of the rate."""
@@ -96,6 +99,7 @@ def lean_of(sent: FullStateSetpoints) -> float:
     return float(np.arccos(force[2] / np.linalg.norm(force)))
 
 
+@settings(deadline=None)
 @given(tilts, angles, angles, vectors)
 def test_thrust_that_is_sent_does_not_lean_too_far_and_nothing_else_is_held_back(tilt, direction, yaw, rate):
     motion = leaning(tilt, direction, yaw, rate)
@@ -107,6 +111,7 @@ def test_thrust_that_is_sent_does_not_lean_too_far_and_nothing_else_is_held_back
         assert kept == pytest.approx(max(np.linalg.norm(rate[:2]) - TRADED_RATE_MAX, 0.0), abs=1e-3)
 
 
+@settings(deadline=None)
 @given(tilts, angles, angles, vectors, vectors)
 def test_rates_that_are_sent_change_steadily_with_the_motion(tilt, direction, yaw, rate, onward):
     """From one motion to another in small steps no rate jumps, also where the bounds of the trade begin to act."""
@@ -128,7 +133,7 @@ def test_an_attitude_that_leans_as_far_itself_is_only_righted():
     assert trade_rates(back, np.zeros((1, 3))).body_rate[0] == pytest.approx([0.0, 0.0, 0.0])
 
 
-@settings(max_examples=12)
+@settings(max_examples=12, deadline=None)
 @given(st.sampled_from(sorted(BOXES)), st.integers(0, 100_000))
 def test_bytes_of_fast_plans_along_random_paths_pass(box, seed):
     """At 5 m/s and 60° of tilt the whole of the rates does not fit into the attitude."""
