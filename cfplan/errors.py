@@ -90,3 +90,24 @@ class LinkError(CfplanError):
     """The vehicle cannot be reached, or was lost."""
 
     exit_code = ExitCode.LINK_LOST
+
+
+class RequestRefusedError(CfplanError):
+    """A request to change the path in the air was refused, or came too late; the vehicle flies on as before."""
+
+    exit_code = ExitCode.INFEASIBLE
+
+
+class FlightEndedError(CfplanError):
+    """The flight has ended, so nothing more can be asked of it; the exit code is that of the flight."""
+
+    def __init__(self, what: str, *, where: str = "", hint: str = "", exit_code: ExitCode = ExitCode.ENDED_BY_OPERATOR):
+        super().__init__(what, where=where, hint=hint)
+        self.exit_code = exit_code
+
+    def __reduce__(self):
+        return _rebuild_ended, (self.what, self.where, self.hint, self.exit_code)
+
+
+def _rebuild_ended(what: str, where: str, hint: str, exit_code: ExitCode) -> FlightEndedError:
+    return FlightEndedError(what, where=where, hint=hint, exit_code=exit_code)

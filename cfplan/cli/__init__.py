@@ -6,7 +6,6 @@ import sys
 
 import click
 
-from cfplan import __version__
 from cfplan.cli.bench import bench, study
 from cfplan.cli.check import check
 from cfplan.cli.dataset import dataset
@@ -23,6 +22,7 @@ from cfplan.cli.sim import sim
 from cfplan.cli.train import train
 from cfplan.cli.virtual import virtual
 from cfplan.errors import CfplanError
+from cfplan.version import __version__
 
 EPILOG = """\b
 Examples:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cfplan.cli.vehicle import SIMULATED
 from cfplan.errors import ExitCode, InputError
+from cfplan.steering.starting_vehicle import SIMULATED
 
 if TYPE_CHECKING:
     from cfplan.preparation.prepare_flight import PreparedFlight

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import click
 
-from cfplan import __version__
 from cfplan.cli import options
 from cfplan.cli.output import print_json, print_table
-from cfplan.cli.vehicle import SIMULATED
 from cfplan.errors import CfplanError
+from cfplan.steering.starting_vehicle import SIMULATED
+from cfplan.version import __version__
 
 NEEDED = ("numpy", "scipy", "numba", "casadi", "cflib", "pydantic", "mcap", "pyarrow", "rerun-sdk")
 OPTIONAL = {

@@ -65,8 +65,8 @@ def fly(
     **planning: Any,
 ) -> int:
     """Fly along PATH: plan, certify, rehearse, then take off, stream the flight, land, and keep a record."""
-    from cfplan.cli.vehicle import StartingVehicle, check_uris, look_at_hardware
     from cfplan.cli.watchers import Watched, check_watchers
+    from cfplan.steering.starting_vehicle import StartingVehicle, check_uris, look_at_hardware
 
     steps, watched = Steps(as_json=as_json), Watched(live, mavlink)
     check_uris(uri, mocap_uri)

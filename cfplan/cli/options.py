@@ -11,6 +11,7 @@ import click
 
 from cfplan.cli.output import VERBOSE, short_path
 from cfplan.errors import InputError
+from cfplan.files.nearest import nearest
 
 if TYPE_CHECKING:
     from cfplan.cli.output import Steps
@@ -84,10 +85,9 @@ def find_safety_file(given: Path | None, path_file: Path) -> Path:
     """
     if given is not None:
         return given
-    for start in (Path.cwd(), path_file.resolve().parent):
-        for folder in (start, *start.parents):
-            if (folder / SAFETY_FILE).is_file():
-                return folder / SAFETY_FILE
+    found = nearest(SAFETY_FILE, Path.cwd(), path_file.resolve().parent)
+    if found is not None:
+        return found
     raise InputError(
         f"no {SAFETY_FILE} in or above this folder, or above the path file",
         where=str(path_file),

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from cfplan.cli.flight_progress import FlightProgress
 from cfplan.cli.output import Steps
-from cfplan.cli.vehicle import StartingVehicle
 from cfplan.cli.watchers import Watched, watchers
 from cfplan.errors import CfplanError
 from cfplan.flight.mocap.poses import PoseSource
@@ -23,6 +22,7 @@ from cfplan.recording.reader import read_record
 from cfplan.recording.record import Record
 from cfplan.recording.summary import summarise
 from cfplan.recording.writer import RecordWriter, new_record_folder, wall_time_at_zero, write_summary
+from cfplan.steering.starting_vehicle import StartingVehicle
 
 
 class RecordedFlight(NamedTuple):

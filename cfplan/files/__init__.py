@@ -1,3 +1,3 @@
 """Text formats: YAML whose mistakes are reported with their place, tables of numbers, and values as JSON knows them."""
 
-__all__ = ["json_values", "text", "yaml_with_places"]
+__all__ = ["json_values", "nearest", "text", "yaml_with_places"]

@@ -102,4 +102,48 @@ class Event:
     text: str
 
 
-Telemetry = SetpointSent | PoseReceived | Estimate | VehicleStatus | PhaseEntered | Event
+@dataclass(frozen=True, slots=True)
+class PlanCommitted:
+    """The pilot is bound to these setpoints from now on; those before the first of them stay as they were."""
+
+    time: float  # s
+    splice: int  # number of the first of them
+    checksum: int  # of the proposal, stops included; 0 for what the flight began with
+    payloads: bytes  # 29 each
+
+
+@dataclass(frozen=True, slots=True)
+class PathRequested:
+    """A change of the path was asked for."""
+
+    time: float  # s
+    number: int  # by which its answer names it
+    wish: str  # extend, replace, stop, slower or faster
+    waypoints: str  # as JSON: [[x, y, z], …], m
+
+
+@dataclass(frozen=True, slots=True)
+class PathAnswered:
+    """What became of a request."""
+
+    time: float  # s
+    number: int  # of the request
+    verdict: str  # accepted, refused, late or superseded
+    reason: str  # why not, one line
+    splice: int  # number of the first setpoint of the new plan; -1 where there is none
+    joint: float  # s from setpoint 0, from when on the motion is another; NaN where there is none
+    ends: float  # s from setpoint 0, when the motion ends; NaN where there is none
+    seconds: float  # from the request to the answer
+
+
+Telemetry = (
+    SetpointSent
+    | PoseReceived
+    | Estimate
+    | VehicleStatus
+    | PhaseEntered
+    | Event
+    | PlanCommitted
+    | PathRequested
+    | PathAnswered
+)

@@ -3,7 +3,8 @@
 A path laid from where the vehicle is, with the velocity that it has, may swing far out before its first waypoint, or
 turn too sharply for its speed. That depends on the nominal time that its first segment takes, and on the unit of s in
 which its start is given: that of the path left, which keeps the curve where waypoints stay, or time, which is gentle
-where the path left is about to stop. Several are tried, first the one that looks fastest by a cheap estimate.
+where the path left is about to stop. Where the vehicle must turn back, it may first go on a little as it would have.
+Several paths are tried, first the one that looks fastest by a cheap estimate.
 """
 
 import math
@@ -38,12 +39,20 @@ from cfplan.vehicle.trajectory import Trajectory
 # Nominal times of the first segment that are tried, in its own, where s goes on as it was and where it is time. Shorter
 # ones look faster than they are: the state at the start allows too little.
 FIRST_TIMES, FIRST_TIMES_TIMED = (0.7, 1.0, 1.4, 2.0, 3.0), (1.0, 1.4, 2.0)
+VIA = (0.25, 0.5, 0.8)  # s later on the path left, a place through which the vehicle may go before it turns off
+FIRST_TIMES_VIA = (1.0, 1.8, 3.0)  # of the segment behind that place
+NEAR_VIA = 0.1  # m from the joint or a waypoint, nearer than which there is no such place
 RATE = 1.0  # units of s a second, where it is time: about the speed in m/s
-TRIES = 4  # paths that are planned
+TRIES = 6  # paths that are planned, and as many that go on a little first
 SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², and s before that, with which the vehicle slows down to a lower speed
+OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
 ROOM = 0.005  # share of each limit that plans leave to whoever continues them
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
 _NODES = 60  # where a path's time is estimated
+
+
+class NoWayError(InfeasibleError):
+    """No path that was tried leads from the state of a joint through the waypoints; from a later one it may."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,15 +90,10 @@ def continue_plan(
     continued_min_snap(joint.derivatives, points)  # refuses what are no waypoints
     _check_waypoints(points, limits)
     known = scaled_limits(limits.airframe, limits.plan)
-    ways = sorted(_ways(joint, trajectory, points, times), key=lambda way: _least_time(way.path, known))
-    failure, tries = "", 0
-    for way in ways:
-        try:
-            check_space(way.path, limits.space)
-            way.path.check()
-        except CfplanError as error:
-            failure = failure or error.what
-            continue
+    failure = ""
+    ways = [*_ways(joint, trajectory, points, times)]
+    later = [*_ways_later(joint, trajectory, points)]
+    for way in (*_sound(ways, limits, known)[:TRIES], *_sound(later, limits, known)[:TRIES]):
         task = PlanningTask(
             way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,
             speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,
@@ -98,12 +102,11 @@ def continue_plan(
         if not isinstance(found, str):
             check_endurance(found.trajectory.duration, limits)
             return Continuation(_plan(found, task, limits, time.perf_counter() - begun), way.reached)
-        failure, tries = found, tries + 1
-        if tries == TRIES:
-            break
+        failure = found
+    failure = failure or _unsound(ways[0].path, limits)
     speed = float(np.linalg.norm(trajectory.at(leave).velocity))
     away = float(np.linalg.norm(points[0] - joint.derivatives[0]))
-    raise InfeasibleError(
+    raise NoWayError(
         f"from {speed:.2f} m/s no way leads through waypoint 1, {away:.2f} m away: {failure}",
         where="waypoint 1",
         hint="give a waypoint farther on and more ahead, or stop first",
@@ -140,9 +143,38 @@ def _ways(joint: Joint, trajectory: Trajectory, points: NDArray, times: ArrayLik
             yield _way(begin, points, np.concatenate([[factor * straight[0]], straight[1:]]))
 
 
+def _ways_later(joint: Joint, trajectory: Trajectory, points: NDArray) -> Iterator[_Way]:
+    """Yield paths that go on a little as the one left would, before they turn off."""
+    for later in VIA:
+        s = float(trajectory.s_at(min(joint.time + later, trajectory.duration)))
+        via = trajectory.path(s)
+        if min(math.dist(via, joint.derivatives[0]), math.dist(via, points[0])) > NEAR_VIA:
+            onwards = centripetal_times(np.concatenate([via[None], points]))
+            for factor in FIRST_TIMES_VIA:
+                ahead = np.concatenate([[s - joint.s, factor * onwards[0]], onwards[1:]])
+                way = _way(joint, np.concatenate([via[None], points]), ahead)
+                yield way._replace(reached=way.reached[1:])
+
+
 def _way(joint: Joint, points: NDArray, times: NDArray) -> _Way:
     path = continued_min_snap(joint.derivatives, points, times)
     return _Way(path, joint.state, tuple(np.cumsum(times).tolist()))
+
+
+def _sound(ways: list[_Way], limits: Limits, known: ScaledLimits) -> list[_Way]:
+    """Return the ways inside the space that can be planned, first the one that looks fastest."""
+    good = [way for way in ways if not _unsound(way.path, limits)]
+    return sorted(good, key=lambda way: _least_time(way.path, known))
+
+
+def _unsound(path: Path, limits: Limits) -> str:
+    """Return why a path cannot be flown at any speed; empty where it can."""
+    try:
+        check_space(path, limits.space)
+        path.check()
+    except CfplanError as error:
+        return error.what
+    return ""
 
 
 def _slowing_to(speed: float, way: _Way) -> SpeedCaps:
@@ -151,7 +183,9 @@ def _slowing_to(speed: float, way: _Way) -> SpeedCaps:
     moving = np.linalg.norm(way.path(s, 1), axis=1)
     length = np.append(0.0, np.cumsum((moving[1:] + moving[:-1]) / 2.0 * np.diff(s)))
     first = moving[0] * way.start.h**0.5
-    falling = np.sqrt(np.maximum((first + 0.1) ** 2 - 2.0 * SLOWING * np.maximum(length - LEVEL_FOR * first, 0.0), 0.0))
+    gaining = moving[0] * way.start.dh / 2.0 + way.start.h * float(way.path(0.0, 1) @ way.path(0.0, 2)) / moving[0]
+    highest = first + 0.1 + OVERSHOOT * max(gaining, 0.0)
+    falling = np.sqrt(np.maximum(highest**2 - 2.0 * SLOWING * np.maximum(length - LEVEL_FOR * first, 0.0), 0.0))
     return SpeedCaps.of(s, np.maximum(falling, speed))
 
 

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-import cfplan
 from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.path import Path
 from cfplan.planning.plan_result import LocalSlowing, Plan
@@ -25,6 +24,7 @@ from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import FullState, Trajectory
+from cfplan.version import __version__
 
 FORMAT = 2  # its keys "slowed" and "speed_share" are a Plan's repair_speed_factor and speed_factor
 RATE = 100  # Hz, of the samples
@@ -44,7 +44,7 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
 
     metadata = {
         "format": FORMAT,
-        "version": cfplan.__version__,
+        "version": __version__,
         "planner": plan.planner,
         "nodes": plan.nodes,
         "slowed": plan.repair_speed_factor,

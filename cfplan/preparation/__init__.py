@@ -1,3 +1,3 @@
 """From a path file to a mission: planned, certified, encoded, rehearsed, with a way to stop from every setpoint."""
 
-__all__ = ["air_planner", "compiled_calls", "plan_flight", "prepare_flight", "replan", "steps"]
+__all__ = ["air_planner", "compiled_calls", "plan_flight", "prepare_flight", "replan", "stepped_planner", "steps"]

@@ -16,13 +16,16 @@ from enum import StrEnum
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
 
+import numpy as np
+
 from cfplan.errors import CfplanError
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.proposals import PilotAnswer, read_answer
-from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, splice
+from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, Refusal, splice
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
-from cfplan.preparation.replan import HeldFlight, Replanned, accepted, halt, replan
+from cfplan.planning.plan_result import Plan
+from cfplan.preparation.replan import PACE, HeldFlight, Replanned, accepted, at_pace, halt, pace, replan
 from cfplan.safety.limits import Limits
 
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
@@ -39,6 +42,8 @@ class Wish(StrEnum):
     EXTEND = "extend"  # fly on through these waypoints after those ahead
     REPLACE = "replace"  # fly through these instead
     STOP = "stop"  # come to rest soon, ahead on the path
+    SLOWER = "slower"  # fly what is ahead, and what is asked for later, at PACE times the speed
+    FASTER = "faster"  # undo that
 
 
 class PathVerdict(StrEnum):
@@ -69,6 +74,40 @@ class PathAnswer:
     joint: float = math.nan  # s from the first setpoint, from when on the new plan is flown
     ends: float = math.nan  # s from the first setpoint, when it ends
     seconds: float = 0.0  # s from the request to the answer
+    splice: int = -1  # number of the first setpoint of the proposal that was accepted; -1 where nothing was proposed
+    checksum: int = 0  # of that proposal
+    plan: Plan | None = None  # behind it
+
+
+def plan_request(held: HeldFlight, request: PathRequest, first: int, limits: Limits) -> Replanned | HeldFlight:
+    """Return the proposal from setpoint `first` on that does what is asked for.
+
+    Where nothing need be proposed, what is held from now on. Raises a CfplanError where no plan does it.
+    """
+    yaw = float(held.flown.at(held.ends).yaw)
+    match request.wish:
+        case Wish.STOP:
+            return halt(held, first, limits)
+        case Wish.SLOWER | Wish.FASTER:
+            now = min(held.speed, limits.plan.speed)
+            speed = now * PACE if request.wish is Wish.SLOWER else now / PACE
+            return pace(held, first, speed, limits, yaw_angle=yaw) or at_pace(held, speed)
+    return replan(held, first, request.waypoints, limits, keep=request.wish is Wish.EXTEND, yaw_angle=yaw)
+
+
+def answer_accepted(request: PathRequest, made: Replanned) -> PathAnswer:
+    """Return the answer to a request whose proposal the pilot has accepted."""
+    flown, proposal = made.held.flown, made.proposal
+    return PathAnswer(
+        request.number, PathVerdict.ACCEPTED, joint=flown.starts[-1], ends=flown.duration, splice=proposal.splice,
+        checksum=proposal.checksum, plan=made.plan,
+    )  # fmt: skip
+
+
+def answer_refused(request: PathRequest, answer: Refusal) -> PathAnswer:
+    """Return the answer to a request whose proposal the pilot has refused."""
+    late = answer.fault is Fault.LATE
+    return PathAnswer(request.number, PathVerdict.LATE if late else PathVerdict.REFUSED, str(answer))
 
 
 class AirPlanner:
@@ -140,14 +179,25 @@ class _Worker:
         self._took: deque[float] = deque([FIRST_TIME], maxlen=LEARNED_FROM)
         self._waiting: tuple[PathRequest, float] | None = None
 
+    @property
+    def _middle(self) -> list[tuple[float, ...]]:
+        """Return two places in the middle of the space, m, apart."""
+        space = self._limits.space
+        shares = (0.4, 0.6)
+        return [
+            tuple(low + share * (high - low) for low, high in zip(space.low, space.high, strict=True))
+            for share in shares
+        ]
+
     def warm_up(self) -> None:
         """Make two plans for nobody: what a first call compiles or loads is there before the flight."""
         held = self._held
         for _ in range(2):
             begun = REAL_CLOCK.now()
             with contextlib.suppress(CfplanError):
-                middle = held.flown.at(held.ends / 2).position
-                replan(held, max(round(held.ends / 4 * RATE), 1), [middle, held.ahead[-1]], self._limits)
+                places = [held.flown.at(held.ends / 2).position, *map(np.array, self._middle)]
+                away = max(places, key=lambda place: float(np.linalg.norm(place - held.ahead[-1])))
+                replan(held, max(round(held.ends / 4 * RATE), 1), [away, held.ahead[-1]], self._limits)
                 self._took[0] = REAL_CLOCK.now() - begun
 
     def serve(self) -> None:
@@ -190,26 +240,23 @@ class _Worker:
             ahead = max(self._took) + SLACK
             first = math.ceil((begun - self._begun + ahead) * RATE) + LEAST_AHEAD
             try:
-                made = self._plan(request, first)
+                made = plan_request(self._held, request, first, self._limits)
             except CfplanError as error:
                 return PathAnswer(request.number, PathVerdict.REFUSED, str(error))
             finally:
                 self._took.append(REAL_CLOCK.now() - begun)
+            if isinstance(made, HeldFlight):
+                self._held = made
+                return PathAnswer(request.number, PathVerdict.ACCEPTED)
             answer = self._propose(made)
             if answer is None:
                 return PathAnswer(request.number, PathVerdict.REFUSED, "the pilot does not answer")
             if answer.commitment is not None:
-                joint = self._held.flown.starts[-1]
-                return PathAnswer(request.number, PathVerdict.ACCEPTED, joint=joint, ends=self._held.ends)
+                return answer_accepted(request, made)
             reason = answer.reason
             if not reason.startswith(Fault.LATE):
                 return PathAnswer(request.number, PathVerdict.REFUSED, reason)
         return PathAnswer(request.number, PathVerdict.LATE, reason)
-
-    def _plan(self, request: PathRequest, first: int) -> Replanned:
-        if request.wish is Wish.STOP:
-            return halt(self._held, first, self._limits)
-        return replan(self._held, first, request.waypoints, self._limits, keep=request.wish is Wish.EXTEND)
 
     def _propose(self, made: Replanned) -> PilotAnswer | None:
         """Send a proposal and wait for the pilot's answer; what it accepts is held from then on."""

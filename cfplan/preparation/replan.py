@@ -18,8 +18,9 @@ from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposa
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, min_snap
-from cfplan.planning.continuation import continue_plan
+from cfplan.planning.continuation import NoWayError, continue_plan
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
@@ -27,9 +28,14 @@ from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.glitches import glitch_at_every_setpoint
 from cfplan.simulation.link_loss import as_believed, link_loss_at_every_setpoint
+from cfplan.vehicle.hover import hover_at
 from cfplan.vehicle.joint import JoinedTrajectory
 
 SLOWER = (1.2, 0.7)  # m/s, at which a flight is tried that would end badly at full speed
+LATER = (0, 15, 35)  # setpoints by which the vehicle may fly on before it turns off, where it cannot do so at once
+LEAST_SPEED = 0.2  # m/s, to which requests may lower the speed
+PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
+HOVER = 0.05  # s, of the motion that a hover counts as
 HALTS = (1.0, 1.15, 1.35, 1.6, 2.0, 2.6)  # times the way that braking takes at its limit, where a stop may end
 REACTION = 0.05  # s at full speed before braking is felt: the vehicle must lean first
 
@@ -48,6 +54,7 @@ class HeldFlight:
     reached: tuple[float, ...]  # s on the last plan's path, of each of them
     begin: int  # number of the setpoint of the first snapshot
     snapshots: NDArray  # (L, N, 31) of the simulated vehicle at each setpoint, for each motor lag
+    speed: float = math.inf  # m/s, at which new plans fly at most, as was asked for; the limits' counts besides
 
     @property
     def ends(self) -> float:
@@ -72,9 +79,28 @@ def hold(planned: Plan, waypoints: ArrayLike) -> HeldFlight:
     """
     points = np.asarray(waypoints, dtype=float)
     flown = JoinedTrajectory((planned.trajectory,), (0.0,))
-    encoded, stops, snapshots = _certified(flown, planned.limits, None)
+    encoded, stops, snapshots = certified(flown, planned.limits, None)
     reached = tuple(np.cumsum(centripetal_times(points)).tolist())
     return HeldFlight(Commitment(0, encoded.payloads, stops), flown, points[1:], reached, 0, snapshots)
+
+
+def hold_hover(position: Triple, yaw: float, limits: Limits) -> HeldFlight:
+    """Return what is held of a vehicle that hovers at a position, m, with a yaw, rad, until it is asked to fly.
+
+    Raises InfeasibleError where that lies outside the space, or link loss there would end outside the walls.
+    """
+    beyond = float(limits.space.beyond(np.array([position])).max())
+    if beyond > 0.0:
+        x, y, z = position
+        raise InfeasibleError(
+            f"the hover at ({x:.2f}, {y:.2f}, {z:.2f}) m is {beyond:.2f} m too far out",
+            where="take-off",
+            hint="take off to a height inside the space less its margin, and nearer to the middle of the room",
+        )
+    flown = JoinedTrajectory((hover_at(position, yaw, HOVER, limits.airframe),), (0.0,))
+    encoded, stops, snapshots = certified(flown, limits, None)
+    place = np.array([position], dtype=float)
+    return HeldFlight(Commitment(0, encoded.payloads, stops), flown, place, (HOVER,), 0, snapshots)
 
 
 def replan(
@@ -82,9 +108,10 @@ def replan(
 ) -> Replanned:
     """Return the proposal to leave what is held at setpoint `splice` and to go through waypoints, (K, 3) m, to rest.
 
-    The motion changes SPLICE_AHEAD setpoints after the splice. With `keep`, the waypoints follow those that are ahead
-    there; else they replace them. Where the vehicle rests by then, the plan begins from rest. Where link loss or a gap
-    would end badly, the vehicle flies slower.
+    The motion changes SPLICE_AHEAD setpoints after the splice, or a little later where it cannot do so at once; never
+    before what is held last has begun. With `keep`, the waypoints follow those that are ahead there; else they replace
+    them. Where the vehicle rests by then, the plan begins from rest. Where link loss or a gap would end badly, the
+    vehicle flies slower.
 
     Raises:
         InputError: what is given are no waypoints.
@@ -94,11 +121,44 @@ def replan(
     points = np.asarray(waypoints, dtype=float)
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
         raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint="give rows of x, y, z in metres")
-    for speed in (limits.plan.speed, *SLOWER):
-        try:
-            return _replan_at(speed, held, splice, points, limits, keep, yaw_angle)
-        except EndsBadlyError as error:
-            refused = error
+    return _replan_within(held, splice, points, limits, keep, yaw_angle)
+
+
+def pace(held: HeldFlight, splice: int, speed: float, limits: Limits, *, yaw_angle: float = 0.0) -> Replanned | None:
+    """Return the proposal to fly what is ahead at setpoint `splice` at a speed, m/s, at most; None where it rests.
+
+    Then nothing need be proposed: what is asked for later flies so. See at_pace(). Raises as replan() does.
+    """
+    if (splice + SPLICE_AHEAD) / RATE >= held.ends:
+        return None
+    return _replan_within(at_pace(held, speed), splice, np.empty((0, 3)), limits, True, yaw_angle)
+
+
+def at_pace(held: HeldFlight, speed: float) -> HeldFlight:
+    """Return the same flight, whose new plans fly at a speed, m/s, at most."""
+    return replace(held, speed=max(speed, LEAST_SPEED))
+
+
+def _replan_within(
+    held: HeldFlight, splice: int, points: NDArray, limits: Limits, keep: bool, yaw_angle: float
+) -> Replanned:
+    """Return what replan() does, at the speed that is asked for, or slower where it must be."""
+    fastest = min(held.speed, limits.plan.speed)
+    refused: InfeasibleError | None = None
+    for speed in (fastest, *(slower for slower in SLOWER if slower < fastest)):
+        for later in LATER:
+            try:
+                return _replan_at(speed, held, splice + later, points, limits, keep, yaw_angle)
+            except EndsBadlyError as error:
+                refused = error
+                break  # slower
+            except NoWayError as error:
+                refused = refused or error
+                if (splice + later + SPLICE_AHEAD) / RATE > held.ends:
+                    break
+        else:
+            break
+    assert refused is not None
     raise refused
 
 
@@ -106,6 +166,7 @@ def _replan_at(
     speed: float, held: HeldFlight, splice: int, points: NDArray, limits: Limits, keep: bool, yaw_angle: float
 ) -> Replanned:
     """Return what replan() does, at that speed, m/s, or less."""
+    splice = _not_before(held, splice)
     joint = (splice + SPLICE_AHEAD) / RATE
     if joint >= held.ends:
         place = held.flown.at(held.ends)
@@ -126,15 +187,23 @@ def _replan_at(
         if keep:
             kept, times = _still_ahead(held, leave, points)
             points = np.concatenate([kept, points])
+            if not len(points):
+                raise InfeasibleError(
+                    "the last waypoint is all but reached",
+                    where="request",
+                    hint="ask for waypoints instead; they are flown so",
+                )
         made = continue_plan(
             held.flown.trajectories[-1], leave, points, limits, times=times, yaw_angle=yaw_angle, speed=speed
         )
         planned, reached = made.plan, made.reached
     flown = held.flown.continued(joint, planned.trajectory)
     row = min(splice - held.begin, held.snapshots.shape[1] - 1)
-    encoded, stops, snapshots = _certified(flown.since(splice / RATE), limits, held.snapshots[:, row])
+    encoded, stops, snapshots = certified(flown.since(splice / RATE), limits, held.snapshots[:, row])
     proposal = propose(held.commitment, splice, encoded.payloads, stops)
-    return Replanned(proposal, HeldFlight(held.commitment, flown, points, reached, splice, snapshots), planned)
+    return Replanned(
+        proposal, HeldFlight(held.commitment, flown, points, reached, splice, snapshots, held.speed), planned
+    )
 
 
 def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned:
@@ -143,6 +212,7 @@ def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned:
     Places are tried from where the limit on braking would allow rest at the earliest. Raises InfeasibleError where the
     vehicle rests soon anyway, or no place is found: then what is held ends as soon.
     """
+    splice = _not_before(held, splice)
     joint = (splice + SPLICE_AHEAD) / RATE
     left = held.ends - joint
     moving = held.flown.at(joint)
@@ -167,6 +237,11 @@ def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned:
     )
 
 
+def _not_before(held: HeldFlight, splice: int) -> int:
+    """Return the splice, or the first whose joint is not before what is held last begins."""
+    return max(splice, math.ceil(held.flown.starts[-1] * RATE - 1e-6) - SPLICE_AHEAD)
+
+
 def accepted(replanned: Replanned, commitment: Commitment) -> HeldFlight:
     """Return what is held once the pilot has accepted a proposal: it is committed to this."""
     return replace(replanned.held, commitment=commitment)
@@ -184,14 +259,17 @@ def _still_ahead(held: HeldFlight, leave: float, more: NDArray) -> tuple[NDArray
     ]
     times = np.diff([s, *(held.reached[number] for number in kept)])
     begin = held.ahead[kept[-1]] if kept else here
-    new = centripetal_times(np.concatenate([begin[None], more]))
+    new = centripetal_times(np.concatenate([begin[None], more])) if len(more) else np.empty(0)
     return held.ahead[kept].reshape(-1, 3), np.concatenate([times, new])
 
 
-def _certified(
+def certified(
     flown: JoinedTrajectory, limits: Limits, starts: NDArray | None
 ) -> tuple[EncodedFlight, NDArray, NDArray]:
-    """Return setpoints, stops and snapshots of a flight that goes on from snapshots (L, 31) or from hover."""
+    """Return setpoints, stops and snapshots of a flight that goes on from snapshots (L, 31) or from hover.
+
+    All of it is checked like a plan before take-off. Raises EndsBadlyError or NotCertifiedError where it does not pass.
+    """
     encoded = encode_trajectory(flown, space=limits.space)
     believed = None if starts is None else as_believed(starts, limits)
 

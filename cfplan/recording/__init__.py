@@ -1,3 +1,15 @@
 """Records of flights: written as they happen, read back, summarised."""
 
-__all__ = ["header", "importers", "mavlink", "overlay", "reader", "record", "report", "rerun", "summary", "writer"]
+__all__ = [
+    "commitments",
+    "header",
+    "importers",
+    "mavlink",
+    "overlay",
+    "reader",
+    "record",
+    "report",
+    "rerun",
+    "summary",
+    "writer",
+]

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan import __version__
 from cfplan.errors import InputError
 from cfplan.files.json_values import json_value, whole_characters
 from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.vehicle.airframe import Airframe
+from cfplan.version import __version__
 
 if TYPE_CHECKING:
     from cfplan.planning.plan_result import Plan
@@ -91,6 +91,32 @@ def header_under(
     )
 
 
+def header_of_steering(limits: Limits, *, name: str, uri: str, place: Triple, wall_time_at_zero: float) -> RecordHeader:
+    """Return the header of a flight whose path is yet to be asked for; it begins in hover at a place, m."""
+    return header_under(
+        limits,
+        name=name,
+        uri=uri,
+        planner="in flight",
+        bounds=_bounds(limits),
+        travel_time=0.0,
+        path=np.array([place], dtype=float),
+        wall_time_at_zero=wall_time_at_zero,
+    )
+
+
+def _bounds(limits: Limits) -> FlightBounds:
+    return FlightBounds(
+        speed=limits.flight.speed.brake,
+        acceleration=limits.flight.acceleration.brake,
+        body_rate=limits.flight.angular_velocity.brake,
+        deviation=limits.flight.deviation.brake,
+        lateness=PROMISED_LATENESS,
+        pose_age=limits.pose.age_warning,
+        battery_voltage=limits.battery.under_load,
+    )
+
+
 def header_of_plan(plan: "Plan", *, name: str, uri: str, source: FilePath, wall_time_at_zero: float) -> RecordHeader:
     """Return the header of the flight of a plan that was made from, or read from, `source`."""
     limits = plan.limits
@@ -99,15 +125,7 @@ def header_of_plan(plan: "Plan", *, name: str, uri: str, source: FilePath, wall_
         name=name,
         uri=uri,
         planner=plan.planner,
-        bounds=FlightBounds(
-            speed=limits.flight.speed.brake,
-            acceleration=limits.flight.acceleration.brake,
-            body_rate=limits.flight.angular_velocity.brake,
-            deviation=limits.flight.deviation.brake,
-            lateness=PROMISED_LATENESS,
-            pose_age=limits.pose.age_warning,
-            battery_voltage=limits.battery.under_load,
-        ),
+        bounds=_bounds(limits),
         travel_time=plan.trajectory.duration,
         path=plan.path(np.linspace(0.0, plan.path.end, _PATH_SAMPLES)),
         wall_time_at_zero=wall_time_at_zero,

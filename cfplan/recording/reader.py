@@ -19,6 +19,7 @@ from mcap.stream_reader import get_chunk_data_stream
 
 from cfplan.errors import InputError
 from cfplan.files.json_values import whole_characters
+from cfplan.recording.commitments import check_commitments
 from cfplan.recording.header import RecordHeader, header_from_json
 from cfplan.recording.plausible import check_places, check_times, check_values
 from cfplan.recording.record import FLIGHT_FILE, SUMMARY_FILE, Record
@@ -92,6 +93,7 @@ def _check_plausible(record: Record, file: Path) -> None:
             check_places(stream.position, topic.name, where=str(file))
         for column in fields(stream):
             check_values(getattr(stream, column.name), f"{topic.name} {column.name}", where=str(file))
+    check_commitments(record.commitments, where=str(file))
     check_times(record.setpoints.due, "the setpoints' deadlines", where=str(file))
     check_times(record.poses.received, "the poses' arrivals", where=str(file))
     ends = [record.start, record.start + record.duration]

@@ -17,6 +17,7 @@ from cfplan.vehicle.rotations import quaternions_of
 FLIGHT_FILE = "flight.mcap"
 SUMMARY_FILE = "summary.json"
 PLAN_FILE = "plan.parquet"
+PLAN_IN_FLIGHT = "plan-{:08x}.parquet"  # by the checksum of its proposal, see Commitments
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +96,46 @@ class Events:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Commitments:
+    """The setpoints to which the pilot was bound, one after another; see telemetry.PlanCommitted."""
+
+    time: NDArray  # (N,) s
+    splice: NDArray  # (N,) int, number of the first of them
+    checksum: NDArray  # (N,) int, of the proposal; 0 for what the flight began with
+    payloads: NDArray  # (N,) bytes, 29 a setpoint
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Requests:
+    """The changes of the path that were asked for; see telemetry.PathRequested."""
+
+    time: NDArray  # (N,) s
+    number: NDArray  # (N,) int
+    wish: NDArray  # (N,) str
+    waypoints: NDArray  # (N,) str, JSON
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answers:
+    """What became of the requests; see telemetry.PathAnswered."""
+
+    time: NDArray  # (N,) s
+    number: NDArray  # (N,) int, of the request
+    verdict: NDArray  # (N,) str
+    reason: NDArray  # (N,) str
+    splice: NDArray  # (N,) int
+    joint: NDArray  # (N,) s from setpoint 0
+    ends: NDArray  # (N,) s from setpoint 0
+    seconds: NDArray  # (N,) from the request to the answer
+
+
+_NONE = np.empty(0)
+_NO_COMMITMENTS = Commitments(_NONE, _NONE, _NONE, _NONE)
+_NO_REQUESTS = Requests(_NONE, _NONE, _NONE, _NONE)
+_NO_ANSWERS = Answers(*[_NONE] * 8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Record:
     """A flight as it was; times are those of time.monotonic() on the machine that flew it."""
 
@@ -108,6 +149,9 @@ class Record:
     events: Events
     summary: Mapping[str, Any]  # as written at the end of the flight; empty where there is none
     truncated: bool  # the file ends before its time; the streams hold all that can be read
+    commitments: Commitments = _NO_COMMITMENTS
+    requests: Requests = _NO_REQUESTS
+    answers: Answers = _NO_ANSWERS
 
     @property
     def start(self) -> float:
@@ -132,5 +176,5 @@ class Record:
         return float(self.phases.time[first]), float(end)
 
     def _times(self) -> list[NDArray]:
-        streams = (self.setpoints, self.poses, self.estimates, self.status, self.phases, self.events)
+        streams = (self.setpoints, self.poses, self.estimates, self.status, self.phases, self.events, self.commitments)
         return [stream.time for stream in streams]

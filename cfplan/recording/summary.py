@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.telemetry import Phase
+from cfplan.recording.commitments import committed_path, committed_time
 from cfplan.recording.path_distance import distance_to_path
 from cfplan.recording.record import Record, Setpoints
 from cfplan.safety.limits import PlanLimits
@@ -71,7 +72,7 @@ def summarise(record: Record) -> FlightSummary:
     gaps = pose_gaps(record.poses.time)
     volts = _finite(record.status.battery_voltage)
     return FlightSummary(
-        travel_time_planned=record.header.travel_time,
+        travel_time_planned=committed_time(record),
         travel_time_flown=end - begin + arrived - sent,
         settling=max(arrived - end, 0.0),
         max_deviation=_worst(along.in_time),
@@ -102,14 +103,18 @@ def reference_span(record: Record) -> tuple[float, float]:
     if len(due) == 0:
         return math.nan, math.nan
     begin = float(due[0])
-    return begin, min(begin + record.header.travel_time, float(due[-1]))
+    return begin, min(begin + committed_time(record), float(due[-1]))
 
 
 def _streamed(record: Record) -> NDArray:
-    """Return the deadlines of the phase `stream`."""
+    """Return the deadlines of the phase `stream`; where plans were made in flight, of the hovers between them too."""
     span = record.phase_span(Phase.STREAM)
     if span is None:
         return np.empty(0)
+    if len(record.commitments.time):
+        phases = record.phases
+        after = phases.time[(phases.time > span[0]) & ~np.isin(phases.phase, (Phase.STREAM, Phase.HOLD))]
+        span = span[0], float(after[0]) if len(after) else record.start + record.duration
     return record.setpoints.due[(record.setpoints.time >= span[0]) & (record.setpoints.due <= span[1])]
 
 
@@ -133,7 +138,8 @@ def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -
     inside = (time >= max(begin, wanted[0])) & (time <= min(end, wanted[-1])) & np.all(np.isfinite(position), axis=1)
     time, position = time[inside], position[inside]
     reference = np.stack([np.interp(time, wanted, axis) for axis in record.setpoints.position.T], axis=1)
-    path = record.header.path[np.all(np.isfinite(record.header.path), axis=1)]
+    path = committed_path(record)
+    path = path[np.all(np.isfinite(path), axis=1)]
     path = path if len(path) else record.setpoints.position
     return PoseDeviations(time, np.linalg.norm(position - reference, axis=1), distance_to_path(position, path))
 
@@ -153,6 +159,8 @@ def arrival(record: Record) -> tuple[float, float]:
     """
     begin, end = reference_span(record)
     held = record.phase_span(Phase.HOLD)
+    if held is not None and len(record.commitments.time):
+        held = held[0], float(_streamed(record)[-1])
     if not finished(record) or held is None:
         return math.nan, math.nan
     due = _streamed(record)
@@ -183,7 +191,7 @@ def finished(record: Record) -> bool:
         return False
     period = float(np.median(np.diff(due)))
     last = int(record.setpoints.index[np.searchsorted(record.setpoints.due, due[-1])])
-    least = record.header.travel_time - 2 * period
+    least = committed_time(record) - 2 * period
     return bool(due[-1] - due[0] >= least and last * period >= least)
 
 

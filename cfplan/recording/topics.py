@@ -1,5 +1,6 @@
 """The topics of a record's MCAP file: for each kind of message its JSON Schema, and the way to JSON and back."""
 
+import base64
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -38,6 +39,9 @@ TOPICS = (
     Topic("/status", telemetry.VehicleStatus, record.StatusReports, "status"),
     Topic("/phase", telemetry.PhaseEntered, record.Phases, "phases"),
     Topic("/event", telemetry.Event, record.Events, "events"),
+    Topic("/committed", telemetry.PlanCommitted, record.Commitments, "commitments"),
+    Topic("/request", telemetry.PathRequested, record.Requests, "requests"),
+    Topic("/answer", telemetry.PathAnswered, record.Answers, "answers"),
 )
 _NAMES = {topic.message: tuple(field.name for field in fields(topic.message)) for topic in TOPICS}
 
@@ -60,6 +64,8 @@ def _schema(kind: Any) -> dict[str, Any]:
         return {"type": "array", "items": _schema(items[0]), "minItems": len(items), "maxItems": len(items)}
     if issubclass(kind, StrEnum):
         return {"type": "string", "enum": [item.value for item in kind]}
+    if kind is bytes:
+        return {"type": "string", "contentEncoding": "base64"}
     return {"type": {float: "number", int: "integer", str: "string"}[kind]}
 
 
@@ -69,12 +75,15 @@ def message_to_json(message: telemetry.Telemetry) -> bytes:
     try:
         return _to_json(values).encode()
     except ValueError:
+        values = {name: _from_numpy(v) if isinstance(v, bytes) else v for name, v in values.items()}
         return json.dumps(json_value(values), separators=(",", ":"), allow_nan=False).encode()
 
 
 def _from_numpy(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
     raise TypeError(f"a {type(value).__name__} does not belong into a message")
 
 
@@ -107,7 +116,7 @@ def _arrow_type(kind: Any) -> pa.DataType:
     items = get_args(kind)
     if items:
         return pa.list_(_arrow_type(items[0]))
-    return pa.string() if issubclass(kind, str) else pa.int64() if kind is int else pa.float64()
+    return pa.string() if issubclass(kind, str | bytes) else pa.int64() if kind is int else pa.float64()
 
 
 def _array(values: Any, kind: Any) -> NDArray:
@@ -120,6 +129,8 @@ def _array(values: Any, kind: Any) -> NDArray:
         return _array(values.flatten(), items[0]).reshape(-1, len(items))
     if values.null_count and kind is not float:
         raise ValueError("a value is missing")
+    if kind is bytes:
+        return _objects([base64.b64decode(value, validate=True) for value in values.to_pylist()])
     if issubclass(kind, str):
         return np.array(values.to_pylist(), dtype=np.str_)
     return values.to_numpy(zero_copy_only=False)
@@ -136,7 +147,16 @@ def columns_of(topic: Topic, messages: Sequence[telemetry.Telemetry]) -> Any:
 def _column(values: list[Any], kind: Any) -> NDArray:
     items = get_args(kind)
     item = items[0] if items else kind
+    if kind is bytes:
+        return _objects(values)
     if not items and issubclass(item, str):
         return np.array([str(value) for value in values], dtype=np.str_)
     shape = (len(values), len(items)) if items else (len(values),)
     return np.array(values, dtype=np.int64 if item is int else np.float64).reshape(shape)
+
+
+def _objects(values: list[Any]) -> NDArray:
+    """Return (N,) objects, whatever their lengths."""
+    out = np.empty(len(values), dtype=object)
+    out[:] = values
+    return out

@@ -5,6 +5,7 @@ __all__ = [
     "airframes",
     "dense",
     "flatness",
+    "hover",
     "joint",
     "measures",
     "profile",

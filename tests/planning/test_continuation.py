@@ -1,5 +1,7 @@
 """Plans that continue a motion: without a jump, certified, and refused in words where none can be flown."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -80,12 +82,29 @@ def test_a_waypoint_outside_is_refused_by_its_number(flown, limits):
         continue_plan(flown.trajectory, 1.0, [[0, 0, 1], [0, 0, 2.5]], limits)
 
 
-def test_a_waypoint_too_near_to_turn_to_is_refused_with_speed_and_distance(flown, limits):
+def test_a_waypoint_just_passed_is_flown_to_after_a_turn(flown, limits):
     leave = 0.5 * flown.trajectory.duration
     state = flown.trajectory.at(leave)
     behind = state.position - 0.05 * state.velocity / np.linalg.norm(state.velocity)
+    made = continue_plan(flown.trajectory, leave, [behind], limits)
+    np.testing.assert_allclose(made.plan.path(made.reached), [behind], atol=1e-9)
+    assert made.plan.path.length > 0.5
+
+
+def test_where_no_way_leads_through_a_waypoint_speed_and_distance_are_said(flown, limits):
+    """The wall stands 10 cm ahead of a vehicle that flies towards it."""
+    leave = 0.5 * flown.trajectory.duration
+    state = flown.trajectory.at(leave)
+    axis = int(np.argmax(np.abs(state.velocity)))
+    towards = np.sign(state.velocity[axis])
+    low, high = list(limits.space.low), list(limits.space.high)
+    wall = high if towards > 0 else low
+    wall[axis] = state.position[axis] + towards * (0.1 + limits.space.margin)
+    room = replace(limits, space=replace(limits.space, low=tuple(low), high=tuple(high)))
+    away = np.zeros(3)
+    away[axis] = -0.05 * towards
     with pytest.raises(InfeasibleError, match=r"from \d\.\d\d m/s no way leads through waypoint 1, 0\.05 m away"):
-        continue_plan(flown.trajectory, leave, [behind], limits)
+        continue_plan(flown.trajectory, leave, [state.position + away], room)
 
 
 @pytest.mark.parametrize("waypoints", [[], [[1, 2]], [[np.nan, 0, 1]], [[0.5, 0, 1], [0.5, 0, 1]]])

@@ -1,5 +1,6 @@
 """A plausible figure-eight flight, made up: every message of it, and its header."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from cfplan.flight.telemetry import (
     Estimate,
     Event,
     Level,
+    PathAnswered,
+    PathRequested,
     Phase,
     PhaseEntered,
     PoseReceived,
@@ -133,6 +136,10 @@ def flight_messages(seed: int = 0) -> list[Telemetry]:
         Event(MONOTONIC + 0.1, Level.INFO, "connected to sim://0"),
         Event(MONOTONIC + 10.1, Level.WARNING, "no pose for 0.1 s"),
         Event(MONOTONIC + STREAM + TRAVEL, Level.INFO, "the path is flown"),
+    ]
+    messages += [
+        PathRequested(MONOTONIC + 12.0, 1, "replace", "[[1.0, 0.0, 1.0]]"),
+        PathAnswered(MONOTONIC + 12.2, 1, "refused", "waypoint 1 is too far out", -1, math.nan, math.nan, 0.2),
     ]
     return sorted(messages, key=lambda message: getattr(message, "received", message.time))
 

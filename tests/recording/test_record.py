@@ -18,14 +18,16 @@ from mcap.writer import Writer
 
 from cfplan.errors import InputError
 from cfplan.flight.clock import SteppedClock
-from cfplan.flight.telemetry import Event, Level, Phase, PhaseEntered, PoseReceived
+from cfplan.flight.setpoints.packets import PAYLOAD_SIZE
+from cfplan.flight.telemetry import Event, Level, Phase, PhaseEntered, PlanCommitted, PoseReceived
+from cfplan.recording.commitments import committed_setpoints
 from cfplan.recording.header import header_from_json, header_to_json
 from cfplan.recording.reader import read_record
 from cfplan.recording.topics import TOPICS, columns_from_json, message_to_json
 from cfplan.recording.writer import FLUSH_PERIOD, RecordWriter, new_record_folder
 
 patiently = settings(deadline=None)  # files and threads take as long as a busy machine lets them
-STREAMS = [(topic.stream, topic.message) for topic in TOPICS]
+STREAMS = [(topic.stream, topic.message) for topic in TOPICS if topic.message is not PlanCommitted]
 
 
 def assert_same_header(left, right):
@@ -40,6 +42,32 @@ def test_every_message_reads_back_exactly(flight, stream, kind):
     assert len(wanted) > 0
     for f in fields(kind):
         np.testing.assert_array_equal(getattr(columns, f.name), [getattr(m, f.name) for m in wanted])
+
+
+def test_what_was_committed_reads_back_and_joins_into_one_sequence(tmp_path, small_header):
+    """A plan replaces the rest of the one before from its splice on; where that has ended, it hovers until then."""
+    random = np.random.default_rng(0)
+    plans = [(0, 10), (6, 20), (40, 5), (41, 2)]
+    payloads = [random.integers(0, 256, (count, PAYLOAD_SIZE), dtype=np.uint8) for _, count in plans]
+    with RecordWriter(tmp_path, small_header) as writer:
+        for number, ((splice, _), rows) in enumerate(zip(plans, payloads, strict=True)):
+            writer.write(PlanCommitted(5.0 + number, splice, (1 << 32) - 1 - number, rows.tobytes()))
+    record = read_record(tmp_path)
+    assert record.commitments.checksum.tolist() == [(1 << 32) - 1 - number for number in range(4)]
+    first, second, third, fourth = payloads
+    hover = np.repeat(second[-1:], 14, axis=0)
+    np.testing.assert_array_equal(
+        committed_setpoints(record), np.concatenate([first[:6], second, hover, third[:1], fourth])
+    )
+
+
+@pytest.mark.parametrize(("splice", "payloads"), [(0, b""), (0, b"x" * 28), (-1, b"x" * 29), (10**12, b"x" * 29)])
+def test_commitments_that_are_none_are_refused(tmp_path, small_header, splice, payloads):
+    with RecordWriter(tmp_path, small_header) as writer:
+        writer.write(PlanCommitted(5.0, 0, 0, b"x" * 29))
+        writer.write(PlanCommitted(5.0, splice, 1, payloads))
+    with pytest.raises(InputError, match="commitment 2"):
+        read_record(tmp_path)
 
 
 def test_the_header_reads_back_exactly(flight):
@@ -58,7 +86,7 @@ def test_other_mcap_readers_see_the_messages_on_one_clock(flight):
     with open(flight.folder / "flight.mcap", "rb") as file:
         seen = list(make_reader(file, validate_crcs=True).iter_messages())
     assert len(seen) == len(flight.messages)
-    assert {channel.topic for _, channel, _ in seen} == {topic.name for topic in TOPICS}
+    assert {channel.topic for _, channel, _ in seen} == {topic.name for topic in TOPICS} - {"/committed"}
     assert all(schema.encoding == "jsonschema" for schema, _, _ in seen)
     wall = flight.header.wall_time_at_zero
     first = next(m for m in flight.messages if isinstance(m, PhaseEntered))

@@ -11,6 +11,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
+from numpy.typing import NDArray
+
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.firmware import Timeouts
 from cfplan.flight.mocap.pose_gate import PoseGate
@@ -28,7 +30,7 @@ from cfplan.flight.radio.link import Link
 from cfplan.flight.setpoints.commitment import Commitment, splice
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
-from cfplan.flight.telemetry import Estimate, Level, PoseReceived, Triple
+from cfplan.flight.telemetry import Estimate, Level, PlanCommitted, PoseReceived, Triple
 from cfplan.vehicle.rotations import yaw_of
 
 TRIES = 3
@@ -42,7 +44,8 @@ _STREAMS = 8  # that are remembered: a pose that comes late is judged by the str
 class OrderSource(Protocol):
     """The operator's orders and the state of the main process."""
 
-    worst: Order | None  # the gravest order so far
+    worst: Order | None  # the gravest order so far that ends the flight early
+    finishing: bool  # the vehicle is to land where its plan ends
     gone: bool  # the main process has ended
 
 
@@ -160,6 +163,11 @@ class FlightLoop:
         self.stream = None
 
     @property
+    def finishing(self) -> bool:
+        """Return whether the vehicle is to land where its plan ends, without waiting for another."""
+        return self._orders.finishing
+
+    @property
     def motion_ends(self) -> float:
         """Time, s, from the plan's first setpoint to the first of those that only hover at its end."""
         return self.commitment.motion_ends / self.mission.rate
@@ -171,6 +179,9 @@ class FlightLoop:
             return
         answer = splice(self.commitment, proposal, self.plan.number(now), self.limits.space)
         if isinstance(answer, Commitment):
+            if not self.commitment.splices:
+                self.history.report(committed(now, self.commitment.first, 0, self.commitment.payloads))
+            self.history.report(committed(now, proposal.splice, proposal.checksum, proposal.payloads))
             self.commitment = answer
             self.plan = self.stream = self._begun[-1] = stream_of(answer, self.mission.rate, self.plan.start)
             self.history.say(Level.INFO, f"a new plan is flown from setpoint {answer.splices[-1]} on")
@@ -380,3 +391,8 @@ class FlightLoop:
         """Return the bits of `mask` that are set in the log variable supervisor.info; 0 without a log."""
         status = self.link.status
         return status.supervisor & mask if status is not None else 0
+
+
+def committed(time: float, splice: int, checksum: int, payloads: NDArray) -> PlanCommitted:
+    """Return the telemetry of setpoints (K, 29) that are committed from number `splice` on, in a proposal or before."""
+    return PlanCommitted(time, splice, checksum, payloads.tobytes())

@@ -25,6 +25,7 @@ _ALT = b"\x00"  # stands for a sequence: Esc before it is Alt
 class Order(IntEnum):
     """Orders that the pilot obeys in the air."""
 
+    FINISH = 0  # fly what is committed to its end, then land, without waiting for a new plan
     LAND = 1
     CUT = 2
 
@@ -33,12 +34,16 @@ class Order(IntEnum):
 class HeldOrders:
     """What the pilot knows of the operator and of the main process; an OrderSource."""
 
-    worst: Order | None = None  # the gravest order so far
+    worst: Order | None = None  # the gravest order so far that ends the flight early
+    finishing: bool = False  # the vehicle is to land where its plan ends
     gone: bool = False  # the main process has ended
 
     def give(self, order: Order) -> None:
         """Take an order; a lesser one than before changes nothing."""
-        self.worst = max(order, self.worst or order)
+        if order is Order.FINISH:
+            self.finishing = True
+        else:
+            self.worst = max(order, self.worst or order)
 
 
 def orders_of(keys: bytes) -> list[Order]:
@@ -64,7 +69,9 @@ class Keyboard:
     terminal closes, that lands too, and what is still printed to it is dropped.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, keys: bool = True) -> None:
+        """Take `keys` too, or leave what is typed to another reader; signals count either way."""
+        self._keys = keys
         self._orders: deque[Order] = deque()
         self._interrupts = 0
         self._terminal: tuple[int, list[Any]] | None = None
@@ -77,7 +84,7 @@ class Keyboard:
         # No terminal, or not in its foreground: signals alone.
         with contextlib.suppress(termios.error, OSError, ValueError, AttributeError):
             descriptor = sys.stdin.fileno()
-            if os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp():
+            if self._keys and os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp():
                 self._terminal = descriptor, termios.tcgetattr(descriptor)
                 self._read_keys_at_once(descriptor)
         return self

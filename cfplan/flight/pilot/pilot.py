@@ -205,7 +205,9 @@ class Pilot:
             loop.until(lambda: loop.now() > loop.plan.end, math.inf)
             self._history.skipped = loop.skipped - skipped
             self._history.enter(Phase.HOLD)
-            if not loop.until(lambda: loop.now() < loop.plan.end, self._mission.hold_time):
+            if not loop.until(lambda: loop.finishing or loop.now() < loop.plan.end, self._mission.hold_time):
+                break
+            if loop.finishing and loop.now() >= loop.plan.end:
                 break
 
     # The abort ladder.

@@ -6,11 +6,11 @@ import pytest
 from click.testing import CliRunner
 
 from cfplan.cli import cfplan
-from cfplan.cli.vehicle import check_uris
 from cfplan.errors import CfplanError, InputError, LinkError
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.simulation.virtual_vicon.vicon import serve
+from cfplan.steering.starting_vehicle import check_uris
 
 
 def moving(t):

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from cfplan.errors import InputError
 
 if TYPE_CHECKING:
-    from cfplan.cli.output import Steps
     from cfplan.flight.mocap.poses import PoseSource
     from cfplan.flight.pilot.process import PilotProcess
+    from cfplan.preparation.steps import OnStep
     from cfplan.safety.limits import Limits, PoseLimits
     from cfplan.simulation.lab.lab import StartingLab
 
@@ -39,22 +39,23 @@ def check_uris(uri: str, mocap_uri: str | None) -> None:
         raise InputError("this vehicle needs a source of poses", where=uri, hint=f"name it with --mocap, as {EXAMPLE}")
 
 
-def look_at_hardware(uri: str, mocap_uri: str | None, limits: "PoseLimits", steps: "Steps") -> None:
+def look_at_hardware(uri: str, mocap_uri: str | None, limits: "PoseLimits", on_step: "OnStep") -> None:
     """Check, before anything is planned, that the radio is available, and the body seen, upright and in metres.
 
-    Prints where the body is, which a person can check with a glance. Raises a CfplanError, within 5 s.
+    Says where the body is, which a person can check with a glance. Raises a CfplanError, within 5 s.
     """
     from cfplan.flight.mocap.source import pose_source
     from cfplan.flight.radio.crazyradio import check_radio
+    from cfplan.preparation.steps import step
     from cfplan.vehicle.rotations import yaw_of
 
     if uri.startswith("radio://"):
-        with steps.step("radio") as said:
+        with step(on_step, "radio") as said:
             check_radio(uri)
             said.append("found, and free")
     if mocap_uri is None or _is_virtual(uri, mocap_uri):
         return
-    with steps.step("body") as said:
+    with step(on_step, "body") as said:
         source = pose_source(mocap_uri, limits)
         try:
             source.open()
@@ -101,16 +102,17 @@ class StartingVehicle:
             room = RoomSettings(vicon=ViconSettings(subject=subject))
         return launch_lab(self._limits.airframe, room=room, number=number)
 
-    def poses(self, steps: "Steps") -> "PoseSource":
+    def poses(self, on_step: "OnStep") -> "PoseSource":
         """Wait for the lab where there is one; return the source of the vehicle's poses."""
         from cfplan.flight.mocap.source import pose_source
         from cfplan.flight.mocap.uri import parse_uri
 
         mocap = parse_uri(self._mocap_uri, subject_needed=True) if self._mocap_uri is not None else None
         if self._lab is not None:
+            from cfplan.preparation.steps import step
             from cfplan.simulation.lab.room import RoomPoseSource
 
-            with steps.step("lab") as results:
+            with step(on_step, "lab") as results:
                 lab = self._lab.wait()
                 results.append(f"the virtual Crazyflie is at {lab.uri}")
             if mocap is None:

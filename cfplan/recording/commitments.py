@@ -1,0 +1,53 @@
+"""What the pilot of a record was bound to fly: the setpoints of all plans committed in flight, in one sequence."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import InputError
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
+from cfplan.recording.record import Commitments, Record
+
+_FARTHEST = 5_000_000  # number of a setpoint: 14 hours, more than a record's longest time
+
+
+def check_commitments(commitments: Commitments, *, where: str) -> None:
+    """Raise InputError where these are no setpoints, or have no numbers that setpoints have."""
+    for number, (splice, payloads) in enumerate(zip(commitments.splice, commitments.payloads, strict=True)):
+        if not payloads or len(payloads) % PAYLOAD_SIZE or not 0 <= splice <= (_FARTHEST if number else 0):
+            raise InputError(
+                f"commitment {number + 1} holds {len(payloads)} bytes from setpoint {splice} on",
+                where=where,
+                hint="the record is damaged, or was changed since",
+            )
+
+
+def committed_setpoints(record: Record) -> NDArray:
+    """Return (N, 29) uint8, each setpoint as it was committed last; none where no plan was committed in flight."""
+    plans = [
+        (int(splice), np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE))
+        for splice, payloads in zip(record.commitments.splice, record.commitments.payloads, strict=True)
+    ]
+    longest = max((splice + len(rows) for splice, rows in plans), default=0)
+    sequence, length = np.empty((longest, PAYLOAD_SIZE), dtype=np.uint8), 0
+    for splice, rows in plans:
+        if length:
+            sequence[length:splice] = sequence[length - 1]  # it hovers at the end of what was held
+        length = splice + len(rows)
+        sequence[splice:length] = rows
+    return sequence[:length]
+
+
+def committed_path(record: Record) -> NDArray:
+    """Return (M, 3) m, where the vehicle was to fly: the header's path, or what was committed in flight."""
+    sequence = committed_setpoints(record)
+    return decode(sequence).position if len(sequence) else record.header.path
+
+
+def committed_time(record: Record) -> float:
+    """Return how long, s, the vehicle was to fly: the header's time, or until the last committed motion ended."""
+    sequence = committed_setpoints(record)
+    if not len(sequence):
+        return record.header.travel_time
+    moving = np.flatnonzero(np.any(decode(sequence).velocity != 0.0, axis=1))
+    return float(moving[-1] + 1) / RATE if len(moving) else 0.0

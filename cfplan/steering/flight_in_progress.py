@@ -1,0 +1,53 @@
+"""A flight in progress as who steers it sees it: by processes in real time, or on a stepped clock."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from cfplan.errors import CfplanError
+from cfplan.flight.clock import Clock
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import FlightOutcome
+from cfplan.flight.telemetry import Telemetry, Triple
+from cfplan.preparation.air_planner import PathAnswer, Wish
+from cfplan.preparation.replan import HeldFlight
+
+
+@dataclass(frozen=True, slots=True)
+class Listeners:
+    """Who hears of a flight; called from any thread, one after the other."""
+
+    telemetry: Callable[[Telemetry], None]
+    answer: Callable[[PathAnswer], None]
+
+
+class FlightInProgress(Protocol):
+    """One flight, which is started once."""
+
+    @property
+    def clock(self) -> Clock:
+        """Return the clock of the flight."""
+
+    outcome: FlightOutcome | CfplanError | None  # how it ended; None until then
+
+    def first_pose(self) -> tuple[Triple, float]:
+        """Return where the vehicle stands, m, and its yaw, rad, before the flight. Raises a CfplanError."""
+
+    def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
+        """Fly a mission from now on; `held` is what it was made from. Returns at once."""
+
+    def ask(self, wish: Wish, waypoints: Sequence[Triple]) -> int:
+        """Ask the planner for a change; return the number of the answer."""
+
+    def order(self, order: Order) -> None:
+        """Give the pilot an order."""
+
+    def wait(self, done: Callable[[], bool], patience: float) -> bool:
+        """Let time pass until `done`, asked after each message, or the flight's end, at most for `patience`, s.
+
+        Returns whether it is done.
+        """
+
+    def close(self) -> None:
+        """Release the vehicle; a flight that goes on is landed first. May be called twice."""

@@ -1,0 +1,159 @@
+"""A steered flight in real time: by the pilot's and the planner's processes, attended to by threads of this one."""
+
+import contextlib
+import sys
+import threading
+import types
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+
+from cfplan.errors import CfplanError
+from cfplan.flight.clock import REAL_CLOCK
+from cfplan.flight.mocap.poses import PoseSource
+from cfplan.flight.pilot.keys import Keyboard, Order
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import FlightOutcome
+from cfplan.flight.pilot.process import fly
+from cfplan.flight.telemetry import Telemetry, Triple
+from cfplan.preparation.air_planner import AirPlanner, PathAnswer, PathVerdict, Wish
+from cfplan.preparation.replan import HeldFlight
+from cfplan.preparation.steps import OnStep
+from cfplan.safety.limits import Limits
+from cfplan.steering.flight_in_progress import Listeners
+from cfplan.steering.starting_vehicle import StartingVehicle
+from cfplan.vehicle.rotations import yaw_of
+
+PLANNER_GONE = "the planner's process has ended; the vehicle flies what is committed, and then hovers"
+_LISTEN_PERIOD = 0.05  # s
+_LANDING = 120.0  # s that landing may take
+_PLANNER_STARTS = 60.0  # s that its process may take, with compiling
+
+
+class RealTimeSteering:
+    """A flight by processes; a FlightInProgress. Make it in the main thread, so that Ctrl-C lands."""
+
+    clock = REAL_CLOCK
+
+    def __init__(self, uri: str, mocap_uri: str | None, limits: Limits, on_step: OnStep, *, keys: bool):
+        """Start the pilot's process, and a virtual vehicle's lab. `keys` says whether those of the terminal count.
+
+        Raises a CfplanError where vehicle or poses cannot be had.
+        """
+        self.outcome: FlightOutcome | CfplanError | None = None
+        self._open = contextlib.ExitStack()
+        self._change = threading.Condition()
+        self._orders: deque[Order] = deque()
+        self.more_orders: list[Callable[[], Sequence[Order]]] = [self._new_orders]
+        self._unanswered: set[int] = set()
+        self.planner: AirPlanner | None = None
+        self._thread: threading.Thread | None = None
+        try:
+            with main_module_hidden():
+                self._vehicle = self._open.enter_context(StartingVehicle(uri, mocap_uri, limits))
+            self._source: PoseSource = self._vehicle.poses(on_step)
+            self._keyboard = self._open.enter_context(Keyboard(keys=keys))
+        except BaseException:
+            self._open.close()
+            raise
+
+    def first_pose(self) -> tuple[Triple, float]:
+        try:
+            self._source.open()
+            pose = self._source.poses()[-1]
+        finally:
+            self._source.close()
+        return pose.position, yaw_of(pose.quaternion)
+
+    def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
+        with main_module_hidden():
+            self.planner = self._open.enter_context(AirPlanner(held, mission.limits, self._vehicle.pilot.proposals))
+        self._thread = threading.Thread(target=self._fly, args=(mission, listeners), name="flight")
+        self._thread.start()
+        threading.Thread(target=self._listen, args=(listeners,), name="planner's answers", daemon=True).start()
+        self.wait(lambda: self.planner is not None and self.planner.ready, _PLANNER_STARTS)
+
+    def _fly(self, mission: Mission, listeners: Listeners) -> None:
+        def tell(message: Telemetry) -> None:
+            with self._change:
+                listeners.telemetry(message)
+                self._change.notify_all()
+
+        outcome: FlightOutcome | CfplanError
+        try:
+            outcome = fly(
+                mission,
+                uri=self._vehicle.uri,
+                pose_source=self._source,
+                pilot=self._vehicle.pilot,
+                on_telemetry=tell,
+                more_orders=lambda: [order for each in self.more_orders for order in each()],
+                keyboard=self._keyboard,
+            )
+        except CfplanError as error:
+            outcome = error
+        except BaseException as error:  # a fault of a listener, which has landed the vehicle
+            outcome = CfplanError(f"fault in the flight: {error!r}", hint="please report this")
+        with self._change:
+            self.outcome = outcome
+            self._change.notify_all()
+
+    def _listen(self, listeners: Listeners) -> None:
+        """Pass the planner's answers on, and answer for it once it has ended."""
+        planner = self.planner
+        assert planner is not None
+        while self.outcome is None:
+            answers = planner.answers(_LISTEN_PERIOD)
+            gone = not planner.alive
+            with self._change:
+                if gone:
+                    told = {answer.number for answer in answers}
+                    left = sorted(self._unanswered - told)
+                    answers += [PathAnswer(number, PathVerdict.REFUSED, PLANNER_GONE) for number in left]
+                for answer in answers:
+                    self._unanswered.discard(answer.number)
+                    listeners.answer(answer)
+                self._change.notify_all()
+            if gone:
+                REAL_CLOCK.sleep(_LISTEN_PERIOD)
+
+    def _new_orders(self) -> list[Order]:
+        orders: list[Order] = []
+        while self._orders:
+            orders.append(self._orders.popleft())
+        return orders
+
+    def ask(self, wish: Wish, waypoints: Sequence[Triple]) -> int:
+        assert self.planner is not None
+        with self._change:
+            number = self.planner.request(wish, waypoints)
+            self._unanswered.add(number)
+        return number
+
+    def order(self, order: Order) -> None:
+        self._orders.append(order)
+
+    def wait(self, done: Callable[[], bool], patience: float) -> bool:
+        with self._change:
+            self._change.wait_for(lambda: done() or self.outcome is not None, timeout=patience)
+            return done()
+
+    def close(self) -> None:
+        if self._thread is not None:
+            if self.outcome is None:
+                self.order(Order.LAND)
+            self._thread.join(_LANDING)
+        self._open.close()
+
+
+@contextlib.contextmanager
+def main_module_hidden() -> Iterator[None]:
+    """Start processes without the program's own module in them: else they would run it again, and steer too.
+
+    That is so wherever a program has no `if __name__ == "__main__"`.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main

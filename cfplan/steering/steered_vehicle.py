@@ -1,0 +1,351 @@
+"""A vehicle that a program steers: take off, fly through waypoints, change them in the air, land.
+
+Whatever the program asks for, or if it dies, the vehicle is bound to setpoints that end in a hover inside the space,
+each with a stop. A request is planned beside the flight, certified like a plan before take-off, and flown from a joint
+ahead of the vehicle without a stop between; where it cannot be, it is refused in words and the flight goes on as it
+was.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cfplan.errors import CfplanError, ExitCode, FlightEndedError, InputError, PreflightError, RequestRefusedError
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import FlightOutcome
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived, SetpointSent, Telemetry, Triple
+from cfplan.preparation.air_planner import PathAnswer, PathRequest, PathVerdict, Wish
+from cfplan.preparation.replan import hold_hover
+from cfplan.recording.record import Record
+from cfplan.safety.limits import Limits
+from cfplan.steering.flight_in_progress import FlightInProgress, Listeners
+from cfplan.steering.recorded_steering import SteeringRecord, answer_text
+
+MOST_WAYPOINTS = 200  # of a request
+_TAKE_OFF_WITHIN = 120.0  # s, preflight and its waits included
+_ANSWER_WITHIN = 15.0  # s, after which a planner does not answer
+_LAND_WITHIN = 120.0  # s
+_FLYING = (Phase.STREAM, Phase.HOLD)
+
+
+class SteeredVehicle:
+    """One flight of a vehicle; a context manager, behind which the vehicle is landed and disarmed.
+
+    `cfplan.connect` makes it. Its methods raise a FlightEndedError once the flight has ended otherwise than by `land`:
+    by the operator's keys, by a safety rule, or as the link was lost; the error says which.
+    """
+
+    def __init__(
+        self,
+        flight: FlightInProgress,
+        limits: Limits,
+        *,
+        uri: str,
+        name: str = "steered",
+        records: Path | None = None,
+        on_record: Callable[[SteeringRecord], None] = lambda _: None,
+    ):
+        """Steer a flight under these limits. It is recorded as a folder in `records`, if that is given."""
+        self._flight, self._limits, self._uri, self._name = flight, limits, uri, name
+        self._records, self._on_record = records, on_record
+        self._recording: SteeringRecord | None = None
+        self._answers: dict[int, PathAnswer] = {}
+        self._unread: list[PathAnswer] = []
+        self._asked: set[int] = set()
+        self._phase: Phase | None = None
+        self._begun = math.nan  # s, when setpoint 0 was due
+        self._sent: SetpointSent | None = None
+        self._pose: PoseReceived | None = None
+        self._ends = 0.0  # s from setpoint 0, when the committed motion ends
+        self._closed = False
+        self._recorded: tuple[Record, dict[str, Any]] | None = None
+
+    # What it knows.
+
+    @property
+    def position(self) -> Triple:
+        """Return where the vehicle was last seen, m; where it stands before the flight."""
+        return self._pose.position if self._pose is not None else self._flight.first_pose()[0]
+
+    @property
+    def target(self) -> Triple:
+        """Return where the vehicle is asked to be now, m, by its last setpoint. Raises InputError before take-off."""
+        if self._sent is None:
+            raise _not_flying()
+        return self._sent.position
+
+    @property
+    def speed(self) -> float:
+        """Return how fast the vehicle is asked to fly now, m/s; 0 before take-off."""
+        return math.hypot(*self._sent.velocity) if self._sent is not None else 0.0
+
+    @property
+    def time(self) -> float:
+        """Return the time, s, on the flight's clock, of which only differences mean anything."""
+        return self._flight.clock.now()
+
+    @property
+    def resting(self) -> bool:
+        """Return whether all that was asked for is flown, and the vehicle hovers."""
+        if self._phase not in _FLYING or self._sent is None or self._asked - self._answers.keys():
+            return False
+        return self._sent.time >= self._begun + self._ends
+
+    @property
+    def outcome(self) -> FlightOutcome | None:
+        """Return how the flight ended; None while it goes on, or where there was none."""
+        ended = self._flight.outcome
+        return ended if isinstance(ended, FlightOutcome) else None
+
+    @property
+    def record(self) -> Path | None:
+        """Return the folder of the flight's record; None before take-off, or where none is written."""
+        return self._recording.folder if self._recording is not None else None
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Return what `cfplan report` says of the record, once the flight is over; empty where there is none."""
+        return self._recorded[1] if self._recorded is not None else {}
+
+    # The flight.
+
+    def take_off(self, height: float | None = None) -> None:
+        """Check everything as before any flight, arm, climb to a height, m, and return once the vehicle hovers there.
+
+        Without a height, to that of the limits. Raises a CfplanError where the vehicle cannot take off: a check failed,
+        the hover lies outside the space, or the link or its poses cannot be had. Nothing is armed then.
+        """
+        if self._recording is not None or self._phase is not None:
+            raise InputError("it has taken off already", where="take_off", hint="connect again for another flight")
+        limits = self._limits
+        if height is not None:
+            if not (np.isreal(height) and math.isfinite(height)):
+                raise InputError(f"{height!r} is no height", where="take_off", hint="give metres above the origin")
+            limits = replace(limits, ground=replace(limits.ground, take_off_height=float(height)))
+        (x, y, _), yaw = self._flight.first_pose()
+        held = hold_hover((x, y, limits.ground.take_off_height), yaw, limits)
+        mission = Mission(held.commitment.payloads, held.commitment.stops, limits)
+        mission = replace(mission, hold_time=max(limits.battery.endurance - mission.duration - 0.01, 0.0))
+        self._ends = held.ends
+        if self._records is not None:
+            place = (x, y, limits.ground.take_off_height)
+            self._recording = SteeringRecord(
+                self._records, self._name, self._uri, limits, place, clock=self._flight.clock
+            )
+            self._on_record(self._recording)
+        self._flight.start(mission, held, Listeners(self._hear, self._hear_answer))
+        if not self._flight.wait(lambda: self._phase in _FLYING and self._sent is not None, _TAKE_OFF_WITHIN):
+            self._require_flying()
+            raise PreflightError("it did not take off in time", where=self._uri, hint="see the record's events")
+
+    def fly(self, waypoints: ArrayLike) -> PathAnswer:
+        """Fly through waypoints, (K, 3) m, to rest at the last, instead of what is ahead; the same as `replace`."""
+        return self.replace(waypoints)
+
+    def extend(self, waypoints: ArrayLike) -> PathAnswer:
+        """Fly on through waypoints, (K, 3) m, after those ahead, without a stop between. As `replace` otherwise."""
+        return self.ask(Wish.EXTEND, waypoints)
+
+    def replace(self, waypoints: ArrayLike) -> PathAnswer:
+        """Leave what is ahead at the next joint, and fly through waypoints, (K, 3) m, to rest at the last.
+
+        Returns once the pilot is bound to it, while the vehicle flies on. Raises InputError where these are no
+        waypoints, RequestRefusedError where no certified plan leads through them or it came too late.
+        """
+        return self.ask(Wish.REPLACE, waypoints)
+
+    def stop(self) -> PathAnswer:
+        """Come to rest soon, ahead on the path. Raises RequestRefusedError where what is committed ends as soon."""
+        return self.ask(Wish.STOP)
+
+    def slower(self) -> PathAnswer:
+        """Fly what is ahead, and what is asked for later, at three quarters of the speed. As `replace` otherwise."""
+        return self.ask(Wish.SLOWER)
+
+    def faster(self) -> PathAnswer:
+        """Undo `slower`, as often as it was asked for. As `replace` otherwise."""
+        return self.ask(Wish.FASTER)
+
+    def ask(self, wish: Wish, waypoints: ArrayLike = ()) -> PathAnswer:
+        """Ask for a change, wait for its answer, and return it. Raises as `replace` does."""
+        answer = self.answer_to(self.request(wish, waypoints))
+        if answer.verdict is not PathVerdict.ACCEPTED:
+            raise RequestRefusedError(
+                answer_text(answer), where=wish.value, hint="ask for something else; the flight goes on as it was"
+            )
+        return answer
+
+    def request(self, wish: Wish, waypoints: ArrayLike = ()) -> int:
+        """Ask for a change and return at once, with the number of its answer.
+
+        The latest request wins: one that waits to be planned is superseded. Raises InputError where these are no
+        waypoints.
+        """
+        self._require_flying()
+        points = checked_waypoints(waypoints) if wish in (Wish.EXTEND, Wish.REPLACE) else ()
+        number = self._flight.ask(wish, points)
+        self._asked.add(number)
+        if self._recording is not None:
+            self._recording.requested(PathRequest(number, wish, points))
+        return number
+
+    def answer_to(self, number: int) -> PathAnswer:
+        """Wait for the answer to a request and return it; where the planner does not answer, one that says so."""
+        self._flight.wait(lambda: number in self._answers, _ANSWER_WITHIN)
+        answer = self._answers.get(number)
+        if answer is None:
+            self._require_flying()
+            answer = PathAnswer(number, PathVerdict.LATE, "the planner does not answer", seconds=_ANSWER_WITHIN)
+            self._hear_answer(answer)
+        self._unread = [other for other in self._unread if other.number != number]
+        return answer
+
+    def answers(self) -> list[PathAnswer]:
+        """Return the answers since the last call, but for those that were waited for."""
+        unread, self._unread = self._unread, []
+        return unread
+
+    def wait(self, patience: float = math.inf) -> bool:
+        """Wait until all that was asked for is flown and the vehicle hovers, at most for `patience`, s.
+
+        Returns whether it does.
+        """
+        until = self.time + patience
+        while not self.resting and self.time < until:
+            self._require_flying()
+            self._flight.wait(lambda: self.resting, min(until - self.time, 1.0))
+        return self.resting
+
+    def sleep(self, duration: float) -> None:
+        """Let `duration`, s, of the flight pass."""
+        until = self.time + duration
+        while self.time < until:
+            self._require_flying()
+            self._flight.wait(lambda: self.time >= until, min(until - self.time, 1.0))
+
+    def land(self) -> None:
+        """Stop along the path where the vehicle still moves, land, disarm, and return when that is done.
+
+        Raises a FlightEndedError where a safety rule or the operator ended the flight instead.
+        """
+        self._end(Order.FINISH if self.resting else Order.LAND)
+        ended = self._flight.outcome
+        if isinstance(ended, CfplanError):
+            raise ended
+        if ended is not None and ended.exit_code not in (ExitCode.OK, ExitCode.ENDED_BY_OPERATOR):
+            raise _ended(ended)
+
+    def finish(self) -> None:
+        """Fly what is committed to its end, then land, disarm, and return. Raises as `land` does."""
+        if self._phase is not None and self._flight.outcome is None:
+            self._flight.order(Order.FINISH)
+            self._flight.wait(lambda: False, self._ends + _LAND_WITHIN)
+        self.land()
+
+    def cut(self) -> None:
+        """Cut the motors at once, wherever the vehicle is: it falls."""
+        self._flight.order(Order.CUT)
+        self._flight.wait(lambda: False, _LAND_WITHIN)
+
+    def close(self) -> None:
+        """Land the vehicle if it flies, release it, and end its record. May be called twice; does not raise."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._flight.close()
+        finally:
+            if self._recording is not None:
+                self._recorded = self._recording.close(self.outcome)
+
+    def __enter__(self) -> "SteeredVehicle":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if error is None and self._phase in _FLYING:
+                self.finish()
+        finally:
+            self.close()
+
+    # Within.
+
+    def _end(self, order: Order) -> None:
+        if self._phase is not None and self._flight.outcome is None:
+            self._flight.order(order)
+            self._flight.wait(lambda: False, _LAND_WITHIN)
+
+    def _hear(self, message: Telemetry) -> None:
+        """Take telemetry, in the thread that attends to the flight."""
+        if isinstance(message, PhaseEntered):
+            self._phase = message.phase
+        elif isinstance(message, PoseReceived):
+            self._pose = message
+        elif isinstance(message, SetpointSent) and self._phase in _FLYING:
+            if math.isnan(self._begun):
+                self._begun = message.due - message.index / RATE
+            self._sent = message
+        if self._recording is not None:
+            self._recording.tell(message)
+
+    def _hear_answer(self, answer: PathAnswer) -> None:
+        if math.isfinite(answer.ends):
+            self._ends = answer.ends
+        self._answers[answer.number] = replace(answer, plan=None)
+        self._unread.append(self._answers[answer.number])
+        if self._recording is not None:
+            self._recording.answered(answer)
+
+    def _require_flying(self) -> None:
+        ended = self._flight.outcome
+        if isinstance(ended, CfplanError):
+            raise ended
+        if ended is not None:
+            raise _ended(ended)
+        if self._phase is None and self._recording is None:
+            raise _not_flying()
+
+
+def checked_waypoints(waypoints: ArrayLike) -> tuple[Triple, ...]:
+    """Return waypoints as rows of x, y, z, m. Raises InputError where they are none."""
+    hint = "give rows of x, y, z in metres, as [[1, 0, 1], [0, 1, 1.2]]"
+    try:
+        points = np.array(waypoints, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError("these are no numbers", where="waypoints", hint=hint) from None
+    if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
+        raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint=hint)
+    if len(points) > MOST_WAYPOINTS:
+        raise InputError(
+            f"{len(points)} waypoints at once", where="waypoints", hint=f"give at most {MOST_WAYPOINTS}, and extend"
+        )
+    if not np.isfinite(points).all():
+        at = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        raise InputError(f"{points[at].tolist()} is no place", where=f"waypoint {at + 1}", hint="give finite numbers")
+    return tuple((x, y, z) for x, y, z in points.tolist())
+
+
+def _not_flying() -> InputError:
+    return InputError("it has not taken off", where="vehicle", hint="call take_off() first")
+
+
+def _ended(outcome: FlightOutcome) -> FlightEndedError:
+    failed = [f"{check.name}: {check.value}, must be {check.threshold}" for check in outcome.checks if not check.passed]
+    hints = [check.hint for check in outcome.checks if not check.passed and check.hint]
+    if outcome.exit_code is ExitCode.PREFLIGHT and failed:
+        return FlightEndedError(
+            "; ".join(failed), where="preflight", hint="; ".join(hints), exit_code=outcome.exit_code
+        )
+    return FlightEndedError(
+        outcome.reason, where="flight", hint="the record tells what happened", exit_code=outcome.exit_code
+    )

@@ -1,0 +1,217 @@
+"""A program steers the virtual vehicle on the stepped clock: what it asks for is flown, or refused in words."""
+
+import numpy as np
+import pytest
+
+import cfplan
+from cfplan.errors import (
+    CfplanError,
+    ExitCode,
+    FlightEndedError,
+    InfeasibleError,
+    InputError,
+    RequestRefusedError,
+)
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.preparation.air_planner import PathVerdict, Wish
+from cfplan.preparation.stepped_planner import PlannerFault
+from cfplan.recording.reader import read_record
+from cfplan.safety.certificate import certify
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.steering.steered_vehicle import SteeredVehicle
+from cfplan.steering.stepped_steering import SteppedSteering
+
+
+@pytest.fixture
+def connect(limits, tmp_path):
+    """Connects to the virtual vehicle on a stepped clock; its records lie in a folder of the test."""
+    return lambda **options: cfplan.connect("sim://0", stepped=True, safety=limits, records=tmp_path, **options)
+
+
+@pytest.fixture
+def flown(limits):
+    """A vehicle in the air without a record, and the flight behind it."""
+    flight = SteppedSteering(limits)
+    with SteeredVehicle(flight, limits, uri="sim://0") as vehicle:
+        vehicle.take_off(0.8)
+        yield vehicle, flight
+
+
+def test_the_readmes_example_flies_and_is_recorded(connect, limits):
+    with connect() as vehicle:
+        vehicle.take_off(0.8)
+        assert vehicle.position[2] == pytest.approx(0.8, abs=0.05)
+        first = vehicle.fly([[1, 0, 1], [0, 1, 1.2]])
+        assert not vehicle.resting
+        vehicle.extend([[-1, 0, 1]])
+        vehicle.replace([[0, -1, 1.5], [1, 1, 1]])
+        vehicle.wait()
+        assert np.linalg.norm(np.subtract(vehicle.position, [1, 1, 1])) < 0.1
+        vehicle.land()
+    assert first.verdict is PathVerdict.ACCEPTED
+    assert vehicle.outcome is not None
+    assert vehicle.outcome.exit_code is ExitCode.OK
+    assert vehicle.outcome.deviation.max < 0.1
+    record = read_record(vehicle.record)
+    assert record.requests.wish.tolist() == ["replace", "extend", "replace"]
+    assert record.answers.verdict.tolist() == ["accepted"] * 3
+    assert len(record.commitments.splice) == 4  # the hover too
+    assert vehicle.summary["max_deviation"] < 0.1
+    assert vehicle.summary["peak_speed"] > 1.0
+
+
+def test_each_plan_goes_through_its_waypoints_without_a_stop_between(flown, limits):
+    vehicle, flight = flown
+    vehicle.fly([[1, 0, 1], [0, 1, 1.2]])
+    vehicle.sleep(0.5)
+    vehicle.extend([[-1, 0, 1]])
+    held = flight.planner.held
+    for trajectory in held.flown.trajectories[1:]:
+        assert certify(trajectory, limits.plan, limits.space).passed
+    states = held.flown.at(np.arange(0.0, held.ends, 1.0 / RATE))
+    for waypoint in ([1, 0, 1], [0, 1, 1.2], [-1, 0, 1]):
+        assert np.linalg.norm(states.position - waypoint, axis=1).min() < 0.03
+    speeds = np.linalg.norm(states.velocity, axis=1)
+    assert speeds[100:-100].min() > 0.3
+    vehicle.wait()
+    assert np.linalg.norm(np.subtract(vehicle.position, [-1, 0, 1])) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("waypoints", "error", "words"),
+    [
+        ([[0, 0, 9]], RequestRefusedError, "7.200 m too far out"),
+        ([[0.5, 0.5, 1], [0.5, 0.5, 1]], RequestRefusedError, "remove one of them"),
+        ([["a", 1, 2]], InputError, "no numbers"),
+        ([[np.nan, 0, 1]], InputError, "waypoint 1"),
+        ([1, 2, 3], InputError, "rows of x, y, z"),
+        ([], InputError, "rows of x, y, z"),
+        (np.ones((1000, 3)), InputError, "at most 200"),
+    ],
+)
+def test_what_cannot_be_flown_is_refused_in_words_and_the_flight_goes_on(flown, waypoints, error, words):
+    vehicle, _ = flown
+    vehicle.fly([[1, 0, 1]])
+    with pytest.raises(error, match=words):
+        vehicle.replace(waypoints)
+    vehicle.wait()
+    assert np.linalg.norm(np.subtract(vehicle.position, [1, 0, 1])) < 0.1
+    vehicle.land()
+    assert vehicle.outcome.exit_code is ExitCode.OK
+
+
+def test_slower_counts_for_what_is_ahead_and_for_what_comes_until_faster_undoes_it(flown):
+    vehicle, _ = flown
+    vehicle.slower()
+    vehicle.slower()
+    slow = vehicle.fly([[1.5, 2.5, 1], [1.5, -2.5, 1]])
+    speeds = []
+    for _ in range(20):
+        vehicle.sleep(0.2)
+        speeds.append(vehicle.speed)
+    assert 0.9 < max(speeds) < 1.14  # 0.75² of 2 m/s
+    vehicle.faster()
+    assert vehicle.faster().ends < slow.ends - 0.5
+
+
+def test_a_stop_ends_soon_ahead_on_the_path(flown):
+    vehicle, _ = flown
+    vehicle.fly([[1.2, 1, 1], [0.5, 3, 1]])
+    vehicle.sleep(0.8)
+    begun = vehicle.time
+    vehicle.stop()
+    vehicle.wait()
+    assert vehicle.time - begun < 2.0
+    with pytest.raises(RequestRefusedError, match="cannot stop sooner"):
+        vehicle.stop()
+
+
+def test_the_latest_request_wins(flown):
+    vehicle, _ = flown
+    numbers = [vehicle.request(Wish.REPLACE, [[0.2 * k, 0.5, 1]]) for k in range(4)]
+    vehicle.wait()
+    verdicts = {answer.number: answer.verdict for answer in vehicle.answers()}
+    assert [verdicts[number] for number in numbers] == [PathVerdict.SUPERSEDED] * 3 + [PathVerdict.ACCEPTED]
+    assert vehicle.answers() == []
+
+
+@pytest.mark.parametrize("fault", [*PlannerFault])
+def test_whatever_is_wrong_with_the_planner_the_vehicle_flies_what_is_committed(flown, fault):
+    vehicle, flight = flown
+    vehicle.fly([[1, 0, 1], [0, 1, 1.2]])
+    flight.planner.fault = fault
+    number = vehicle.request(Wish.REPLACE, [[-1, 0, 1]])
+    vehicle.sleep(4.0)
+    assert np.linalg.norm(np.subtract(vehicle.position, [0, 1, 1.2])) < 0.1
+    assert all(answer.verdict is not PathVerdict.ACCEPTED for answer in vehicle.answers() if answer.number == number)
+
+
+def test_a_program_that_fails_leaves_its_vehicle_landed_and_disarmed(limits):
+    flight = SteppedSteering(limits)
+
+    def program() -> None:
+        with vehicle:
+            vehicle.take_off()
+            vehicle.fly([[1, 0, 1]])
+            vehicle.sleep(0.5)
+            raise ZeroDivisionError
+
+    vehicle = SteeredVehicle(flight, limits, uri="sim://0")
+    with pytest.raises(ZeroDivisionError):
+        program()
+    assert vehicle.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
+    assert flight.lab.truth().position[-1, 2] < 0.05
+    assert not flight.lab.truth().motor[-1].any()
+
+
+def test_a_block_that_ends_in_flight_flies_on_to_its_end_and_lands(limits):
+    with SteeredVehicle(SteppedSteering(limits), limits, uri="sim://0") as vehicle:
+        vehicle.take_off()
+        vehicle.fly([[1, 0, 1]])
+    assert vehicle.outcome.exit_code is ExitCode.OK
+    assert np.linalg.norm(np.subtract(vehicle.outcome.end_position[:2], [1, 0])) < 0.15
+
+
+def test_landing_in_motion_stops_along_the_path(flown):
+    vehicle, flight = flown
+    vehicle.fly([[1.5, 0, 1]])
+    vehicle.sleep(0.8)
+    vehicle.land()
+    assert 0.2 < flight.lab.truth().position[-1, 0] < 1.4
+    with pytest.raises(FlightEndedError):
+        vehicle.fly([[0, 0, 1]])
+
+
+def test_a_take_off_that_cannot_be_is_refused_and_nothing_is_armed(limits):
+    for height in (1.9, 0.0, np.nan, "high"):
+        flight = SteppedSteering(limits)
+        with SteeredVehicle(flight, limits, uri="sim://0") as vehicle, pytest.raises((InfeasibleError, InputError)):
+            vehicle.take_off(height)
+        assert vehicle.outcome is None
+
+
+def test_a_failed_preflight_check_is_said_in_words(limits):
+    old = VehicleSettings(protocol=10, firmware="2025.09")
+    with SteeredVehicle(SteppedSteering(limits, vehicle=old), limits, uri="sim://0") as vehicle:
+        with pytest.raises(InputError, match="take_off"):
+            vehicle.fly([[0, 0, 1]])
+        with pytest.raises(FlightEndedError, match="firmware") as refused:
+            vehicle.take_off()
+    assert refused.value.exit_code is ExitCode.PREFLIGHT
+    assert refused.value.hint
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"uri": "sim//0"}, "hint"),
+        ({"uri": "radio://0/80/2M/E7E7E7E7E7", "stepped": True, "mocap": "vicon://1.2.3.4/cf1"}, "stepped"),
+        ({"uri": "udp://127.0.0.1:1"}, "poses"),
+        ({"safety": "nowhere.yaml"}, "nowhere.yaml"),
+    ],
+)
+def test_wrong_arguments_are_refused_with_place_and_hint(options, words):
+    with pytest.raises(CfplanError) as refused:
+        cfplan.connect(**options)
+    assert words in str(refused.value)
+    assert refused.value.hint
