@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
+from cfplan.machine_code import njit
 from cfplan.safety import quantities
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import scaled
@@ -27,7 +28,7 @@ FINE_ALLOWANCE = 5e-3  # likewise in brisk intervals
 
 # Chebyshev-Lobatto: both ends of an interval, and closer together near them
 _PLACES, _FINE = ((1.0 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2.0 for count in (COUNT, FINE_COUNT))
-CONTINUOUS = np.flatnonzero(~quantities.JUMPS).tolist()
+CONTINUOUS = np.flatnonzero(~quantities.JUMPS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class DensePath:
 
     def __init__(self, path: Path, nodes: int, held: NDArray, caps: SpeedCaps | None = None) -> None:
         """Take `held`, (N,): how far, 0 to 1, a boundary state decides each interval; its violation counts less."""
-        self.held = held[:, None]
+        self.held = held
         step = path.end / nodes
         brisk = turns(path, nodes) > SHARP
         brisk[:END_INTERVALS] = brisk[-END_INTERVALS:] = True
@@ -64,6 +65,8 @@ class DensePath:
         )  # fmt: skip
         # First all first places of a group of intervals, then all second ones: so are extremes found fastest.
         self.interval = np.concatenate([np.tile(which, len(places)) for which, places in self.groups])
+        self._order = np.concatenate([which for which, _ in self.groups])
+        self._counts = np.array([(len(which), len(places)) for which, places in self.groups])
         self.places = step * np.concatenate([np.repeat(places, len(which)) for which, places in self.groups])
         self.derivatives = np.concatenate(
             [_by_place(path, step * (which[:, None] + places)) for which, places in self.groups], axis=2
@@ -72,9 +75,11 @@ class DensePath:
 
     def violation(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Violation:
         """Return the violation by a profile with as many intervals; h must be positive."""
-        highest, lowest = self._extremes(profile, airframe, limits)
-        upper, lower = highest.T - quantities.UPPER + self.allowance, quantities.LOWER - lowest.T + self.allowance
-        return Violation(upper - self.held * np.maximum(upper, 0.0), lower - self.held * np.maximum(lower, 0.0))
+        count = len(self.allowance)
+        rows = scaled(_extremes(self.measures(profile, airframe, limits), self._order, self._counts), limits)
+        return Violation(*_beyond(
+            rows[:, :count], rows[:, count:], quantities.UPPER, quantities.LOWER, self.allowance, self.held
+        ))  # fmt: skip
 
     def measures(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> NDArray:
         """Return the measures at all places, (MEASURES, P · K), speed counted against caps as against the limit."""
@@ -90,16 +95,47 @@ class DensePath:
             least[which] = values[begin:end].reshape(len(places), len(which)).min(axis=0)
         return least
 
-    def _extremes(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> tuple[NDArray, NDArray]:
-        """Return the highest and the lowest value of each row in each interval, (MEASURES, N)."""
-        at = self.measures(profile, airframe, limits)
-        highest, lowest = (np.empty((MEASURES, len(profile.dddh))) for _ in range(2))
-        end = 0
-        for which, places in self.groups:
-            begin, end = end, end + len(which) * len(places)
-            rows = at[:, begin:end].reshape(MEASURES, len(places), len(which))
-            highest[:, which], lowest[:, which] = rows.max(axis=1), rows.min(axis=1)
-        return scaled(highest, limits), scaled(lowest, limits)
+
+@njit
+def _extremes(measured: NDArray, order: NDArray, counts: NDArray) -> NDArray:
+    """Return the highest of each row in each interval, then the lowest, (MEASURES, 2 N); `measured` is (MEASURES, P).
+
+    `counts` has how many intervals and places each group has, `order`, (N,), which intervals those are.
+    """
+    rows, intervals = measured.shape[0], len(order)
+    extremes, high, low = np.empty((rows, 2 * intervals)), np.empty(intervals), np.empty(intervals)
+    for row in range(rows):
+        begin, first = 0, 0
+        for group in range(len(counts)):
+            size, places = counts[group]
+            for n in range(size):
+                high[first + n] = low[first + n] = measured[row, begin + n]
+            for place in range(1, places):
+                values = measured[row, begin + place * size : begin + (place + 1) * size]
+                for n in range(size):
+                    value = values[n]
+                    high[first + n] = value if value > high[first + n] else high[first + n]
+                    low[first + n] = value if value < low[first + n] else low[first + n]
+            begin += size * places
+            first += size
+        for n in range(intervals):
+            extremes[row, order[n]], extremes[row, intervals + order[n]] = high[n], low[n]
+    return extremes
+
+
+@njit
+def _beyond(
+    highest: NDArray, lowest: NDArray, most: NDArray, least: NDArray, allowance: NDArray, held: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return the fields of a Violation, (N, MEASURES), of the extremes, (MEASURES, N) each."""
+    upper, lower = np.empty(allowance.shape), np.empty(allowance.shape)
+    for n in range(allowance.shape[0]):
+        for row in range(allowance.shape[1]):
+            above = highest[row, n] - most[row] + allowance[n, row]
+            below = least[row] - lowest[row, n] + allowance[n, row]
+            upper[n, row] = above - held[n] * max(above, 0.0) if held[n] > 0.0 else above
+            lower[n, row] = below - held[n] * max(below, 0.0) if held[n] > 0.0 else below
+    return upper, lower
 
 
 def violates_at_nodes(
@@ -135,10 +171,12 @@ def turns(path: Path, nodes: int) -> NDArray:
     return np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0))
 
 
-def spread(violation: NDArray) -> NDArray:
-    """Return (N, MEASURES): what is continuous counts for neighbours too, whose points lie as near to its peak."""
-    wider = violation.copy()
-    for column in CONTINUOUS:
-        wider[1:, column] = np.maximum(wider[1:, column], violation[:-1, column])
-        wider[:-1, column] = np.maximum(wider[:-1, column], violation[1:, column])
+@njit
+def spread(violation: NDArray, continuous: NDArray) -> NDArray:
+    """Return (N, MEASURES): what is `continuous` counts for neighbours too, whose points lie as near to its peak."""
+    wider, last = violation.copy(), len(violation) - 1
+    for row in continuous:
+        for n in range(len(violation)):
+            before, after = violation[max(n - 1, 0), row], violation[min(n + 1, last), row]
+            wider[n, row] = max(violation[n, row], before, after)
     return wider

@@ -10,7 +10,7 @@ from cfplan.geometry.path import Path
 from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.initial_guess import guess
-from cfplan.planners.expert.intersample import Violation, spread
+from cfplan.planners.expert.intersample import CONTINUOUS, Violation, spread
 from cfplan.planners.expert.layout import Layout
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
@@ -196,14 +196,10 @@ def tightened(problem: Problem, violation: Violation, rows: NDArray) -> Problem:
     `rows`, (ROWS, P), is what the solution has at the points: a peak far from every point lowers the limits from there.
     """
     layout = problem.layout
-    over, under = OVERTIGHTENING * spread(violation.upper), OVERTIGHTENING * spread(violation.lower)
-    least, most = _extremes(rows, layout.bounded, layout.interval, layout.shape.nodes)
-    from_above = np.where(violation.upper[:, : len(rows)] > 0.0, most, np.inf)
-    from_below = np.where(violation.lower[:, : len(rows)] > 0.0, least, -np.inf)
-    at, width = layout.interval, len(rows)
-    upper = np.minimum(problem.upper, from_above[at].T) - np.maximum(over[:, :width], 0.0)[at].T
-    lower = np.maximum(problem.lower, from_below[at].T) + np.maximum(under[:, :width], 0.0)[at].T
-    upper, lower = np.where(layout.bounded, upper, np.inf), np.where(layout.bounded, lower, -np.inf)
+    over, under = (OVERTIGHTENING * spread(each, CONTINUOUS) for each in (violation.upper, violation.lower))
+    lower, upper = _lowered(
+        problem.lower, problem.upper, rows, layout.bounded, layout.interval, violation.lower, violation.upper, under, over
+    )
     slower = 1.0 - np.maximum(over[:, SPEED], 0.0)
     nodes = layout.shape.nodes
     factor = slower[layout.speed_interval]
@@ -212,15 +208,29 @@ def tightened(problem: Problem, violation: Violation, rows: NDArray) -> Problem:
 
 
 @njit
-def _extremes(rows: NDArray, bounded: NDArray, interval: NDArray, nodes: int) -> tuple[NDArray, NDArray]:
-    """Return the least and the most of each row at the points of each interval where it is bounded, (N, ROWS)."""
-    least, most = np.full((nodes, len(rows)), np.inf), np.full((nodes, len(rows)), -np.inf)
+def _lowered(
+    lower: NDArray, upper: NDArray, rows: NDArray, bounded: NDArray, interval: NDArray, below: NDArray, above: NDArray,
+    under: NDArray, over: NDArray,
+) -> tuple[NDArray, NDArray]:  # fmt: skip
+    """Return the bounds of the rows at points, tightened by `under` and `over`, (N, MEASURES), of their intervals.
+
+    That is from the most, or least, that the rows have at the points of an interval, where that exceeds a limit
+    between them by `above`, or `below`, and from the bound before elsewhere.
+    """
+    low, high = np.full(lower.shape, -np.inf), np.full(upper.shape, np.inf)
     for row in range(len(rows)):
+        least, most = np.full(len(above), np.inf), np.full(len(above), -np.inf)
         for p in range(len(interval)):
             if bounded[row, p]:
                 k, value = interval[p], rows[row, p]
-                least[k, row], most[k, row] = min(least[k, row], value), max(most[k, row], value)
-    return least, most
+                least[k], most[k] = min(least[k], value), max(most[k], value)
+        for p in range(len(interval)):
+            if bounded[row, p]:
+                k = interval[p]
+                highest = min(upper[row, p], most[k]) if above[k, row] > 0.0 else upper[row, p]
+                lowest = max(lower[row, p], least[k]) if below[k, row] > 0.0 else lower[row, p]
+                high[row, p], low[row, p] = highest - max(over[k, row], 0.0), lowest + max(under[k, row], 0.0)
+    return low, high
 
 
 def held_by(ends: Ends, nodes: int) -> NDArray:

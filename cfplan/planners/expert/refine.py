@@ -27,7 +27,7 @@ from cfplan.planners.expert.search import (
     rejection_reason,
     solve,
 )
-from cfplan.planners.expert.tightening import Tightened, tighten_until_feasible
+from cfplan.planners.expert.tightening import Tightened, tighten, tighten_until_feasible
 from cfplan.planners.expert.windows import (
     Joined,
     WindowSize,
@@ -60,11 +60,10 @@ def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WI
 
 
 def refinements(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WINDOW) -> Iterator[Solution]:
-    """Yield the refined profile: first with limits held at points, then, if it is asked for, between them too.
+    """Yield the refined profile, after each round in which limits exceeded between points are lowered.
 
-    The first often passes the certificate, and costs half. A path longer than `window` is planned window by window; its
-    profile comes once, with limits held between points. A failure comes alone. At the task's deadline what is not
-    refined yet stays as given.
+    The first mostly passes the certificate. A path longer than `window` is planned window by window; its profile comes
+    once, after all rounds. A failure comes alone. At the task's deadline what is not refined yet stays as given.
     """
     began = time.perf_counter()
     path, limits, nodes = task.path, task.limits, len(profile.s) - 1
@@ -83,9 +82,8 @@ def refinements(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize
     if isinstance(found, str):
         yield _solution(whole, found, began, task.deadline)
         return
-    yield solution_of(whole, Joined(found.attempt.coefficients, (), found.attempt.iterations, 0), began)
-    between = tighten_until_feasible(found.attempt, found.problem, whole, found.restarts, task.deadline)
-    yield solution_of(whole, Joined(between.coefficients, (), between.iterations, between.rounds), began)
+    for held in tighten(found.attempt, found.problem, whole, found.restarts, task.deadline):
+        yield solution_of(whole, Joined(held.coefficients, (), held.iterations, held.rounds), began)
 
 
 def _solution(whole: Segment, joined: Joined | str, began: float, deadline: Deadline) -> Solution:

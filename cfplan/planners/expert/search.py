@@ -10,7 +10,7 @@ from cfplan.deadline import NEVER, Deadline
 from cfplan.planners.expert.initial_guess import lowered
 from cfplan.planners.expert.problem import Problem, Segment
 from cfplan.planners.expert.transcription import SplineProgram
-from cfplan.planners.solver.interior_point import Search, minimise
+from cfplan.planners.solver.interior_point import Multipliers, Search, minimise
 
 
 class Start(NamedTuple):
@@ -18,6 +18,7 @@ class Start(NamedTuple):
 
     search: Search
     lowered: float = 0.0  # share of h by which it starts below the coefficients that it is given
+    goes_on: bool = False  # with the multipliers that are known
 
 
 class Attempt(NamedTuple):
@@ -25,6 +26,7 @@ class Attempt(NamedTuple):
 
     coefficients: NDArray  # (N+3, 1 or 2)
     rows: NDArray  # (ROWS, P) at points
+    multipliers: Multipliers
     solved: bool
     iterations: int  # of all searches
     message: str
@@ -36,8 +38,9 @@ COLD_START = (
     Start(Search(barrier=0.1, push=0.3, iterations=100)),
     Start(Search(barrier=0.1, push=0.3, iterations=100), lowered=0.5),
 )
-# From the solution of a problem almost the same: near the bounds, and further off where that fails.
+# From the solution of a problem almost the same: with its multipliers, near the bounds, and further off where that fails.
 WARM_START = (
+    Start(Search(barrier=3e-3, iterations=12), goes_on=True),
     Start(Search(barrier=3e-3, push=1e-4, iterations=20)),
     Start(Search(barrier=0.05, push=1e-3, iterations=40)),
     *COLD_START,
@@ -66,7 +69,8 @@ def refining_starts(interval: float, *, capped: bool = False) -> Sequence[Start]
 def refining_restarts(interval: float, *, capped: bool = False) -> Sequence[Start]:
     """Return the same from the solution of a problem almost the same."""
     stop = EARLIER * EARLY_STOP if capped else EARLY_STOP
-    return _early(stop * interval, push=3e-3, iterations=20), *WARM_START
+    start = _early(stop * interval, push=3e-3, iterations=20)
+    return start._replace(goes_on=True), start, *WARM_START
 
 
 def _early(barrier: float, push: float, iterations: int) -> Start:
@@ -76,20 +80,28 @@ def _early(barrier: float, push: float, iterations: int) -> Start:
     ))  # fmt: skip
 
 
-def solve(problem: Problem, coefficients: NDArray, starts: Sequence[Start], deadline: Deadline = NEVER) -> Attempt:
-    """Search from these coefficients, (N+3, 1 or 2), as the first of `starts` that succeeds, until the deadline."""
+def solve(
+    problem: Problem, coefficients: NDArray, starts: Sequence[Start], deadline: Deadline = NEVER,
+    known: Multipliers | None = None,
+) -> Attempt:  # fmt: skip
+    """Search from these coefficients, (N+3, 1 or 2), as the first of `starts` that succeeds, until the deadline.
+
+    Starts that go on take the multipliers that are `known` of a problem almost the same.
+    """
     program, iterations = SplineProgram(problem), 0
     for start in starts:
         from_here = coefficients
         if start.lowered:
             from_here = lowered(coefficients, start.lowered, problem.ends.held, problem.unit**0.5 / problem.step)
-        result = minimise(program, program.v_of(from_here), start.search, deadline)
+        result = minimise(
+            program, program.v_of(from_here), start.search, deadline, known if start.goes_on else None
+        )
         iterations += result.iterations
         if result.solved or deadline.passed:
             break
     return Attempt(
-        program.coefficients_of(result.v), program.rows_of(result.values.constraints), result.solved, iterations,
-        result.message,
+        program.coefficients_of(result.v), program.rows_of(result.values.constraints), result.multipliers,
+        result.solved, iterations, result.message,
     )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """From limits kept at points to limits kept between them: lower them where they are exceeded, and search again."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from numpy.typing import NDArray
@@ -22,25 +22,36 @@ class Tightened(NamedTuple):
     iterations: int  # of the attempt and of all rounds
 
 
+def tighten(
+    attempt: Attempt, problem: Problem, segment: Segment, starts: Sequence[Start] = WARM_START,
+    deadline: Deadline = NEVER,
+) -> Iterator[Tightened]:  # fmt: skip
+    """Lower limits and solve again until none is exceeded between points; yield what each round leads to.
+
+    Where nothing is exceeded at first, or the deadline has passed by then, the attempt itself comes alone. A round that
+    fails is the last: slowing will do the rest.
+    """
+    nodes = segment.layout.shape.nodes
+    dense = DensePath(segment.path, nodes, held_by(segment.ends, nodes), segment.caps)
+    found = Tightened(attempt.coefficients, 0, attempt.iterations)
+    for done in range(ROUNDS):
+        violation = dense.violation(segment.profile(attempt.coefficients), segment.airframe, segment.limits)
+        if violation.worst <= ENOUGH or deadline.passed:
+            break
+        problem = tightened(problem, violation, attempt.rows)
+        attempt = solve(problem, attempt.coefficients, starts, deadline, attempt.multipliers)
+        if rejection_reason(attempt, segment):
+            break
+        found = Tightened(attempt.coefficients, done + 1, found.iterations + attempt.iterations)
+        yield found
+    if not found.rounds:
+        yield found
+
+
 def tighten_until_feasible(
     attempt: Attempt, problem: Problem, segment: Segment, starts: Sequence[Start] = WARM_START,
     deadline: Deadline = NEVER,
 ) -> Tightened:  # fmt: skip
-    """Lower limits and solve again until none is exceeded between points, or the deadline passes.
-
-    A round that fails leaves the solution of the one before: slowing will do the rest.
-    """
-    nodes = segment.layout.shape.nodes
-    dense = DensePath(segment.path, nodes, held_by(segment.ends, nodes), segment.caps)
-    iterations = attempt.iterations
-    for done in range(ROUNDS):
-        violation = dense.violation(segment.profile(attempt.coefficients), segment.airframe, segment.limits)
-        if violation.worst <= ENOUGH or deadline.passed:
-            return Tightened(attempt.coefficients, done, iterations)
-        problem = tightened(problem, violation, attempt.rows)
-        following = solve(problem, attempt.coefficients, starts, deadline)
-        iterations += following.iterations
-        if rejection_reason(following, segment):
-            return Tightened(attempt.coefficients, done, iterations)
-        attempt = following
-    return Tightened(attempt.coefficients, ROUNDS, iterations)
+    """Return what the last round of tighten() leads to."""
+    *_, last = tighten(attempt, problem, segment, starts, deadline)
+    return last

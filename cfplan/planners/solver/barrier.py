@@ -79,6 +79,33 @@ def initialise(g, bounds, barrier, push):
     return slacks, terms
 
 
+@njit(error_model="numpy")
+def carried_over(g, bounds, slacks, new):
+    """Return (slacks, terms) of a search that ended here, for `new` bounds, (5, m): as far from them as from the old.
+
+    Multipliers stay, so what is left to do is to bring the constraints to where their slacks are now. Where there was
+    no bound there is none now.
+    """
+    after, terms = np.empty((3, len(g))), np.empty((4, len(g)))
+    for j in range(len(g)):
+        below, above = slacks[0, j] - bounds[0, j], bounds[1, j] - slacks[0, j]
+        if new[2, j] > 0.0 and new[3, j] > 0.0:
+            span = (new[1, j] - new[0, j]) / (below + above)
+            below, above = span * below, span * above
+        s = g[j]
+        if new[2, j] > 0.0:
+            s = new[0, j] + below
+        elif new[3, j] > 0.0:
+            s = new[1, j] - above
+        by_below, by_above = new[2, j] / below, new[3, j] / above
+        low, high = slacks[1, j], slacks[2, j]
+        sigma = low * by_below + high * by_above
+        after[0, j], after[1, j], after[2, j] = s, low, high
+        terms[0, j], terms[1, j] = sigma, high - low
+        terms[2, j], terms[3, j] = by_above - by_below, new[4, j] * sigma * (g[j] - s)
+    return after, terms
+
+
 @register_jitable
 def _largest(values):
     """Return the largest of non-negative numbers.

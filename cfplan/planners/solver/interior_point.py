@@ -25,6 +25,7 @@ from cfplan.planners.solver.barrier import (
     Errors,
     SearchDirection,
     accept_step,
+    carried_over,
     errors,
     initialise,
     merit_terms,
@@ -87,11 +88,19 @@ class Search:
     iterations: int = 100
 
 
+class Multipliers(NamedTuple):
+    """What a search knows of the constraints where it ends, for another to go on from there."""
+
+    bounds: NDArray  # (5, m) of that search
+    slacks: NDArray  # (3, m) with their multipliers
+
+
 class SearchResult(NamedTuple):
     """Where a search ended."""
 
     v: NDArray
     values: Values  # there
+    multipliers: Multipliers  # there
     solved: bool
     iterations: int
     message: str
@@ -130,11 +139,25 @@ class _Step(NamedTuple):
     widens: bool  # the filter
 
 
-def minimise(program: NonlinearProgram, v: NDArray, search: Search, deadline: Deadline = NEVER) -> SearchResult:
-    """Search from v, where the functions must be defined, until the deadline."""
+def minimise(
+    program: NonlinearProgram, v: NDArray, search: Search, deadline: Deadline = NEVER,
+    known: Multipliers | None = None,
+) -> SearchResult:  # fmt: skip
+    """Search from v, where the functions must be defined, until the deadline.
+
+    With the multipliers `known` from a search of nearly the same problem, whose bounds alone may differ, it goes on
+    where that one ended; else it begins with what the barrier makes of its slacks.
+    """
     barrier, bounds, rows = search.barrier, program.bounds, program.rows
     values = program.evaluate(v)
-    slacks, terms = initialise(values.constraints, bounds, barrier, search.push)
+    if known is None:
+        slacks, terms = initialise(values.constraints, bounds, barrier, search.push)
+    else:
+        slacks, terms = carried_over(values.constraints, known.bounds, known.slacks, bounds)
+
+    def ended(solved: bool, iterations: int, message: str) -> SearchResult:
+        return SearchResult(v, values, Multipliers(bounds, slacks), solved, iterations, message)
+
     off = errors(values.constraints, bounds, slacks, barrier)
     infeasible, walls = merit_terms(values.constraints, bounds, slacks, slacks, 0.0, barrier, rows)
     filtered, regularised = _Filter(1e4 * max(1.0, infeasible)), 0.0
@@ -143,13 +166,13 @@ def minimise(program: NonlinearProgram, v: NDArray, search: Search, deadline: De
         gradient, by_multiplier, by_barrier, by_residual = near.gradients
         off_gradient = float(np.abs(gradient + by_multiplier).max())
         if deadline.passed:
-            return SearchResult(v, values, False, iteration, f"{OUT_OF_TIME} after {iteration} iterations")
+            return ended(False, iteration, f"{OUT_OF_TIME} after {iteration} iterations")
         if not math.isfinite(infeasible + off_gradient + values.cost):
-            return SearchResult(v, values, False, iteration, "a value is not a number")
+            return ended(False, iteration, "a value is not a number")
         lowered = False
         while _error(off, off_gradient, search) <= BARRIER_SOLVED * barrier:
             if barrier <= search.last_barrier:
-                return SearchResult(v, values, True, iteration, f"solved in {iteration} iterations")
+                return ended(True, iteration, f"solved in {iteration} iterations")
             barrier = max(search.last_barrier, min(BARRIER_FACTOR * barrier, barrier**BARRIER_POWER))
             off = errors(values.constraints, bounds, slacks, barrier)
             lowered = True
@@ -161,14 +184,14 @@ def minimise(program: NonlinearProgram, v: NDArray, search: Search, deadline: De
         regularised = added if added > 0.0 else regularised / 3.0
         slope = float(gradient @ dv)
         if not math.isfinite(slope):
-            return SearchResult(v, values, False, iteration, "no direction of descent")
+            return ended(False, iteration, "no direction of descent")
         dg = near.jvp(dv)
         direction = search_direction(values.constraints, dg, bounds, slacks, barrier, max(BOUNDARY, 1 - barrier))
         del near, dg  # so that the next ones get their memory, which the processor's cache still holds
         before = infeasible, values.cost + walls
         step = _line_search(program, v, dv, slacks, direction, barrier, before, slope + direction.slope, filtered)
         if step is None:
-            return SearchResult(v, values, False, iteration, "no step improves the solution")
+            return ended(False, iteration, "no step improves the solution")
         if step.widens:
             filtered.pairs.append(((1 - FILTER) * infeasible, before[1] - FILTER * infeasible))
         v, values, infeasible, walls = step.v, step.values, step.infeasible, step.walls
@@ -180,8 +203,8 @@ def minimise(program: NonlinearProgram, v: NDArray, search: Search, deadline: De
         if search.left_by_step is not None and whole and barrier <= search.last_barrier:
             left = search.left_by_step * off_gradient
             if _error(off, left, search) <= BARRIER_SOLVED * barrier:
-                return SearchResult(v, values, True, iteration + 1, f"solved in {iteration + 1} iterations")
-    return SearchResult(v, values, False, search.iterations, f"not solved in {search.iterations} iterations")
+                return ended(True, iteration + 1, f"solved in {iteration + 1} iterations")
+    return ended(False, search.iterations, f"not solved in {search.iterations} iterations")
 
 
 def _line_search(

@@ -187,7 +187,7 @@ def test_an_instruction_that_cannot_be_written_out_is_named(monkeypatch):
 
 def test_an_answer_that_is_not_a_flight_is_not_believed(monkeypatch):
     def claims(problem, coefficients, starts, deadline):
-        return Attempt(np.full_like(coefficients, np.nan), problem.upper, True, 1, "solved")
+        return Attempt(np.full_like(coefficients, np.nan), problem.upper, None, True, 1, "solved")
 
     monkeypatch.setattr(expert, "solve", claims)
     solution = plan_expert(PlanningTask(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=40))

@@ -125,3 +125,15 @@ def test_what_is_not_a_number_is_told():
     ended = minimise(Valley(8, 0.0, 1.0), np.full(8, np.nan), Search())
     assert not ended.solved
     assert "not a number" in ended.message
+
+
+def test_a_search_goes_on_from_another_whose_bounds_were_wider_in_a_few_steps():
+    start = np.linspace(0.5, 1.5, 8)
+    near = Search(barrier=1e-3, last_barrier=1e-3, gradient=1e-3, feasibility=1e-3, iterations=300)
+    wide, narrow = Valley(8, -np.inf, 0.5, 0.1), Valley(8, -np.inf, 0.49, 0.11)
+    ended = minimise(wide, start, near)
+    afresh, went_on = minimise(narrow, ended.v, near), minimise(narrow, ended.v, near, known=ended.multipliers)
+    assert afresh.solved
+    assert went_on.solved
+    assert went_on.iterations < afresh.iterations
+    np.testing.assert_allclose(went_on.v, afresh.v, atol=5e-3)
