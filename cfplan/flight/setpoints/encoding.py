@@ -126,15 +126,15 @@ def motion_at(
     The acceleration is that of the thrust, less gravity: it includes the compensation for drag.
     """
     states = trajectory.at(times)
-    thrust = trajectory.at(times + thrust_lead).specific_thrust
-    acceleration = thrust[:, None] * states.thrust_axis
+    ahead, turning = (trajectory.at(times + by) if by else states for by in (thrust_lead, rate_lead))
+    acceleration = ahead.specific_thrust[:, None] * states.thrust_axis
     acceleration[:, 2] -= GRAVITY
     return FullStateSetpoints(
         position=states.position,
         velocity=states.velocity,
         acceleration=acceleration,
         quaternion=states.quaternion,
-        body_rate=trajectory.at(times + rate_lead).body_rate,
+        body_rate=turning.body_rate,
     )
 
 

@@ -59,24 +59,15 @@ class DensePath:
         self.allowance = np.full((nodes, MEASURES), ALLOWANCE)
         self.allowance[:, quantities.JUMPS] = THRUST_ALLOWANCE
         self.allowance[brisk] = FINE_ALLOWANCE
-        self.groups = tuple(
-            (which, places) for which, places in ((np.flatnonzero(~brisk), _PLACES), (np.flatnonzero(brisk), _FINE))
-            if len(which)
-        )  # fmt: skip
-        # First all first places of a group of intervals, then all second ones: so are extremes found fastest.
-        self.interval = np.concatenate([np.tile(which, len(places)) for which, places in self.groups])
-        self._order = np.concatenate([which for which, _ in self.groups])
-        self._counts = np.array([(len(which), len(places)) for which, places in self.groups])
-        self.places = step * np.concatenate([np.repeat(places, len(which)) for which, places in self.groups])
-        self.derivatives = np.concatenate(
-            [_by_place(path, step * (which[:, None] + places)) for which, places in self.groups], axis=2
-        )
+        self.begins = np.concatenate([[0], np.cumsum(np.where(brisk, FINE_COUNT, COUNT))])
+        self.interval, self.places = _laid_out(brisk, self.begins, _PLACES, _FINE, step)
+        self.derivatives = path.derivatives(step * self.interval + self.places)[1:]
         self.caps = None if caps is None else caps.at(step * self.interval + self.places)
 
     def violation(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Violation:
         """Return the violation by a profile with as many intervals; h must be positive."""
         count = len(self.allowance)
-        rows = scaled(_extremes(self.measures(profile, airframe, limits), self._order, self._counts), limits)
+        rows = scaled(_extremes(self.measures(profile, airframe, limits), self.begins), limits)
         return Violation(*_beyond(
             rows[:, :count], rows[:, count:], quantities.UPPER, quantities.LOWER, self.allowance, self.held
         ))  # fmt: skip
@@ -89,37 +80,39 @@ class DensePath:
 
     def least_of_intervals(self, values: NDArray) -> NDArray:
         """Return the least of values at all places, (P · K,), in each interval, (N,)."""
-        least, end = np.empty(len(self.allowance)), 0
-        for which, places in self.groups:
-            begin, end = end, end + len(which) * len(places)
-            least[which] = values[begin:end].reshape(len(places), len(which)).min(axis=0)
-        return least
+        return np.asarray(np.minimum.reduceat(values, self.begins[:-1]))
 
 
 @njit
-def _extremes(measured: NDArray, order: NDArray, counts: NDArray) -> NDArray:
-    """Return the highest of each row in each interval, then the lowest, (MEASURES, 2 N); `measured` is (MEASURES, P).
+def _laid_out(
+    brisk: NDArray, begins: NDArray, usual: NDArray, fine: NDArray, step: float
+) -> tuple[NDArray, NDArray]:  # fmt: skip
+    """Return the interval of each place, and how far in s it lies in there; one interval's after another's."""
+    interval, within = np.empty(begins[-1], np.int64), np.empty(begins[-1])
+    for k in range(len(brisk)):
+        places = fine if brisk[k] else usual
+        for n in range(len(places)):
+            interval[begins[k] + n], within[begins[k] + n] = k, step * places[n]
+    return interval, within
 
-    `counts` has how many intervals and places each group has, `order`, (N,), which intervals those are.
-    """
-    rows, intervals = measured.shape[0], len(order)
-    extremes, high, low = np.empty((rows, 2 * intervals)), np.empty(intervals), np.empty(intervals)
+
+def _extremes_interpreted(measured: NDArray, begins: NDArray) -> NDArray:
+    highest, lowest = (extreme.reduceat(measured, begins[:-1], axis=1) for extreme in (np.maximum, np.minimum))
+    return np.concatenate([highest, lowest], axis=1)
+
+
+@njit(interpreted=_extremes_interpreted)
+def _extremes(measured: NDArray, begins: NDArray) -> NDArray:
+    """Return the highest of each row, (MEASURES, P), in each interval, then the lowest, (MEASURES, 2 N)."""
+    rows, count = measured.shape[0], len(begins) - 1
+    extremes = np.empty((rows, 2 * count))
     for row in range(rows):
-        begin, first = 0, 0
-        for group in range(len(counts)):
-            size, places = counts[group]
-            for n in range(size):
-                high[first + n] = low[first + n] = measured[row, begin + n]
-            for place in range(1, places):
-                values = measured[row, begin + place * size : begin + (place + 1) * size]
-                for n in range(size):
-                    value = values[n]
-                    high[first + n] = value if value > high[first + n] else high[first + n]
-                    low[first + n] = value if value < low[first + n] else low[first + n]
-            begin += size * places
-            first += size
-        for n in range(intervals):
-            extremes[row, order[n]], extremes[row, intervals + order[n]] = high[n], low[n]
+        for k in range(count):
+            high = low = measured[row, begins[k]]
+            for n in range(begins[k] + 1, begins[k + 1]):
+                value = measured[row, n]
+                high, low = value if value > high else high, value if value < low else low
+            extremes[row, k], extremes[row, count + k] = high, low
     return extremes
 
 
@@ -153,12 +146,6 @@ def _count_against_caps(measured: NDArray, caps: NDArray | None, limits: PlanLim
     """Scale the squared speed in (MEASURES, P) so that the limit stands for the cap at each place, if that is lower."""
     if caps is not None:
         measured[SPEED] *= (limits.speed / np.minimum(caps, limits.speed)) ** 2
-
-
-def _by_place(path: Path, s: NDArray) -> NDArray:
-    """Return (4, 3, P · K): γ' to the fourth derivative at s, (K, P): of all first places, then on."""
-    found = path.derivatives(s.ravel())[1:].reshape(4, 3, *s.shape)
-    return found.transpose(0, 1, 3, 2).reshape(4, 3, -1)
 
 
 def turns(path: Path, nodes: int) -> NDArray:

@@ -198,8 +198,9 @@ def tightened(problem: Problem, violation: Violation, rows: NDArray) -> Problem:
     layout = problem.layout
     over, under = (OVERTIGHTENING * spread(each, CONTINUOUS) for each in (violation.upper, violation.lower))
     lower, upper = _lowered(
-        problem.lower, problem.upper, rows, layout.bounded, layout.interval, violation.lower, violation.upper, under, over
-    )
+        problem.lower, problem.upper, rows, layout.bounded, layout.interval, violation.lower, violation.upper,
+        under, over,
+    )  # fmt: skip
     slower = 1.0 - np.maximum(over[:, SPEED], 0.0)
     nodes = layout.shape.nodes
     factor = slower[layout.speed_interval]

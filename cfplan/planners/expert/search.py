@@ -38,7 +38,7 @@ COLD_START = (
     Start(Search(barrier=0.1, push=0.3, iterations=100)),
     Start(Search(barrier=0.1, push=0.3, iterations=100), lowered=0.5),
 )
-# From the solution of a problem almost the same: with its multipliers, near the bounds, and further off where that fails.
+# From the solution of a problem almost the same: with its multipliers; near the bounds, and further off.
 WARM_START = (
     Start(Search(barrier=3e-3, iterations=12), goes_on=True),
     Start(Search(barrier=3e-3, push=1e-4, iterations=20)),
@@ -47,8 +47,11 @@ WARM_START = (
 )
 # Refining stops early, within about 0.02 % of the optimum: at a barrier of EARLY_STOP for each second that an interval
 # takes. What then remains of the constraints is a fraction of the margin that they are tightened by; whole steps leave
-# less than a tenth of the gradient.
+# less than a tenth of the gradient. Before limits are tightened ROUGHLY as many times that may remain.
 EARLY_STOP, EARLY_FEASIBILITY, EARLY_GRADIENT, EARLY_LEFT_BY_STEP = 0.15, 2e-4, 0.05, 0.2
+ROUGHLY = 10.0
+# Times the last barrier: what multipliers are at first, which are far larger where limits are used to the full.
+EARLY_MULTIPLIERS = 10.0
 
 # Times that barrier, further inside the bounds and 0.3 % from the optimum: where the search does not end otherwise, and
 # under caps, which giving way finds step by step: from profiles at their limits it finds lower ones.
@@ -58,10 +61,10 @@ EARLIER = 8.0
 def refining_starts(interval: float, *, capped: bool = False) -> Sequence[Start]:
     """Return the searches that refine a near-feasible profile whose intervals take this long, s."""
     if capped:
-        return _early(EARLIER * EARLY_STOP * interval, push=1e-2, iterations=40), *COLD_START
+        return _early(EARLIER * EARLY_STOP * interval, push=1e-2, iterations=40, roughly=ROUGHLY), *COLD_START
     return (
-        _early(EARLY_STOP * interval, push=1e-2, iterations=40),
-        _early(EARLIER * EARLY_STOP * interval, push=1e-2, iterations=40),
+        _early(EARLY_STOP * interval, push=1e-2, iterations=40, roughly=ROUGHLY),
+        _early(EARLIER * EARLY_STOP * interval, push=1e-2, iterations=40, roughly=ROUGHLY),
         *COLD_START,
     )
 
@@ -73,10 +76,10 @@ def refining_restarts(interval: float, *, capped: bool = False) -> Sequence[Star
     return start._replace(goes_on=True), start, *WARM_START
 
 
-def _early(barrier: float, push: float, iterations: int) -> Start:
+def _early(barrier: float, push: float, iterations: int, roughly: float = 1.0) -> Start:
     return Start(Search(
-        barrier=barrier, last_barrier=barrier, push=push, iterations=iterations, feasibility=EARLY_FEASIBILITY,
-        gradient=EARLY_GRADIENT, left_by_step=EARLY_LEFT_BY_STEP,
+        barrier=barrier, last_barrier=barrier, push=push, multipliers=EARLY_MULTIPLIERS, iterations=iterations,
+        feasibility=roughly * EARLY_FEASIBILITY, gradient=roughly * EARLY_GRADIENT, left_by_step=EARLY_LEFT_BY_STEP,
     ))  # fmt: skip
 
 
@@ -93,9 +96,7 @@ def solve(
         from_here = coefficients
         if start.lowered:
             from_here = lowered(coefficients, start.lowered, problem.ends.held, problem.unit**0.5 / problem.step)
-        result = minimise(
-            program, program.v_of(from_here), start.search, deadline, known if start.goes_on else None
-        )
+        result = minimise(program, program.v_of(from_here), start.search, deadline, known if start.goes_on else None)
         iterations += result.iterations
         if result.solved or deadline.passed:
             break

@@ -85,6 +85,7 @@ class Search:
     feasibility: float = 1e-5  # of the constraints, at the end
     left_by_step: float | None = None  # share of the gradient that a whole step leaves; None: it is always computed
     push: float = 1e-2  # how far slacks start inside their bounds at least, of the span between them
+    multipliers: float = 1.0  # at first, times what the barrier makes of their slacks
     iterations: int = 100
 
 
@@ -151,7 +152,7 @@ def minimise(
     barrier, bounds, rows = search.barrier, program.bounds, program.rows
     values = program.evaluate(v)
     if known is None:
-        slacks, terms = initialise(values.constraints, bounds, barrier, search.push)
+        slacks, terms = initialise(values.constraints, bounds, search.multipliers * barrier, search.push)
     else:
         slacks, terms = carried_over(values.constraints, known.bounds, known.slacks, bounds)
 
