@@ -8,7 +8,7 @@ import click
 
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table, styled
-from cfplan.errors import ExitCode
+from cfplan.errors import ExitCode, InputError
 from cfplan.preparation.compiled_calls import Stage
 
 if TYPE_CHECKING:
@@ -26,11 +26,19 @@ Examples:
   cfplan fly flights/figure8.yaml
   cfplan fly flights/figure8.yaml --speed 0.3
   cfplan fly flights/figure8.yaml --live --mavlink udp:127.0.0.1:14550
+  printf '1 0 1\\n0 1 1.2\\n' | cfplan fly --waypoints -
 
 Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts.""",
 )
-@options.path_or_plan
+@options.path_or_plan_or_none
 @options.planning
+@click.option(
+    "--waypoints",
+    "lines",
+    metavar="-|HOST:PORT",
+    help="Instead of a path: fly waypoints that come while it flies, x y z a line, from standard input (-) or from "
+    "clients of a port of this machine, as 127.0.0.1:7777.",
+)
 @click.option("--uri", default="sim://0", show_default=True, help="The vehicle; sim:// is the virtual Crazyflie.")
 @click.option(
     "--mocap",
@@ -53,7 +61,8 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
 @click.option("--yes", is_flag=True, help="Do not ask before hardware flies.")
 @options.as_json
 def fly(
-    path_or_plan: Path,
+    path_or_plan: Path | None,
+    lines: str | None,
     safety_file: Path | None,
     uri: str,
     mocap_uri: str | None,
@@ -72,6 +81,8 @@ def fly(
     check_uris(uri, mocap_uri)
     check_watchers(watched)
     options.check_records_folder(records)
+    if path_or_plan is None or lines is not None:
+        return _steer(path_or_plan, lines, safety_file, uri, mocap_uri, records, watched, yes, as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.FLIGHT)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # starts while the flight is prepared
@@ -80,9 +91,8 @@ def fly(
             from cfplan.cli.recorded_flight import fly_and_record
             from cfplan.cli.warm_up import compiling_paused
             from cfplan.preparation.prepare_flight import prepare_flight
-        prepared = prepare_flight(
-            path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps
-        )
+        chosen = options.flight_options(planning, safety_file, path_or_plan)
+        prepared = prepare_flight(path_or_plan, limits, chosen, steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             click.echo("not flown", err=True)
             return int(ExitCode.ENDED_BY_OPERATOR)
@@ -90,6 +100,18 @@ def fly(
             flown = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
     _print_result(prepared, flown, as_json)
     return int(flown.outcome.exit_code)
+
+
+def _steer(path_or_plan: Path | None, lines: str | None, *flight: Any) -> int:
+    from cfplan.cli.fly_waypoints import fly_waypoints
+
+    if lines is None or path_or_plan is not None:
+        raise InputError(
+            "neither a path nor waypoints" if lines is None else "both a path and waypoints",
+            where=str(path_or_plan or "cfplan fly"),
+            hint="name a path file, or give --waypoints -",
+        )
+    return fly_waypoints(lines, *flight)
 
 
 def _print_result(prepared: "PreparedFlight", flown: "RecordedFlight", as_json: bool) -> None:

@@ -24,6 +24,9 @@ SAFETY_FILE = "safety.yaml"
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 path_file = click.argument("path_file", metavar="PATH", type=click.Path(path_type=Path))
 path_or_plan = click.argument("path_or_plan", metavar="PATH_OR_PLAN", type=click.Path(path_type=Path))
+path_or_plan_or_none = click.argument(
+    "path_or_plan", metavar="PATH_OR_PLAN", type=click.Path(path_type=Path), required=False
+)
 
 
 def _remember_verbose(context: click.Context, _: click.Parameter, verbose: bool) -> None:

@@ -88,7 +88,7 @@ def continue_plan(
     joint = joint_at(trajectory, leave)
     points = np.asarray(waypoints, dtype=float)
     continued_min_snap(joint.derivatives, points)  # refuses what are no waypoints
-    _check_waypoints(points, limits)
+    check_waypoints(points, limits)
     known = scaled_limits(limits.airframe, limits.plan)
     failure = ""
     ways = [*_ways(joint, trajectory, points, times)]
@@ -113,13 +113,14 @@ def continue_plan(
     )
 
 
-def _check_waypoints(points: NDArray, limits: Limits) -> None:
+def check_waypoints(points: NDArray, limits: Limits) -> None:
+    """Raise InfeasibleError where one of the waypoints, (K, 3) m, lies outside the space."""
     beyond = limits.space.beyond(points).max(axis=1)
     if (beyond > 0.0).any():
         at = int(np.argmax(beyond > 0.0))
         x, y, z = points[at]
         raise InfeasibleError(
-            f"waypoint {at + 1}, ({x:.3f}, {y:.3f}, {z:.3f}) m, is {beyond[at]:.3f} m too far out",
+            f"({x:.3f}, {y:.3f}, {z:.3f}) m is {beyond[at]:.3f} m too far out",
             where=f"waypoint {at + 1}",
             hint="keep waypoints inside the space less its margin",
         )

@@ -20,7 +20,7 @@ from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, min_snap
-from cfplan.planning.continuation import NoWayError, continue_plan
+from cfplan.planning.continuation import NoWayError, check_waypoints, continue_plan
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
@@ -121,6 +121,7 @@ def replan(
     points = np.asarray(waypoints, dtype=float)
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
         raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint="give rows of x, y, z in metres")
+    check_waypoints(points, limits)
     return _replan_within(held, splice, points, limits, keep, yaw_angle)
 
 

@@ -1,10 +1,11 @@
 """Connect a program to a vehicle, real or virtual, that it will steer."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from cfplan.errors import InputError
 from cfplan.files.nearest import nearest
+from cfplan.flight.pilot.keys import Order
 from cfplan.machine_code import compile_from_here
 from cfplan.preparation.steps import OnStep, ignore_steps
 from cfplan.safety.limits import Limits
@@ -31,6 +32,7 @@ def connect(
     keys: bool = True,
     on_step: OnStep = ignore_steps,
     on_record: Callable[[SteeringRecord], None] = lambda _: None,
+    more_orders: Callable[[], Sequence[Order]] = tuple,
 ) -> SteeredVehicle:
     """Connect to a vehicle and return it, on the ground; use it in a `with` block, behind which it has landed.
 
@@ -44,6 +46,7 @@ def connect(
         keys: whether keys of the terminal count: space lands, Esc cuts the motors. Ctrl-C lands, twice cuts, anyway.
         on_step: hears of the steps of connecting.
         on_record: is given the record when it begins, so that others may listen.
+        more_orders: returns orders to the pilot since its last call, as of a ground station; must not wait.
 
     Raises a CfplanError, with place and hint, where an argument is wrong, or vehicle, radio or poses cannot be had.
     """
@@ -57,7 +60,7 @@ def connect(
         flight = SteppedSteering(limits)
     else:
         look_at_hardware(uri, mocap, limits.pose, on_step)
-        flight = RealTimeSteering(uri, mocap, limits, on_step, keys=keys)
+        flight = RealTimeSteering(uri, mocap, limits, on_step, keys=keys, more_orders=more_orders)
     folder = Path(records) if records is not None else None
     return SteeredVehicle(flight, limits, uri=uri, name=name, records=folder, on_record=on_record)
 

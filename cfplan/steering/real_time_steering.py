@@ -34,7 +34,16 @@ class RealTimeSteering:
 
     clock = REAL_CLOCK
 
-    def __init__(self, uri: str, mocap_uri: str | None, limits: Limits, on_step: OnStep, *, keys: bool):
+    def __init__(
+        self,
+        uri: str,
+        mocap_uri: str | None,
+        limits: Limits,
+        on_step: OnStep,
+        *,
+        keys: bool,
+        more_orders: Callable[[], Sequence[Order]] = tuple,
+    ):
         """Start the pilot's process, and a virtual vehicle's lab. `keys` says whether those of the terminal count.
 
         Raises a CfplanError where vehicle or poses cannot be had.
@@ -43,7 +52,7 @@ class RealTimeSteering:
         self._open = contextlib.ExitStack()
         self._change = threading.Condition()
         self._orders: deque[Order] = deque()
-        self.more_orders: list[Callable[[], Sequence[Order]]] = [self._new_orders]
+        self._more_orders = more_orders
         self._unanswered: set[int] = set()
         self.planner: AirPlanner | None = None
         self._thread: threading.Thread | None = None
@@ -86,7 +95,7 @@ class RealTimeSteering:
                 pose_source=self._source,
                 pilot=self._vehicle.pilot,
                 on_telemetry=tell,
-                more_orders=lambda: [order for each in self.more_orders for order in each()],
+                more_orders=lambda: [*self._new_orders(), *self._more_orders()],
                 keyboard=self._keyboard,
             )
         except CfplanError as error:
