@@ -35,7 +35,7 @@ _WORDS = {wish.value: wish for wish in Wish}
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class TextLine:
     """A line, and where its answer goes."""
 
     text: str
@@ -45,7 +45,7 @@ class Line:
 class LineSource(Protocol):
     """Where lines come from."""
 
-    def next(self, patience: float) -> Line | None:
+    def next(self, patience: float) -> TextLine | None:
         """Return the next line, waiting for it for `patience`, s; None where none came. Raises EOFError at the end."""
 
 
@@ -53,7 +53,7 @@ class LineSource(Protocol):
 class _Asked:
     """What a line asks for: a wish with waypoints, or to land or to cut."""
 
-    line: Line
+    line: TextLine
     number: int  # of the line
     wish: Wish | str
     waypoints: tuple[Triple, ...] = ()
@@ -114,7 +114,7 @@ def steer_by_lines(vehicle: SteeredVehicle, lines: LineSource) -> None:
             waiting = []
 
 
-def _read(line: Line, number: int) -> _Asked | None:
+def _read(line: TextLine, number: int) -> _Asked | None:
     try:
         return _Asked(line, number, *parse_line(line.text))
     except InputError as error:
@@ -145,9 +145,9 @@ class QueuedLines:
     """Lines that threads read; a LineSource."""
 
     def __init__(self) -> None:
-        self._queue: queue.Queue[Line | None] = queue.Queue(_WAITING)
+        self._queue: queue.Queue[TextLine | None] = queue.Queue(_WAITING)
 
-    def next(self, patience: float) -> Line | None:
+    def next(self, patience: float) -> TextLine | None:
         try:
             line = self._queue.get(timeout=patience) if patience > 0.0 else self._queue.get_nowait()
         except queue.Empty:
@@ -160,7 +160,7 @@ class QueuedLines:
         """Take a stream's lines until it ends or breaks."""
         with contextlib.suppress(OSError, ValueError):
             while text := stream.readline(_LONGEST):
-                self._queue.put(Line(text.decode("utf-8", "replace"), reply))
+                self._queue.put(TextLine(text.decode("utf-8", "replace"), reply))
 
     def end(self) -> None:
         """Say that no more lines come."""

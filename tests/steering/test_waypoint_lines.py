@@ -15,7 +15,7 @@ from cfplan.errors import ExitCode, InputError
 from cfplan.preparation.air_planner import Wish
 from cfplan.steering.steered_vehicle import SteeredVehicle
 from cfplan.steering.stepped_steering import SteppedSteering
-from cfplan.steering.waypoint_lines import Line, opened_lines, parse_line, steer_by_lines
+from cfplan.steering.waypoint_lines import TextLine, opened_lines, parse_line, steer_by_lines
 
 
 class ListedLines:
@@ -25,14 +25,14 @@ class ListedLines:
         self._vehicle, self._lines = vehicle, list(lines)
         self.answers: list[str] = []
 
-    def next(self, patience: float) -> Line | None:
+    def next(self, patience: float) -> TextLine | None:
         if not self._lines:
             raise EOFError
         text = self._lines.pop(0)
         if text.startswith("sleep"):
             self._vehicle.sleep(float(text.split()[1]))
             return None
-        return Line(text, self.answers.append)
+        return TextLine(text, self.answers.append)
 
 
 def steer(limits, lines: Iterable[str]) -> tuple[SteeredVehicle, list[str]]:
