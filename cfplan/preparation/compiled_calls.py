@@ -43,8 +43,8 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         from cfplan.geometry.min_snap import min_snap
         from cfplan.planning.plan import plan
         from cfplan.safety.limits_file import load_limits
-        from cfplan.simulation.glitches import glitch_at_every_setpoint
-        from cfplan.simulation.link_loss import link_loss_at_every_setpoint, link_loss_within_stops
+        from cfplan.simulation.glitches import glitch_at_sampled_setpoints
+        from cfplan.simulation.link_loss import link_loss_near_walls, link_loss_within_stops
 
         limits = load_limits(safety_file)
         middle = (np.array(limits.space.low) + limits.space.high) / 2
@@ -55,10 +55,12 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         planned = plan(path, limits.airframe, limits, planner="expert", nodes=NODES)  # exceeds limits between nodes
         encoded = encode_trajectory(planned.trajectory, space=limits.space)
         begin, first = encoded.payloads[:2], np.array([0])
-        lost = link_loss_at_every_setpoint(begin, limits)
+        lost = link_loss_near_walls(begin, limits, 0.0)
         stop = encode_stops(encoded.motion, RATE, rows=first, gains=encoded.gains, space=encoded.space)
-        link_loss_within_stops(stop, lost.snapshots[:, first], limits, np.array([stop.shape[1] - 1]))
-        glitch_at_every_setpoint(begin, limits)
+        end = np.arange(stop.shape[1])[None] == stop.shape[1] - 1
+        for coarsely in (True, False):
+            link_loss_within_stops(stop, lost.snapshots[:, first], limits, end, coarsely=coarsely)
+        glitch_at_sampled_setpoints(begin, limits)
         if last >= Stage.REHEARSAL:
             from cfplan.preparation.plan_flight import PlannedFlight
             from cfplan.preparation.prepare_flight import encode_flight, make_mission, rehearse

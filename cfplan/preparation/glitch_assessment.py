@@ -5,7 +5,7 @@ import numpy as np
 from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.preparation.local_slowing import Assessment
 from cfplan.safety.limits import Limits
-from cfplan.simulation.glitches import GAP, KINDS, TURNED_OVER, glitch_at_every_setpoint
+from cfplan.simulation.glitches import GAP, KINDS, TURNED_OVER, glitch_at_sampled_setpoints
 
 KEPT = 0.9  # share of what is lost, that planning stays within
 _HINT = "make the path gentler there, or plan with a lower speed or acceleration"
@@ -13,7 +13,7 @@ _HINT = "make the path gentler there, or plan with a lower speed or acceleration
 
 def assess_glitches(encoded: EncodedFlight, limits: Limits) -> Assessment:
     """Simulate a gap at each setpoint; at fault is what nearly loses the vehicle, by its deviation or its tilt."""
-    moments, cut = glitch_at_every_setpoint(encoded.payloads, limits), limits.flight.deviation.cut
+    moments, cut = glitch_at_sampled_setpoints(encoded.payloads, limits), limits.flight.deviation.cut
     shares = np.fmax(moments.deviation / cut, moments.tilt / TURNED_OVER)  # (3, N) of what is lost
     shares[moments.lost & ~(shares >= 1.0)] = np.inf
     kind, share = np.argmax(shares, axis=0), shares.max(axis=0)

@@ -1,11 +1,14 @@
 """Link loss as an assessment: how far beyond the walls each setpoint leaves the vehicle, were it the last one.
 
 So do the setpoints of the stops. There are a hundred times as many of these as setpoints of the plan, so they are
-sampled: every tenth stop after every twelfth of its setpoints; and each stop about one that so comes near a wall or
-sends more than harmless rates, after every other setpoint.
+sampled: every tenth stop after every twelfth of its setpoints; and about each that so comes near a wall or sends more
+than harmless rates more densely, up to every stop after every other setpoint, as GRIDS says.
+
+Most setpoints are far from all walls, which a coarse look tells with a margin. What may be at fault is simulated with
+every motor lag.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,39 +16,40 @@ from numpy.typing import NDArray
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.flight.setpoints.rate_trade import BRAKE_RATE_MAX
-from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.flight.setpoints.stops import DURATION, encode_stops
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss
 from cfplan.safety.limits import Limits
-from cfplan.simulation.link_loss import WALLS, LinkLossMoments, link_loss_at_every_setpoint, link_loss_within_stops
+from cfplan.simulation.link_loss import (
+    ALLOWANCE,
+    WALLS,
+    LinkLossMoments,
+    link_loss_near_walls,
+    link_loss_within_stops,
+)
 
 MARGIN = 0.02  # m inside the walls that planning aims at: what the last refinement changes stays within
 OUTSIDE_HINT = (
     "keep the path farther from that wall; in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
 )
 _LEAST_REACH = 1e-3  # m
-STOPS_EVERY, STOPS_EACH, STOPS_DENSE = 10, 12, 2  # setpoints between sampled stops, within them, and near a wall
-STOPS_NEAR = 0.15  # m from a wall, within which stops are sampled densely
+STOPS_EVERY, STOPS_EACH = 10, 12  # setpoints between sampled stops, and within them
+GRIDS = ((STOPS_EVERY, STOPS_EACH, 0.18), (3, 4, 0.1), (1, 2, 0.0))
+"""The same on denser grids, of which each is used about what came within so many m of a wall on the one before."""
+_HARMLESS = BRAKE_RATE_MAX + 1e-3  # rad/s
 
 
 def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MARGIN) -> Assessment:
     """Simulate that each setpoint is the last one; what comes down within `margin`, m, of a wall is at fault."""
-    moments = link_loss_at_every_setpoint(encoded.payloads, limits)
-    number, (axis, side) = np.arange(len(moments.time)), np.array(WALLS)[moments.wall].T
-    reach = np.where(side[:, None], moments.high - moments.place, moments.place - moments.low)[number, axis]
+    moments = link_loss_near_walls(encoded.payloads, limits, margin)
 
     def describe(at: int) -> str:
-        far = (
-            f"{moments.beyond[at]:.2f} m beyond"
-            if moments.beyond[at] > 0.0
-            else f"within {-moments.beyond[at]:.2f} m of"
-        )
-        return f"takes the vehicle {far} {moments.name_of_wall(at, limits)}"
+        return f"takes the vehicle {_how_far(moments.beyond[at])} {moments.name_of_wall(at, limits)}"
 
     return Assessment(
         what="link loss",
         time=encoded.times,
         excess=moments.beyond + margin,
-        reach=np.maximum(reach, _LEAST_REACH),
+        reach=_reach(moments),
         describe=describe,
         near=lambda at: moments.name_of_wall(at, limits),
         hint=OUTSIDE_HINT,
@@ -58,51 +62,101 @@ def assess_link_loss_of_stops(
 ) -> Assessment:
     """Simulate that the link is lost within stops from the setpoints of a flight, whose own link loss is `plan`.
 
-    A setpoint is at fault for a stop that was sampled from it; one from which none was is not.
+    A setpoint is at fault for a stop that was sampled from it; one from which none was is not. What was only looked at
+    coarsely counts as ending as far out as it may.
     """
-    count = len(encoded.payloads)
-    worst, far, walls = np.full(count, -np.inf), np.full(count, _LEAST_REACH), np.zeros(count, dtype=int)
-
-    def sample(begin: NDArray, each: int, rows: slice = slice(None)) -> tuple[NDArray, NDArray]:
-        stops = encode_stops(encoded.motion, RATE, rows=begin, gains=encoded.gains, space=encoded.space)
-        within = np.unique(np.append(np.arange(0, stops.shape[1], each), stops.shape[1] - 1))[rows]
-        found = link_loss_within_stops(stops, plan.snapshots[:, begin], limits, within)
-        beyond = found.beyond.reshape(len(begin), len(within))
-        beyond = np.where(np.isnan(beyond), np.inf, beyond)
-        rates = decode(stops.reshape(-1, PAYLOAD_SIZE)).body_rate[:, :2].reshape(*stops.shape[:2], 2)
-        harmful = np.linalg.norm(rates, axis=2) > BRAKE_RATE_MAX + 1e-3
-        number = np.arange(len(begin)) * len(within) + beyond.argmax(axis=1)
-        axis, side = np.array(WALLS)[found.wall[number]].T
-        up, down = (found.high - found.place)[number, axis], (found.place - found.low)[number, axis]
-        higher = beyond.max(axis=1) > worst[begin]
-        some = begin[higher]
-        worst[some], far[some], walls[some] = (
-            beyond.max(axis=1)[higher],
-            np.where(side, up, down)[higher],
-            found.wall[number][higher],
-        )
-        near = np.concatenate([within[beyond.max(axis=0) > -STOPS_NEAR], np.flatnonzero(harmful.any(axis=0))])
-        return begin[(beyond.max(axis=1) > -STOPS_NEAR) | harmful.any(axis=1)], near
-
-    coarse = np.unique(np.append(np.arange(0, count, STOPS_EVERY), count - 1))
-    near, within = sample(coarse, STOPS_EACH)
-    if len(near):
-        about = near[:, None] + np.arange(1 - STOPS_EVERY, STOPS_EVERY)
-        first, last = max(within.min() - STOPS_EACH, 0), within.max() + STOPS_EACH
-        rows = slice(int(first) // STOPS_DENSE, int(last) // STOPS_DENSE + 1)
-        sample(np.unique(np.clip(about, 0, count - 1)), STOPS_DENSE, rows)
-    moments = replace(plan, wall=walls)
+    count, length = len(encoded.payloads), round(DURATION * RATE) + 1
+    sampled = _Sampled(np.full(count, -np.inf), np.full(count, _LEAST_REACH), np.zeros(count, dtype=int))
+    about, done = np.ones((count, length), dtype=bool), np.zeros((count, length), dtype=bool)
+    for every, each, near in GRIDS:
+        asked = about & _every(count, every)[:, None] & _every(length, each) & ~done
+        if not asked.any():
+            break
+        about, done = _about(_sample(sampled, asked, encoded, limits, plan, margin) > -near, every, each), done | asked
+    moments = replace(plan, wall=sampled.wall)
 
     def describe(at: int) -> str:
-        where = f"{worst[at]:.2f} m beyond" if worst[at] > 0.0 else f"within {-worst[at]:.2f} m of"
-        return f"takes the vehicle {where} {moments.name_of_wall(at, limits)}"
+        return f"takes the vehicle {_how_far(sampled.beyond[at])} {moments.name_of_wall(at, limits)}"
 
     return Assessment(
         what="link loss within a stop",
         time=encoded.times,
-        excess=worst + margin,
-        reach=np.maximum(far, _LEAST_REACH),
+        excess=sampled.beyond + margin,
+        reach=sampled.reach,
         describe=describe,
         near=lambda at: moments.name_of_wall(at, limits),
         hint=OUTSIDE_HINT,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Sampled:
+    """The worst that was sampled of the stops from each setpoint; written as samples come."""
+
+    beyond: NDArray  # (N,) m beyond a wall; -inf where no stop was sampled
+    reach: NDArray  # (N,) m
+    wall: NDArray  # (N,) int, as in WALLS
+
+
+def _sample(
+    sampled: _Sampled, asked: NDArray, encoded: EncodedFlight, limits: Limits, plan: LinkLossMoments, margin: float
+) -> NDArray:
+    """Lose the link in the stops from the setpoints and after the rows that are `asked`, (N, M).
+
+    Returns, (N, M), how far beyond the walls they end, as seen coarsely; what sends more than harmless rates is at inf,
+    what was not looked at at -inf.
+    """
+    begin = np.flatnonzero(asked.any(axis=1))
+    forks, starts = asked[begin], plan.snapshots[:, begin]
+    stops = encode_stops(encoded.motion, RATE, rows=begin, gains=encoded.gains, space=encoded.space)
+    seen = link_loss_within_stops(stops, starts, limits, forks, coarsely=True)
+    beyond, reach, wall = seen.beyond + ALLOWANCE, _reach(seen), seen.wall
+    in_doubt = ~(beyond < -margin)
+    if in_doubt.any():
+        exactly = forks.copy()
+        exactly[forks] = in_doubt
+        some = exactly.any(axis=1)
+        found = link_loss_within_stops(stops[some], starts[:, some], limits, exactly[some])
+        beyond[in_doubt], reach[in_doubt], wall[in_doubt] = found.beyond, _reach(found), found.wall
+    beyond = np.where(np.isnan(beyond), np.inf, beyond)
+
+    rates = decode(stops.reshape(-1, PAYLOAD_SIZE)).body_rate[:, :2]
+    harmful = (np.linalg.norm(rates, axis=1) > _HARMLESS).reshape(forks.shape)
+    near = np.full(asked.shape, -np.inf)
+    near[asked] = np.where(np.isnan(seen.beyond), np.inf, seen.beyond)
+    near[begin] = np.where(harmful, np.inf, near[begin])
+
+    of_all = np.full(forks.shape, -np.inf)
+    of_all[forks] = beyond
+    numbers = np.full(forks.shape, -1)
+    numbers[forks] = np.arange(len(beyond))
+    at = numbers[np.arange(len(begin)), of_all.argmax(axis=1)]
+    worse = beyond[at] > sampled.beyond[begin]
+    for values, new in ((sampled.beyond, beyond), (sampled.reach, reach), (sampled.wall, wall)):
+        values[begin[worse]] = new[at[worse]]
+    return near
+
+
+def _about(near: NDArray, every: int, each: int) -> NDArray:
+    """Return, (N, M), what lies about what is `near`, (N, M), not farther than the next samples."""
+    from scipy.ndimage import maximum_filter1d  # slow to import
+
+    rows = maximum_filter1d(near.view(np.uint8), 2 * each - 1, axis=1, mode="constant")
+    return maximum_filter1d(rows, 2 * every - 1, axis=0, mode="constant").astype(bool)
+
+
+def _every(count: int, step: int) -> NDArray:
+    """Return (N,) bool: so many apart, and the last."""
+    number = np.arange(count)
+    return (number % step == 0) | (number == count - 1)
+
+
+def _reach(moments: LinkLossMoments) -> NDArray:
+    """Return how far each goes towards the wall that it comes nearest to, m, positive."""
+    number, (axis, side) = np.arange(len(moments.wall)), np.array(WALLS)[moments.wall].T
+    reach = np.where(side[:, None], moments.high - moments.place, moments.place - moments.low)[number, axis]
+    return np.maximum(reach, _LEAST_REACH)
+
+
+def _how_far(beyond: float) -> str:
+    return f"{beyond:.2f} m beyond" if beyond > 0.0 else f"within {-beyond:.2f} m of"

@@ -34,6 +34,7 @@ from cfplan.simulation.dynamics.body import (
     FULL_EFFICIENCY,
     LAG,
     MASS,
+    STEP,
     STILL_AIR,
     THRUST_MAX,
     pack_body,
@@ -59,11 +60,13 @@ OFF_BY_WATCHDOG = Timeouts().keep_alive  # if the emergency-stop watchdog is ena
 WALLS = ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1))
 """(axis, low or high side) of the walls and the ceiling; on the floor is where it ends."""
 _LONGEST = 4.0  # s that are simulated after the last setpoint, unless the vehicle lies on the floor before
-_STEP = 0.004  # s, of the simulation after the last setpoint
+_STEP, _COARSE_STEP = 0.004, 0.008  # s, of the simulation after the last setpoint, and where it only looks for walls
 _SETTLED_AFTER = 0.5  # s of level-out, after which a vehicle that hardly turns has settled
 _SETTLED_RATE = 0.2  # rad/s, below which it hardly turns
 _COAST_STEP = 0.01  # s, of the place alone
 _NEAR = 0.1  # m from a wall, within which it also matters that the accelerometer may say too much
+_COARSE_EVERY = 2  # setpoints between those that are looked at coarsely
+ALLOWANCE = 0.1  # m, by which what is looked at coarsely may end farther out; 0.07 m at most in 36 flights, to 3 m/s
 _PUSH, _DAMPING, _LIFT = range(3)  # as _wrong packs what the vehicle has wrong
 
 
@@ -118,8 +121,47 @@ def link_loss_at_every_setpoint(
 
     The flight begins in hover, or from the snapshots `starts`, (L, 31), of another at the same setpoint.
     """
-    state, time, wrong, bodies = decode(payloads), np.arange(len(payloads)) / rate, _wrong(limits), _bodies(limits)
-    begins = [hovering_snapshot(limits.airframe, state)] * len(bodies) if starts is None else list(starts)
+    state = decode(payloads)
+    return _lose_link(state, limits, rate, _begins(state, limits, starts), np.ones(len(payloads), dtype=np.bool_))
+
+
+def link_loss_near_walls(
+    payloads: NDArray, limits: Limits, within: float, rate: float = RATE, starts: NDArray | None = None
+) -> LinkLossMoments:
+    """Lose the link after each setpoint that may leave the vehicle `within` m of a wall, and after the worst of all.
+
+    Of each other one it is only known how far it ends at most: one motor lag, coarse steps and every other setpoint
+    tell, with ALLOWANCE. Its box is as seen so. Arguments as for link_loss_at_every_setpoint, whose worst moment this
+    finds in a fraction of the time.
+    """
+    state = decode(payloads)
+    begins = _begins(state, limits, starts)
+    seen = _look_coarsely(state, limits, rate, begins)
+    forks = ~(seen.beyond + ALLOWANCE < -within)
+    forks[seen.beyond.argmax()] = True
+    found = _lose_link(state, limits, rate, begins, forks, seen)
+    others = ~forks & (found.beyond > found.beyond[forks].max())
+    if others.any():  # which may be worse
+        found = _lose_link(state, limits, rate, begins, forks | others, seen)
+    return found
+
+
+def _begins(state: FullStateSetpoints, limits: Limits, starts: NDArray | None) -> list[NDArray]:
+    """Return the snapshot that a flight begins from, for each motor lag."""
+    return [hovering_snapshot(limits.airframe, state)] * len(_lags(limits)) if starts is None else list(starts)
+
+
+def _lose_link(
+    state: FullStateSetpoints,
+    limits: Limits,
+    rate: float,
+    begins: list[NDArray],
+    forks: NDArray,
+    seen: LinkLossMoments | None = None,
+) -> LinkLossMoments:
+    """Lose the link after the setpoints where `forks`, (N,), says so; the others end as seen coarsely, or farther."""
+    wrong, bodies = _wrong(limits), _bodies(limits)
+    time = np.arange(len(state.position)) / rate
 
     def swept(forks: NDArray, wrong: NDArray) -> tuple[list[NDArray], list[NDArray]]:
         def one(body: tuple[NDArray, NDArray], begin: NDArray) -> tuple[NDArray, NDArray]:
@@ -129,14 +171,32 @@ def link_loss_at_every_setpoint(
             flown = list(pool.map(one, bodies, begins))
         return [boxes for boxes, _ in flown], [snapshots for _, snapshots in flown]
 
-    boxes, snapshots = swept(np.ones(len(payloads), dtype=np.bool_), wrong)
+    boxes, snapshots = swept(forks, wrong)
+    if seen is not None:
+        coarse = np.stack([seen.low, seen.high], axis=1)
+        boxes = [np.where(forks[:, None, None], box, coarse) for box in boxes]
     found = _judge(time, state.position, boxes, limits, snapshots)
-    near = ~(found.beyond < -_NEAR)
+    near = forks & ~(found.beyond < -_NEAR)
     if wrong[_LIFT] and near.any():
         also, _ = swept(near, wrong * (1.0, 1.0, -1.0))
         sinking = [np.where(near[:, None, None], box, boxes[0]) for box in also]
         found = _judge(time, state.position, boxes + sinking, limits, snapshots)
-    return found
+    return found if seen is None else replace(found, beyond=np.where(forks, found.beyond, found.beyond + ALLOWANCE))
+
+
+def _look_coarsely(state: FullStateSetpoints, limits: Limits, rate: float, begins: list[NDArray]) -> LinkLossMoments:
+    """Return how each setpoint ends, by one motor lag, coarse steps and every other setpoint."""
+    count, middle = len(state.position), len(begins) // 2
+    looked_at = np.zeros(count, dtype=np.bool_)
+    looked_at[::_COARSE_EVERY] = looked_at[-1] = True
+    body, wrong = _coarse_body(limits), _wrong(limits)
+    boxes, _ = _swept(state, limits, body, rate, begins[middle], looked_at, wrong, _COARSE_STEP)
+    rows = np.flatnonzero(looked_at)
+    before = np.repeat(np.arange(len(rows)), np.diff(rows, append=count))
+    after = np.where(looked_at, before, np.minimum(before + 1, len(rows) - 1))
+    boxes = boxes[rows]
+    low, high = np.minimum(boxes[before, 0], boxes[after, 0]), np.maximum(boxes[before, 1], boxes[after, 1])
+    return _judge(np.arange(count) / rate, state.position, [np.stack([low, high], axis=1)], limits, [])
 
 
 def as_believed(snapshots: NDArray, limits: Limits) -> NDArray:
@@ -160,8 +220,8 @@ def link_loss_of_stops(
         start, forks = hovering_snapshot(limits.airframe, state), np.zeros(len(payloads), dtype=np.bool_)
         snapshots = _swept(state, limits, body, rate, start, forks, _wrong(limits))[1][begin]
         swept = np.empty((len(begin), stops.shape[1], 2, 3))
-        forks = np.zeros(stops.shape[1], dtype=np.bool_)
-        forks[within] = True
+        forks = np.zeros((len(begin), stops.shape[1]), dtype=np.bool_)
+        forks[:, within] = True
         _fly_stops(swept, rows, snapshots, forks, _gains(limits), *body, *_steps(limits), arrivals, _wrong(limits))
         boxes.append(swept[:, within].reshape(-1, 2, 3))
     times = begin[:, None] / rate + within / rate
@@ -170,26 +230,30 @@ def link_loss_of_stops(
 
 
 def link_loss_within_stops(
-    stops: NDArray, starts: NDArray, limits: Limits, within: NDArray, rate: float = RATE
+    stops: NDArray, starts: NDArray, limits: Limits, forks: NDArray, rate: float = RATE, *, coarsely: bool = False
 ) -> LinkLossMoments:
-    """Lose the link in K stops, (K, M, 29) uint8 at `rate`, Hz, after each of their setpoints `within`, (W,) rows.
+    """Lose the link in K stops, (K, M, 29) uint8 at `rate`, Hz, after those of their setpoints where `forks`, (K, M).
 
     Each stop begins from a snapshot of its flight, `starts`, (L, K, 31) for each motor lag, as the moments of a plan
-    hold them. Returns K · W moments, one stop after another; their times are from the first setpoint of the stop.
+    hold them. Returns a moment for each fork, one stop after another; times are from the first setpoint of the stop.
+    Coarsely, by one motor lag and coarse steps, what ends farther out than it seems does so by less than ALLOWANCE.
     """
     rows = setpoint_rows(decode(stops.reshape(-1, PAYLOAD_SIZE))).reshape(*stops.shape[:2], SETPOINT_SIZE)
-    arrivals, forks = arrival_steps(stops.shape[1], rate), np.zeros(stops.shape[1], dtype=np.bool_)
-    forks[within] = True
+    arrivals, wrong, gains = arrival_steps(stops.shape[1], rate), _wrong(limits), _gains(limits)
+    steps = _steps(limits, _COARSE_STEP if coarsely else _STEP)
 
     def one(body: tuple[NDArray, NDArray], begin: NDArray) -> NDArray:
         swept = np.empty((*stops.shape[:2], 2, 3))
-        wrong = _wrong(limits)
-        _fly_stops(swept, rows, begin, forks, _gains(limits), *body, *_steps(limits), arrivals, wrong)
-        return swept[:, within].reshape(-1, 2, 3)
+        _fly_stops(swept, rows, begin, forks, gains, *body, *steps, arrivals, wrong)
+        return swept[forks]
 
-    with ThreadPoolExecutor() as pool:  # a motor lag each
-        boxes = list(pool.map(one, _bodies(limits), np.ascontiguousarray(starts)))  # compiled for one layout
-    times, places = np.tile(within / rate, len(stops)), rows[:, within, 0:3].reshape(-1, 3)
+    begins = np.ascontiguousarray(starts)  # compiled for one layout
+    if coarsely:
+        boxes = [one(_coarse_body(limits), begins[len(begins) // 2])]
+    else:
+        with ThreadPoolExecutor() as pool:  # a motor lag each
+            boxes = list(pool.map(one, _bodies(limits), begins))
+    times, places = np.nonzero(forks)[1] / rate, rows[..., 0:3][forks]
     return _judge(times, places, boxes, limits, [np.empty((0, SNAPSHOT_SIZE))] * len(boxes))
 
 
@@ -234,6 +298,13 @@ def _bodies(limits: Limits) -> list[tuple[NDArray, NDArray]]:
     return [(pack_body(airframe), pack_body(airframe, step=_STEP)) for airframe in airframes]
 
 
+def _coarse_body(limits: Limits) -> tuple[NDArray, NDArray]:
+    """Return the parameters of the body for coarse steps, with the motor lag in the middle."""
+    lags = _lags(limits)
+    airframe = replace(limits.airframe, motor_time_constant=lags[len(lags) // 2])
+    return pack_body(airframe), pack_body(airframe, step=_COARSE_STEP)
+
+
 def _lags(limits: Limits) -> list[float]:
     return sorted({*limits.link_loss.motor_lags, limits.airframe.motor_time_constant})
 
@@ -242,10 +313,10 @@ def _gains(limits: Limits) -> NDArray:
     return gains_for(limits.airframe).pack()
 
 
-def _steps(limits: Limits) -> tuple[int, int]:
+def _steps(limits: Limits, step: float = _STEP) -> tuple[int, int]:
     """Return after how many steps of a branch the vehicle levels out, and after how many its motors stop."""
     off = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER
-    return round(LEVEL_AFTER / _STEP), round(off / _STEP)
+    return round(LEVEL_AFTER / step), round(off / step)
 
 
 def _swept(
@@ -256,12 +327,13 @@ def _swept(
     start: NDArray,
     forks: NDArray,
     wrong: NDArray,
+    step: float = _STEP,
 ) -> tuple[NDArray, NDArray]:
     """Return boxes (N, 2, 3) where `forks`, (N,), and snapshots of vehicle and controller at each setpoint."""
     count, rows = len(state.position), setpoint_rows(state)
     swept, snapshots = np.empty((count, 2, 3)), np.empty((count, SNAPSHOT_SIZE))
     arrivals = arrival_steps(count, rate)
-    _fly(swept, snapshots, rows, start, forks, _gains(limits), *body, *_steps(limits), arrivals, wrong)
+    _fly(swept, snapshots, rows, start, forks, _gains(limits), *body, *_steps(limits, step), arrivals, wrong)
     return swept, snapshots
 
 
@@ -281,9 +353,12 @@ def _fly_stops(
 ) -> None:
     snapshots = np.empty((stops.shape[1], SNAPSHOT_SIZE))
     for n in range(len(stops)):
+        end = stops.shape[1]
+        while end > 0 and not forks[n, end - 1]:
+            end -= 1
         _fly(
-            swept[n], snapshots, stops[n], starts[n], forks, gains, body, later_body, level_after, off_after, arrivals,
-            wrong,
+            swept[n], snapshots, stops[n, :end], starts[n], forks[n], gains, body, later_body, level_after, off_after,
+            arrivals, wrong,
         )  # fmt: skip
 
 
@@ -303,7 +378,8 @@ def _fly(
     wrong: NDArray,
 ) -> None:
     """Fly setpoints from a snapshot; branch off where `forks` says so, at the moment at which each arrives."""
-    now, branch, setpoint, control, motors = start.copy(), start.copy(), setpoints[0].copy(), np.zeros(4), np.zeros(4)
+    now, branch, setpoint = start.copy(), start.copy(), np.zeros(SETPOINT_SIZE)
+    control, motors = np.zeros(4), np.zeros(4)
     full_state, mode, astray = FULL_STATE.copy(), FULL_STATE.copy(), np.zeros(3)
     for newest in range(len(setpoints)):
         for k in range(SNAPSHOT_SIZE):
@@ -345,23 +421,24 @@ def _go_on_alone(
     `now`, `setpoint`, `mode`, `astray`, `control` and `motors` are overwritten.
     """
     astray[0] = astray[1] = astray[2] = 0.0  # m, m/s: drift to a side, its speed; m/s: at which it believes to sink
-    settled_after = level_after + round(_SETTLED_AFTER / _STEP)
+    period = body[STEP]
+    settled_after = level_after + round(_SETTLED_AFTER / period)
     for k in range(3):
         swept[0, k], swept[1, k] = now[k], now[k]
-    for after in range(round(_LONGEST / _STEP)):
+    for after in range(round(_LONGEST / period)):
         if after == level_after:
             level_out(setpoint, mode)
         turning = abs(now[10]) + abs(now[11]) + abs(now[12])
         if settled_after <= after < off_after and turning < _SETTLED_RATE:
-            _coast(swept, now, setpoint, gains, body, (off_after - after) * _STEP, wrong, astray)
+            _coast(swept, now, setpoint, gains, body, (off_after - after) * period, wrong, astray)
             return
         if after < off_after:
-            step_control(now, now, gains, setpoint, mode, body, _STEP, control, motors)
+            step_control(now, now, gains, setpoint, mode, body, period, control, motors)
         else:
             for k in range(4):
                 now[THRUSTS + k] = 0.0
         step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
-        _go_astray(astray, setpoint, wrong, after < off_after, _STEP)
+        _go_astray(astray, setpoint, wrong, after < off_after, period)
         _widen(swept, now, astray[0])
         if after > off_after and now[2] <= 0.0:
             return

@@ -11,7 +11,7 @@ from cfplan.preparation.link_loss_assessment import STOPS_EACH, STOPS_EVERY, ass
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight, prepare_mission, require_harmless_stops
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.link_loss import link_loss_at_every_setpoint, link_loss_of_stops
+from cfplan.simulation.link_loss import ALLOWANCE, link_loss_at_every_setpoint, link_loss_of_stops
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -34,8 +34,8 @@ def test_what_is_sampled_is_what_whole_stops_give(encoded, limits):
     coarse = np.arange(0, len(encoded.payloads), STOPS_EVERY)
     worst = whole.beyond.reshape(len(coarse), -1).max(axis=1)
     assert np.all(assessed.excess[coarse] >= worst - 1e-9)
-    far = worst < -0.3  # where nothing was sampled more densely
-    assert assessed.excess[coarse][far] == pytest.approx(worst[far])
+    far = worst < -0.3  # where nothing was sampled more densely, nor simulated with every motor lag
+    assert np.all(assessed.excess[coarse][far] <= worst[far] + ALLOWANCE + 0.03)
     assert np.isinf(assessed.excess).any()  # from most setpoints no stop is sampled
     assert assessed.passed
 

@@ -74,7 +74,7 @@ def called(monkeypatch):
     """Notes each call of what encodes, checks and simulates."""
     noted = []
     for module, name in (
-        (link_loss_assessment, "link_loss_at_every_setpoint"), (glitch_assessment, "glitch_at_every_setpoint"),
+        (link_loss_assessment, "link_loss_near_walls"), (glitch_assessment, "glitch_at_sampled_setpoints"),
         (link_loss, "link_loss_at_every_setpoint"), (preparation, "check_bytes"), (preparation, "dry_run"),
         (preparation, "certify_stops"),
     ):  # fmt: skip
@@ -83,7 +83,7 @@ def called(monkeypatch):
     return noted
 
 
-IN_PLANNING = ["glitch_at_every_setpoint", "link_loss_at_every_setpoint"]
+IN_PLANNING = ["glitch_at_sampled_setpoints", "link_loss_near_walls"]
 
 
 def test_nothing_is_simulated_twice(limits, called):
@@ -103,7 +103,7 @@ def test_a_plan_file_is_looked_at_whole(limits, tmp_path, called):
     save_plan(plan_flight(LINE, limits).plan, tmp_path / "plan.parquet")
     called.clear()
     prepare_flight(tmp_path / "plan.parquet", limits)
-    checked = ["check_bytes", "dry_run", "link_loss_at_every_setpoint", "glitch_at_every_setpoint", "certify_stops"]
+    checked = ["check_bytes", "dry_run", "link_loss_at_every_setpoint", "glitch_at_sampled_setpoints", "certify_stops"]
     assert called == checked
 
 

@@ -12,7 +12,16 @@ from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dynamics.body import hovering
 from cfplan.simulation.dynamics.closed_loop import fly_setpoints
-from cfplan.simulation.glitches import AFTERWARDS, GAP, KINDS, WITHOUT_POSES_EVERY, glitch_at_every_setpoint
+from cfplan.simulation.glitches import (
+    AFTERWARDS,
+    GAP,
+    KINDS,
+    NEARLY,
+    TURNED_OVER,
+    WITHOUT_POSES_EVERY,
+    glitch_at_every_setpoint,
+    glitch_at_sampled_setpoints,
+)
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -94,6 +103,19 @@ def test_between_setpoints_at_which_poses_stop_too_the_worse_one_counts(found, l
         for first, last in pairwise(sampled):
             assert np.all(found.deviation[kind, first + 1 : last] >= found.deviation[kind, first])
             assert np.all(found.tilt[kind, first + 1 : last] >= found.tilt[kind, first])
+
+
+def test_sampled_gaps_say_the_same_where_the_vehicle_is_nearly_lost_and_little_less_elsewhere(found, line, limits):
+    sampled = glitch_at_sampled_setpoints(line, limits)
+    assert sampled.deviation.max() == found.deviation.max()
+    assert np.all(sampled.deviation > found.deviation - 0.1 * limits.flight.deviation.cut)
+    cut = found.deviation.max() / 0.9  # then some are nearly lost
+    strict = replace(limits, flight=replace(limits.flight, deviation=replace(limits.flight.deviation, cut=cut)))
+    sampled = glitch_at_sampled_setpoints(line, strict)
+    nearly = (np.fmax(found.deviation / cut, found.tilt / TURNED_OVER) > NEARLY + 0.15).any(axis=0)
+    assert 0 < np.count_nonzero(nearly) < len(line)
+    np.testing.assert_array_equal(sampled.deviation[:, nearly], found.deviation[:, nearly])
+    np.testing.assert_array_equal(sampled.tilt[:, nearly], found.tilt[:, nearly])
 
 
 def test_a_vehicle_that_turns_over_is_lost(line, limits):

@@ -14,7 +14,9 @@ from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.link_loss import (
+    ALLOWANCE,
     link_loss_at_every_setpoint,
+    link_loss_near_walls,
     link_loss_of_stops,
     link_loss_of_transfer,
     simulate_link_loss,
@@ -166,6 +168,23 @@ def test_it_says_which_wall(limits):
     assert found.name_of_wall(0, limits) == f"the wall x = {limits.space.low[0]:g} m"  # it begins 2 m to the left
     assert found.worst.beyond == found.beyond.max()
     assert found.worst.moment == found.time[np.argmax(found.beyond)]
+
+
+@pytest.mark.parametrize("name", ["line", "loop3d", "slalom"])
+@pytest.mark.parametrize("speed", [2.0, 3.0])
+def test_what_may_end_near_a_wall_is_simulated_and_of_the_rest_is_known_how_far_it_ends_at_most(name, speed, limits):
+    fast = replace(limits, plan=replace(limits.plan, speed=speed, acceleration=2.5 * speed))
+    payloads = prepare_mission(REPOSITORY / "flights" / f"{name}.yaml", fast).payloads
+    for within in (0.0, 0.3):
+        all_of_them, found = link_loss_at_every_setpoint(payloads, fast), link_loss_near_walls(payloads, fast, within)
+        assert found.worst == all_of_them.worst
+        near = all_of_them.beyond > -within
+        assert within == 0.0 or near.any()
+        np.testing.assert_array_equal(found.beyond[near], all_of_them.beyond[near])
+        np.testing.assert_array_equal(found.wall[near], all_of_them.wall[near])
+        assert np.all(found.beyond >= all_of_them.beyond)
+        assert np.all(found.beyond <= all_of_them.beyond + 2.5 * ALLOWANCE)
+        np.testing.assert_array_equal(found.snapshots, all_of_them.snapshots)
 
 
 def test_stops_from_a_flight_are_harmless_too(line, limits):
