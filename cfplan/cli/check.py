@@ -1,26 +1,36 @@
 """`cfplan check`: the certificate of a plan or of a path."""
 
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from cfplan.cli import options
-from cfplan.cli.output import Steps, print_json
+from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.errors import ExitCode
 from cfplan.preparation.compiled_calls import Stage
 
 
-@click.command(short_help="The certificate of a path or of a plan.", epilog="Example: cfplan check flights/circle.yaml")
+@click.command(
+    short_help="The certificate of a path, of a plan or of a record.",
+    epilog="""\b
+Examples:
+  cfplan check flights/circle.yaml
+  cfplan check records/<flight>""",
+)
 @options.path_or_plan
 @options.planning
 @options.as_json
 def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> int:
     """Check every limit along a path's plan, or along a plan file's, and the bytes that would fly it.
 
-    Exit code 4 where a limit is exceeded.
+    Of a record's folder: certify again everything that was ever committed in that flight, under its limits of that day,
+    and that what was streamed is what was committed. Exit code 4 where a limit is exceeded, or that is not so.
     """
     steps = Steps(as_json=as_json)
+    if (path_or_plan / "flight.mcap").is_file():
+        return _check_record(path_or_plan, steps)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate
@@ -37,4 +47,21 @@ def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **plannin
     from cfplan.preparation.prepare_flight import encode_flight
 
     encode_flight(planned, steps)
+    return 0
+
+
+def _check_record(folder: Path, steps: Steps) -> int:
+    with steps.step("record") as results:
+        from cfplan.recording.reader import read_record
+        from cfplan.steering.recertify import recertify
+
+        record = read_record(folder)
+        results.append(f"{record.header.name}, {record.duration:.1f} s, {len(record.commitments.time)} commitments")
+    with steps.waiting("certifying again"):
+        checked = recertify(record)
+    if steps.as_json:
+        certificate = checked.certificate.to_dict() if checked.certificate is not None else None
+        print_json({**asdict(replace(checked, certificate=None)), "certificate": certificate})
+    else:
+        print_table("Certified again", ["", "value"], checked.rows())
     return 0

@@ -91,8 +91,13 @@ def header_under(
     )
 
 
-def header_of_steering(limits: Limits, *, name: str, uri: str, place: Triple, wall_time_at_zero: float) -> RecordHeader:
-    """Return the header of a flight whose path is yet to be asked for; it begins in hover at a place, m."""
+def header_of_steering(
+    limits: Limits, *, name: str, uri: str, place: Triple, yaw: float, wall_time_at_zero: float
+) -> RecordHeader:
+    """Return the header of a flight whose path is yet to be asked for; it begins in hover at a place, m, and yaw, rad.
+
+    Both are kept to the last digit: `cfplan check` simulates the flight again from there.
+    """
     return header_under(
         limits,
         name=name,
@@ -102,6 +107,7 @@ def header_of_steering(limits: Limits, *, name: str, uri: str, place: Triple, wa
         travel_time=0.0,
         path=np.array([place], dtype=float),
         wall_time_at_zero=wall_time_at_zero,
+        provenance={"yaw": repr(float(yaw))},
     )
 
 

@@ -31,13 +31,14 @@ class SteeringRecord:
         uri: str,
         limits: Limits,
         place: Triple,
+        yaw: float,
         *,
         clock: Clock = REAL_CLOCK,
     ):
-        """Open a new folder under `root`; the flight begins in hover at a place, m. Raises InputError."""
+        """Open a new folder under `root`; the flight begins in hover at a place, m, and yaw, rad. Raises InputError."""
         self.folder = new_record_folder(root, name)
         self.header: RecordHeader = header_of_steering(
-            limits, name=name, uri=uri, place=place, wall_time_at_zero=wall_time_at_zero()
+            limits, name=name, uri=uri, place=place, yaw=yaw, wall_time_at_zero=wall_time_at_zero()
         )
         self._clock, self._uri = clock, uri
         self._writer = RecordWriter(self.folder, self.header, warn=lambda _: None, clock=clock)

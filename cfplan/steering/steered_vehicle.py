@@ -138,7 +138,7 @@ class SteeredVehicle:
         if self._records is not None:
             place = (x, y, limits.ground.take_off_height)
             self._recording = SteeringRecord(
-                self._records, self._name, self._uri, limits, place, clock=self._flight.clock
+                self._records, self._name, self._uri, limits, place, yaw, clock=self._flight.clock
             )
             self._on_record(self._recording)
         self._flight.start(mission, held, Listeners(self._hear, self._hear_answer))

@@ -15,6 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.flight.telemetry import Level
 from cfplan.recording.header import RecordHeader
 from cfplan.recording.plots import FLOWN as FLOWN_COLOUR
@@ -39,6 +40,8 @@ THRUST_COLOUR: Colour = (240, 228, 66)
 FENCE_COLOUR: Colour = (170, 90, 90)
 FLOOR_COLOUR: Colour = (62, 66, 74)
 PATH_COLOUR: Colour = (130, 130, 140)
+COMMITTED_COLOUR: Colour = (120, 170, 255)
+COMMITTED_EVERY = 5  # setpoints, of which one is drawn
 _STRIP = pa.list_(pa.field("item", pa.list_(pa.field("item", pa.float32(), nullable=False), 3), nullable=False))
 LEVEL_NAMES = {Level.INFO: "INFO", Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 
@@ -155,6 +158,7 @@ def log_columns(stream: rr.RecordingStream, record: Record, shown: Sequence[Plot
                 stream.send_columns(entity, [_since(start, line.time)], columns, strict=True)
     _log_states(stream, record, start)
     _log_events(stream, record, start)
+    _log_commitments(stream, record, start)
 
 
 def _log_whole_track(stream: rr.RecordingStream, record: Record) -> None:
@@ -255,6 +259,21 @@ def _log_events(stream: rr.RecordingStream, record: Record, start: float) -> Non
         ]  # the viewer's own column of times is too narrow to read
         columns = rr.TextLog.columns(text=texts, level=levels)
         stream.send_columns(layout.EVENTS, [_since(start, events.time)], columns, strict=True)
+
+
+def _log_commitments(stream: rr.RecordingStream, record: Record, start: float) -> None:
+    """Send where the vehicle was bound to fly from each moment on, at which a plan was committed in flight."""
+    commitments = record.commitments
+    if not len(commitments.time):
+        return
+    strips = [
+        decode(np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)[::COMMITTED_EVERY]).position
+        for payloads in commitments.payloads
+    ]
+    columns = rr.LineStrips3D.columns(
+        strips=strips, colors=[COMMITTED_COLOUR] * len(strips), radii=[PATH_RADIUS] * len(strips)
+    )
+    stream.send_columns(layout.COMMITTED, [_since(start, commitments.time)], columns, strict=True)
 
 
 def _since(start: float, times: NDArray) -> rr.TimeColumn:

@@ -1,0 +1,167 @@
+"""Certify a record again: everything that its pilot was ever bound to fly, and that this is what it streamed.
+
+Each plan that was committed is read from its file and certified anew, from the vehicle as it is simulated up to its
+splice: its limits, its bytes, a stop from each setpoint, link loss, gaps and the dry run. Its setpoints and stops must
+be those that the pilot verified, to the byte, and each setpoint streamed the one that was committed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import CfplanError, InputError, NotCertifiedError
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, checksum_of
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
+from cfplan.flight.telemetry import Phase
+from cfplan.planning.plan_file import load_plan
+from cfplan.planning.plan_result import Plan
+from cfplan.preparation.replan import HeldFlight, certified, hold, hold_hover
+from cfplan.recording.commitments import committed_setpoints
+from cfplan.recording.record import PLAN_FILE, PLAN_IN_FLIGHT, Record
+from cfplan.safety.certificate import Certificate
+
+YAW = "yaw"  # rad, in the provenance of a header: that of the hover in which a steered flight begins
+_SAME = 1e-6  # m, m/s, m/s², m/s³, that a motion may jump by at a joint
+_RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)
+
+
+@dataclass(frozen=True, slots=True)
+class Recertified:
+    """What was certified again."""
+
+    plans: int  # that were committed
+    certificate: Certificate | None  # of the plan that uses most of a limit; None where there is only a hover
+    joints: int  # between motions, none of which jumps
+    jump: float  # the largest, in m, m/s, m/s² or m/s³
+    committed: int  # setpoints, each with its stop
+    streamed: int  # setpoints that were sent, each as committed
+    left_after: float | None  # s from setpoint 0, when a rung of the abort ladder was taken; None where none was
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return it for people."""
+        left = f", until the plan was left after {self.left_after:.2f} s" if self.left_after is not None else ""
+        worst = self.certificate.worst if self.certificate is not None else None
+        share = f"{100 * worst.share:.1f} % of the limit on {worst.name}" if worst is not None else "a hover"
+        return [
+            ("plans committed, certified again", f"{self.plans}, which use {share} at most"),
+            ("joints", f"{self.joints}, the motion jumps by {self.jump:.1e} at most"),
+            ("setpoints committed", f"{self.committed}, each with a certified stop"),
+            ("setpoints streamed", f"{self.streamed}, each as committed{left}"),
+        ]
+
+
+def recertify(record: Record) -> Recertified:
+    """Certify again what a record says was committed, and compare it with what was streamed.
+
+    Raises InputError where a plan's file is missing or damaged, NotCertifiedError where anything does not pass.
+    """
+    commitments = record.commitments
+    plans = [_plan_of(record, int(checksum)) for checksum in commitments.checksum[1:]]
+    held, first = _beginning(record, plans)
+    found = [plan.certificate for plan in (*([first] if first else []), *plans)]
+    for number, certificate in enumerate(found, 1):
+        if not certificate.passed:
+            worst = certificate.worst
+            raise NotCertifiedError(
+                f"it uses {100 * worst.share:.1f} % of the limit on {worst.name}",
+                where=f"plan {number}",
+                hint="the record was changed since, or made by another version",
+            )
+    jump, setpoints = 0.0, len(held.commitment.payloads)
+    for number, plan in enumerate(plans, 1):
+        splice = int(commitments.splice[number])
+        jump = max(jump, _jump(held, splice, plan))
+        held = _committed(held, splice, plan, commitments.payloads[number], int(commitments.checksum[number]), number)
+        setpoints += len(commitments.payloads[number]) // PAYLOAD_SIZE
+    sequence = committed_setpoints(record) if len(commitments.time) else held.commitment.payloads
+    streamed, left_after = _compare(record, sequence)
+    certificates = sorted(found, key=lambda certificate: certificate.worst.share)
+    worst_of_all = certificates[-1] if certificates else None
+    return Recertified(len(found), worst_of_all, len(plans), jump, setpoints, streamed, left_after)
+
+
+def _plan_of(record: Record, checksum: int) -> Plan:
+    return load_plan(record.folder / PLAN_IN_FLIGHT.format(checksum))
+
+
+def _beginning(record: Record, plans: list[Plan]) -> tuple[HeldFlight, Plan | None]:
+    """Return what was held before anything was asked for, and the plan behind it; None for a hover."""
+    if (record.folder / PLAN_FILE).is_file():
+        first = load_plan(record.folder / PLAN_FILE)
+        ends = first.path(np.array([0.0, first.path.end]))
+        return hold(first, ends), first
+    if not plans or not len(record.header.path):
+        raise InputError(
+            "no plan was committed, so there is nothing to certify",
+            where=str(record.folder),
+            hint="name the record of a flight that `cfplan fly` or a program flew along a path",
+        )
+    x, y, z = record.header.path[0].tolist()
+    yaw = float(record.header.provenance.get(YAW, "0"))
+    return hold_hover((x, y, z), yaw, plans[0].limits), None
+
+
+def _jump(held: HeldFlight, splice: int, plan: Plan) -> float:
+    """Return by how much position to jerk jump at a joint. Raises NotCertifiedError where they do."""
+    time = (splice + SPLICE_AHEAD) / RATE
+    before, after = held.flown.at(time), plan.trajectory.at(0.0)
+    jumps = [
+        float(np.abs(getattr(after, name) - getattr(before, name)).max())
+        for name in ("position", "velocity", "acceleration", "jerk")
+    ]
+    if max(jumps) > _SAME:
+        raise NotCertifiedError(
+            f"the motion jumps by {max(jumps):.2g} at {time:.2f} s",
+            where=f"the joint behind setpoint {splice}",
+            hint="the record was changed since, or made by another version",
+        )
+    return max(jumps)
+
+
+def _committed(held: HeldFlight, splice: int, plan: Plan, payloads: bytes, checksum: int, number: int) -> HeldFlight:
+    """Certify a plan again and return what was held with it. Raises NotCertifiedError where that is something else."""
+    where = f"plan {number}, from setpoint {splice} on"
+    flown = held.flown.continued((splice + SPLICE_AHEAD) / RATE, plan.trajectory)
+    row = min(splice - held.begin, held.snapshots.shape[1] - 1)
+    try:
+        encoded, stops, snapshots = certified(flown.since(splice / RATE), plan.limits, held.snapshots[:, row])
+    except CfplanError as error:
+        raise NotCertifiedError(f"{error.where}: {error.what}", where=where, hint=error.hint) from error
+    told = np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
+    if told.shape != encoded.payloads.shape or (told != encoded.payloads).any():
+        raise NotCertifiedError("the setpoints are not those of the plan", where=where, hint="was the record changed?")
+    if checksum_of(splice, encoded.payloads, stops) != checksum:
+        raise NotCertifiedError("the stops are not those that were verified", where=where, hint="was it changed?")
+    commitment = Commitment(splice, encoded.payloads, stops)
+    return HeldFlight(commitment, flown, held.ahead, held.reached, splice, snapshots)
+
+
+def _compare(record: Record, sequence: NDArray) -> tuple[int, float | None]:
+    """Return how many setpoints were streamed, each as committed, and when the plan was left, s.
+
+    Raises NotCertifiedError where one is another.
+    """
+    phases, sent, events = record.phases, record.setpoints, record.events
+    began = phases.time[phases.phase == Phase.STREAM]
+    if not len(began):
+        return 0, None
+    over = phases.time[(phases.time > began[0]) & ~np.isin(phases.phase, (Phase.STREAM, Phase.HOLD))]
+    aborts = [time for time, text in zip(events.time, events.text, strict=True) if text.startswith(_RUNGS)]
+    left = min((time for time in aborts if time >= began[0]), default=np.inf)
+    end = min(left, float(over[0]) if len(over) else np.inf)
+    rows = np.flatnonzero((sent.time >= began[0]) & (sent.time < end))
+    planned = decode(sequence)
+    numbers = np.minimum(sent.index[rows], len(sequence) - 1)
+    for name in ("position", "velocity", "acceleration", "quaternion", "body_rate"):
+        off = np.abs(getattr(sent, name)[rows] - getattr(planned, name)[numbers]).max(axis=1, initial=0.0)
+        if (off > 0.0).any():
+            at = rows[int(np.argmax(off))]
+            raise NotCertifiedError(
+                f"its {name.replace('_', ' ')} is off by {off.max():.4f} from what was committed",
+                where=f"setpoint {sent.index[at]} as streamed",
+                hint="the pilot sent what it was not bound to, or the record was changed since",
+            )
+    return len(rows), float(left - began[0]) if np.isfinite(left) and left <= end else None
