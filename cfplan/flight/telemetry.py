@@ -65,6 +65,11 @@ class Estimate:
         (x, y, z), (vx, vy, vz), ahead = self.position, self.velocity, time - self.time
         return x + ahead * vx, y + ahead * vy, z + ahead * vz
 
+    def velocity_at(self, time: float) -> Triple:
+        """Return the velocity, m/s, a moment earlier or later, s, at the same acceleration."""
+        (vx, vy, vz), (ax, ay, az), ahead = self.velocity, self.acceleration, time - self.time
+        return vx + ahead * ax, vy + ahead * ay, vz + ahead * az
+
 
 @dataclass(frozen=True, slots=True)
 class VehicleStatus:

@@ -113,6 +113,7 @@ class World:
         self.clock = SteppedClock(100.0, self.pass_time)
         self.motors_on, self._blown = False, (0.0, 0.0, 0.0)
         self._poses: list[Pose] = []
+        self._asked = (0.0, 0.0, 0.0)  # m/s, by the last setpoint
         self._count = 0
         self.motors_off_since = -math.inf
         self.estimate: Estimate | None = None
@@ -152,7 +153,6 @@ class World:
         return "\n".join(message.text for message in self.messages if isinstance(message, Event))
 
     def _move(self, step: float) -> None:
-        before = self.position
         flying = self.position[2] > self.floor + 0.03
         if self.motors_on:
             self.motors_off_since = math.inf
@@ -162,7 +162,7 @@ class World:
             self.motors_off_in_the_air += step
         self._blown = tuple(a + b * step for a, b in zip(self._blown, self.push, strict=True))
         self.position = tuple(a + b * step for a, b in zip(self.position, self.push, strict=True))
-        self.velocity = tuple((a - b) / step for a, b in zip(self.position, before, strict=True))
+        self.velocity = tuple(a + b for a, b in zip(self._asked, self.push, strict=True))
         self._count += 1
         if self._count % 2 == 0:
             self._sense()
@@ -204,7 +204,8 @@ class World:
         if self.deaf or self.stopped:
             return
         self.motors_on = True
-        x, y, z = decode(np.frombuffer(bytes(packet.data), dtype=np.uint8)).position[0].tolist()
+        state = decode(np.frombuffer(bytes(packet.data), dtype=np.uint8))
+        (x, y, z), self._asked = state.position[0].tolist(), tuple(state.velocity[0].tolist())
         self.position = x + self._blown[0], y + self._blown[1], max(z + self._blown[2], self.floor)
 
     def send_pose(self, position, quaternion) -> None:

@@ -1,5 +1,6 @@
 """The fault table: each row at full speed in the stepped lab, judged by the simulated truth."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,21 @@ def test_a_vehicle_whose_pilot_stood_still_lands_where_it_is(line, stall):
     places = truth.position[woken][:, :2]
     assert np.linalg.norm(places - places[0], axis=1).max() < 0.5
     assert judge(scenario, flown, line, readable=True).landed
+
+
+@pytest.mark.parametrize("turned", [-120.0, -75.0, 45.0, 60.0, 90.0, 132.0, 180.0])
+def test_body_axes_that_are_not_the_vehicles_end_the_flight_near_where_it_took_off(line, turned):
+    """On the floor nothing shows it: the vehicle takes its yaw from the poses."""
+    fault = ViconFault(FaultKind.FLIP, 0.0, FOR_GOOD, math.radians(turned))
+    scenario = Scenario("turned", Rung.CUT, (fault,), Phase.CONFIGURE, 0.0)
+    truth = (flown := fly_stepped(scenario, line)).truth
+    assert "are its axes the vehicle's?" in flown.reason
+    assert judge(scenario, flown, line, readable=True).to_wall > 0.0
+    if abs(turned) > 45.0:
+        assert np.linalg.norm(truth.position[:, :2] - truth.position[0, :2], axis=1).max() < 1.0
+    if abs(turned) >= 90.0:  # it cannot hover
+        assert truth.position[:, 2].max() < 0.55
+        assert np.linalg.norm(truth.position[-1, :2] - truth.position[0, :2]) < 0.55
 
 
 def test_two_swapped_bodies_never_let_the_vehicle_climb_away(line):

@@ -5,6 +5,7 @@ vehicle's filter takes it as the truth of the moment in which it arrives, so at 
 and its controller would fly ahead by as much. A straight line through the last poses makes up for that.
 """
 
+import math
 from collections import deque
 
 from cfplan.flight.mocap.poses import Pose
@@ -27,12 +28,18 @@ class PosePredictor:
         while self._poses[0].time < pose.time - WINDOW:
             self._poses.popleft()
 
+    @property
+    def middle(self) -> float:
+        """Return the time, s, in the middle of the line; not a number while there are too few poses."""
+        count = len(self._poses)
+        return sum([pose.time for pose in self._poses]) / count if count >= _FEWEST else math.nan
+
     def velocity(self) -> Triple:
         """Return the slope of the line, m/s; zero while there are too few poses."""
         count = len(self._poses)
         if count < _FEWEST:
             return 0.0, 0.0, 0.0
-        middle = sum([pose.time for pose in self._poses]) / count
+        middle = self.middle
         spread = x = y = z = 0.0
         for pose in self._poses:
             off, (px, py, pz) = pose.time - middle, pose.position

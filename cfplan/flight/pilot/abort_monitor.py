@@ -18,6 +18,9 @@ LATEST_SETPOINT = 0.25  # s that a setpoint may be late; the vehicle stops follo
 OLDEST_LOG = 0.5  # s without the vehicle's log
 LINK_GONE = 10.0  # s without a log, after which the link counts as lost; until then it may come back
 DISAGREEMENT_FACTOR = 5.0  # times preflight's limit that estimate and pose may be apart in the air
+# m/s, horizontally and lasting, that the poses may move otherwise than the vehicle believes, while it flies slowly:
+# 0.05 in the virtual lab, where the wind blows 0.15, and 0.4 once the vehicle cannot be held any more.
+MOVES_OTHERWISE = Ladder(brake=0.2, land=0.2, cut=0.3)
 # By what a quantity of the table with a ladder is measured.
 MEASURED: Mapping[str, Callable[[Estimate, VehicleStatus], Triple]] = MappingProxyType(
     {
@@ -52,6 +55,8 @@ class Observation:
     """m, where the vehicle should have been when the pose was taken; None where no setpoint says so."""
     estimate: Estimate | None = None
     status: VehicleStatus | None = None
+    otherwise: float = 0.0
+    """m/s, horizontally, between the motion of the poses and that of the estimate; 0 where that is not looked at."""
     late: float = 0.0  # s, by which the last setpoint missed its deadline
 
 
@@ -144,6 +149,12 @@ class AbortMonitor:
             apart = math.dist(observation.pose.position, observation.estimate.position)
             if apart > DISAGREEMENT_FACTOR * self._limits.pose.agreement:
                 yield safety_abort(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")
+        moves = _rung(
+            MOVES_OTHERWISE,
+            observation.otherwise,
+            "the tracked body moves by {:.2f} m/s otherwise than the vehicle believes: are its axes the vehicle's?",
+        )
+        yield self._lasting("moves otherwise", observation.now, moves)
         for quantity in ON_LADDER:
             value = math.hypot(*MEASURED[quantity.ladder](observation.estimate, observation.status))
             text = f"{quantity.name} of {{:.1f}} {quantity.unit}"

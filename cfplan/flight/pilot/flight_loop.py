@@ -318,12 +318,27 @@ class FlightLoop:
             wanted=self.wanted(pose.time) if pose is not None else None,
             estimate=link.estimate,
             status=link.status,
+            otherwise=self._moves_otherwise(now),
             late=late if self.stream is not None else 0.0,
         )
         watched = self.airborne and not self._stopped(link)
         abort = self._monitor.gravest(observation) if watched else self._monitor.ordered(observation)
         if abort is not None and abort.rung > self._tolerated:
             raise AbortRaised(abort)
+
+    def _moves_otherwise(self, now: float) -> float:
+        """Return by how much, m/s, the body moves otherwise than the vehicle believes; 0 once the plan has begun.
+
+        Take-off and the way to the start are slow, so little else than axes that are not the vehicle's explains it. On
+        the floor nothing shows how the body is turned about the vertical.
+        """
+        estimate, then = self.link.estimate, self._predictor.middle
+        if not self.airborne or self.history.first_setpoint or estimate is None or math.isnan(then):
+            return 0.0
+        if now - min(estimate.time, self.pose().time) > self.limits.pose.age_warning:
+            return 0.0
+        seen, believed = self._predictor.velocity(), estimate.velocity_at(then)
+        return math.dist(seen[:2], believed[:2])
 
     def _stopped(self, link: Link) -> bool:
         """Return whether the motors stand, as they are meant to."""

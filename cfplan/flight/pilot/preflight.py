@@ -1,6 +1,7 @@
 """Preflight: the table of checks before arming, each a small function with a value, a threshold and a verdict."""
 
 import math
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,11 +17,12 @@ from cfplan.flight.radio.supervisor_bits import FAULTS, FLYING
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Estimate, VehicleStatus
 from cfplan.safety.limits import Limits
-from cfplan.vehicle.rotations import yaw_of
+from cfplan.vehicle.rotations import tilt_of, yaw_of
 
 OLDEST_PROTOCOL = 8  # the first with go-to as it is sent here
 LARGEST_VARIANCE = 1e-3  # m², a standard deviation of 3 cm
 LARGEST_ROUND_TRIP = 0.05  # s
+LARGEST_TILT = math.radians(5.0)  # of the tracked body on the floor: floors lean by less
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +190,14 @@ def check_yaw_agreement(snapshot: PreflightSnapshot) -> Check:
     )  # fmt: skip
 
 
+def check_tilt(snapshot: PreflightSnapshot) -> Check:
+    tilt = statistics.median(float(tilt_of(pose.quaternion)) for pose in snapshot.poses)
+    return Check(
+        "tilt of the body", f"{math.degrees(tilt):.1f}°", f"≤ {math.degrees(LARGEST_TILT):.0f}°", tilt <= LARGEST_TILT,
+        "define the tracked body while the vehicle stands level, with its own axes",
+    )  # fmt: skip
+
+
 def check_variance(snapshot: PreflightSnapshot) -> Check:
     worst = max(snapshot.variance)
     return Check(
@@ -243,6 +253,7 @@ CHECKS: tuple[Callable[[PreflightSnapshot], Check], ...] = (
     check_pose_age,
     check_agreement,
     check_yaw_agreement,
+    check_tilt,
     check_variance,
     check_start_place,
     check_plan_inside,

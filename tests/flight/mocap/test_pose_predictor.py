@@ -23,6 +23,13 @@ def test_steady_motion_is_carried_on_exactly():
     forecast = filled(lambda t: (2.0 * t, -1.0 * t, 1.0))
     assert forecast.velocity() == pytest.approx((2.0, -1.0, 0.0))
     assert forecast.position(0.21) == pytest.approx((0.42, -0.21, 1.0))
+    assert forecast.middle == pytest.approx(0.16, abs=0.006)
+
+
+def test_before_there_are_some_poses_there_is_no_line():
+    few = filled(lambda t: (2.0 * t, 0.0, 0.0), times=(0.0, 0.01))
+    assert math.isnan(few.middle)
+    assert few.velocity() == (0.0, 0.0, 0.0)
 
 
 def test_hard_acceleration_costs_millimetres():

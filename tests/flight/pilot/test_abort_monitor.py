@@ -77,6 +77,12 @@ def test_a_speed_counts_only_when_it_lasts(monitor):
     assert rung(monitor, observation(now=10.11, velocity=fast)) is Rung.BRAKE
 
 
+@pytest.mark.parametrize(("otherwise", "expected"), [(0.19, Rung.NONE), (0.25, Rung.LAND), (0.35, Rung.CUT)])
+def test_a_body_that_lastingly_moves_otherwise_than_the_vehicle_believes_ends_the_flight(monitor, otherwise, expected):
+    assert rung(monitor, observation(now=10.0, otherwise=otherwise)) is Rung.NONE
+    assert rung(monitor, observation(now=10.11, otherwise=otherwise)) is expected
+
+
 def test_a_single_noisy_value_is_forgotten(monitor):
     fast = (3.5, 0.0, 0.0)
     assert rung(monitor, observation(now=10.0, velocity=fast)) is Rung.NONE

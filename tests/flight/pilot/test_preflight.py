@@ -83,6 +83,7 @@ def test_a_vehicle_in_order_passes_every_line(ground):
         ("pose age", {"pose_age": 0.3}),
         ("estimate against pose", {"estimate": Estimate(1.0, (0.1, 0.0, 0.02), STILL, STILL, LEVEL)}),
         ("yaw against pose", {"estimate": Estimate(1.0, PLACE, STILL, STILL, (0.0, 0.0, 0.7071, 0.7071))}),
+        ("tilt of the body", {"poses": poses(quaternion=(math.sin(0.05), 0.0, 0.0, math.cos(0.05)))}),  # 5.7°
         ("estimator deviation", {"variance": (1.0, 0.0, 0.0)}),
         ("estimator deviation", {"variance": (math.inf,)}),
         ("this computer's lateness", {"waking": Lateness(0.001, 0.02, 0.03, 100, 0)}),
