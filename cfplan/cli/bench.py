@@ -280,7 +280,7 @@ def giving_way(path_files: tuple[Path, ...], **given: Any) -> None:
 @_count(1000, "Families take turns.")
 @_seed(0)
 @click.option(
-    "--compare-every", type=click.IntRange(0), default=10, show_default=True,
+    "--compare-every", type=click.IntRange(0), default=7, show_default=True,
     help="Of so many paths one is planned by the expert too, with all the time that it wants; 0: none.",
 )  # fmt: skip
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")

@@ -72,7 +72,8 @@ def a_model_knows(task: PlanningTask, _found: Sequence[Found]) -> Due:
 
 def nothing_finished(_task: PlanningTask, found: Sequence[Found]) -> Due:
     """Take the step unless a flight was found that was refined to its end, on a whole grid, and needed no slowing."""
-    return Due(not any(_finished(one.repaired) and one.grid >= 1.0 for one in found))
+    refined = (one for one in found if PLANNERS[one.planner].finished is not Finish.SLOWED)
+    return Due(not any(_finished(one.repaired) and one.grid >= 1.0 for one in refined))
 
 
 def _finished(repaired: Repaired) -> bool:

@@ -77,7 +77,7 @@ def hard_paths(
     *,
     paths: int = 1000,
     first_seed: int = 0,
-    compare_every: int = 10,
+    compare_every: int = 7,
     jobs: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StudyResult:

@@ -3,7 +3,7 @@
 import pytest
 
 from cfplan.planning.planners import AUTO, PLANNERS
-from cfplan.planning.policy import POLICIES
+from cfplan.planning.policy import POLICIES, Found, nothing_finished
 
 pytestmark = pytest.mark.unit
 
@@ -25,3 +25,12 @@ def test_policies_name_known_planners_once_each_and_end_with_a_robust_one(policy
     assert len(set(asked)) == len(asked)
     assert set(asked) <= set(PLANNERS)
     assert asked[-1] in ("convex", "minsnap")
+
+
+def test_auto_goes_on_where_nothing_but_a_profile_that_is_only_slowed_was_found():
+    class Repaired:
+        speed_factor, failed = 1.0, ""
+
+    assert nothing_finished(None, [Found(Repaired, "minsnap", 100, ())]).due
+    assert not nothing_finished(None, [Found(Repaired, "expert", 100, ())]).due
+    assert nothing_finished(None, [Found(Repaired, "learned", 100, (), grid=0.5)]).due
