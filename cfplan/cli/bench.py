@@ -177,12 +177,13 @@ def lateness(**given: Any) -> None:
 def faults(path_file: Path, only: tuple[str, ...], **given: Any) -> None:
     """Fly along PATH with one fault a flight, at full speed, and judge what the pilot does about it."""
     from cfplan.studies.fault_scenarios import SCENARIOS
-    from cfplan.studies.faults import fault_table
+    from cfplan.studies.faults import fault_table, prepare_held
 
     def run(**rest: Any) -> "StudyResult":
         wanted = [row for row in SCENARIOS if not only or any(text in row.name for text in only)]
         mission = _prepared_mission(path_file)
-        return fault_table(mission, path_file.stem, scenarios=wanted, **rest)
+        held = prepare_held(path_file, mission.limits) if any(row.planner for row in wanted) else None
+        return fault_table(mission, path_file.stem, scenarios=wanted, held=held, **rest)
 
     _measure(run, "flying", given)
 

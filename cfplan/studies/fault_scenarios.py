@@ -6,7 +6,8 @@ from typing import Any
 
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.outcome import Rung
-from cfplan.flight.telemetry import Phase
+from cfplan.flight.telemetry import Phase, Triple
+from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.simulation.lab.lab import Fault
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
@@ -15,6 +16,8 @@ from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 
 FOR_GOOD = 60.0  # s, beyond the end of any flight of the table
+ASKED: Triple = (0.6, 2.0, 1.0)  # m, a waypoint that would be flown to if the planner were well
+ASKED_AFTER = 0.8  # s after the stream began
 FULL_SPEED = 1.5  # s after the stream began: the path's cruise
 
 
@@ -35,6 +38,8 @@ class Scenario:
     pilot_killed: bool = False
     pilot_killed_after: float = 0.0  # s from the moment
     disk_full: bool = False
+    planner: PlannerFault | None = None
+    """What is wrong with the planner in flight, which is asked for ASKED at that moment."""
     from_start: bool = False  # the faults are there before anything is connected
     vehicle: VehicleSettings = field(default_factory=lambda: VehicleSettings(auto_arming=False))
     """Armed by request alone, so that a test can see whether it was disarmed."""
@@ -142,4 +147,11 @@ SCENARIOS: tuple[Scenario, ...] = (
     Scenario("space bar while landing", Rung.LAND, order=Order.LAND, phase=Phase.LAND, moment=0.5),
     Scenario("Esc in the stream", Rung.CUT, order=Order.CUT),
     Scenario("disk full", Rung.NONE, disk_full=True),
+    Scenario("planner killed", Rung.NONE, planner=PlannerFault.KILLED, moment=ASKED_AFTER),
+    Scenario("planner stopped for 1 s", Rung.NONE, planner=PlannerFault.STOPPED, moment=ASKED_AFTER),
+    Scenario("planner answers late", Rung.NONE, planner=PlannerFault.LATE, moment=ASKED_AFTER),
+    Scenario("planner answers garbage", Rung.NONE, planner=PlannerFault.GARBAGE, moment=ASKED_AFTER),
+    Scenario(
+        "planner answers with a plan for another joint", Rung.NONE, planner=PlannerFault.OTHER_JOINT, moment=ASKED_AFTER
+    ),
 )  # fmt: skip

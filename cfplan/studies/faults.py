@@ -14,22 +14,29 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cfplan.errors import CfplanError, ExitCode
+from cfplan.errors import CfplanError, ExitCode, InputError
 from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome, Rung
 from cfplan.flight.pilot.pilot import Pilot
+from cfplan.flight.pilot.proposals import NO_PROPOSALS
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry, Triple
+from cfplan.geometry.path_file import load_path_file
+from cfplan.preparation.air_planner import PathAnswer, Wish
+from cfplan.preparation.plan_flight import plan_flight
+from cfplan.preparation.replan import HeldFlight, hold
+from cfplan.preparation.stepped_planner import SteppedPlanner
 from cfplan.recording.header import RecordHeader, header_under
 from cfplan.recording.reader import read_record
 from cfplan.recording.writer import RecordWriter, new_file
+from cfplan.safety.limits import Limits
 from cfplan.simulation.lab.lab import Truth
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
 from cfplan.simulation.virtual_crazyflie.supervisor import State
-from cfplan.studies.fault_scenarios import SCENARIOS, Scenario
+from cfplan.studies.fault_scenarios import ASKED, SCENARIOS, Scenario
 from cfplan.studies.result import Column, StudyResult, Table, detail_table
 
 COLUMNS = (
@@ -81,6 +88,7 @@ class FaultFlight:
     disarmed: bool
     readable: bool  # what was recorded can be read
     reason: str
+    planner: str  # its answer; empty where it was asked nothing or did not answer
 
     def row(self) -> dict[str, Any]:
         """Return it by the keys of COLUMNS, with the fields that those are made of."""
@@ -89,7 +97,7 @@ class FaultFlight:
         return asdict(self) | {
             "end": (", ".join(ends) or "in the air") + without,
             "record": "readable" if self.readable else "not readable",
-            "why": "" if self.reason == "landed" else self.reason,
+            "why": self.planner if self.reason == "landed" else self.reason,
         }
 
 
@@ -102,6 +110,7 @@ class SteppedFlight:
     truth: Truth
     struck: float  # s, when the fault began; NaN where it was there from the start, or never began
     events: list[tuple[float, str]] = field(default_factory=list)
+    answers: list[PathAnswer] = field(default_factory=list)  # of the planner
     sent: list[tuple[float, Triple]] = field(default_factory=list)  # s, m, each setpoint from the plan's first on
     landing: float = math.inf  # s, when the last phase of landing began
     killed: bool = False  # the pilot, in flight or before
@@ -113,20 +122,32 @@ def fault_table(
     path: str,
     *,
     scenarios: Iterable[Scenario] = SCENARIOS,
+    held: HeldFlight | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StudyResult:
-    """Fly every scenario."""
+    """Fly every scenario; those with a fault of the planner fly what is `held`, as prepare_held() makes it."""
     flights, chosen = [], tuple(scenarios)
     for done, scenario in enumerate(chosen):
         progress(done, len(chosen))
-        flights.append(fly_scenario(scenario, mission))
+        flights.append(fly_scenario(scenario, mission, held=held))
     progress(len(chosen), len(chosen))
     table = Table("faults", "Faults at full speed", COLUMNS, tuple(flight.row() for flight in flights))
     return StudyResult("faults", {"path": path}, (table,), (detail_table("flights", flights),))
 
 
-def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0) -> FaultFlight:
-    """Fly one, with a record, and judge it by the truth."""
+def prepare_held(source: Path, limits: Limits) -> HeldFlight:
+    """Return the flight along a path file as a planner holds it. Raises what planning raises."""
+    return hold(plan_flight(source, limits).plan, load_path_file(source).waypoints)
+
+
+def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0, *, held: HeldFlight | None = None) -> FaultFlight:
+    """Fly one, with a record, and judge it by the truth. A fault of the planner needs what is held."""
+    if scenario.planner is not None:
+        if held is None:
+            raise InputError(
+                "no planner flies with a mission alone", where=scenario.name, hint="give what prepare_held() returns"
+            )
+        mission = Mission(held.commitment.payloads, held.commitment.stops, mission.limits)
     lab = _lab(scenario, mission, seed)
     with tempfile.TemporaryDirectory() as folder:
         writer = RecordWriter(
@@ -137,7 +158,7 @@ def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0) -> FaultFl
             clock=lab.clock,
         )
         with writer:
-            flown = fly_stepped(scenario, mission, listen=writer.write, lab=lab)
+            flown = fly_stepped(scenario, mission, listen=writer.write, lab=lab, held=held)
         try:
             readable = len(read_record(Path(folder)).phases.time) > 0
         except CfplanError:
@@ -152,16 +173,23 @@ def fly_stepped(
     listen: Callable[[Telemetry], None] = lambda _: None,
     seed: int = 0,
     lab: SteppedLab | None = None,
+    held: HeldFlight | None = None,
 ) -> SteppedFlight:
     """Fly one in a stepped lab, by default a new one with that seed, until everything has come to rest."""
     lab = lab or _lab(scenario, mission, seed)
     orders, flown, begin = HeldOrders(), SteppedFlight(None, "", lab.truth(), math.nan), lab.now
+    planner = None
+    if scenario.planner is not None and held is not None:
+        planner = SteppedPlanner(held, mission.limits, lab.clock, flown.answers.append)
 
     def strike() -> None:
         flown.struck = lab.now
         for fault in scenario.faults if not scenario.from_start else ():
             lab.disturb(fault)
         orders.worst = scenario.order
+        if planner is not None:
+            planner.fault = scenario.planner
+            planner.request(Wish.REPLACE, [ASKED])
         if scenario.stall:
             lab.clock.at(lab.now + scenario.stall_after, lambda: lab.clock.stall(scenario.stall))
         if scenario.main_killed:
@@ -199,6 +227,7 @@ def fly_stepped(
         source=SteppedPoses(lab, mission.limits.pose),
         report=hear,
         orders=orders,
+        proposals=planner or NO_PROPOSALS,
         clock=lab.clock,
     )
     try:
@@ -247,6 +276,7 @@ def judge(scenario: Scenario, flown: SteppedFlight, mission: Mission, readable: 
         disarmed=truth.supervisor[-1] not in _ARMED,
         readable=readable,
         reason=flown.reason,
+        planner=", ".join(answer.reason or answer.verdict.value for answer in flown.answers),
     )
 
 

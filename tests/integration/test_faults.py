@@ -6,16 +6,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cfplan.errors import InputError
+from cfplan.errors import ExitCode, InputError
+from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Phase
+from cfplan.preparation.air_planner import PathVerdict
 from cfplan.preparation.prepare_flight import prepare_mission
+from cfplan.preparation.replan import replan
+from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
-from cfplan.studies.fault_scenarios import FOR_GOOD, SCENARIOS, Scenario
-from cfplan.studies.faults import fly_scenario, fly_stepped, judge
+from cfplan.studies.fault_scenarios import ASKED, ASKED_AFTER, FOR_GOOD, SCENARIOS, Scenario
+from cfplan.studies.faults import fly_scenario, fly_stepped, judge, prepare_held
 from cfplan.studies.random_faults import fly_random, prepare_missions, random_flights, random_scenario
 
 REPOSITORY = Path(__file__).parents[2]
@@ -31,6 +37,8 @@ QUICK = (
     "locked between arming and take-off",
     "two bodies swapped",
     "disk full",
+    "planner answers late",
+    "planner answers with a plan for another joint",
 )
 CRASHES = 72  # tumbles, hits the floor and has no pilot any more: its estimate is worth nothing then, and it flies on
 SEEDS = [  # the first ones in their order; none is left out
@@ -45,12 +53,17 @@ def line():
     return prepare_mission(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml"))
 
 
+@pytest.fixture(scope="module")
+def held(line):
+    return prepare_held(REPOSITORY / "flights" / "line.yaml", line.limits)
+
+
 @pytest.mark.parametrize(
     "scenario",
     [pytest.param(row, id=row.name, marks=[] if row.name in QUICK else pytest.mark.slow) for row in SCENARIOS],
 )
-def test_a_fault_comes_to_its_rung_and_the_vehicle_to_the_ground(scenario, line):
-    flown = fly_scenario(scenario, line)
+def test_a_fault_comes_to_its_rung_and_the_vehicle_to_the_ground(scenario, line, held):
+    flown = fly_scenario(scenario, line, held=held)
     assert flown.rung == flown.expected, flown.reason
     assert flown.to_wall > 0.0
     assert flown.landed
@@ -59,6 +72,18 @@ def test_a_fault_comes_to_its_rung_and_the_vehicle_to_the_ground(scenario, line)
     if not scenario.falls and flown.rung != "cut":
         assert flown.motors_off == 0
         assert flown.off_plan < 0.4
+
+
+@pytest.mark.parametrize("scenario", [row for row in SCENARIOS if row.planner], ids=lambda row: row.name)
+def test_whatever_is_wrong_with_the_planner_the_flight_ends_in_the_committed_hover(scenario, line, held):
+    asked_for = replan(held, round(ASKED_AFTER * RATE) + 20, [ASKED], line.limits)  # what a planner that is well plans
+    assert np.linalg.norm(decode(asked_for.proposal.payloads[-1:]).position[0] - ASKED) < 0.01
+    flown = fly_stepped(scenario, Mission(held.commitment.payloads, held.commitment.stops, line.limits), held=held)
+    assert flown.outcome.exit_code is ExitCode.OK
+    committed = decode(held.commitment.payloads[-1:]).position[0]
+    assert np.linalg.norm(flown.truth.position[-1, :2] - committed[:2]) < 0.1
+    assert all(answer.verdict is not PathVerdict.ACCEPTED for answer in flown.answers)
+    assert bool(flown.answers) == (scenario.planner is not PlannerFault.KILLED)
 
 
 def test_a_vehicle_that_is_late_on_its_path_is_off_its_setpoint_and_that_ends_the_flight(line):
