@@ -74,6 +74,11 @@ class Timeouts:
         """Return when, s after the last setpoint, the motors stop at the latest."""
         return self.motors_off + self.period
 
+    @property
+    def watchdog_at_latest(self) -> float:
+        """Return when, s after the last keep-alive packet, the motors stop at the latest."""
+        return self.keep_alive + self.period
+
 
 # Each from this version on; read in supervisor.c of every release from 2023.06 to 2026.08, which agree.
 TIMEOUTS: tuple[tuple[tuple[int, ...], Timeouts], ...] = (((2023, 6), Timeouts()),)

@@ -100,8 +100,9 @@ class FirmwareSettings:
     controller: int  # stabilizer.controller
     estimator: int  # stabilizer.estimator
     oldest: tuple[int, ...]  # the oldest firmware that may fly
-    watchdog: bool = False
-    """Whether motors stop 1 s after the pilot's last sign of life, also after landing: then restart the vehicle."""
+    watchdog: bool = True
+    """Whether motors stop 1 s after the pilot's last sign of life; it locks then, also after landing, and the pilot
+    restarts the vehicle there."""
 
 
 @dataclass(frozen=True, slots=True)

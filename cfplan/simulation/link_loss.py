@@ -56,7 +56,7 @@ from cfplan.vehicle.rotations import axes_of
 
 # s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
 LEVEL_AFTER, OFF_AFTER = Timeouts().level_out_at_latest, Timeouts().motors_off_at_latest
-OFF_BY_WATCHDOG = Timeouts().keep_alive  # if the emergency-stop watchdog is enabled
+OFF_BY_WATCHDOG = Timeouts().watchdog_at_latest  # if the emergency-stop watchdog is enabled
 WALLS = ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1))
 """(axis, low or high side) of the walls and the ceiling; on the floor is where it ends."""
 _LONGEST = 4.0  # s that are simulated after the last setpoint, unless the vehicle lies on the floor before

@@ -31,8 +31,8 @@ COLUMNS = (
     ),
     Column("distance", "comes down", "m", ".1f", meaning="horizontally from the last setpoint, from the worst moment"),
     Column("beyond", "beyond the walls", "m", ".1f", meaning="negative inside"),
-    Column("watchdog_distance", "with watchdog: comes down", "m", ".1f"),
-    Column("watchdog_beyond", "with watchdog: beyond the walls", "m", ".1f"),
+    Column("alone_distance", "without watchdog: comes down", "m", ".1f"),
+    Column("alone_beyond", "without watchdog: beyond the walls", "m", ".1f"),
 )
 
 
@@ -64,19 +64,19 @@ def _row(path_file: Path, safety_file: Path, speed: float) -> dict[str, Any]:
     planned = plan_flight(path_file, limits, FlightOptions(speed_factor=speed))
     encoded = encode_flight(planned)
     as_rates = link_loss_at_every_setpoint(_with_rates(encoded, planned.plan.trajectory), limits)
-    without, with_watchdog = (
+    watched, alone = (
         simulate_link_loss(encoded.payloads, replace(limits, firmware=replace(limits.firmware, watchdog=watchdog)))
-        for watchdog in (False, True)
+        for watchdog in (True, False)
     )
     return {
         "path": path_file.stem,
         "speed_factor": speed,
-        "moment": without.moment,
+        "moment": watched.moment,
         "rates_beyond": as_rates.worst.beyond,
-        "distance": without.distance,
-        "beyond": without.beyond,
-        "watchdog_distance": with_watchdog.distance,
-        "watchdog_beyond": with_watchdog.beyond,
+        "distance": watched.distance,
+        "beyond": watched.beyond,
+        "alone_distance": alone.distance,
+        "alone_beyond": alone.beyond,
     }
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from septic_flight import septic_payloads
 
+from cfplan.errors import LinkError
 from cfplan.flight.clock import SteppedClock
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.keys import HeldOrders
@@ -98,6 +99,7 @@ class World:
     poses_frozen: bool = False
     poses_stopped: bool = False
     logs_stopped: bool = False
+    restarts: bool = True
     push: tuple[float, float, float] = (0.0, 0.0, 0.0)
     messages: list[Telemetry] = field(default_factory=list)
     forwarded: list[tuple[float, ...]] = field(default_factory=list)
@@ -245,6 +247,11 @@ class World:
             return
         self.stopped, self.armed, self.motors_on = True, False, False
         self.extra_bits |= LOCKED
+
+    def restart(self) -> None:
+        self.calls.append("restart")
+        if not self.restarts:
+            raise LinkError("it does not answer", where=self.uri, hint="switch it off and on by hand")
 
     def keep_alive(self) -> None:
         self.signs_of_life.append(self.now)

@@ -247,7 +247,8 @@ class FlightLoop:
                 self.history.report(stream.sent(index, now, due))
             if stream is self.plan and now < stream.end:
                 self.history.late.append(now - due)
-        if self.airborne and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
+        watched = self.airborne or self.watched  # to the end of the link: it locks 1 s later
+        if watched and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
             self._kept_alive = now
             self.link.keep_alive()
         self.waking.append(now - due)
@@ -349,6 +350,11 @@ class FlightLoop:
         abort = self._monitor.ordered(Observation(self.now(), self._orders.worst, self._orders.gone))
         if abort is not None:
             raise AbortRaised(abort)
+
+    @property
+    def watched(self) -> bool:
+        """Return whether the vehicle's watchdog has been started."""
+        return self._kept_alive > -math.inf
 
     # Waiting.
 

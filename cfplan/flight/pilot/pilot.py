@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cfplan.errors import CfplanError, ExitCode, PreflightError
+from cfplan.errors import CfplanError, ExitCode, LinkError, PreflightError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.pilot.abort_monitor import Abort, safety_abort
@@ -314,6 +314,16 @@ class Pilot:
                         break
             except (LinkLost, AbortRaised):
                 self._history.say(Level.WARNING, "the link went before the vehicle was disarmed")
+            locked = loop.bits(LOCKED)
             loop.link.close()
+            if loop.watched and not locked:
+                self._restart()
         loop.close_poses()
         self._history.enter(Phase.CLOSED)
+
+    def _restart(self) -> None:
+        """Restart the vehicle, which its watchdog locks now that nothing feeds it, for the next flight."""
+        try:
+            self._loop.link.restart()
+        except LinkError as error:
+            self._history.say(Level.WARNING, str(error))

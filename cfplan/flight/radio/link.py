@@ -15,6 +15,7 @@ import numpy as np
 from cfplan.errors import LinkError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.radio.perishable import EXTERNAL_POSE, LOCALIZATION_PORT
+from cfplan.flight.radio.restart import restart_vehicle
 from cfplan.flight.setpoints.packets import CRTP_PORT, decompress_quaternion
 from cfplan.flight.telemetry import Estimate, Telemetry, Triple, VehicleStatus
 from cfplan.vehicle.airframe import GRAVITY
@@ -219,6 +220,10 @@ class Link:
         closing.join(timeout=2.0)
         if self._radio_lock is not None:
             self._radio_lock.close()
+
+    def restart(self) -> None:
+        """Restart the vehicle's main processor, after `close`; takes 2 s. Raises LinkError if it does not confirm."""
+        restart_vehicle(self.uri, self._clock)
 
     def note_loss(self, _: str, reason: str = "the link was closed") -> None:
         """Remember why the link is gone; a callback of cflib."""

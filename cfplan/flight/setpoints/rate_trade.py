@@ -9,10 +9,11 @@ to the wanted one. Any share of the rate can therefore be moved into the wanted 
     a' = T / cos|φ| · z(q') - g                  T: specific thrust; it acts along the true axis, hence the cosine
 
 This matters once setpoints stop: the firmware then wants a level attitude, yet keeps the last roll and pitch rates, and
-settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25° for 1.5 s. So the rates that are sent are only
-those with which that tilt does good: it brakes what speed will be left, v_left = 0.41 v + 0.089 s · a(t + 0.15 s),
-horizontally, as the vehicle first holds its last place for half a second; and within 1.5 m of a wall it leans away from
-that wall, the more the nearer, so that an attitude that the vehicle has wrong does not carry it there.
+settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25°. So the rates that are sent are only those with
+which that tilt does good: it brakes what speed will be left, v_left = 0.41 v + 0.089 s · a(t + 0.15 s), horizontally,
+as the vehicle first holds its last place for half a second; and within 1.5 m of a wall it leans away from that wall,
+the more the nearer, so that an attitude that the vehicle has wrong does not carry it there. How much is chosen for a
+vehicle whose watchdog stops the motors half a second later; without it they run three times as long.
 
 Two bounds leave more of the rate as a rate: φ grows to 90° as |Δ| nears 7 rad/s, so at most TRADED_RATE_MAX is traded;
 and z(q') may not lean beyond LEAN_MAX, where little of the thrust carries the vehicle and the controller's heading is
@@ -39,11 +40,11 @@ from cfplan.vehicle.rotations import heading_of, matrices_of, product, yaw_of
 BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ahead of the setpoint
 SPEED_LEFT = 0.41  # share of the velocity that is left when the firmware begins to level out
 SPEED_GAINED = 0.089  # s, speed gained until then for each m/s² of acceleration
-BRAKING = 1.0  # 1/s, deceleration by level-out over the speed left
-BRAKE_RATE_MAX = 0.6  # rad/s; 4.9° of tilt, for 1.5 s
+BRAKING = 2.0  # 1/s, deceleration by level-out over the speed left: to nothing in the half second of the watchdog
+BRAKE_RATE_MAX = 1.2  # rad/s; 10° of tilt, for half a second
 WALL_LEAD = 0.3  # s by which the place that tells how near a wall will be is ahead of the setpoint
 WALL_REACH = 1.5  # m from a wall, within which level-out leans away from it
-WALL_STIFFNESS = 0.35  # 1/s², acceleration away from a wall for each m nearer than that
+WALL_STIFFNESS = 0.2  # 1/s², acceleration away from a wall for each m nearer than that
 WALL_PULL_MAX = 0.45  # m/s²; 2.6° of tilt
 TRADED_RATE_MAX = 4.5  # rad/s; what exceeds it is sent as a rate, as φ grows to 90° at 7 rad/s
 LEAN_MAX = math.radians(65.0)  # of the thrust that is sent; plans under the shipped limits reach 45°

@@ -156,8 +156,8 @@ class SimDriver(CRTPDriver):
 
 
 def lab_number(uri: str) -> int:
-    """Return N of sim://N. Raises InputError."""
-    match = re.fullmatch(r"sim://(\d{1,3})", uri)
+    """Return N of sim://N, whatever options cflib appends. Raises InputError."""
+    match = re.fullmatch(r"sim://(\d{1,3})(\?.*)?", uri)
     if match is None:
         raise InputError("no such virtual vehicle", where=uri, hint="sim://0, sim://1, …")
     return int(match[1])

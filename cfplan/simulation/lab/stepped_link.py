@@ -11,6 +11,7 @@ from cfplan.flight.mocap.source import MocapSource
 from cfplan.flight.mocap.uri import parse_uri
 from cfplan.flight.radio.connection import PATIENCE
 from cfplan.flight.radio.link import PLATFORM_PORT, Link
+from cfplan.flight.radio.restart import BOOT, POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
 from cfplan.flight.telemetry import Telemetry
 from cfplan.safety.limits import PoseLimits
 from cfplan.simulation.lab.stepped_lab import SteppedLab
@@ -21,6 +22,7 @@ _STEP = 0.001  # s
 _ASK_AGAIN = 0.1  # s
 _PATIENCE = 3.0  # s for an answer
 _ROUND_TRIP_MS = 2.0
+_POWER_OFF = 1.0  # s, as long as cflib leaves it off
 _READ, _WRITE, _DATA = 1, 2, 2
 _CREATE_BLOCK, _APPEND_BLOCK, _RESET_LOG, _START_BLOCK, _STOP_BLOCK = 6, 7, 5, 8, 4
 _CREATED = 27  # bytes of variables that fit into the first packet
@@ -100,6 +102,11 @@ class SteppedLink(Link):
 
     def close(self) -> None:
         self._lab.heard = lambda _: None
+
+    def restart(self) -> None:
+        for command, wait in ((SYSTEM_OFF, _POWER_OFF), (SYSTEM_ON, BOOT)):
+            self._lab.radio.send(pack(Port.LINK, POWER_CHANNEL, bytes((POWER, command))))
+            self._lab.clock.sleep(wait)
 
     def _ask(self, port: Port, channel: int, payload: bytes, head: bytes, patience: float) -> bytes:
         """Send until an answer comes, and return it. Raises LinkError if none comes."""

@@ -1,5 +1,6 @@
 """The virtual Crazyflie: it takes packets, advances by milliseconds when told to, and returns packets."""
 
+import math
 import re
 from functools import partial
 
@@ -7,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.firmware import GAIN_PARAMETERS
-from cfplan.simulation.dynamics.body import MASS, THRUST_MAX
+from cfplan.flight.radio.restart import POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
+from cfplan.simulation.dynamics.body import MASS, MOTORS, THRUST_MAX
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.catalogue import lacking
 from cfplan.simulation.virtual_crazyflie.collision_avoidance import CollisionAvoidance
@@ -40,6 +42,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import yaw_of
 
 COMMANDER_PERIOD = 10  # ticks of 1 ms between runs of planner and log blocks
+_BOOT = 500  # ms from power on until it answers
 
 _SETPOINT_CHANNEL, _META_CHANNEL = 0, 1
 _NOTIFY_SETPOINT_STOP = 0
@@ -60,9 +63,18 @@ class VirtualCrazyflie:
     def __init__(self, airframe: Airframe, settings: VehicleSettings | None = None):
         self.settings = settings or VehicleSettings()
         self.tick = 0
-        self._commanded = -1  # the last tick at which the slower loops ran
+        self._airframe = airframe
         self._version = tuple(int(part) for part in re.findall(r"\d+", self.settings.firmware))
-        without = lacking(self._version)
+        self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks at which they begin and end
+        self._estimator: int | None = None  # that a deck has chosen
+        self._runs_from: float = 0  # tick from which its processor listens and answers
+        self.battery = Battery(self.settings.charge)
+        self._boot()
+
+    def _boot(self) -> None:
+        """Start the processor: everything is as after switching on."""
+        airframe, without = self._airframe, lacking(self._version)
+        self._commanded = -1  # the last tick at which the slower loops ran
         self.parameters = Parameters(DEFAULTS, without=without, stubborn=self.settings.stubborn)
         self.stabilizer = Stabilizer(
             airframe,
@@ -77,7 +89,6 @@ class VirtualCrazyflie:
         self.planner = HighLevelCommander(self.memories.trajectory, self._where)
         self.commander = Commander(self.planner.stop)
         self.localization = Localization()
-        self.battery = Battery(self.settings.charge)
         self.setpoint = Setpoint()  # what the controller is given
         self._attitude_setpoints = AttitudeSetpoints()
         self._out: list[bytes] = []
@@ -94,15 +105,29 @@ class VirtualCrazyflie:
             ),
             without=without,
         )
-        self._airframe = airframe
-        self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks at which they begin and end
         self._avoidance = CollisionAvoidance()
         self._watch_parameters()
         self.parameters.restore(self.settings.stored)
+        if self._estimator is not None:
+            self.parameters["stabilizer.estimator"] = self._estimator
 
     def use_kalman(self) -> None:
-        """Choose the Kalman filter, as a positioning deck does at start."""
+        """Choose the Kalman filter, as a positioning deck does at each start."""
+        self._estimator = KALMAN
         self.parameters["stabilizer.estimator"] = KALMAN
+
+    def _switch(self, command: int) -> None:
+        """Obey the radio's own processor, which switches the other off and on; the body stays where it is."""
+        if command == SYSTEM_OFF:
+            before = self.stabilizer.loop
+            self._boot()
+            after = self.stabilizer.loop
+            after.truth[:], after.counts[:] = before.truth, before.counts
+            after.truth[MOTORS] = 0.0
+            self._runs_from = math.inf
+        elif command == SYSTEM_ON:
+            self._runs_from = min(self._runs_from, self.tick + _BOOT)
+        self._out.append(pack(Port.LINK, POWER_CHANNEL, bytes((POWER, command))))
 
     def inject(self, fault: VehicleFault) -> None:
         """Let something go wrong; its start counts from now."""
@@ -135,7 +160,11 @@ class VirtualCrazyflie:
             return
         port, channel, payload = packet[0] >> 4, packet[0] & 3, packet[1 : 1 + LARGEST_PAYLOAD]
         answer: bytes | None = None
-        if port == Port.LINK:
+        if (port, channel) == (Port.LINK, POWER_CHANNEL) and payload[:1] == bytes((POWER,)) and len(payload) > 1:
+            self._switch(payload[1])
+        elif self.tick < self._runs_from:
+            return
+        elif port == Port.LINK:
             answer = answer_link(channel, payload)
         elif port == Port.PLATFORM:
             answer = self._platform(channel, payload)
@@ -169,7 +198,8 @@ class VirtualCrazyflie:
         )
 
     def _send(self, port: Port, channel: int, payload: bytes) -> None:
-        self._out.append(pack(port, channel, payload))
+        if self.tick >= self._runs_from:
+            self._out.append(pack(port, channel, payload))
 
     def command(self) -> None:
         """Run the slower loops if they are due now: planner and log blocks at 100 Hz, supervisor at 25 Hz.

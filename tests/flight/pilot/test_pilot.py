@@ -18,7 +18,7 @@ def test_a_flight_goes_through_every_phase_in_order_and_ends_disarmed(world, fly
     assert outcome.exit_code is ExitCode.OK
     assert world.phases == list(Phase)
     assert world.calls[0] == "release"
-    assert world.calls[-3:-1] == ["disarm", "close"]
+    assert world.calls[-4:-1] == ["disarm", "close", "restart"]
     assert world.position[2] < 0.05
     assert world.motors_off_in_the_air == 0.0
 
@@ -35,7 +35,7 @@ def test_each_setpoint_is_sent_when_it_is_due(world, mission, fly):
 def test_motors_stop_by_stop_setpoints_on_the_floor_and_the_vehicle_counts_its_own_again(world, fly):
     fly()
     flown = world.calls[world.calls.index("arm") :]
-    assert flown == ["arm", "preflight logs off", "stop setpoint", "release", "disarm", "close", "close"]
+    assert flown == ["arm", "preflight logs off", "stop setpoint", "release", "disarm", "close", "restart", "close"]
 
 
 def test_stop_setpoints_that_the_radio_swallows_are_sent_again(world, fly):
@@ -385,15 +385,33 @@ def test_leaving_the_room_beyond_the_last_line_cuts(world, limits, fly):
     assert "fence" in outcome.reason
 
 
-def test_the_watchdog_of_the_vehicle_sleeps_unless_it_is_asked_for(world, fly):
-    fly()
+def test_the_watchdog_of_the_vehicle_sleeps_where_it_is_not_wanted(world, mission, fly):
+    fly(firmware=replace(mission.limits.firmware, watchdog=False))
     assert not world.signs_of_life
+    assert "restart" not in world.calls
 
 
-def test_the_watchdog_gets_ten_signs_of_life_a_second_from_take_off_to_landing(world, mission, fly):
-    watched = replace(mission.limits.firmware, watchdog=True)
-    outcome = fly(firmware=watched)
+def test_the_watchdog_gets_ten_signs_of_life_a_second_from_take_off_to_the_end_of_the_link(world, fly):
+    outcome = fly()
     phases = dict(outcome.phases)
-    assert min(world.signs_of_life) < phases[Phase.TAKE_OFF] + 0.5
+    assert phases[Phase.TAKE_OFF] <= min(world.signs_of_life) < phases[Phase.TAKE_OFF] + 0.5
     assert max(b - a for a, b in pairwise(world.signs_of_life)) < 0.15
-    assert max(world.signs_of_life) < phases[Phase.DISARM]
+    assert max(world.signs_of_life) > phases[Phase.DISARM] - 0.15
+
+
+def test_a_vehicle_whose_motors_were_cut_stays_locked(world, fly):
+    world.when(Phase.STREAM, 0.5, lambda: setattr(world.orders, "worst", Order.CUT))
+    assert fly().rung is Rung.CUT
+    assert "restart" not in world.calls
+
+
+def test_a_vehicle_that_never_took_off_is_not_restarted(world, fly):
+    world.can_fly = False
+    assert fly().exit_code is ExitCode.PREFLIGHT
+    assert "restart" not in world.calls
+
+
+def test_a_restart_that_fails_is_said_and_the_flight_counts(world, fly):
+    world.restarts = False
+    assert fly().exit_code is ExitCode.OK
+    assert "switch it off and on" in world.said

@@ -37,7 +37,7 @@ def test_the_roll_and_pitch_rates_that_are_sent_lean_against_the_motion(told):
     halfway = len(told.position) // 2
     straight = hover_to_hover((0.0, 0.0, 1.0), 0.0, (3.0, 0.0, 1.0), 0.0, 5.0, 100.0)
     roll, pitch, yaw = sent(straight).body_rate[halfway]
-    assert -0.6 <= pitch < -0.2
+    assert -1.2 <= pitch < -0.2
     assert abs(roll) < 0.01
     assert yaw == 0.0
 
