@@ -1,0 +1,48 @@
+"""The examples fly as they stand, on the virtual vehicle and the stepped clock."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import cfplan
+from cfplan.errors import ExitCode
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def example(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def vehicle(limits):
+    with cfplan.connect("sim://0", stepped=True, safety=limits, records=None) as connected:
+        yield connected
+    assert connected.outcome.exit_code is ExitCode.OK
+    assert connected.outcome.deviation.max < 0.15
+
+
+def test_a_moving_target_is_followed(vehicle):
+    accepted, distance = example("follow_a_target").fly(vehicle, 6.0)
+    assert accepted > 8
+    assert distance < 0.6
+
+
+def test_a_tour_of_random_waypoints_goes_on(vehicle):
+    accepted, _ = example("random_tour").fly(vehicle, 8.0)
+    assert accepted >= 3
+
+
+def test_a_gate_that_moves_is_flown_through(vehicle):
+    missed = example("race_a_moving_gate").fly(vehicle, 1)
+    assert max(missed) < 0.1
+
+
+def test_every_example_is_tested():
+    here = Path(__file__).read_text()
+    assert all(f'example("{file.stem}")' in here for file in EXAMPLES.glob("*.py"))
