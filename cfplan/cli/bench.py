@@ -92,6 +92,21 @@ def learned(**given: Any) -> None:
     _measure(learned_study, "planning", given)
 
 
+@study.command(epilog="Example: cfplan study proposals -o results/proposals.json")
+@_count(60, "Random paths at each speed.")
+@click.option("--box", default="4.5x8x2", show_default=True, help="4.5x8x2 or 10x10x10.")
+@click.option("--limits", default="simulation", show_default=True, help="hardware or simulation; the speed is varied.")
+@_seed(20_000)
+@_output
+@options.as_json
+def proposals(**given: Any) -> None:
+    """Refine what the network, the convex planner and the expert begin with to the same end: steps, time, failures."""
+    _use_one_thread()
+    from cfplan.studies.proposals import proposals as run
+
+    _measure(run, "planning", given)
+
+
 @study.command(epilog="Example: cfplan study scaling -o results/scaling.json")
 @click.option("--planner", default="expert", show_default=True)
 @click.option("--repeats", type=int, default=5, show_default=True, help="Paths of each size.")

@@ -103,9 +103,7 @@ def test_each_parameter_that_is_wrong_on_board_keeps_the_vehicle_on_the_floor(mi
     "rule", [rule for rule in PARAMETER_RULES if rule.action is Action.SET], ids=lambda rule: rule.name
 )
 def test_what_is_set_flies_whatever_it_was_before(mission, rule):
-    unwatched = replace(
-        LIMITS, firmware=replace(LIMITS.firmware, watchdog=False)
-    )
+    unwatched = replace(LIMITS, firmware=replace(LIMITS.firmware, watchdog=False))
     flown = Flown(replace(mission, limits=unwatched), stored={rule.name: wrong_on_board(rule, LIMITS)})
     assert flown.code is ExitCode.OK, flown.reason
     assert flown.lab.vehicle.parameters[rule.name] == pytest.approx(rule.value(LIMITS))

@@ -10,7 +10,7 @@ import pytest
 from cfplan.errors import InputError
 from cfplan.planners.solution import Solution, Status
 from cfplan.planning import planners
-from cfplan.studies import feasibility, scaling, trials
+from cfplan.studies import feasibility, proposals, scaling, trials
 from cfplan.studies.bench import bench
 from cfplan.studies.machine import this_machine
 from cfplan.studies.trials import quantiles, random_path
@@ -113,6 +113,16 @@ def test_feasibility_shares_its_paths_out_and_keeps_failures():
         assert group["unslowed"] + failed == group["paths"]
     titles, cells = groups.cells()
     assert all(len(row) == len(titles) for row in cells)
+
+
+def test_every_proposal_is_refined_to_the_experts_flight_and_the_networks_in_the_fewest_steps():
+    result = proposals.proposals(paths=2, speeds=(2.0,))
+    rows = {row["proposal"]: row for row in result.table("speeds").rows}
+    assert list(rows) == list(proposals.WAYS)
+    assert [row["failed"] for row in rows.values()] == [0] * len(rows)
+    assert max(row["slower_max"] for row in rows.values()) < 2e-3
+    assert rows["network"]["steps"] < min(rows["convex"]["steps"], rows["expert"]["steps"])
+    assert rows["network"]["steps"] < rows["network, multipliers not kept"]["steps"]
 
 
 def test_scaling_grows_the_path_with_the_grid():

@@ -5,7 +5,7 @@ A warm start: from a near-feasible profile the search of the expert's problem ta
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -59,11 +59,15 @@ def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WI
     return last
 
 
-def refinements(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WINDOW) -> Iterator[Solution]:
+def refinements(
+    task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WINDOW,
+    restarts: Callable[..., Sequence[Start]] = refining_restarts,
+) -> Iterator[Solution]:  # fmt: skip
     """Yield the refined profile, after each round in which limits exceeded between points are lowered.
 
     The first mostly passes the certificate. A path longer than `window` is planned window by window; its profile comes
     once, after all rounds. A failure comes alone. At the task's deadline what is not refined yet stays as given.
+    `restarts` gives the searches of those rounds, for a path that is not.
     """
     began = time.perf_counter()
     path, limits, nodes = task.path, task.limits, len(profile.s) - 1
@@ -82,7 +86,8 @@ def refinements(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize
     if isinstance(found, str):
         yield _solution(whole, found, began, task.deadline)
         return
-    for held in tighten(found.attempt, found.problem, whole, found.restarts, task.deadline):
+    starts = restarts(found.interval, capped=task.speed_caps is not None)
+    for held in tighten(found.attempt, found.problem, whole, starts, task.deadline):
         yield solution_of(whole, Joined(held.coefficients, (), held.iterations, held.rounds), began)
 
 
@@ -98,7 +103,7 @@ class _HeldAtPoints(NamedTuple):
 
     attempt: Attempt
     problem: Problem
-    restarts: Sequence[Start]
+    interval: float  # s that an interval takes, about
 
 
 def _hold_at_points(task: PlanningTask, segment: Segment, near: NDArray) -> _HeldAtPoints | str:
@@ -114,12 +119,12 @@ def _hold_at_points(task: PlanningTask, segment: Segment, near: NDArray) -> _Hel
     if rejection_reason(attempt, segment) and not task.deadline.passed:  # not near enough
         problem = build_problem(segment, angle)
         attempt = solve(problem, problem.coefficients, COLD_START, task.deadline)
-    restarts = refining_restarts(interval, capped=capped)
-    return rejection_reason(attempt, segment) or _HeldAtPoints(attempt, problem, restarts)
+    return rejection_reason(attempt, segment) or _HeldAtPoints(attempt, problem, interval)
 
 
 def _refine_window(task: PlanningTask, segment: Segment, near: NDArray) -> Tightened | str:
     found = _hold_at_points(task, segment, near)
     if isinstance(found, str):
         return found
-    return tighten_until_feasible(found.attempt, found.problem, segment, found.restarts, task.deadline)
+    restarts = refining_restarts(found.interval, capped=segment.caps is not None)
+    return tighten_until_feasible(found.attempt, found.problem, segment, restarts, task.deadline)
