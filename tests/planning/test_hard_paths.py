@@ -9,6 +9,7 @@ from cfplan.errors import InfeasibleError
 from cfplan.planning.plan import plan
 from cfplan.safety.space import Space
 
+SLOWED = 0.999  # by less, a plan hangs on the last digits of what the network proposes
 HALL = Space(low=(-200.0, -200.0, -200.0), high=(200.0, 200.0, 200.0), margin=0.1)
 
 
@@ -25,7 +26,7 @@ def test_the_plan_is_as_expected(case, limits):
     if expected in ("certified", "slowed"):
         made = plan_of(case, limits)
         assert made.certificate.passed
-        assert (made.repair_speed_factor < 1.0) == (expected == "slowed")
+        assert (made.repair_speed_factor < SLOWED) == (expected == "slowed")
     else:
         with pytest.raises(InfeasibleError, match=expected):
             plan_of(case, limits)
