@@ -42,7 +42,16 @@ def machine_code() -> dict[str, Any]:
 
 
 class Kernels(Protocol):
-    """The kernels at the points of a problem."""
+    """The kernels at the points of a problem; each call writes into the same arrays."""
+
+    coefficients: NDArray
+    """(k, P) of the points' intervals, from which both calls compute: to be filled in before."""
+    work: NDArray
+    """(derivative_rows(k), P), which differentiate() fills in.
+
+    It begins with gradients, k rows each: that of the penalty, and of rows · each of the terms but the first. Behind
+    them lies the Hessian of penalty + multipliers · rows, plus J'ΣJ: its lower triangle, column by column.
+    """
 
     def __init__(self, free_yaw: bool, data: NDArray, common: NDArray, weights: NDArray, spare: int) -> None:
         """Take `data`, (POINT_DATA, P), `common`, (COMMON_DATA,), and `weights`, (3,) those of the penalties.
@@ -50,21 +59,16 @@ class Kernels(Protocol):
         Arrays of constraints have `spare` more behind the rows of the points, of which the kernels know nothing.
         """
 
-    def evaluate(self, coefficients: NDArray) -> tuple[NDArray, NDArray]:
-        """Return (constraints, penalties (P,)) from the (k, P) coefficients: rows of all points, one after another."""
+    def evaluate(self) -> tuple[NDArray, NDArray]:
+        """Return (constraints, penalties (P,)), in arrays of their own: rows of all points, one after another."""
 
-    def differentiate(self, coefficients: NDArray, terms: NDArray, work: NDArray) -> NDArray:
-        """Return the Jacobian, (k ROWS, P), and fill in `work`, (derivative_rows(k), P); `terms` are barrier.TERMS.
-
-        The Jacobian has all rows by the first coefficient first. Work begins with gradients, k rows each: that of the
-        penalty, and of rows · each of the terms but the first. Behind them lies the Hessian of penalty + multipliers ·
-        rows, plus J'ΣJ: its lower triangle, column by column.
-        """
+    def differentiate(self, terms: NDArray) -> NDArray:
+        """Return the Jacobian, (k ROWS, P), all rows by the first coefficient first; `terms` are barrier.TERMS."""
 
 
-def derivative_rows(k: int) -> int:
-    """Return how many rows of work differentiate() fills in, by k coefficients an interval."""
-    return len(TERMS) * k + k * (k + 1) // 2
+def _work(k: int, points: int) -> NDArray:
+    """Return the array that differentiate() fills in, by k coefficients an interval."""
+    return np.empty((len(TERMS) * k + k * (k + 1) // 2, points))
 
 
 class CompiledKernels:
@@ -73,24 +77,25 @@ class CompiledKernels:
     def __init__(self, free_yaw: bool, data: NDArray, common: NDArray, weights: NDArray, spare: int) -> None:
         self._k, self._points, self._spare = variables(free_yaw), data.shape[1], spare
         self._values, self._derivatives = (machine_code()[f"{family(free_yaw)}_{title}"] for title in _TITLES)
+        self.coefficients, self.work = np.empty((self._k, self._points)), _work(self._k, self._points)
+        self._jacobian = np.empty((ROWS * self._k, self._points))
         self._given = [np.array(each, dtype=float, order="C") for each in (data, common, weights)]  # kept alive
-        self._addresses = tuple(_address(each) for each in self._given)
+        self._inputs = tuple(_address(each) for each in (self.coefficients, *self._given))
+        at = _address(self.work)
+        self._outputs = _address(self._jacobian), at, at + 8 * len(TERMS) * self._k * self._points
 
-    def evaluate(self, coefficients: NDArray) -> tuple[NDArray, NDArray]:
+    def evaluate(self) -> tuple[NDArray, NDArray]:
         rows = ROWS * self._points + self._spare
         result = np.empty(rows + self._points)
         at = _address(result)
-        self._values(self._points, _address(coefficients), *self._addresses, at, at + 8 * rows)
+        self._values(self._points, *self._inputs, at, at + 8 * rows)
         return result[:rows], result[rows:]
 
-    def differentiate(self, coefficients: NDArray, terms: NDArray, work: NDArray) -> NDArray:
-        jacobian = np.empty((ROWS * self._k, self._points))
-        at, first, row = _address(work), _address(terms), 8 * terms.shape[1]
-        self._derivatives(
-            self._points, _address(coefficients), *self._addresses, *(first + kind * row for kind in range(len(terms))),
-            _address(jacobian), at, at + 8 * len(terms) * self._k * self._points,
-        )  # fmt: skip
-        return jacobian
+    def differentiate(self, terms: NDArray) -> NDArray:
+        first, row = _address(terms), 8 * terms.shape[1]
+        by_kind = (first + kind * row for kind in range(len(terms)))
+        self._derivatives(self._points, *self._inputs, *by_kind, *self._outputs)
+        return self._jacobian
 
 
 def _address(array: NDArray) -> int:
@@ -106,16 +111,18 @@ class InterpretedKernels:
 
         points, self._spare = data.shape[1], spare
         self._values, self._derivatives = (kernel.map(points) for kernel in point_kernels(free_yaw))
+        k = variables(free_yaw)
+        self.coefficients, self.work = np.empty((k, points)), _work(k, points)
         self._given = data, *(np.tile(each[:, None], points) for each in (common, weights))
 
-    def evaluate(self, coefficients: NDArray) -> tuple[NDArray, NDArray]:
-        rows, penalty = (np.array(each) for each in self._values(coefficients, *self._given))
+    def evaluate(self) -> tuple[NDArray, NDArray]:
+        rows, penalty = (np.array(each) for each in self._values(self.coefficients, *self._given))
         return np.append(rows, np.empty(self._spare)), penalty[0]
 
-    def differentiate(self, coefficients: NDArray, terms: NDArray, work: NDArray) -> NDArray:
-        at_points = terms[:, : ROWS * coefficients.shape[1]].reshape(len(terms), ROWS, -1)
-        jacobian, gradients, hessian = self._derivatives(coefficients, *self._given, *at_points)
-        work[: gradients.shape[0]], work[gradients.shape[0] :] = np.array(gradients), np.array(hessian)
+    def differentiate(self, terms: NDArray) -> NDArray:
+        at_points = terms[:, : ROWS * self.coefficients.shape[1]].reshape(len(terms), ROWS, -1)
+        jacobian, gradients, hessian = self._derivatives(self.coefficients, *self._given, *at_points)
+        self.work[: gradients.shape[0]], self.work[gradients.shape[0] :] = np.array(gradients), np.array(hessian)
         return np.array(jacobian)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
-from cfplan.planners.expert.kernel import Kernels, derivative_rows, kernels_at_hand
+from cfplan.planners.expert.kernel import Kernels, kernels_at_hand
 from cfplan.planners.expert.layout import variables_of
 from cfplan.planners.expert.problem import FLOOR, Problem
 from cfplan.planners.solver.barrier import bounds_of
@@ -41,10 +41,7 @@ class SplineProgram:
             problem.layout.shape.free_yaw, problem.point_data, problem.common, OBJECTIVE_SCALE * problem.penalties,
             self._linear,
         )  # fmt: skip
-        # Within one call of evaluate() or linearise():
-        self._local = np.empty(it.local.shape)
-        self._at_points = np.empty((len(it.local), problem.point_data.shape[1]))
-        self._work = np.empty((derivative_rows(len(it.local)), problem.point_data.shape[1]))
+        self._local = np.empty(it.local.shape)  # within one call of evaluate() or linearise()
         self._scale = OBJECTIVE_SCALE * math.sqrt(problem.step**2 / problem.unit)  # of time in node units
         self.rows = point_constraints.ROWS
         self.bounds = self._bounds(problem)
@@ -76,17 +73,17 @@ class SplineProgram:
     def evaluate(self, v: NDArray) -> Values:
         """Return f and g at v."""
         it = self._variables.sparsity
-        _gather(v, it.slots, it.runs, self._fixed_local, self._local, self._at_points)
-        constraints, penalty = self._kernels.evaluate(self._at_points)
+        _gather(v, it.slots, it.runs, self._fixed_local, self._local, self._kernels.coefficients)
+        constraints, penalty = self._kernels.evaluate()
         return Values(_complete(constraints, penalty, self._local, it, self._scale), constraints)
 
     def linearise(self, v: NDArray, terms: NDArray) -> Linearisation:
-        """Return the derivatives at v, where the constraints have these barrier.TERMS."""
-        it = self._variables
-        _gather(v, it.sparsity.slots, it.sparsity.runs, self._fixed_local, self._local, self._at_points)
-        jacobian = self._kernels.differentiate(self._at_points, terms, self._work)
+        """Return the derivatives at v, where the constraints have these barrier.TERMS; jvp holds until the next."""
+        it, kernels = self._variables, self._kernels
+        _gather(v, it.sparsity.slots, it.sparsity.runs, self._fixed_local, self._local, kernels.coefficients)
+        jacobian = kernels.differentiate(terms)
         gradients, matrix = np.zeros((len(terms), it.size)), np.zeros((it.size, it.band + 1))
-        _assemble(self._work, it.sparsity, terms, self._local, self._scale, gradients, matrix)
+        _assemble(kernels.work, it.sparsity, terms, self._local, self._scale, gradients, matrix)
         return Linearisation(gradients, matrix, partial(_jvp, jacobian, it.sparsity))
 
 
