@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
 from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, propose
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight, check_bytes, encode_trajectory
-from cfplan.flight.setpoints.stop_certificate import certify_stops
-from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.flight.setpoints.stop_certificate import encode_certified_stops
 from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, min_snap
 from cfplan.planning.continuation import NoWayError, check_waypoints, continue_plan
@@ -26,8 +25,8 @@ from cfplan.planning.plan_result import Plan
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import dry_run
-from cfplan.simulation.glitches import glitch_at_every_setpoint
-from cfplan.simulation.link_loss import as_believed, link_loss_at_every_setpoint
+from cfplan.simulation.glitches import glitch_at_sampled_setpoints
+from cfplan.simulation.link_loss import as_believed, link_loss_near_walls
 from cfplan.vehicle.hover import hover_at
 from cfplan.vehicle.joint import JoinedTrajectory
 
@@ -275,13 +274,12 @@ def certified(
     believed = None if starts is None else as_believed(starts, limits)
 
     def stop_everywhere() -> NDArray:
-        stops = encode_stops(encoded.motion, RATE, gains=encoded.gains, space=encoded.space)
-        certified = certify_stops(stops, encoded.motion, limits, RATE, gains=encoded.gains, space=encoded.space)
-        certified.require(limits)
+        stops, passed = encode_certified_stops(encoded.motion, limits, RATE, encoded.gains, encoded.space)
+        passed.require(limits)
         return stops
 
     def lose_link() -> NDArray:
-        lost = link_loss_at_every_setpoint(encoded.payloads, limits, starts=starts)
+        lost = link_loss_near_walls(encoded.payloads, limits, 0.0, starts=starts)
         if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
             raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
         if not limits.link_loss.only_warn:
@@ -292,7 +290,7 @@ def certified(
         return lost.snapshots
 
     def meet_gaps() -> None:
-        glitches = glitch_at_every_setpoint(encoded.payloads, limits, start=believed)
+        glitches = glitch_at_sampled_setpoints(encoded.payloads, limits, start=believed)
         if glitches.lost.any():
             raise EndsBadlyError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
 

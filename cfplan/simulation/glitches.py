@@ -83,17 +83,22 @@ def glitch_at_every_setpoint(
     return _moments(_simulate(payloads, limits, _as_sampled(len(payloads), limits), rate, gap, start), limits, rate)
 
 
-def glitch_at_sampled_setpoints(payloads: NDArray, limits: Limits, rate: float = RATE) -> GlitchMoments:
-    """Let a gap begin at every tenth setpoint of a flight, and at each where one of these nearly loses the vehicle."""
+def glitch_at_sampled_setpoints(
+    payloads: NDArray, limits: Limits, rate: float = RATE, *, start: NDArray | None = None
+) -> GlitchMoments:
+    """Let a gap begin at every tenth setpoint of a flight, and at each where one of these nearly loses the vehicle.
+
+    Arguments as for glitch_at_every_setpoint.
+    """
     whole = _as_sampled(len(payloads), limits)
     first = np.where(_every(len(payloads), SAMPLED_EVERY), whole.max(), 0)
-    found = _simulate(payloads, limits, first, rate)
+    found = _simulate(payloads, limits, first, rate, start=start)
     moments = _moments(found, limits, rate)
     share = np.fmax(moments.deviation / limits.flight.deviation.cut, moments.tilt / TURNED_OVER).max(axis=0)
     share[moments.lost.any(axis=0)] = np.inf
     kinds = np.where((first == 0) & ~(share < min(NEARLY, share.max() - _NEAR_WORST)), whole, 0)
     if kinds.any():
-        more = _simulate(payloads, limits, kinds, rate)
+        more = _simulate(payloads, limits, kinds, rate, start=start)
         for kind in range(len(KINDS)):
             found.gaps[:, kind, kinds > kind] = more.gaps[:, kind, kinds > kind]
             found.simulated[kind, kinds > kind] = True

@@ -161,3 +161,8 @@ def rotations_of(vectors: NDArray) -> NDArray:
         out[n, 0, 2], out[n, 2, 0] = versine * x * z + sine * y, versine * x * z - sine * y
         out[n, 1, 2], out[n, 2, 1] = versine * y * z - sine * x, versine * y * z + sine * x
     return out
+
+
+def norms(vectors: NDArray) -> NDArray:
+    """Return (...) the lengths of vectors (..., K), several times as fast as numpy's norm where K is small."""
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))

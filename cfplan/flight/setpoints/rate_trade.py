@@ -35,7 +35,7 @@ from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.machine_code import njit
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import heading_of, matrices_of, product, yaw_of
+from cfplan.vehicle.rotations import heading_of, matrices_of, norms, product, yaw_of
 
 BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ahead of the setpoint
 SPEED_LEFT = 0.41  # share of the velocity that is left when the firmware begins to level out
@@ -119,11 +119,11 @@ def harmless_rates(
     left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
     wanted = off_low - off_high - BRAKING * speed_left
     pull = np.stack([np.sum(wanted * forward, axis=1), np.sum(wanted * left, axis=1)], axis=1)
-    size = np.maximum(np.linalg.norm(pull, axis=1), 1e-12)
+    size = np.maximum(norms(pull), 1e-12)
     rate = np.minimum(gains.full_rate * np.sin(np.arctan2(size, GRAVITY)), BRAKE_RATE_MAX)
     good = (rate / size)[:, None] * np.stack([-pull[:, 1], pull[:, 0]], axis=1)
     traded = motion.body_rate[:, :2] - good
-    size = np.linalg.norm(traded, axis=1)
+    size = norms(traded)
     up = matrices_of(motion.quaternion)[:, 2]  # the vertical in body axes
     aside = np.sum(up[:, :2] * np.stack([traded[:, 1], -traded[:, 0]], axis=1), axis=1) / np.maximum(size, 1e-12)
     upright = np.arctan2(aside, up[:, 2])  # the turn after which the axis leans least, by acos(reached)
@@ -135,7 +135,7 @@ def harmless_rates(
 
 def turns_for(rate: NDArray, gains: AttitudeGains = FIRMWARE_GAINS) -> NDArray:
     """Return the rotation vectors φ, (N, 3) rad in body axes, that make up for roll and pitch rates, (N, 2) rad/s."""
-    size = np.linalg.norm(rate, axis=1)
+    size = norms(rate)
     angle = np.arcsin(np.minimum(size / gains.full_rate, 1.0))
     share = np.where(size > 0.0, angle / np.where(size > 0.0, size, 1.0), 0.0)
     return np.concatenate([rate * share[:, None], np.zeros((len(rate), 1))], axis=1)

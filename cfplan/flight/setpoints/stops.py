@@ -25,7 +25,7 @@ from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains, ahead
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import about_z, quaternions_of, yaw_of
+from cfplan.vehicle.rotations import about_z, norms, quaternions_of, yaw_of
 
 DURATION = 1.2  # s, from full speed to rest: 3.1 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
@@ -94,7 +94,7 @@ def stop_motion(
     body_rate = _ahead(_turn_rates(attitude.reshape(len(begin), steps + 1, 4), rate), rate_lead * rate)
     body_rate[:, -1] = 0.0  # the vehicle may be left with the last setpoint
     force = acceleration + _GRAVITY
-    thrust = np.linalg.norm(force, axis=2, keepdims=True)
+    thrust = norms(force)[..., None]
     sent = _ahead(thrust, thrust_lead * rate) / thrust * force - _GRAVITY
     stops = FullStateSetpoints(
         position=at(motion.position).reshape(-1, 3),
@@ -123,6 +123,6 @@ def _turn_rates(quaternion: NDArray, rate: float) -> NDArray:
     v0, w0, v1, w1 = before[..., :3], before[..., 3:], after[..., :3], after[..., 3:]
     vector = w0 * v1 - w1 * v0 - np.cross(v0, v1)
     scalar = w0 * w1 + np.sum(v0 * v1, axis=-1, keepdims=True)
-    sine = np.linalg.norm(vector, axis=-1, keepdims=True)
+    sine = norms(vector)[..., None]
     angle = 2.0 * np.arctan2(sine, np.abs(scalar)) * np.sign(np.where(scalar == 0.0, 1.0, scalar))
     return vector / np.maximum(sine, 1e-12) * angle * rate / periods[:, None]
