@@ -39,6 +39,7 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
 
         from cfplan.errors import CfplanError
         from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
+        from cfplan.flight.setpoints.rate_trade import gains_under
         from cfplan.flight.setpoints.stops import encode_stops
         from cfplan.geometry.min_snap import min_snap
         from cfplan.planning.plan import plan
@@ -53,7 +54,7 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         with suppress(CfplanError):  # there may be no model for this vehicle
             plan(path, limits.airframe, limits, planner="learned", nodes=NODES)
         planned = plan(path, limits.airframe, limits, planner="expert", nodes=NODES)  # exceeds limits between nodes
-        encoded = encode_trajectory(planned.trajectory, space=limits.space)
+        encoded = encode_trajectory(planned.trajectory, gains=gains_under(limits), space=limits.space)
         begin, first = encoded.payloads[:2], np.array([0])
         lost = link_loss_near_walls(begin, limits, 0.0)
         stop = encode_stops(encoded.motion, RATE, rows=first, gains=encoded.gains, space=encoded.space)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
-from cfplan.flight.setpoints.rate_trade import BRAKE_RATE_MAX
 from cfplan.flight.setpoints.stops import DURATION, encode_stops
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss
 from cfplan.safety.limits import Limits
@@ -35,7 +34,6 @@ _LEAST_REACH = 1e-3  # m
 STOPS_EVERY, STOPS_EACH = 10, 12  # setpoints between sampled stops, and within them
 GRIDS = ((STOPS_EVERY, STOPS_EACH, 0.18), (3, 4, 0.1), (1, 2, 0.0))
 """The same on denser grids, of which each is used about what came within so many m of a wall on the one before."""
-_HARMLESS = BRAKE_RATE_MAX + 1e-3  # rad/s
 
 
 def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MARGIN) -> Assessment:
@@ -121,7 +119,7 @@ def _sample(
     beyond = np.where(np.isnan(beyond), np.inf, beyond)
 
     rates = decode(stops.reshape(-1, PAYLOAD_SIZE)).body_rate[:, :2]
-    harmful = (np.linalg.norm(rates, axis=1) > _HARMLESS).reshape(forks.shape)
+    harmful = (np.linalg.norm(rates, axis=1) > encoded.gains.level_out.rate_max + 1e-3).reshape(forks.shape)
     near = np.full(asked.shape, -np.inf)
     near[asked] = np.where(np.isnan(seen.beyond), np.inf, seen.beyond)
     near[begin] = np.where(harmful, np.inf, near[begin])

@@ -8,6 +8,7 @@ from typing import Any
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InputError
 from cfplan.flight.setpoints.encoding import encode_trajectory
+from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.path_file import load_path_file
 from cfplan.machine_code import compile_from_here, interprets
 from cfplan.planners.baselines.convex import lower_bound
@@ -148,7 +149,7 @@ def give_way(
     compile_from_here()  # without, simulating takes minutes
 
     def assess(trajectory: Trajectory) -> list[Assessment]:
-        encoded = encode_trajectory(trajectory, space=limits.space)
+        encoded = encode_trajectory(trajectory, gains=gains_under(limits), space=limits.space)
         if limits.link_loss.only_warn:
             return [assess_glitches(encoded, limits)]
         with ThreadPoolExecutor() as pool:

@@ -14,6 +14,7 @@ import numpy as np
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.pilot.mission import Mission, mission_of
 from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import StopCertificate, certify_stops
 from cfplan.machine_code import compile_from_here
 from cfplan.planning.plan_result import Plan
@@ -90,7 +91,10 @@ def encode_flight(planned: PlannedFlight, on_step: OnStep = ignore_steps, *, str
             )
     with step(on_step, "bytes") as results:
         encoded = encode_trajectory(
-            plan.trajectory, hold=max(HOLD, stream_for - plan.trajectory.duration), space=planned.limits.space
+            plan.trajectory,
+            hold=max(HOLD, stream_for - plan.trajectory.duration),
+            gains=gains_under(planned.limits),
+            space=planned.limits.space,
         )
         check_bytes(encoded, plan.trajectory, planned.limits.plan)
         results.append(f"{len(encoded.payloads)} setpoints")

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
 from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, propose
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import encode_certified_stops
 from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, min_snap
@@ -270,7 +271,7 @@ def certified(
 
     All of it is checked like a plan before take-off. Raises EndsBadlyError or NotCertifiedError where it does not pass.
     """
-    encoded = encode_trajectory(flown, space=limits.space)
+    encoded = encode_trajectory(flown, gains=gains_under(limits), space=limits.space)
     believed = None if starts is None else as_believed(starts, limits)
 
     def stop_everywhere() -> NDArray:

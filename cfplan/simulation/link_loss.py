@@ -24,7 +24,7 @@ from cfplan.flight.firmware import Timeouts, gains_for
 from cfplan.flight.setpoints.encoding import RATE, encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, decode
-from cfplan.flight.setpoints.rate_trade import ahead
+from cfplan.flight.setpoints.rate_trade import ahead, gains_under
 from cfplan.flight.telemetry import Triple
 from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
@@ -265,7 +265,7 @@ def link_loss_of_transfer(
     Places in m, yaw in rad, `duration` in s; the first and the last setpoint are those of a hover.
     """
     motion = hover_to_hover(begin, yaw, end, end_yaw, duration, rate)
-    payloads = encode_motion(motion, ahead(motion.acceleration, rate), space=limits.space)
+    payloads = encode_motion(motion, ahead(motion.acceleration, rate), gains_under(limits), space=limits.space)
     return link_loss_at_every_setpoint(payloads, limits, rate)
 
 

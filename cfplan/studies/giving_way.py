@@ -17,6 +17,7 @@ import numpy as np
 from cfplan.errors import CfplanError, InfeasibleError
 from cfplan.flight.setpoints.encoding import EncodedFlight, command_quaternion, encode_trajectory
 from cfplan.flight.setpoints.packets import encode
+from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.path_file import load_path_file
@@ -101,12 +102,12 @@ def _trial(
     name: str, path: Path, yaw: YawMode, yaw_angle: float, limits: Limits, lags: Sequence[float]
 ) -> dict[str, Any]:
     planned = plan(path, limits.airframe, limits, yaw=yaw, yaw_angle=yaw_angle)
-    before = encode_trajectory(planned.trajectory, space=limits.space)
+    before = encode_trajectory(planned.trajectory, gains=gains_under(limits), space=limits.space)
     refused, after = "", before
     slowed = planned
     try:
         slowed, _ = give_way(planned)
-        after = encode_trajectory(slowed.trajectory, space=limits.space)
+        after = encode_trajectory(slowed.trajectory, gains=gains_under(limits), space=limits.space)
     except InfeasibleError as error:
         refused = str(error)
     before_beyond = _beyond(before, limits, lags)

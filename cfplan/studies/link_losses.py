@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.encoding import EncodedFlight, command_quaternion, motion_at
 from cfplan.flight.setpoints.packets import encode
-from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.link_loss import link_loss_at_every_setpoint, simulate_link_loss
+from cfplan.simulation.link_loss import LinkLoss, link_loss_at_every_setpoint, simulate_link_loss
 from cfplan.studies.result import Column, StudyResult, Table, collect
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -64,10 +64,7 @@ def _row(path_file: Path, safety_file: Path, speed: float) -> dict[str, Any]:
     planned = plan_flight(path_file, limits, FlightOptions(speed_factor=speed))
     encoded = encode_flight(planned)
     as_rates = link_loss_at_every_setpoint(_with_rates(encoded, planned.plan.trajectory), limits)
-    watched, alone = (
-        simulate_link_loss(encoded.payloads, replace(limits, firmware=replace(limits.firmware, watchdog=watchdog)))
-        for watchdog in (True, False)
-    )
+    watched, alone = (_lost(planned, watchdog) for watchdog in (True, False))
     return {
         "path": path_file.stem,
         "speed_factor": speed,
@@ -78,6 +75,12 @@ def _row(path_file: Path, safety_file: Path, speed: float) -> dict[str, Any]:
         "alone_distance": alone.distance,
         "alone_beyond": alone.beyond,
     }
+
+
+def _lost(planned: PlannedFlight, watchdog: bool) -> LinkLoss:
+    """Return the worst moment to lose the link of a flight, with setpoints for this."""
+    limits = replace(planned.limits, firmware=replace(planned.limits.firmware, watchdog=watchdog))
+    return simulate_link_loss(encode_flight(replace(planned, limits=limits)).payloads, limits)
 
 
 def _with_rates(encoded: EncodedFlight, trajectory: Trajectory) -> NDArray:

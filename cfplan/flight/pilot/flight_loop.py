@@ -30,6 +30,7 @@ from cfplan.flight.radio.link import Link
 from cfplan.flight.setpoints.commitment import Commitment, splice
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
+from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import Estimate, Level, PlanCommitted, PoseReceived, Triple
 from cfplan.vehicle.rotations import yaw_of
 
@@ -221,7 +222,7 @@ class FlightLoop:
         y = min(max(y + _BRAKES_IN * velocity[1], space.low[1] + inside), space.high[1] - inside)
         place, rate = (x, y, min(z, space.high[2] - inside)), self.mission.rate
         motion = hover_to_hover(place, yaw, place, yaw, 1.0 / rate, rate)
-        self.begin(Stream(encode_motion(motion, motion.acceleration, space=space), rate))
+        self.begin(Stream(encode_motion(motion, motion.acceleration, gains_under(self.limits), space=space), rate))
         self.left_alone = not heard
         return heard
 

@@ -114,8 +114,8 @@ class Landing:
     def _sink(self, begin: tuple[Triple, Triple, float], pace: Pace, lowest: float) -> None:
         """Send a descent from a position, m, velocity, m/s, and yaw, rad, to a height, m."""
         loop, (position, velocity, yaw) = self._loop, begin
-        rate, space = loop.mission.rate, loop.limits.space
-        loop.begin(Stream(descent(position, yaw, -velocity[2], pace, self._floor, lowest, space, rate), rate))
+        sinks = descent(position, yaw, -velocity[2], pace, self._floor, lowest, loop.limits, loop.mission.rate)
+        loop.begin(Stream(sinks, loop.mission.rate))
 
     def _sunk(self) -> bool:
         stream = self._loop.stream

@@ -25,7 +25,7 @@ from cfplan.flight.radio.link import Link
 from cfplan.flight.radio.supervisor_bits import ARMED, CAN_FLY, FAULTS, FLYING, LOCKED
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
-from cfplan.flight.setpoints.rate_trade import ahead
+from cfplan.flight.setpoints.rate_trade import ahead, gains_under
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Level, Phase, Telemetry, Triple
 from cfplan.vehicle.rotations import yaw_of
@@ -167,10 +167,12 @@ class Pilot:
         """Return setpoints from hover to hover, with a way to stop from each."""
         rate = self._mission.rate
         motion = hover_to_hover(begin, yaw, end, end_yaw, duration, rate)
-        space = self._limits.space
-        payloads = encode_motion(motion, ahead(motion.acceleration, rate), space=space)
+        gains, space = gains_under(self._limits), self._limits.space
+        payloads = encode_motion(motion, ahead(motion.acceleration, rate), gains, space=space)
         return Stream(
-            payloads, rate, stop_from=lambda row: encode_stops(motion, rate, rows=np.array([row]), space=space)[0]
+            payloads,
+            rate,
+            stop_from=lambda row: encode_stops(motion, rate, rows=np.array([row]), gains=gains, space=space)[0],
         )
 
     def _go_to_start(self) -> None:

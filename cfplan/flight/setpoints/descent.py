@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
+from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import Triple
-from cfplan.safety.space import Space
+from cfplan.safety.limits import Limits
 from cfplan.vehicle.rotations import about_z
 
 _QUICK = 3.0  # m/s²: thrust stays above half of gravity, below which a vehicle counts as tumbling
@@ -45,7 +46,7 @@ QUICK = Pace(2.0, acceleration=_QUICK, touch_speed=0.6, slow_above=0.1)
 
 
 def descent(
-    begin: Triple, yaw: float, speed_now: float, pace: Pace, floor: float, lowest: float, space: Space, rate: float
+    begin: Triple, yaw: float, speed_now: float, pace: Pace, floor: float, lowest: float, limits: Limits, rate: float
 ) -> NDArray:
     """Return payloads, (N, 29) uint8 at `rate`, Hz, straight down from `begin`, m, to the height `lowest`, m.
 
@@ -63,7 +64,8 @@ def descent(
     change[:-2, 2] = -np.diff(speeds) * rate
     still = np.zeros((count, 3))
     level = np.tile(about_z(yaw), (count, 1))
-    return encode_motion(FullStateSetpoints(position, velocity, change, level, still), still, space=space)
+    motion = FullStateSetpoints(position, velocity, change, level, still)
+    return encode_motion(motion, still, gains_under(limits), space=limits.space)
 
 
 def sinking(payloads: NDArray, lowest: float, speed: float, rate: float) -> NDArray:

@@ -12,8 +12,8 @@ This matters once setpoints stop: the firmware then wants a level attitude, yet 
 settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25°. So the rates that are sent are only those with
 which that tilt does good: it brakes what speed will be left, v_left = 0.41 v + 0.089 s · a(t + 0.15 s), horizontally,
 as the vehicle first holds its last place for half a second; and within 1.5 m of a wall it leans away from that wall,
-the more the nearer, so that an attitude that the vehicle has wrong does not carry it there. How much is chosen for a
-vehicle whose watchdog stops the motors half a second later; without it they run three times as long.
+the more the nearer, so that an attitude that the vehicle has wrong does not carry it there. How much depends on how
+long level-out lasts until the motors stop (LevelOut).
 
 Two bounds leave more of the rate as a rate: φ grows to 90° as |Δ| nears 7 rad/s, so at most TRADED_RATE_MAX is traded;
 and z(q') may not lean beyond LEAN_MAX, where little of the thrust carries the vehicle and the controller's heading is
@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from cfplan.flight.firmware import MellingerGains
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.machine_code import njit
+from cfplan.safety.limits import Limits
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import heading_of, matrices_of, norms, product, yaw_of
@@ -40,11 +41,8 @@ from cfplan.vehicle.rotations import heading_of, matrices_of, norms, product, ya
 BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ahead of the setpoint
 SPEED_LEFT = 0.41  # share of the velocity that is left when the firmware begins to level out
 SPEED_GAINED = 0.089  # s, speed gained until then for each m/s² of acceleration
-BRAKING = 2.0  # 1/s, deceleration by level-out over the speed left: to nothing in the half second of the watchdog
-BRAKE_RATE_MAX = 1.2  # rad/s; 10° of tilt, for half a second
 WALL_LEAD = 0.3  # s by which the place that tells how near a wall will be is ahead of the setpoint
 WALL_REACH = 1.5  # m from a wall, within which level-out leans away from it
-WALL_STIFFNESS = 0.2  # 1/s², acceleration away from a wall for each m nearer than that
 WALL_PULL_MAX = 0.45  # m/s²; 2.6° of tilt
 TRADED_RATE_MAX = 4.5  # rad/s; what exceeds it is sent as a rate, as φ grows to 90° at 7 rad/s
 LEAN_MAX = math.radians(65.0)  # of the thrust that is sent; plans under the shipped limits reach 45°
@@ -55,11 +53,25 @@ _ROWS_AHEAD = 2  # of 10 ms, that rates are sent ahead
 
 
 @dataclass(frozen=True, slots=True)
+class LevelOut:
+    """What level-out is to do, by how long it lasts until the motors stop."""
+
+    braking: float  # 1/s, deceleration over the speed left
+    rate_max: float  # rad/s, of the rates that are sent for it
+    wall_stiffness: float  # 1/s², acceleration away from a wall for each m nearer than WALL_REACH
+
+
+UNTIL_WATCHDOG = LevelOut(braking=2.0, rate_max=1.2, wall_stiffness=0.2)  # half a second, at up to 10° of tilt
+UNTIL_TIMEOUT = LevelOut(braking=1.0, rate_max=0.6, wall_stiffness=0.35)  # 1.5 s, at up to 5°
+
+
+@dataclass(frozen=True, slots=True)
 class AttitudeGains:
-    """The firmware's gains that the trade rests on, by their names in the group ctrlMel, with its defaults."""
+    """What of the firmware the trade rests on: gains by their names in the group ctrlMel, with its defaults."""
 
     kR_xy: float = MellingerGains().kR_xy
     kw_xy: float = MellingerGains().kw_xy
+    level_out: LevelOut = UNTIL_WATCHDOG
 
     @property
     def full_rate(self) -> float:
@@ -68,6 +80,13 @@ class AttitudeGains:
 
 
 FIRMWARE_GAINS = AttitudeGains()
+
+
+def gains_under(limits: Limits) -> AttitudeGains:
+    """Return the firmware's gains, with level-out as long as safety.yaml lets it last."""
+    return replace(FIRMWARE_GAINS, level_out=UNTIL_WATCHDOG if limits.firmware.watchdog else UNTIL_TIMEOUT)
+
+
 GAIN_TOLERANCE = 0.05
 """Share by which 2 kR / kw of a vehicle may differ from that of the packets; 10 % makes deviations of up to 3.1 cm."""
 
@@ -93,6 +112,7 @@ def trade_rates(
         np.array(motion.body_rate, dtype=float),
         _walls(space),
         gains.full_rate,
+        np.array([gains.level_out.braking, gains.level_out.rate_max, gains.level_out.wall_stiffness]),
     )
     return replace(motion, acceleration=acceleration, quaternion=quaternion, body_rate=rate)
 
@@ -110,17 +130,17 @@ def harmless_rates(
     low, high = _walls(space)
     place = motion.position[:, :2] + WALL_LEAD * motion.velocity[:, :2]
     off_low, off_high = (
-        np.minimum(WALL_STIFFNESS * np.maximum(WALL_REACH - far, 0.0), WALL_PULL_MAX)
+        np.minimum(gains.level_out.wall_stiffness * np.maximum(WALL_REACH - far, 0.0), WALL_PULL_MAX)
         for far in (place - low, high - place)
     )
     speed_left = SPEED_LEFT * motion.velocity[:, :2] + SPEED_GAINED * acceleration_ahead[:, :2]
     yaw = yaw_of(motion.quaternion.T)
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
-    wanted = off_low - off_high - BRAKING * speed_left
+    wanted = off_low - off_high - gains.level_out.braking * speed_left
     pull = np.stack([np.sum(wanted * forward, axis=1), np.sum(wanted * left, axis=1)], axis=1)
     size = np.maximum(norms(pull), 1e-12)
-    rate = np.minimum(gains.full_rate * np.sin(np.arctan2(size, GRAVITY)), BRAKE_RATE_MAX)
+    rate = np.minimum(gains.full_rate * np.sin(np.arctan2(size, GRAVITY)), gains.level_out.rate_max)
     good = (rate / size)[:, None] * np.stack([-pull[:, 1], pull[:, 0]], axis=1)
     traded = motion.body_rate[:, :2] - good
     size = norms(traded)
@@ -205,12 +225,15 @@ def _traded(
     body_rate: NDArray,
     walls: NDArray,
     full_rate: float,
+    level_out: NDArray,
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return what trade_rates gives: body rates (N, 3), attitudes (N, 4) and accelerations (N, 3)."""
     rates, attitudes, accelerations = body_rate.copy(), np.empty_like(quaternion), np.empty_like(acceleration)
     for n in range(len(velocity)):
         wx, wy = body_rate[n, 0], body_rate[n, 1]
-        good_x, good_y = _good_rate(position[n], velocity[n], acceleration_ahead[n], quaternion[n], walls, full_rate)
+        good_x, good_y = _good_rate(
+            position[n], velocity[n], acceleration_ahead[n], quaternion[n], walls, full_rate, level_out
+        )
         dx, dy = wx - good_x, wy - good_y
         size = math.sqrt(dx * dx + dy * dy)
         most = min(TRADED_RATE_MAX, _most_by_lean(quaternion[n], dx, dy, size, full_rate))
@@ -261,26 +284,28 @@ def _good_rate(
     quaternion: NDArray,
     walls: NDArray,
     full_rate: float,
+    level_out: NDArray,
 ) -> tuple[float, float]:
     """Return the roll and pitch rates, rad/s, at which level-out brakes the speed left and leans away from walls."""
+    braking, rate_max, stiffness = level_out
     x, y = heading_of(quaternion)
     size = math.sqrt(x * x + y * y)
     cos, sin = (x / size, y / size) if size > 0.0 else (1.0, 0.0)
-    pull_x = -BRAKING * (SPEED_LEFT * velocity[0] + SPEED_GAINED * acceleration_ahead[0])
-    pull_y = -BRAKING * (SPEED_LEFT * velocity[1] + SPEED_GAINED * acceleration_ahead[1])
-    pull_x += _pull_off(position[0] + WALL_LEAD * velocity[0], walls[0, 0], walls[1, 0])
-    pull_y += _pull_off(position[1] + WALL_LEAD * velocity[1], walls[0, 1], walls[1, 1])
+    pull_x = -braking * (SPEED_LEFT * velocity[0] + SPEED_GAINED * acceleration_ahead[0])
+    pull_y = -braking * (SPEED_LEFT * velocity[1] + SPEED_GAINED * acceleration_ahead[1])
+    pull_x += _pull_off(position[0] + WALL_LEAD * velocity[0], walls[0, 0], walls[1, 0], stiffness)
+    pull_y += _pull_off(position[1] + WALL_LEAD * velocity[1], walls[0, 1], walls[1, 1], stiffness)
     forward, left = cos * pull_x + sin * pull_y, cos * pull_y - sin * pull_x
     pull = math.sqrt(forward * forward + left * left)
     scale = full_rate / math.sqrt(GRAVITY * GRAVITY + pull * pull)  # sin(atan(pull / g)) / pull
-    if scale * pull > BRAKE_RATE_MAX:
-        scale = BRAKE_RATE_MAX / pull
+    if scale * pull > rate_max:
+        scale = rate_max / pull
     return -scale * left, scale * forward
 
 
 @njit(error_model="numpy")
-def _pull_off(place: float, low: float, high: float) -> float:
+def _pull_off(place: float, low: float, high: float, stiffness: float) -> float:
     """Return the acceleration, m/s², away from two opposite walls."""
-    off_low = min(max(WALL_STIFFNESS * (WALL_REACH - (place - low)), 0.0), WALL_PULL_MAX)
-    off_high = min(max(WALL_STIFFNESS * (WALL_REACH - (high - place)), 0.0), WALL_PULL_MAX)
+    off_low = min(max(stiffness * (WALL_REACH - (place - low)), 0.0), WALL_PULL_MAX)
+    off_high = min(max(stiffness * (WALL_REACH - (high - place)), 0.0), WALL_PULL_MAX)
     return off_low - off_high

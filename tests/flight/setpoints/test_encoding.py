@@ -18,7 +18,7 @@ from cfplan.flight.setpoints.encoding import (
     motion_at,
 )
 from cfplan.flight.setpoints.packets import decode, encode
-from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, BRAKE_RATE_MAX, FIRMWARE_GAINS, AttitudeGains, motion_of_sent
+from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, FIRMWARE_GAINS, UNTIL_WATCHDOG, AttitudeGains, motion_of_sent
 from cfplan.geometry.min_snap import min_snap
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY
@@ -112,7 +112,7 @@ def test_thrust_is_flown_ahead_and_its_direction_is_not(flown, encoded, trajecto
 def test_roll_and_pitch_rates_that_are_sent_are_small_and_the_yaw_rate_is_whole(encoded, trajectory):
     sent, planned = encoded.decoded.body_rate, trajectory.at(encoded.times + RATE_LEAD).body_rate
     assert np.linalg.norm(planned[:, :2], axis=1).max() > 0.8
-    assert np.linalg.norm(sent[:, :2], axis=1).max() <= BRAKE_RATE_MAX + 1e-3
+    assert np.linalg.norm(sent[:, :2], axis=1).max() <= UNTIL_WATCHDOG.rate_max + 1e-3
     assert sent[:, 2] == pytest.approx(planned[:, 2], abs=0.6e-3)
 
 

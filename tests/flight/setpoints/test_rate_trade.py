@@ -1,5 +1,7 @@
 """The trade of rates for attitude: exact, bounded, and braking where setpoints stop."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,11 +12,12 @@ from scipy.spatial.transform import Rotation
 from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import (
-    BRAKE_RATE_MAX,
     LEAN_MAX,
     TRADED_RATE_MAX,
+    UNTIL_WATCHDOG,
     AttitudeGains,
     ahead,
+    gains_under,
     harmless_rates,
     trade_rates,
     turns_for,
@@ -69,8 +72,8 @@ def test_rates_are_what_brakes_and_what_exceeds_the_most(velocity, rate, coming)
     sent = trade_rates(motion, coming[None]).body_rate
     assert sent[:, :2] == pytest.approx(harmless_rates(motion, coming[None]), abs=0.51e-3)
     assert np.linalg.norm(rate[:2] - sent[0, :2]) <= TRADED_RATE_MAX + 1e-3
-    excess = max(np.linalg.norm(rate[:2]) + BRAKE_RATE_MAX - TRADED_RATE_MAX, 0.0)
-    assert np.linalg.norm(sent[0, :2]) <= BRAKE_RATE_MAX + excess + 1e-3
+    excess = max(np.linalg.norm(rate[:2]) + UNTIL_WATCHDOG.rate_max - TRADED_RATE_MAX, 0.0)
+    assert np.linalg.norm(sent[0, :2]) <= UNTIL_WATCHDOG.rate_max + excess + 1e-3
 
 
 @settings(deadline=None)
@@ -160,3 +163,13 @@ def test_other_gains_make_other_turns():
 def test_the_acceleration_ahead_is_that_of_fifteen_setpoints_later_and_the_last_holds():
     values = np.arange(40.0)[:, None] * np.ones(3)
     assert ahead(values, 100.0)[:, 0] == pytest.approx(np.minimum(np.arange(40) + 15, 39))
+
+
+def test_without_the_watchdog_level_out_brakes_less_as_it_lasts_longer(limits):
+    unwatched = replace(limits, firmware=replace(limits.firmware, watchdog=False))
+    flying = motion_of((0.5, 0.0, 0.0), (0.0, 0.0, 0.0), rotvec=(0.0, 0.0, 0.0))
+    watched, alone = (trade_rates(flying, np.zeros((1, 3)), gains_under(each)) for each in (limits, unwatched))
+    assert 0.0 > alone.body_rate[0, 1] > watched.body_rate[0, 1]
+    assert harmless_rates(flying, np.zeros((1, 3)), gains_under(unwatched)) == pytest.approx(
+        alone.body_rate[:, :2], abs=0.51e-3
+    )

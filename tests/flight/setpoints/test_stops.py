@@ -5,7 +5,7 @@ import pytest
 
 from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
-from cfplan.flight.setpoints.rate_trade import BRAKE_RATE_MAX
+from cfplan.flight.setpoints.rate_trade import UNTIL_WATCHDOG
 from cfplan.flight.setpoints.stops import encode_stops, stop_motion
 from cfplan.vehicle.airframe import GRAVITY
 
@@ -90,7 +90,7 @@ def test_a_stop_at_the_end_of_the_plan_does_not_run_past_it(circle):
 def test_roll_and_pitch_rates_are_sent_as_attitude(circle):
     planned, sent = stop_from(circle, 100, rate_lead=RATE_LEAD), decode(encode_stops(circle, 100.0)[100])
     assert np.linalg.norm(planned.body_rate[:, :2], axis=1).max() > 1.0
-    assert np.linalg.norm(sent.body_rate[:, :2], axis=1).max() <= BRAKE_RATE_MAX + 1e-3
+    assert np.linalg.norm(sent.body_rate[:, :2], axis=1).max() <= UNTIL_WATCHDOG.rate_max + 1e-3
     assert sent.body_rate[:, 2] == pytest.approx(planned.body_rate[:, 2], abs=0.6e-3)
 
 
