@@ -97,8 +97,8 @@ def _line(mark: str, head: str, result: str) -> str:
 
 def _compiling_here() -> str:
     """Say that this process compiles, if it does; whether it can is known without loading what compiles."""
-    machine_code = sys.modules.get("cfplan.machine_code")
-    return "compiling, once for this machine" if machine_code is not None and machine_code.compiles() else ""
+    compiles = getattr(sys.modules.get("cfplan.machine_code"), "compiles", None)  # none while that is still loading
+    return "compiling, once for this machine" if compiles and compiles() else ""
 
 
 class _WaitingNote:

@@ -33,6 +33,9 @@ def plan(
 
     flight = options.flight_options(planning, safety_file, path_file, only_shown=output is None)
     planned = plan_flight(path_file, limits, flight, steps)
+    with steps.step("bound") as results:
+        bound = planned.lower_bound()
+        results.append(_compared(planned.plan.trajectory.duration, bound, planned.plan.speed_factor))
     if output is not None:
         from cfplan.planning.plan_file import save_plan
 
@@ -40,9 +43,15 @@ def plan(
             save_plan(planned.plan, output, {"name": planned.name, "path file": str(path_file)})
             results.append(str(output))
     if as_json:
-        print_json(planned.to_dict() | ({"file": str(output)} if output else {}))
+        print_json(planned.to_dict() | {"lower_bound": bound} | ({"file": str(output)} if output else {}))
     else:
         print_certificate(planned.plan.certificate)
+
+
+def _compared(duration: float, bound: float, speed_factor: float) -> str:
+    """Return one line about a flight's duration and the least time of any flight at the same share of its speed, s."""
+    at_share = f" at {speed_factor:g} of full speed" if speed_factor < 1.0 else ""
+    return f"{100 * (duration / bound - 1.0):.1f} % above {bound:.2f} s, which no flight{at_share} beats"
 
 
 def _check_output(output: Path, force: bool) -> None:

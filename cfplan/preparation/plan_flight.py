@@ -50,13 +50,13 @@ class PlannedFlight:
     name: str
     plan: Plan
     limits: Limits
-    lower_bound: float | None = None  # s, which no flight along the path can beat; None for a plan that was read
     link_loss: SimulatedLinkLoss | None = None  # of the plan's bytes, where planning looked at it
+    was_read: bool = False  # from a plan file, so that nothing but its limits was checked yet
 
-    @property
-    def was_read(self) -> bool:
-        """Return whether the plan is a file's, of which nothing but its limits was checked yet."""
-        return self.lower_bound is None
+    def lower_bound(self) -> float:
+        """Return the time, s, that no flight along the path beats at the plan's speed factor; takes up to a second."""
+        plan = self.plan
+        return lower_bound(PlanningTask(plan.path, plan.airframe, self.limits.plan)) / plan.speed_factor
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures of the plan and its certificate, for JSON."""
@@ -67,7 +67,6 @@ class PlannedFlight:
             "planner": plan.planner,
             "length": plan.path.length,
             "duration": plan.trajectory.duration,
-            "lower_bound": self.lower_bound,
             "nodes": plan.nodes,
             "planning_seconds": plan.seconds,
             "slowed": plan.repair_speed_factor,
@@ -113,24 +112,18 @@ def plan_flight(
             models=options.models,
         )
         left = deadline.left
-        results.append(f"{planned.trajectory.duration:.2f} s of flight by {planned.planner}")
-        if planned.speed_factor < 1.0:
-            results.append(f"at {planned.speed_factor:g} of full speed")
+        at_share = f" at {planned.speed_factor:g} of full speed" if planned.speed_factor < 1.0 else ""
+        results.append(f"{planned.trajectory.duration:.2f} s of flight{at_share} by {planned.planner}")
         if planned.left_out:
             results.warn(f"the budget of time is spent: {planned.left_out}")
         results.details += planned.notes
-    with step(on_step, "bound") as results:
-        bound = lower_bound(PlanningTask(planned.path, planned.airframe, limits.plan))
-        more = planned.trajectory.duration * planned.speed_factor / bound - 1
-        whose = "this one takes" if planned.speed_factor == 1.0 else "at full speed this one would take"
-        results.append(f"no flight takes less than {bound:.2f} s; {whose} {100 * more:.1f} % more")
     if options.only_shown and interprets():  # simulating link loss takes minutes without machine code
         with step(on_step, "slowing") as results:
             results.warn("not looked at before machine code is compiled; plan again, or with -o, to see it")
-        return PlannedFlight(path_file.name, planned, limits, bound)
+        return PlannedFlight(path_file.name, planned, limits)
     compile_from_here()  # without, simulating takes minutes
     planned, link_loss = give_way(planned, on_step, Deadline.after(left))
-    return PlannedFlight(path_file.name, planned, limits, bound, link_loss)
+    return PlannedFlight(path_file.name, planned, limits, link_loss)
 
 
 def give_way(
@@ -160,14 +153,13 @@ def give_way(
 
     with step(on_step, "slowing") as results:
         slowed, (glitches, *link_loss) = slow_locally(planned, assess, deadline)
+        results.append(slowed.describe_slowing() or "nowhere")
         for each, where in zip(link_loss, ("at any setpoint", "within sampled stops"), strict=False):
             inside = MARGIN - each.excess[each.worst]
-            results.append(f"at least {inside:.2f} m inside the walls after link loss {where}")
-        results.append(f"a gap {glitches.describe(glitches.worst)} at most")
-        if slowed.slowing:
-            results.append(slowed.describe_slowing())
-            if deadline.passed:
-                results.warn("perhaps more than needed, as the budget of time is spent")
+            results.details.append(f"at least {inside:.2f} m inside the walls after link loss {where}")
+        results.details.append(f"a gap {glitches.describe(glitches.worst)} at most")
+        if slowed.slowing and deadline.passed:
+            results.warn("perhaps more than needed, as the budget of time is spent")
     return slowed, link_loss[0].simulated if link_loss else None
 
 
@@ -186,4 +178,4 @@ def _read_plan(file: Path, limits: Limits, on_step: OnStep) -> PlannedFlight:
         results.append(f"{plan.trajectory.duration:.2f} s, {plan.planner}, read from {file}")
         if plan.slowing:
             results.append(plan.describe_slowing())
-    return PlannedFlight(file.stem, replace(plan, limits=limits, certificate=certificate), limits)
+    return PlannedFlight(file.stem, replace(plan, limits=limits, certificate=certificate), limits, was_read=True)

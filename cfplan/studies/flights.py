@@ -167,15 +167,14 @@ def flight_tables(
 
 
 def _rehearsed(name: str, planned: PlannedFlight, encoded: EncodedFlight) -> RehearsedPlan:
-    plan, bound = planned.plan, planned.lower_bound
-    assert bound is not None  # a path file has one
+    plan = planned.plan
     without_drag = dry_run(_without_drag(encoded, plan.trajectory), plan.trajectory, plan.airframe, plan.limits.flight)
     return RehearsedPlan(
         path=name,
         length=plan.path.length,
         planner=plan.planner,
         planned=plan.trajectory.duration,
-        lower_bound=bound,
+        lower_bound=planned.lower_bound(),
         speed_factor=plan.repair_speed_factor,
         worst_share=plan.certificate.worst.share,
         dry_run=rehearse(planned, encoded).deviation,

@@ -56,9 +56,12 @@ def test_a_plan_gives_way_near_the_wall_and_no_setpoint_ends_outside(warned, gav
 def test_the_cost_is_told(path_file, limits, gave_way):
     noted = []
     plan_flight(path_file, limits, on_step=lambda *report: noted.append(report))
-    (told,) = [result for name, state, result in noted if name == "slowing" and state is StepState.FINISHED]
-    assert gave_way.plan.describe_slowing() in told
-    assert "inside the walls" in told
+    assert ("slowing", StepState.FINISHED, gave_way.plan.describe_slowing()) in noted
+    (*link_loss, gap) = [result for name, state, result in noted if (name, state) == ("slowing", StepState.DETAIL)]
+    assert [each.split(" m ")[1] for each in link_loss] == [
+        "inside the walls after link loss at any setpoint", "inside the walls after link loss within sampled stops",
+    ]  # fmt: skip
+    assert gap.startswith("a gap of 0.2 s in ")
 
 
 def test_where_safety_yaml_says_to_warn_nothing_is_slowed(warned):

@@ -40,14 +40,14 @@ def steps():
 
 def test_every_step_is_reported_once_in_the_order_of_the_data(limits, steps):
     prepared = prepare_flight(LINE, limits, on_step=steps)
-    order = ["path", "plan", "bound", "slowing", *AFTER_PLANNING]
+    order = ["path", "plan", "slowing", *AFTER_PLANNING]
     assert steps.names(StepState.BEGUN) == steps.names(*ENDED_WELL) == order
     assert all(result for _, state, result in steps.noted if state in ENDED_WELL)
     assert prepared.plan.certificate.passed
     assert prepared.dry_run.passed
     assert prepared.mission.payloads is prepared.encoded.payloads
     assert prepared.stops.count == len(prepared.mission.stops) == len(prepared.mission.payloads)
-    assert prepared.planned.lower_bound <= prepared.plan.trajectory.duration
+    assert prepared.planned.lower_bound() <= prepared.plan.trajectory.duration
 
 
 def after_link_loss(limits, monkeypatch, steps, beyond, only_warn) -> None:
@@ -115,7 +115,8 @@ def test_a_plan_file_gives_the_same_bytes_as_its_path_file(limits, tmp_path, ste
     assert steps.names(*ENDED_WELL) == ["plan", *before, "glitches", "link loss of stops", stops]
     np.testing.assert_array_equal(again.mission.payloads, prepared.mission.payloads)
     np.testing.assert_array_equal(again.mission.stops, prepared.mission.stops)
-    assert again.planned.lower_bound is None
+    assert again.planned.was_read
+    assert not prepared.planned.was_read
 
 
 def test_a_plan_of_another_vehicle_is_refused(limits, tmp_path):

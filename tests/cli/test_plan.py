@@ -1,0 +1,40 @@
+"""`cfplan plan`: what it says of a plan compares like with like, in one short line a step."""
+
+import re
+
+import pytest
+
+
+@pytest.fixture
+def planned(cfplan, path_file, safety_file, tmp_path):
+    """Plan the line with more words, and return what was printed."""
+    kept = tmp_path / "plan.parquet"  # for what is not kept nobody waits until everything is compiled
+    files = path_file("name: line\nwaypoints: [[-1.2, -1.2, 0.7], [0.0, 0.0, 0.9], [1.2, 1.2, 1.1]]\n"), safety_file()
+
+    def run(*words):
+        return cfplan("plan", files[0], "--safety", files[1], "-o", kept, "--force", *words)
+
+    return run
+
+
+def test_at_half_the_speed_the_flight_and_its_bound_are_twice_as_long(planned):
+    shares = []
+    for speed in ("1", "0.5"):
+        out = planned("--speed", speed).out
+        (flight,) = re.findall(r"plan .* ms  (\d+\.\d+) s of flight", out)
+        (more, bound) = re.findall(r"bound .* ms  (\d+\.\d) % above (\d+\.\d+) s, which no flight", out)[0]
+        assert float(flight) / float(bound) - 1.0 == pytest.approx(float(more) / 100, abs=0.004)
+        shares.append(float(more))
+        assert ("at 0.5 of full speed" in out) == (speed == "0.5")
+        assert all(len(line) < 100 for line in out.splitlines() if re.match(r"\S+ (plan|bound) ", line))
+    assert shares[1] == pytest.approx(shares[0], abs=0.2)
+
+
+def test_details_are_told_to_who_asks(planned):
+    assert "a gap of 0.2 s" not in planned().out
+    assert "a gap of 0.2 s" in planned("--verbose").out
+
+
+def test_the_bound_is_in_the_document(planned):
+    document = planned("--json").json
+    assert 0.8 * document["duration"] < document["lower_bound"] < document["duration"]
