@@ -22,6 +22,7 @@ from cfplan.preparation.glitch_assessment import assess_glitches
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
 from cfplan.preparation.local_slowing import SimulatedLinkLoss
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
+from cfplan.preparation.slow_motion import require_harmless_slow_motion
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import DryRun, dry_run
@@ -64,6 +65,7 @@ def prepare_flight(
         require_glitch_margin(encoded, limits, on_step)
         require_harmless_stops(encoded, limits, on_step)
     mission, stops = make_mission(encoded, limits, on_step)
+    require_harmless_slow_motion(mission, on_step)
     return PreparedFlight(planned, encoded, rehearsed, lost, stops, mission)
 
 

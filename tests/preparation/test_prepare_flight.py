@@ -20,7 +20,7 @@ from cfplan.simulation.link_loss import LinkLoss, simulate_link_loss
 
 REPOSITORY = Path(__file__).parents[2]
 LINE = REPOSITORY / "flights" / "line.yaml"
-AFTER_PLANNING = ["certificate", "bytes", "dry run", "link loss", "stops"]
+AFTER_PLANNING = ["certificate", "bytes", "dry run", "link loss", "stops", "link loss of take-off and landing"]
 
 ENDED_WELL = (StepState.FINISHED, StepState.WARNED)
 
@@ -111,8 +111,8 @@ def test_a_plan_file_gives_the_same_bytes_as_its_path_file(limits, tmp_path, ste
     prepared = prepare_flight(LINE, limits)
     save_plan(prepared.plan, tmp_path / "plan.parquet")
     again = prepare_flight(tmp_path / "plan.parquet", limits, on_step=steps)
-    *before, stops = AFTER_PLANNING
-    assert steps.names(*ENDED_WELL) == ["plan", *before, "glitches", "link loss of stops", stops]
+    *before, stops, slow = AFTER_PLANNING
+    assert steps.names(*ENDED_WELL) == ["plan", *before, "glitches", "link loss of stops", stops, slow]
     np.testing.assert_array_equal(again.mission.payloads, prepared.mission.payloads)
     np.testing.assert_array_equal(again.mission.stops, prepared.mission.stops)
     assert again.planned.was_read

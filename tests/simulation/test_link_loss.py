@@ -9,7 +9,10 @@ from link_loss_oracle import fly_on
 
 from cfplan.flight.firmware import gains_for
 from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.setpoints.encoding import RATE, encode_motion
+from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
+from cfplan.flight.setpoints.rate_trade import ahead, gains_under
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
@@ -17,8 +20,8 @@ from cfplan.simulation.link_loss import (
     ALLOWANCE,
     link_loss_at_every_setpoint,
     link_loss_near_walls,
-    link_loss_of_stops,
-    link_loss_of_transfer,
+    link_loss_of_slow_motion,
+    link_loss_within_stops,
     simulate_link_loss,
 )
 from cfplan.studies.fault_scenarios import SCENARIOS
@@ -200,31 +203,30 @@ def test_what_may_end_near_a_wall_is_simulated_and_of_the_rest_is_known_how_far_
 
 
 def test_stops_from_a_flight_are_harmless_too(line, limits):
-    limits = without_errors(limits)
+    limits, begin = without_errors(limits), np.arange(0, len(line.payloads), 10)
     flight = link_loss_at_every_setpoint(line.payloads, limits)
-    every = link_loss_of_stops(line.payloads, line.stops, limits, every=10, each=8)
-    assert len(every.time) == 16 * len(range(0, len(line.payloads), 10))
-    assert every.worst.beyond < 0.0
-    first = np.flatnonzero(np.isin(every.time, flight.time) & (np.arange(len(every.time)) % 16 == 0))
-    rows = np.round(every.time[first] * 100).astype(int)
+    forks = np.zeros((len(begin), line.stops.shape[1]), dtype=np.bool_)
+    forks[:, ::8] = True
+    within = link_loss_within_stops(line.stops[begin], flight.snapshots[:, begin], limits, forks)
+    assert len(within.time) == forks.sum()
+    assert within.worst.beyond < 0.0
     # A stop begins as the flight goes on, but brakes harder within its first setpoints.
-    assert every.high[first] == pytest.approx(flight.high[rows], abs=0.25)
+    assert within.high[within.time == 0.0] == pytest.approx(flight.high[begin], abs=0.25)
 
 
-@pytest.mark.parametrize("yaw", [0.0, 2.0])
-def test_take_off_and_the_way_to_the_start_are_harmless_from_corner_to_corner(limits, yaw):
-    space, height = limits.space, limits.ground.take_off_height
-    x, y = np.add(space.low, space.margin)[:2].tolist()
-    far_x, far_y = np.subtract(space.high, space.margin)[:2].tolist()
-    corners = (x, y, height), (far_x, far_y, space.high[2] - space.margin)
-    across = np.linalg.norm(np.subtract(*corners)) / limits.ground.go_to_speed
-    for begin, end, duration in (
-        ((x, y, 0.0), corners[0], height / limits.ground.take_off_speed),
-        (*corners, across),
-        (*corners[::-1], across),
-    ):
-        found = link_loss_of_transfer(begin, 0.0, end, yaw, max(float(duration), 1.5), limits)
-        assert found.worst.beyond < 0.0, (begin, end, found.worst)
+@pytest.mark.parametrize("away", [0.2, 0.75, 3.0])
+def test_slow_motion_looked_at_coarsely_is_what_a_whole_simulation_gives_and_near_a_wall_it_is_that(limits, away):
+    edge = limits.space.low[0] + limits.space.margin
+    for begin in (edge, edge + 1.0):
+        motion = hover_to_hover((begin, 0.0, 0.5), 1.0, (begin + away, 0.0, 1.0), 0.0, max(1.5, 2.0 * away), RATE)
+        payloads = encode_motion(motion, ahead(motion.acceleration, RATE), gains_under(limits), space=limits.space)
+        found = link_loss_of_slow_motion(payloads, limits)
+        whole = link_loss_at_every_setpoint(payloads, limits)
+        assert found.worst.beyond == pytest.approx(whole.worst.beyond, abs=0.01)
+    fast = hover_to_hover((edge + 1.0, 0.0, 0.5), 0.0, (edge, 0.0, 1.0), 0.0, 1.1, RATE)
+    payloads = encode_motion(fast, ahead(fast.acceleration, RATE), gains_under(limits), space=limits.space)
+    found = link_loss_of_slow_motion(payloads, limits)
+    np.testing.assert_array_equal(found.beyond, link_loss_at_every_setpoint(payloads, limits).beyond)
 
 
 def test_setpoints_as_they_are_sent_are_harmless_when_they_stop(line, limits):

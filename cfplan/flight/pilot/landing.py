@@ -19,7 +19,6 @@ from cfplan.flight.radio.supervisor_bits import FLYING
 from cfplan.flight.setpoints.descent import QUICK, Pace, descent, gentle, sinking
 from cfplan.flight.telemetry import Level, Phase, Triple
 
-_CRUISE = 1.5  # times the mean speed of landing: what a descent sinks at between its ends
 _BENEATH_FLOOR = 0.3  # m below where it took off, and below the space, that setpoints sink to
 _NEAR_FLOOR = 0.15  # m above where it took off
 _NOT_FOLLOWING = 0.05  # m that a standing vehicle is above its setpoint, near the floor
@@ -84,7 +83,7 @@ class Landing:
         """Sink until the vehicle stands, or poses are gone; from the pose if those have only come back."""
         loop = self._loop
         lowest = min(self._floor, loop.limits.space.low[2]) - _BENEATH_FLOOR
-        pace = gentle(_CRUISE * loop.limits.ground.land_speed)
+        pace = gentle(loop.limits.ground.land_speed)
         self._sink(loop.seen() if self._was_blind else loop.asked(), pace, lowest)
         self._was_blind = False
         loop.until(lambda: self._stands_by_poses() or self._sunk() or loop.blind or loop.left_alone, math.inf)

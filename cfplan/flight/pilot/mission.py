@@ -12,7 +12,7 @@ from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.rotations import yaw_of
 
-_SHORTEST_MANOEUVRE = 1.5  # s
+SHORTEST_MANOEUVRE = 1.5  # s
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0
 
 def manoeuvre_time(distance: float, mean_speed: float) -> float:
     """Return the time, s, for a distance, m, from hover to hover."""
-    return max(_SHORTEST_MANOEUVRE, distance / mean_speed)
+    return max(SHORTEST_MANOEUVRE, distance / mean_speed)
 
 
 def _place(payload: NDArray) -> tuple[Triple, float]:

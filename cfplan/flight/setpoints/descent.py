@@ -18,6 +18,7 @@ from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.rotations import about_z
 
+_CRUISE = 1.5  # times the mean speed of landing: what a descent sinks at between its ends
 _QUICK = 3.0  # m/s²: thrust stays above half of gravity, below which a vehicle counts as tumbling
 
 
@@ -36,9 +37,9 @@ class Pace:
         return min(self.speed, math.sqrt(self.touch_speed**2 + 2.0 * self.acceleration * left))
 
 
-def gentle(speed: float) -> Pace:
-    """Return the pace of a landing with poses, at most at `speed`, m/s."""
-    return Pace(speed, acceleration=0.8, touch_speed=0.1, slow_above=0.05)
+def gentle(mean_speed: float) -> Pace:
+    """Return the pace of a landing with poses, at `mean_speed`, m/s, with its slow ends."""
+    return Pace(_CRUISE * mean_speed, acceleration=0.8, touch_speed=0.1, slow_above=0.05)
 
 
 # Without poses: as fast as what falls from 0.2 m, and where the floor may be, as what falls from 2 cm.

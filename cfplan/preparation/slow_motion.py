@@ -1,0 +1,85 @@
+"""Link loss of slow motion: after each setpoint of take-off, of the way to the start and of landing, too, the vehicle
+must come down inside the walls.
+
+Where it will stand before take-off is not known yet. The worst is a way straight towards a wall or away from one that
+is just so long that it takes the least time, as nothing else accelerates as much, and take-off beside two walls. So
+these are looked at: to the start from all sides so far away, from each wall and from each corner, and take-off there.
+"""
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import NotCertifiedError
+from cfplan.flight.pilot.mission import SHORTEST_MANOEUVRE, Mission, manoeuvre_time
+from cfplan.flight.setpoints.descent import descent, gentle
+from cfplan.flight.setpoints.encoding import encode_motion
+from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
+from cfplan.flight.setpoints.rate_trade import ahead, gains_under
+from cfplan.flight.telemetry import Triple
+from cfplan.preparation.steps import OnStep, ignore_steps, step
+from cfplan.simulation.link_loss import link_loss_of_slow_motion
+
+_TURN = np.pi / 2  # rad, of the vehicle on its way to the start
+_BENEATH_FLOOR = 0.3  # m that a landing's setpoints sink beneath the floor
+_NETS = "in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
+_TAKE_OFF_HINT = f"lower `ground.take_off_speed`, or widen `space.margin`; {_NETS}"
+_START_HINT = f"lower `ground.go_to_speed`, or begin the path farther from that wall; {_NETS}"
+_LANDING_HINT = f"end the path farther from that wall; {_NETS}"
+
+_Motion = tuple[str, str, NDArray]  # what it is and from where, a hint, its payloads
+
+
+def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_steps) -> None:
+    """Simulate link loss in take-off, on the way to the start, and in landing after the mission.
+
+    Raises NotCertifiedError where the vehicle comes down outside the walls, unless safety.yaml says only to warn.
+    """
+    limits, farthest, worst = mission.limits, -np.inf, ""
+    with step(on_step, "link loss of take-off and landing") as results:
+        for what, hint, payloads in _motions(mission):
+            moments = link_loss_of_slow_motion(payloads, limits, mission.rate)
+            at = int(np.argmax(np.where(np.isnan(moments.beyond), np.inf, moments.beyond)))
+            beyond = float(moments.beyond[at])
+            if not beyond <= farthest:
+                side = "beyond" if not beyond <= 0.0 else "inside"
+                farthest, worst = beyond, f"{what} {abs(beyond):.2f} m {side} {moments.name_of_wall(at, limits)}"
+            if not beyond <= 0.0 and not limits.link_loss.only_warn:
+                raise NotCertifiedError(f"link loss {worst}", where="link loss", hint=hint)
+        (results.append if farthest <= 0.0 else results.warn)(worst)
+
+
+def _motions(mission: Mission) -> Iterator[_Motion]:
+    space, ground, height = mission.limits.space, mission.limits.ground, mission.take_off_height
+    (x, y, z), yaw = mission.start
+    low, high = np.add(space.low, space.margin), np.subtract(space.high, space.margin)
+    sides = [(low[0], y), (high[0], y), (x, low[1]), (x, high[1])]
+    corners = list(product((low[0], high[0]), (low[1], high[1])))
+    for side, other in corners[::3]:  # two, which face all walls
+        begin, above = (float(side), float(other), space.low[2]), (float(side), float(other), height)
+        climb = manoeuvre_time(height - space.low[2], ground.take_off_speed)
+        yield f"in take-off at {_text(begin)}", _TAKE_OFF_HINT, _way(begin, above, yaw, yaw, climb, mission)
+    reach = np.sqrt(max((SHORTEST_MANOEUVRE * ground.go_to_speed) ** 2 - (z - height) ** 2, 0.0))
+    near = [np.clip((x + a * reach, y + b * reach), low[:2], high[:2]) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    for place in [*near, *sides, *corners]:
+        begin = (float(place[0]), float(place[1]), height)
+        duration = manoeuvre_time(float(np.linalg.norm(np.subtract((x, y, z), begin))), ground.go_to_speed)
+        way = _way(begin, (x, y, z), yaw + _TURN, yaw, duration, mission)
+        yield f"on the way from {_text(begin)} to the start", _START_HINT, way
+    end, end_yaw = mission.end
+    floor, pace = space.low[2], gentle(ground.land_speed)
+    down = descent(end, end_yaw, 0.0, pace, floor, floor - _BENEATH_FLOOR, mission.limits, mission.rate)
+    yield f"in landing at {_text(end)}", _LANDING_HINT, down
+
+
+def _way(begin: Triple, end: Triple, yaw: float, end_yaw: float, duration: float, mission: Mission) -> NDArray:
+    limits, rate = mission.limits, mission.rate
+    motion = hover_to_hover(begin, yaw, end, end_yaw, duration, rate)
+    return encode_motion(motion, ahead(motion.acceleration, rate), gains_under(limits), space=limits.space)
+
+
+def _text(place: Triple) -> str:
+    x, y, z = place
+    return f"({x:.2f}, {y:.2f}, {z:.2f}) m"
