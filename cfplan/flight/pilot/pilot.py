@@ -325,6 +325,7 @@ class Pilot:
 
     def _restart(self) -> None:
         """Restart the vehicle, which its watchdog locks now that nothing feeds it, for the next flight."""
+        self._history.say(Level.INFO, "the vehicle restarts for the next flight")
         try:
             self._loop.link.restart()
         except LinkError as error:
