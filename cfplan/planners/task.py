@@ -37,6 +37,7 @@ class PlanningTask:
     end: BoundaryState | None = None
     speed_caps: SpeedCaps | None = None  # along the path, besides the limit on speed
     deadline: Deadline = field(default=NEVER, compare=False, repr=False)  # by which to answer, if only with a reason
+    dispensable: bool = field(default=False, compare=False, repr=False)  # given up where it is late: others answered
     models: tuple[pathlib.Path, ...] = ()  # of the learned planner: folders of models, or one of a model itself
     refusal: Solution | None = field(init=False, compare=False, repr=False)
     """The answer of a planner that keeps all limits and boundary states, where no search is needed to see that none

@@ -127,7 +127,9 @@ def choose(policy: str, task: PlanningTask, nodes: int | None, space: Space) -> 
         due = step.when(task, found)
         notes += due.notes
         if due.due:
-            one, failures = _take(step, task, nodes, space)
+            one, failures = _take(step, replace(task, dispensable=bool(found)), nodes, space)
+            if found and one is None and task.deadline.passed:
+                skipped.append(f"{step.planners[0]} not finished")
             found += [one] if one else []
             notes += failures
     if not found:

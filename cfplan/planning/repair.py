@@ -75,12 +75,17 @@ def repair(task: PlanningTask, profile: SpeedProfile, space: Space | None = None
 
 
 def refine(task: PlanningTask, profile: SpeedProfile, space: Space | None = None) -> Repaired:
-    """Return the certified trajectory to which refining leads, to the optimum near the profile. Raises as repair()."""
+    """Return the certified trajectory to which refining leads, to the optimum near the profile.
+
+    Raises as repair(), and InfeasibleError where a dispensable task is not refined by its deadline.
+    """
     limits, caps, before = task.limits, task.speed_caps, duration_of(profile)
     refined = _refined(task, profile, space)
     if refined.certificate and (refined.certificate.passed or _nearly_passes(refined.certificate)):
         slowed = slow_until_certified(refined.trajectory, limits, space, refined.certificate, caps, task.deadline)
         return _repaired(slowed, before, profile, refined)
+    if task.dispensable and task.deadline.passed:
+        raise InfeasibleError(refined.failed or "out of time", hint="give planning more time (--budget)")
     return _lowered(task, profile, space, refined, before)
 
 

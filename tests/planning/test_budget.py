@@ -18,6 +18,7 @@ from cfplan.planners.solution import Status
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import plan
 from cfplan.planning.planners import PLANNERS
+from cfplan.planning.repair import repair
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.studies.scaling import path_of_length
@@ -54,6 +55,15 @@ def test_what_there_was_no_time_for_is_told(path, limits):
     assert "not refined" in made.left_out
     assert "out of time" in made.left_out
     assert "not asked" in made.left_out
+
+
+def test_what_is_late_is_given_up_where_another_planner_has_answered(path, limits):
+    task = PlanningTask(path, limits.airframe, limits.plan, nodes=200, deadline=after(0))
+    profile = plan(path, limits.airframe, limits).profile.slowed(1.5)
+    assert repair(task, profile).certificate.passed
+    with pytest.raises(InfeasibleError, match="out of time") as caught:
+        repair(replace(task, dispensable=True), profile)
+    assert "--budget" in caught.value.hint
 
 
 def test_more_time_makes_faster_flights(path, limits):
