@@ -26,7 +26,7 @@ TRIALS, CHEAP = 4, 0.005  # to win time back, where a plan loses more than this 
 PLACES = 4  # of caps in an interval
 LEAST_SHARE, MOST_SHARE = 0.5, 0.98  # of its speed, to which a place is slowed in a round
 POWER = 1.5  # of speed, with which the way that is left grows: some of it is v t, some v² / a
-ABOUT = 0.05  # s of flight before and after a setpoint at fault, along which a first round slows; later ones slow more
+ABOUT = 0.1  # s of flight before and after a setpoint at fault, along which a first round slows; later ones slow more
 LEAST_SPEED = 0.05  # m/s, of caps
 LEADING_UP = 0.4  # s about a setpoint that decide how it ends: caps that are the least there leave nothing to do
 
