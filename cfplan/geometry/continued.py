@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
 from cfplan.geometry.min_snap import (
-    MIN_DENSE_SPACING,
     MIN_SPACING,
     centripetal_times,
     check_points,
@@ -26,7 +25,6 @@ from cfplan.geometry.min_snap import (
 )
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import hermite, padded, shifted
-from cfplan.geometry.rest import with_rest_end
 
 ORDERS = 5  # γ and four derivatives, that a path continues
 BLEND = 0.4  # s of nominal time, over which a given γ'''' fades; at most half of the first segment
@@ -45,29 +43,12 @@ def continued_min_snap(start: ArrayLike, waypoints: ArrayLike, times: ArrayLike 
         InputError: two points in a row closer than MIN_SPACING, numbers that are not finite, times that are not
             positive.
     """
-    begin, points = _checked(start, waypoints, MIN_SPACING)
+    begin, points = _checked(start, waypoints)
     spans = centripetal_times(points) if times is None else check_times(points, times)
     return _fitted(begin, spans, pieces_through(points, spans, start=begin[1:4], rest_end=True))
 
 
-def continued_through(start: ArrayLike, points: ArrayLike) -> Path:
-    """Return the path through dense points, (K, 3) m, K at least 4, that begins as `start`, (5, 3), says.
-
-    Its end is free, then brought to rest; see min_snap.smooth_through. Raises InputError.
-    """
-    begin, points = _checked(start, points, MIN_DENSE_SPACING)
-    if len(points) < 5:
-        raise InputError(
-            f"a smooth path with a free end needs at least four points ahead, not {len(points) - 1}",
-            where="points",
-            hint="give more points, or lay a path of least snap through these",
-        )
-    times = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    spans, table = with_rest_end(times, pieces_through(points, times, start=begin[1:4], rest_end=False))
-    return _fitted(begin, spans, table)
-
-
-def _checked(start: ArrayLike, waypoints: ArrayLike, spacing: float) -> tuple[NDArray, NDArray]:
+def _checked(start: ArrayLike, waypoints: ArrayLike) -> tuple[NDArray, NDArray]:
     """Return the start, (5, 3), and the points, (K+1, 3), the first of which is the start's."""
     begin, ahead = np.asarray(start, dtype=float), np.asarray(waypoints, dtype=float)
     if begin.shape != (ORDERS, 3) or not np.isfinite(begin).all():
@@ -84,14 +65,15 @@ def _checked(start: ArrayLike, waypoints: ArrayLike, spacing: float) -> tuple[ND
         )
     points = np.concatenate([begin[:1], ahead])
     if len(ahead) > 1:
-        check_points(ahead, spacing)
-    if not math.dist(points[0], points[1]) >= spacing:
+        check_points(ahead, MIN_SPACING)
+    away = math.dist(points[0], points[1])
+    if not away >= MIN_SPACING:
         raise InputError(
-            f"the path begins {math.dist(points[0], points[1]):.4f} m from its first waypoint, less than {spacing} m",
+            f"the path begins {away:.4f} m from its first waypoint, less than {MIN_SPACING} m",
             where="waypoint 1",
             hint="leave it out: it has been passed",
         )
-    check_points(points[:2], spacing, lambda index: f"waypoint {index}" if index else "start")
+    check_points(points[:2], MIN_SPACING, lambda index: f"waypoint {index}" if index else "start")
     return begin, points
 
 

@@ -29,6 +29,7 @@ from cfplan.preparation.replan import PACE, HeldFlight, Replanned, accepted, at_
 from cfplan.safety.limits import Limits
 
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
+FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 LEARNED_FROM = 8  # plans, the longest of which says how long the next may take
 SLACK = 0.05  # s more than that, for the way to the pilot
 TRIES = 2  # of a request whose proposal comes late
@@ -76,7 +77,7 @@ class PathAnswer:
     seconds: float = 0.0  # s from the request to the answer
     splice: int = -1  # number of the first setpoint of the proposal that was accepted; -1 where nothing was proposed
     checksum: int = 0  # of that proposal
-    plan: Plan | None = None  # behind it
+    plan: Plan | None = None  # behind it; a stop has none
 
 
 def plan_request(held: HeldFlight, request: PathRequest, first: int, limits: Limits) -> Replanned | HeldFlight:
@@ -99,7 +100,7 @@ def answer_accepted(request: PathRequest, made: Replanned) -> PathAnswer:
     """Return the answer to a request whose proposal the pilot has accepted."""
     flown, proposal = made.held.flown, made.proposal
     return PathAnswer(
-        request.number, PathVerdict.ACCEPTED, joint=flown.starts[-1], ends=flown.duration, splice=proposal.splice,
+        request.number, PathVerdict.ACCEPTED, joint=made.joint, ends=flown.duration, splice=proposal.splice,
         checksum=proposal.checksum, plan=made.plan,
     )  # fmt: skip
 
@@ -177,6 +178,7 @@ class _Worker:
         self._held, self._limits, self._requests, self._pilot = held, limits, requests, pilot
         self._begun: float | None = None  # s, when setpoint 0 was due
         self._took: deque[float] = deque([FIRST_TIME], maxlen=LEARNED_FROM)
+        self._stops_took: deque[float] = deque([FIRST_STOP], maxlen=LEARNED_FROM)
         self._waiting: tuple[PathRequest, float] | None = None
 
     @property
@@ -190,15 +192,16 @@ class _Worker:
         ]
 
     def warm_up(self) -> None:
-        """Make two plans for nobody: what a first call compiles or loads is there before the flight."""
+        """Make two plans and stops for nobody: what a first call compiles or loads is there before the flight."""
         held = self._held
         for _ in range(2):
             begun = REAL_CLOCK.now()
             with contextlib.suppress(CfplanError):
                 places = [held.flown.at(held.ends / 2).position, *map(np.array, self._middle)]
                 away = max(places, key=lambda place: float(np.linalg.norm(place - held.ahead[-1])))
-                replan(held, max(round(held.ends / 4 * RATE), 1), [away, held.ahead[-1]], self._limits)
+                made = replan(held, max(round(held.ends / 4 * RATE), 1), [away, held.ahead[-1]], self._limits)
                 self._took[0] = REAL_CLOCK.now() - begun
+                halt(made.held, made.proposal.splice + round(RATE), self._limits)
 
     def serve(self) -> None:
         """Plan until the main process or the pilot has ended."""
@@ -237,14 +240,15 @@ class _Worker:
         reason = ""
         for _ in range(TRIES):
             begun = REAL_CLOCK.now()
-            ahead = max(self._took) + SLACK
+            took = self._stops_took if request.wish is Wish.STOP else self._took
+            ahead = max(took) + SLACK
             first = math.ceil((begun - self._begun + ahead) * RATE) + LEAST_AHEAD
             try:
                 made = plan_request(self._held, request, first, self._limits)
             except CfplanError as error:
                 return PathAnswer(request.number, PathVerdict.REFUSED, str(error))
             finally:
-                self._took.append(REAL_CLOCK.now() - begun)
+                took.append(REAL_CLOCK.now() - begun)
             if isinstance(made, HeldFlight):
                 self._held = made
                 return PathAnswer(request.number, PathVerdict.ACCEPTED)

@@ -15,9 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
 from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, propose
-from cfplan.flight.setpoints.encoding import RATE, EncodedFlight, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.encoding import HOLD, RATE, EncodedFlight, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.rate_trade import gains_under
-from cfplan.flight.setpoints.stop_certificate import encode_certified_stops
+from cfplan.flight.setpoints.stop_certificate import certify_stops, encode_certified_stops
+from cfplan.flight.setpoints.stops import DURATION, encode_stops
 from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, min_snap
 from cfplan.planning.continuation import NoWayError, check_waypoints, continue_plan
@@ -30,14 +32,15 @@ from cfplan.simulation.glitches import glitch_at_sampled_setpoints
 from cfplan.simulation.link_loss import as_believed, link_loss_near_walls
 from cfplan.vehicle.hover import hover_at
 from cfplan.vehicle.joint import JoinedTrajectory
+from cfplan.vehicle.rotations import yaw_of
 
 SLOWER = (1.2, 0.7)  # m/s, at which a flight is tried that would end badly at full speed
 LATER = (0, 15, 35)  # setpoints by which the vehicle may fly on before it turns off, where it cannot do so at once
 LEAST_SPEED = 0.2  # m/s, to which requests may lower the speed
 PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
 HOVER = 0.05  # s, of the motion that a hover counts as
-HALTS = (1.0, 1.15, 1.35, 1.6, 2.0, 2.6)  # times the way that braking takes at its limit, where a stop may end
-REACTION = 0.05  # s at full speed before braking is felt: the vehicle must lean first
+STOPS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.8, 1.0, DURATION)
+"""s within which a request to stop is tried to be met: from 2 m/s the first would brake at 7.5 m/s², a tilt of 37°."""
 
 
 class EndsBadlyError(InfeasibleError):
@@ -55,6 +58,9 @@ class HeldFlight:
     begin: int  # number of the setpoint of the first snapshot
     snapshots: NDArray  # (L, N, 31) of the simulated vehicle at each setpoint, for each motor lag
     speed: float = math.inf  # m/s, at which new plans fly at most, as was asked for; the limits' counts besides
+    exact_from: int = 0
+    """Number of the setpoint from which on the trajectories are those behind the bytes: in a stop before it they are
+    those that it brakes along."""
 
     @property
     def ends(self) -> float:
@@ -68,7 +74,8 @@ class Replanned:
 
     proposal: Proposal
     held: HeldFlight
-    plan: Plan
+    plan: Plan | None  # None for a stop, which brakes along the plan before
+    joint: float  # s from setpoint 0, from when on the motion is another
 
 
 def hold(planned: Plan, waypoints: ArrayLike) -> HeldFlight:
@@ -202,45 +209,69 @@ def _replan_at(
     row = min(splice - held.begin, held.snapshots.shape[1] - 1)
     encoded, stops, snapshots = certified(flown.since(splice / RATE), limits, held.snapshots[:, row])
     proposal = propose(held.commitment, splice, encoded.payloads, stops)
-    return Replanned(
-        proposal, HeldFlight(held.commitment, flown, points, reached, splice, snapshots, held.speed), planned
-    )
+    later = HeldFlight(held.commitment, flown, points, reached, splice, snapshots, held.speed)
+    return Replanned(proposal, later, planned, joint)
 
 
 def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned:
-    """Return the proposal to leave what is held at setpoint `splice` and to come to rest soon, ahead on its path.
+    """Return the proposal to leave what is held at setpoint `splice` and to come to rest as soon as may be on its path.
 
-    Places are tried from where the limit on braking would allow rest at the earliest. Raises InfeasibleError where the
-    vehicle rests soon anyway, or no place is found: then what is held ends as soon.
+    That is a stop as there is one from each setpoint, but the shortest that keeps what stops may reach. Raises
+    InfeasibleError where the vehicle rests as soon anyway, or no stop passes: then it rests at the end of what is held.
     """
-    splice = _not_before(held, splice)
-    joint = (splice + SPLICE_AHEAD) / RATE
-    left = held.ends - joint
-    moving = held.flown.at(joint)
-    speed = float(np.linalg.norm(moving.velocity))
-    last = held.flown.trajectories[-1]
-    if left > 0.0 and speed > 0.0:
-        s = float(last.s_at(joint - held.flown.starts[-1])) + np.linspace(0.0, 1.0, 201) * last.path.end
-        s = s[s <= last.path.end]
-        points = last.path(s)
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-        for share in HALTS:
-            far = share * speed**2 / (2.0 * limits.plan.acceleration) + REACTION * speed
-            if far > along[-1]:
-                break
-            place = [np.interp(far, along, points[:, axis]) for axis in range(3)]
-            with suppress(InfeasibleError, InputError, NotCertifiedError):
-                return replan(held, splice, [place], limits, yaw_angle=float(moving.yaw))
+    splice = max(splice, held.exact_from)
+    left = held.ends - splice / RATE
+    for duration in STOPS:
+        if duration < left:
+            with suppress(InfeasibleError, NotCertifiedError):
+                return stop_within(held, splice, duration, limits)
     raise InfeasibleError(
-        f"at {speed:.2f} m/s, {max(left, 0.0):.1f} s before its end, the vehicle cannot stop sooner",
+        f"{max(left, 0.0):.1f} s before its end, the vehicle cannot stop sooner",
         where="stop",
         hint="it rests at the end of what is committed",
     )
 
 
+def stop_within(held: HeldFlight, splice: int, duration: float, limits: Limits) -> Replanned:
+    """Return the proposal to stop along the path from the setpoint behind `splice` on, within `duration`, s.
+
+    Raises NotCertifiedError where the stop exceeds what stops may reach, InfeasibleError where link loss or a gap
+    within it would end badly.
+    """
+    encoded = encode_trajectory(held.flown.since(splice / RATE), gains=gains_under(limits), space=limits.space)
+    motion, gains, space = encoded.motion, encoded.gains, encoded.space
+    first, second = np.array([0]), np.array([1])
+    stop = encode_stops(motion, RATE, duration, second, gains, space)
+    certify_stops(stop, motion, limits, RATE, second, gains, space).require(limits)
+    rows, rest = stop[0], stop[0, -1:]
+    hovering = np.repeat(rest, round(HOLD * RATE), axis=0)
+    payloads = np.concatenate([encoded.payloads[:1], rows, hovering])
+    # From within a stop, what is left of it is the stop; it is as long as all others, the end of it a hover.
+    whole = encode_stops(motion, RATE, DURATION, first, gains, space)
+    padded = np.concatenate([rows, np.repeat(rest, whole.shape[1], axis=0)])
+    after = [padded[min(row, len(rows)) :][: whole.shape[1]] for row in range(len(payloads) - 1)]
+    stops = np.concatenate([whole, np.stack(after)])
+    starts = held.snapshots[:, min(splice - held.begin, held.snapshots.shape[1] - 1)]
+    lost = link_loss_near_walls(payloads, limits, 0.0, starts=starts)
+    if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
+        raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
+    glitches = glitch_at_sampled_setpoints(payloads, limits, start=as_believed(starts, limits))
+    if glitches.lost.any():
+        raise EndsBadlyError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
+    end, rests_from = decode(rest), splice + len(rows)
+    x, y, z = end.position[0].tolist()
+    qx, qy, qz, qw = end.quaternion[0].tolist()
+    hover = hover_at((x, y, z), yaw_of((qx, qy, qz, qw)), HOVER, limits.airframe)
+    flown = held.flown.continued(rests_from / RATE, hover)
+    later = HeldFlight(
+        held.commitment, flown, end.position, (HOVER,), splice, lost.snapshots, held.speed, rests_from
+    )  # fmt: skip
+    return Replanned(propose(held.commitment, splice, payloads, stops), later, None, splice / RATE)
+
+
 def _not_before(held: HeldFlight, splice: int) -> int:
     """Return the splice, or the first whose joint is not before what is held last begins."""
-    return max(splice, math.ceil(held.flown.starts[-1] * RATE - 1e-6) - SPLICE_AHEAD)
+    return max(splice, held.exact_from, math.ceil(held.flown.starts[-1] * RATE - 1e-6) - SPLICE_AHEAD)
 
 
 def accepted(replanned: Replanned, commitment: Commitment) -> HeldFlight:

@@ -5,6 +5,7 @@ splice: its limits, its bytes, a stop from each setpoint, link loss, gaps and th
 be those that the pilot verified, to the byte, and each setpoint streamed the one that was committed.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,10 +19,11 @@ from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.flight.telemetry import Phase
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
-from cfplan.preparation.replan import HeldFlight, certified, hold, hold_hover
+from cfplan.preparation.replan import STOPS, HeldFlight, certified, hold, hold_hover, stop_within
 from cfplan.recording.commitments import committed_setpoints
 from cfplan.recording.record import PLAN_FILE, PLAN_IN_FLIGHT, Record
 from cfplan.safety.certificate import Certificate
+from cfplan.safety.limits import Limits
 
 YAW = "yaw"  # rad, in the provenance of a header: that of the hover in which a steered flight begins
 _SAME = 1e-6  # m, m/s, m/s², m/s³, that a motion may jump by at a joint
@@ -33,6 +35,7 @@ class Recertified:
     """What was certified again."""
 
     plans: int  # that were committed
+    stops: int  # that were asked for, and committed
     certificate: Certificate | None  # of the plan that uses most of a limit; None where there is only a hover
     joints: int  # between motions, none of which jumps
     jump: float  # the largest, in m, m/s, m/s² or m/s³
@@ -47,6 +50,7 @@ class Recertified:
         share = f"{100 * worst.share:.1f} % of the limit on {worst.name}" if worst is not None else "a hover"
         return [
             ("plans committed, certified again", f"{self.plans}, which use {share} at most"),
+            ("stops committed, certified again", str(self.stops)),
             ("joints", f"{self.joints}, the motion jumps by {self.jump:.1e} at most"),
             ("setpoints committed", f"{self.committed}, each with a certified stop"),
             ("setpoints streamed", f"{self.streamed}, each as committed{left}"),
@@ -61,7 +65,7 @@ def recertify(record: Record) -> Recertified:
     commitments = record.commitments
     plans = [_plan_of(record, int(checksum)) for checksum in commitments.checksum[1:]]
     held, first = _beginning(record, plans)
-    found = [plan.certificate for plan in (*([first] if first else []), *plans)]
+    found = [plan.certificate for plan in (first, *plans) if plan is not None]
     for number, certificate in enumerate(found, 1):
         if not certificate.passed:
             worst = certificate.worst
@@ -70,30 +74,39 @@ def recertify(record: Record) -> Recertified:
                 where=f"plan {number}",
                 hint="the record was changed since, or made by another version",
             )
+    limits = next(plan.limits for plan in (first, *plans) if plan is not None)
     jump, setpoints = 0.0, len(held.commitment.payloads)
     for number, plan in enumerate(plans, 1):
         splice = int(commitments.splice[number])
-        jump = max(jump, _jump(held, splice, plan))
-        held = _committed(held, splice, plan, commitments.payloads[number], int(commitments.checksum[number]), number)
+        if plan is not None:
+            jump, limits = max(jump, _jump(held, splice, plan)), plan.limits
+        held = _committed(
+            held, splice, plan, limits, commitments.payloads[number], int(commitments.checksum[number]), number
+        )
         setpoints += len(commitments.payloads[number]) // PAYLOAD_SIZE
     sequence = committed_setpoints(record) if len(commitments.time) else held.commitment.payloads
     streamed, left_after = _compare(record, sequence)
     certificates = sorted(found, key=lambda certificate: certificate.worst.share)
     worst_of_all = certificates[-1] if certificates else None
-    return Recertified(len(found), worst_of_all, len(plans), jump, setpoints, streamed, left_after)
+    joints = sum(plan is not None for plan in plans)
+    stops = len(plans) - joints
+    return Recertified(len(found), stops, worst_of_all, joints, jump, setpoints, streamed, left_after)
 
 
-def _plan_of(record: Record, checksum: int) -> Plan:
-    return load_plan(record.folder / PLAN_IN_FLIGHT.format(checksum))
+def _plan_of(record: Record, checksum: int) -> Plan | None:
+    """Return the plan of a proposal; None where the record has none, as that of a stop."""
+    file = record.folder / PLAN_IN_FLIGHT.format(checksum)
+    return load_plan(file) if file.is_file() else None
 
 
-def _beginning(record: Record, plans: list[Plan]) -> tuple[HeldFlight, Plan | None]:
+def _beginning(record: Record, plans: list[Plan | None]) -> tuple[HeldFlight, Plan | None]:
     """Return what was held before anything was asked for, and the plan behind it; None for a hover."""
     if (record.folder / PLAN_FILE).is_file():
         first = load_plan(record.folder / PLAN_FILE)
         ends = first.path(np.array([0.0, first.path.end]))
         return hold(first, ends), first
-    if not plans or not len(record.header.path):
+    first_made = next((plan for plan in plans if plan is not None), None)
+    if first_made is None or not len(record.header.path):
         raise InputError(
             "no plan was committed, so there is nothing to certify",
             where=str(record.folder),
@@ -101,7 +114,7 @@ def _beginning(record: Record, plans: list[Plan]) -> tuple[HeldFlight, Plan | No
         )
     x, y, z = record.header.path[0].tolist()
     yaw = float(record.header.provenance.get(YAW, "0"))
-    return hold_hover((x, y, z), yaw, plans[0].limits), None
+    return hold_hover((x, y, z), yaw, first_made.limits), None
 
 
 def _jump(held: HeldFlight, splice: int, plan: Plan) -> float:
@@ -121,22 +134,40 @@ def _jump(held: HeldFlight, splice: int, plan: Plan) -> float:
     return max(jumps)
 
 
-def _committed(held: HeldFlight, splice: int, plan: Plan, payloads: bytes, checksum: int, number: int) -> HeldFlight:
+def _committed(
+    held: HeldFlight, splice: int, plan: Plan | None, limits: Limits, payloads: bytes, checksum: int, number: int
+) -> HeldFlight:
     """Certify a plan again and return what was held with it. Raises NotCertifiedError where that is something else."""
     where = f"plan {number}, from setpoint {splice} on"
+    told = np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
+    if plan is None:
+        return _stopped(held, splice, told, checksum, where, limits)
     flown = held.flown.continued((splice + SPLICE_AHEAD) / RATE, plan.trajectory)
     row = min(splice - held.begin, held.snapshots.shape[1] - 1)
     try:
-        encoded, stops, snapshots = certified(flown.since(splice / RATE), plan.limits, held.snapshots[:, row])
+        encoded, stops, snapshots = certified(flown.since(splice / RATE), limits, held.snapshots[:, row])
     except CfplanError as error:
         raise NotCertifiedError(f"{error.where}: {error.what}", where=where, hint=error.hint) from error
-    told = np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
     if told.shape != encoded.payloads.shape or (told != encoded.payloads).any():
         raise NotCertifiedError("the setpoints are not those of the plan", where=where, hint="was the record changed?")
     if checksum_of(splice, encoded.payloads, stops) != checksum:
         raise NotCertifiedError("the stops are not those that were verified", where=where, hint="was it changed?")
     commitment = Commitment(splice, encoded.payloads, stops)
     return HeldFlight(commitment, flown, held.ahead, held.reached, splice, snapshots)
+
+
+def _stopped(held: HeldFlight, splice: int, told: NDArray, checksum: int, where: str, limits: Limits) -> HeldFlight:
+    """Return what was held with a stop that was asked for, certified again. Raises InputError where there is none."""
+    for duration in STOPS:
+        with suppress(CfplanError):
+            made = stop_within(held, splice, duration, limits)
+            if made.proposal.checksum == checksum and np.array_equal(made.proposal.payloads, told):
+                return made.held
+    raise InputError(
+        "there is no such file with its plan, and it is no certified stop either",
+        where=where,
+        hint="copy the whole folder of the record; else it was changed since",
+    )
 
 
 def _compare(record: Record, sequence: NDArray) -> tuple[int, float | None]:

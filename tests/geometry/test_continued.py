@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfplan.errors import InputError
-from cfplan.geometry.continued import BLEND, continued_min_snap, continued_through
-from cfplan.geometry.min_snap import centripetal_times, min_snap, smooth_through
+from cfplan.geometry.continued import BLEND, continued_min_snap
+from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.geometry.path import Path
 
 WAYPOINTS = np.array([[0, 0, 1], [1.2, 0.4, 1.1], [1.5, -0.8, 0.7], [-0.3, -1.0, 1.2], [-1.0, 0.9, 0.9]])
@@ -69,24 +69,6 @@ def test_what_is_missing_of_the_fourth_derivative_moves_the_curve_little_and_not
     assert not apart[s > BLEND].any()
 
 
-def test_a_path_through_dense_points_can_continue_too():
-    angle = np.linspace(0.0, 2 * np.pi, 80)
-    points = np.stack([np.cos(angle), np.sin(angle), 1.0 + 0.1 * np.sin(2 * angle)], axis=1)
-    flown = smooth_through(points)
-    begin = state(flown, 0.4 * flown.end)
-    ahead = points[int(np.argmin(np.linalg.norm(points - begin[0], axis=1))) + 2 :]
-    path = continued_through(begin, ahead)
-    for order in range(5):
-        np.testing.assert_allclose(path(0.0, order), begin[order], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(path(path.end), points[-1], atol=1e-9)
-    for order in (1, 2, 3):
-        assert not path(path.end, order).any()
-    assert_four_times_differentiable(path)
-    dense = path(np.linspace(0.0, path.end, 5000))
-    nearest = np.linalg.norm(dense[:, None] - ahead[None], axis=2).min(axis=0)
-    assert nearest.max() < 1e-3
-
-
 STATE = np.zeros((5, 3))
 
 
@@ -111,8 +93,3 @@ def test_what_cannot_be_continued_is_refused_in_words(start, waypoints, times, m
         continued_min_snap(start, waypoints, times)
     assert refused.value.hint
     assert refused.value.where
-
-
-def test_a_handful_of_points_is_no_dense_list():
-    with pytest.raises(InputError, match="at least four points ahead, not 2"):
-        continued_through(STATE, [[1, 0, 1], [2, 0, 1]])

@@ -22,7 +22,7 @@ from cfplan.steering.recertify import recertify
 
 @pytest.fixture(scope="module")
 def folder(limits, tmp_path_factory):
-    """The record of a flight that was extended, slowed down, replaced from rest, and ended early by a landing."""
+    """The record of a flight that was extended, slowed down, begun anew, stopped, and ended early by a landing."""
     records = tmp_path_factory.mktemp("records")
     with cfplan.connect("sim://0", stepped=True, safety=limits, records=records) as vehicle:
         vehicle.take_off(0.8)
@@ -32,6 +32,10 @@ def folder(limits, tmp_path_factory):
         vehicle.slower()
         vehicle.wait()
         vehicle.sleep(0.5)
+        vehicle.fly([[0, 1.5, 1]])
+        vehicle.sleep(0.6)
+        vehicle.stop()
+        vehicle.wait()
         vehicle.fly([[0, -1.5, 1]])
         vehicle.sleep(0.9)
         vehicle.land()
@@ -46,7 +50,8 @@ def copy(folder, tmp_path):
 def test_everything_committed_is_certified_again_and_was_streamed(folder):
     record = read_record(folder)
     checked = recertify(record)
-    assert checked.plans == checked.joints == 4
+    assert checked.plans == checked.joints == 5
+    assert checked.stops == 1
     assert checked.jump < 1e-9
     assert 0.9 < checked.certificate.worst.share <= 1.0
     assert checked.streamed > 400
@@ -96,7 +101,7 @@ def test_a_plan_that_is_missing_or_another_is_said(copy):
     with pytest.raises(NotCertifiedError, match="the motion jumps"):
         recertify(record)
     second.unlink()
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="no such file with its plan"):
         recertify(record)
 
 
