@@ -13,7 +13,7 @@ from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.proposals import HeldProposals
-from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal, checksum_of
+from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, Refusal, checksum_of
 from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.rate_trade import gains_under
@@ -268,7 +268,7 @@ def random_requests(random: np.random.Generator, limits, count: Counter):
             case "outside":
                 points[-1, 2] = 3.0
             case "near":
-                points[0] = planner.held.flown.at((now + TAKES + 15) / RATE).position + 0.02
+                points[0] = planner.held.flown.at((now + TAKES + SPLICE_AHEAD) / RATE).position + 0.02
             case "late":
                 return replan(planner.held, now + 4, points, limits)
             case "extend" if planner.held.ends - now / RATE < 8.0:

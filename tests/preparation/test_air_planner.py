@@ -10,7 +10,7 @@ from waiting import until
 
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.proposals import ReceivedProposals
-from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal, propose, splice
+from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, Refusal, propose, splice
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
@@ -96,7 +96,7 @@ def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(b
             break
     assert answer.verdict is PathVerdict.ACCEPTED, answer
     assert isinstance(pilot.given[-1], Commitment)
-    assert answer.joint == pytest.approx((pilot.commitment.splices[-1] + 15) / RATE)
+    assert answer.joint == pytest.approx((pilot.commitment.splices[-1] + SPLICE_AHEAD) / RATE)
     again = answer_to(planner.request(Wish.EXTEND, [(0.5, -0.5, 1.0)]), planner, pilot)
     assert again.verdict is PathVerdict.ACCEPTED, again
 

@@ -13,6 +13,7 @@ be late, mistaken or broken, so the pilot verifies by itself, without trusting a
 Where anything of that fails, the old commitment is flown to its end. A commitment is a value: splicing makes a new one.
 """
 
+import math
 import struct
 import zlib
 from dataclasses import dataclass
@@ -22,14 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, RATE, controller_attitude
+from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, LEAD, RATE, controller_attitude
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, turns_for
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import rotations_of
 
-SPLICE_AHEAD = round(BRAKE_LEAD * RATE)  # setpoints from a splice to its joint: as far ahead a setpoint looks
+SPLICE_AHEAD = math.ceil((LEAD + BRAKE_LEAD) * RATE)  # setpoints from a splice to its joint: so far ahead one looks
 LEAST_AHEAD = 2  # setpoints from the clock to a splice, at least, in time for it
 FARTHEST_AHEAD = 6000  # setpoints from the clock to a splice, at most: a minute
 KEPT_BEHIND = 100  # setpoints before a splice that are kept, for a vehicle that fell behind

@@ -28,6 +28,7 @@ from cfplan.flight.setpoints.rate_trade import (
     harmless_rates,
     trade_rates,
     turns_for,
+    turns_seen,
 )
 from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
@@ -42,12 +43,16 @@ from cfplan.vehicle.trajectory import Trajectory
 RATE = 100.0  # Hz
 HOLD = 0.5  # s of hover after the end, so that what the vehicle keeps when the stream stops is a hover
 
-# s by which body rates are sent ahead of the rest: the controller turns them into torque, which the motors give late.
-RATE_LEAD = 0.018
+# s by which setpoints are ahead of the clock: half of the 10 ms for which each is held. Poses are predicted to when
+# they are sent, so the position that the vehicle believes is on time but for the beat of its filter, which is as long.
+LEAD = 0.005
 
-# s by which the length of the thrust vector is sent ahead of its direction, as motors give it late. Both leads were
-# chosen together, for the least deviations in the dry run of all paths at motor lags of 0.07, 0.105 and 0.13 s. What is
-# sent is still a thrust of the plan, so no limit is nearer.
+# s by which body rates are sent ahead of the rest: the controller turns them into torque, which the motors give late.
+RATE_LEAD = 0.022
+
+# s by which the length of the thrust vector is sent ahead of its direction, as motors give it late: for the least
+# deviations in the dry run of all paths at motor lags of 0.07, 0.105 and 0.13 s; the lead of rates is for those in the
+# stepped lab besides. What is sent is still a thrust of the plan, so no limit is nearer.
 THRUST_LEAD = 0.077
 
 HALF_QUANTUM = 0.5e-3  # of position m, velocity m/s, acceleration m/s², body rate rad/s
@@ -83,7 +88,7 @@ def encode_trajectory(
     *,
     rate: float = RATE,
     hold: float = HOLD,
-    lead: float = 0.0,
+    lead: float = LEAD,
     rate_lead: float = RATE_LEAD,
     thrust_lead: float = THRUST_LEAD,
     gains: AttitudeGains = FIRMWARE_GAINS,
@@ -91,10 +96,9 @@ def encode_trajectory(
 ) -> EncodedFlight:
     """Encode a flight: full states at `rate`, Hz, then hover at the end for at least `hold`, s.
 
-    `lead`, s, samples the trajectory that much ahead of the clock; the default is none, because a setpoint is held for
-    10 ms and poses are about as old, and the two cancel. `space` has the walls that a vehicle whose setpoints stop is
-    to keep away from. Raises NotCertifiedError with the setpoint where a value is
-    not finite or does not fit its 16 bits.
+    `lead`, s, samples the trajectory that much ahead of the clock. `space` has the walls that a vehicle whose setpoints
+    stop is to keep away from. Raises NotCertifiedError with the setpoint where a value is not finite or does not fit
+    its 16 bits.
     """
     if not (np.isfinite([trajectory.duration, lead, rate_lead, thrust_lead]).all() and rate > 0 and hold >= 0):
         raise NotCertifiedError(
@@ -229,7 +233,8 @@ def check_motion(
     _check_values("body_rate", decoded.body_rate - sent_rate, require)
 
     traded = motion.body_rate[:, :2] - decoded.body_rate[:, :2]
-    turn = rotations_of(turns_for(traded, gains))
+    seen = rotations_of(turns_seen(motion.body_rate))
+    turn = seen @ rotations_of(turns_for(traded, gains))
     wanted, along = frames @ turn, turn[:, 2, 2]  # cosine between thrust as flown and as sent
     force = decoded.acceleration + _GRAVITY
     thrust = norms(motion.acceleration + _GRAVITY) / along
@@ -238,8 +243,8 @@ def check_motion(
     turned, off, flown, attitude = _turned_back(sent, quaternion, wanted, turn, frames)
     _check_attitude(turned, off, force, require)
 
-    # The rates that setpoints ask for at the motion's attitude.
-    lean = np.einsum("nij,ni->nj", frames, force) / norms(force)[:, None]
+    # The rates that setpoints ask for at the attitude that the controller believes in the motion.
+    lean = np.einsum("nij,ni->nj", frames @ seen, force) / norms(force)[:, None]
     rates = gains.full_rate * np.stack([-lean[:, 1], lean[:, 0], np.zeros(len(lean))], axis=1)
     return replace(decoded, acceleration=flown - _GRAVITY, quaternion=attitude, body_rate=decoded.body_rate + rates)
 

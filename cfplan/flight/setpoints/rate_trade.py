@@ -5,8 +5,9 @@ to the wanted one. Any share of the rate can therefore be moved into the wanted 
 
     Δ  = (ω - ω_sent)_xy                         ω: the rate to fly
     φ  = asin(|Δ| kw / 2kR) along Δ              in body axes, no z
-    q' = q ⊗ exp(φ)                              sent instead of q
-    a' = T / cos|φ| · z(q') - g                  T: specific thrust; it acts along the true axis, hence the cosine
+    q̂  = q ⊗ exp(-τ ω_xy)                        the attitude that the controller believes: its filter's, of τ before
+    q' = q̂ ⊗ exp(φ)                              sent instead of q
+    a' = T / cos∠(z(q), z(q')) · z(q') - g       T: specific thrust; it acts along the true axis, hence the cosine
 
 This matters once setpoints stop: the firmware then wants a level attitude, yet keeps the last roll and pitch rates, and
 settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25°. So the rates that are sent are only those with
@@ -17,7 +18,7 @@ long level-out lasts until the motors stop (LevelOut).
 
 Two bounds leave more of the rate as a rate: φ grows to 90° as |Δ| nears 7 rad/s, so at most TRADED_RATE_MAX is traded;
 and z(q') may not lean beyond LEAN_MAX, where little of the thrust carries the vehicle and the controller's heading is
-hardly defined. With n the direction of φ × z in body axes, u the vertical in them, and both in the plane of z and n,
+hardly defined. In the axes of q̂, with n the direction of φ × z, and u the vertical in the plane of z and n,
 
     z(q')·u = u_n sin φ + u_z cos φ >= cos LEAN_MAX    ⟺    φ <= atan2(u_n, u_z) + acos(cos LEAN_MAX / |(u_n, u_z)|)
 
@@ -36,7 +37,7 @@ from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import heading_of, matrices_of, norms, product, yaw_of
+from cfplan.vehicle.rotations import heading_of, matrices_of, norms, product, rotations_of, yaw_of
 
 BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ahead of the setpoint
 SPEED_LEFT = 0.41  # share of the velocity that is left when the firmware begins to level out
@@ -47,6 +48,9 @@ WALL_PULL_MAX = 0.45  # m/s²; 2.6° of tilt
 TRADED_RATE_MAX = 4.5  # rad/s; what exceeds it is sent as a rate, as φ grows to 90° at 7 rad/s
 LEAN_MAX = math.radians(65.0)  # of the thrust that is sent; plans under the shipped limits reach 45°
 _LEAST_LIFT = math.cos(LEAN_MAX)
+ATTITUDE_AGE = 0.007
+"""s, τ: age of the attitude by which the controller goes, as the firmware's filter predicts it every 10 ms only. In the
+virtual vehicle it was 6.6 to 7.3 ms about roll and pitch, on three paths."""
 _QUANTUM = 1e-3  # rad/s, of rates in a packet
 _LONGEST_GAP = 0.05  # s between setpoints, after which they are read anew
 _ROWS_AHEAD = 2  # of 10 ms, that rates are sent ahead
@@ -144,13 +148,18 @@ def harmless_rates(
     good = (rate / size)[:, None] * np.stack([-pull[:, 1], pull[:, 0]], axis=1)
     traded = motion.body_rate[:, :2] - good
     size = norms(traded)
-    up = matrices_of(motion.quaternion)[:, 2]  # the vertical in body axes
+    up = (matrices_of(motion.quaternion) @ rotations_of(turns_seen(motion.body_rate)))[:, 2]  # in the axes believed
     aside = np.sum(up[:, :2] * np.stack([traded[:, 1], -traded[:, 0]], axis=1), axis=1) / np.maximum(size, 1e-12)
     upright = np.arctan2(aside, up[:, 2])  # the turn after which the axis leans least, by acos(reached)
     reached = np.hypot(aside, up[:, 2])
     widest = np.clip(upright + np.arccos(np.minimum(math.cos(LEAN_MAX) / reached, 1.0)), 0.0, np.pi / 2)
     most = np.minimum(TRADED_RATE_MAX, gains.full_rate * np.sin(widest))
     return np.asarray(motion.body_rate[:, :2] - (np.minimum(size, most) / np.maximum(size, 1e-12))[:, None] * traded)
+
+
+def turns_seen(body_rate: NDArray) -> NDArray:
+    """Return the rotation vectors, (N, 3) rad, from the attitude to the one that the controller believes, at rates."""
+    return np.asarray(-ATTITUDE_AGE * body_rate * (1.0, 1.0, 0.0))
 
 
 def turns_for(rate: NDArray, gains: AttitudeGains = FIRMWARE_GAINS) -> NDArray:
@@ -234,25 +243,24 @@ def _traded(
         good_x, good_y = _good_rate(
             position[n], velocity[n], acceleration_ahead[n], quaternion[n], walls, full_rate, level_out
         )
+        back = _turn(-0.5 * ATTITUDE_AGE * math.sqrt(wx * wx + wy * wy), wx, wy)
         dx, dy = wx - good_x, wy - good_y
         size = math.sqrt(dx * dx + dy * dy)
-        most = min(TRADED_RATE_MAX, _most_by_lean(quaternion[n], dx, dy, size, full_rate))
+        most = min(TRADED_RATE_MAX, _most_by_lean(product(quaternion[n], back), dx, dy, size, full_rate))
         share = most / size if size > most else 1.0
         rates[n, 0] = math.floor((wx - share * dx) / _QUANTUM + 0.5) * _QUANTUM
         rates[n, 1] = math.floor((wy - share * dy) / _QUANTUM + 0.5) * _QUANTUM
 
         dx, dy = wx - rates[n, 0], wy - rates[n, 1]
         size = math.sqrt(dx * dx + dy * dy)
-        sine = min(size / full_rate, 1.0)
-        half = 0.5 * math.asin(sine)
-        along = math.sin(half) / size if size > 0.0 else 0.0
-        turned = product(quaternion[n], (along * dx, along * dy, 0.0, math.cos(half)))
+        turn = product(back, _turn(0.5 * math.asin(min(size / full_rate, 1.0)), dx, dy))
+        turned = product(quaternion[n], turn)
         for k in range(4):
             attitudes[n, k] = turned[k]
 
         x, y, z, w = turned
         fx, fy, fz = acceleration[n, 0], acceleration[n, 1], acceleration[n, 2] + GRAVITY
-        thrust = math.sqrt(fx * fx + fy * fy + fz * fz) / math.sqrt(1.0 - sine * sine)
+        thrust = math.sqrt(fx * fx + fy * fy + fz * fz) / (1.0 - 2.0 * (turn[0] ** 2 + turn[1] ** 2))
         scale = 2.0 * thrust / (x * x + y * y + z * z + w * w)
         accelerations[n, 0] = scale * (x * z + y * w)
         accelerations[n, 1] = scale * (y * z - x * w)
@@ -261,7 +269,17 @@ def _traded(
 
 
 @njit(error_model="numpy")
-def _most_by_lean(quaternion: NDArray, dx: float, dy: float, size: float, full_rate: float) -> float:
+def _turn(half: float, x: float, y: float) -> tuple[float, float, float, float]:
+    """Return the quaternion that turns about (x, y, 0) by twice an angle, rad; none where that is zero."""
+    size = math.sqrt(x * x + y * y)
+    along = math.sin(half) / size if size > 0.0 else 0.0
+    return along * x, along * y, 0.0, math.cos(half)
+
+
+@njit(error_model="numpy")
+def _most_by_lean(
+    quaternion: tuple[float, float, float, float], dx: float, dy: float, size: float, full_rate: float
+) -> float:
     """Return how much of a rate along (dx, dy), of that size, rad/s, may be traded until the thrust leans too far."""
     if size == 0.0:
         return full_rate

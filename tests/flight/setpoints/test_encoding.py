@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.encoding import (
+    LEAD,
     RATE_LEAD,
     THRUST_LEAD,
     check_bytes,
@@ -52,15 +53,14 @@ def encoded(trajectory):
 
 
 def ahead_of(encoded, trajectory):
-    return trajectory.at(encoded.times + BRAKE_LEAD).acceleration
+    return trajectory.at(encoded.times + encoded.lead + BRAKE_LEAD).acceleration
 
 
 @pytest.fixture(scope="module")
 def flown(encoded, trajectory):
     """The motion that the bytes make the vehicle fly."""
-    return check_motion(
-        encoded.payloads, motion_at(trajectory, encoded.times), ahead_of(encoded, trajectory), FIRMWARE_GAINS
-    )
+    motion = motion_at(trajectory, encoded.times + encoded.lead)
+    return check_motion(encoded.payloads, motion, ahead_of(encoded, trajectory), FIRMWARE_GAINS)
 
 
 def test_a_setpoint_is_due_every_ten_milliseconds_until_well_after_the_end(encoded, trajectory):
@@ -85,9 +85,9 @@ def test_it_begins_and_ends_in_hover(encoded, trajectory):
 def test_the_acceleration_field_makes_up_for_drag(trajectory):
     """Newton's second law: mass times planned acceleration is thrust, weight and drag together."""
     encoded = encode_trajectory(trajectory, thrust_lead=0.0)
-    motion = motion_at(trajectory, encoded.times, thrust_lead=0.0)
+    motion = motion_at(trajectory, encoded.times + encoded.lead, thrust_lead=0.0)
     flown = check_motion(encoded.payloads, motion, ahead_of(encoded, trajectory), FIRMWARE_GAINS)
-    states = trajectory.at(encoded.times)
+    states = trajectory.at(encoded.times + encoded.lead)
     turn = Rotation.from_quat(states.quaternion)
     air = turn.inv().apply(states.velocity)
     drag = -turn.apply(air * [AIRFRAME.drag[0], AIRFRAME.drag[0], AIRFRAME.drag[1]])
@@ -98,37 +98,39 @@ def test_the_acceleration_field_makes_up_for_drag(trajectory):
 
 
 def test_body_rates_are_flown_ahead(flown, encoded, trajectory):
-    later = trajectory.at(encoded.times + RATE_LEAD).body_rate
+    later = trajectory.at(encoded.times + encoded.lead + RATE_LEAD).body_rate
     assert flown.body_rate == pytest.approx(later, abs=2e-3)
 
 
 def test_thrust_is_flown_ahead_and_its_direction_is_not(flown, encoded, trajectory):
     force = flown.acceleration + np.array([0, 0, GRAVITY])
     thrust = np.linalg.norm(force, axis=1)
-    assert thrust == pytest.approx(trajectory.at(encoded.times + THRUST_LEAD).specific_thrust, abs=1e-3)
-    assert force / thrust[:, None] == pytest.approx(trajectory.at(encoded.times).thrust_axis, abs=2e-4)
+    assert thrust == pytest.approx(trajectory.at(encoded.times + encoded.lead + THRUST_LEAD).specific_thrust, abs=1e-3)
+    assert force / thrust[:, None] == pytest.approx(trajectory.at(encoded.times + encoded.lead).thrust_axis, abs=2e-4)
 
 
 def test_roll_and_pitch_rates_that_are_sent_are_small_and_the_yaw_rate_is_whole(encoded, trajectory):
-    sent, planned = encoded.decoded.body_rate, trajectory.at(encoded.times + RATE_LEAD).body_rate
+    sent, planned = encoded.decoded.body_rate, trajectory.at(encoded.times + encoded.lead + RATE_LEAD).body_rate
     assert np.linalg.norm(planned[:, :2], axis=1).max() > 0.8
     assert np.linalg.norm(sent[:, :2], axis=1).max() <= UNTIL_WATCHDOG.rate_max + 1e-3
     assert sent[:, 2] == pytest.approx(planned[:, 2], abs=0.6e-3)
 
 
 def test_the_torque_at_the_planned_attitude_is_that_of_the_planned_rates(encoded, trajectory):
-    """Mellinger's attitude error, (Rd' R - R' Rd)/2, and his gains, written out."""
-    planned, later = trajectory.at(encoded.times), trajectory.at(encoded.times + RATE_LEAD).body_rate
+    """Mellinger's attitude error, (Rd' R - R' Rd)/2, and his gains, at the attitude that he believes: 7 ms old."""
+    times = encoded.times + encoded.lead
+    planned, later = trajectory.at(times), trajectory.at(times + RATE_LEAD).body_rate
     sent = encoded.decoded
     wanted = controller_attitude(sent.acceleration + np.array([0, 0, GRAVITY]), sent.quaternion)
-    flown = Rotation.from_quat(planned.quaternion).as_matrix()
-    error = np.swapaxes(wanted, 1, 2) @ flown - np.swapaxes(flown, 1, 2) @ wanted
+    planned_turn = Rotation.from_quat(planned.quaternion)
+    believed = (planned_turn * Rotation.from_rotvec(-0.007 * later * (1.0, 1.0, 0.0))).as_matrix()
+    error = np.swapaxes(wanted, 1, 2) @ believed - np.swapaxes(believed, 1, 2) @ wanted
     turning = -70000.0 * np.stack([error[:, 2, 1], error[:, 0, 2]], axis=1)
     torque = turning + 20000.0 * (sent.body_rate - planned.body_rate)[:, :2]
     assert torque == pytest.approx(20000.0 * (later - planned.body_rate)[:, :2], abs=40.0)  # of 32000
     force = sent.acceleration + np.array([0, 0, GRAVITY])
-    along = np.einsum("ni,ni->n", force, flown[:, :, 2])
-    assert along == pytest.approx(trajectory.at(encoded.times + THRUST_LEAD).specific_thrust, abs=2e-3)
+    along = np.einsum("ni,ni->n", force, planned_turn.as_matrix()[:, :, 2])
+    assert along == pytest.approx(trajectory.at(encoded.times + encoded.lead + THRUST_LEAD).specific_thrust, abs=2e-3)
 
 
 def attitudes(tilt_max: float, count: int = 5000):
@@ -288,7 +290,7 @@ def test_a_path_out_of_the_packets_range_is_refused_with_the_setpoint():
     with pytest.raises(NotCertifiedError, match="position") as caught:
         encode_trajectory(Trajectory(path, profile, AIRFRAME))
     row = int(caught.value.where.split()[1])
-    assert motion_at(Trajectory(path, profile, AIRFRAME), np.array([row / 100])).position[0, 0] > 32.767
+    assert motion_at(Trajectory(path, profile, AIRFRAME), np.array([row / 100 + LEAD])).position[0, 0] > 32.767
 
 
 @pytest.mark.parametrize("bad", [{"rate": 0.0}, {"hold": -1.0}, {"lead": np.nan}, {"rate": np.nan}])
@@ -298,13 +300,14 @@ def test_sampling_that_makes_no_sense_is_refused(trajectory, bad):
 
 
 def test_of_the_packets_alone_people_see_the_motion_that_was_planned(encoded, trajectory):
-    sent, planned = encoded.decoded, trajectory.at(encoded.times)
+    sent, planned = encoded.decoded, trajectory.at(encoded.times + encoded.lead)
     made = Rotation.from_matrix(controller_attitude(sent.acceleration + np.array([0, 0, GRAVITY]), sent.quaternion))
     attitude, acceleration, rate = motion_of_sent(encoded.times, sent.acceleration, made.as_quat(), sent.body_rate)
     later = slice(50, None)  # it takes half a second to forget how it began
     off = (Rotation.from_quat(attitude[later]).inv() * Rotation.from_quat(planned.quaternion[later])).magnitude()
     assert np.degrees(off.max()) < 1.0
-    assert rate[later] == pytest.approx(trajectory.at(encoded.times + RATE_LEAD).body_rate[later], abs=0.12)
-    led = motion_at(trajectory, encoded.times).acceleration
+    turning = trajectory.at(encoded.times + encoded.lead + RATE_LEAD).body_rate
+    assert rate[later] == pytest.approx(turning[later], abs=0.12)
+    led = motion_at(trajectory, encoded.times + encoded.lead).acceleration
     assert acceleration[later] == pytest.approx(led[later], abs=0.15)
     assert np.abs(sent.acceleration - led)[later].max() > 0.5

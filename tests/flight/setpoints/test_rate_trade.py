@@ -50,10 +50,11 @@ vectors = arrays(float, 3, elements=st.floats(-5.0, 5.0))
 @settings(deadline=None)
 @given(vectors, vectors, st.floats(3.0, 15.0), arrays(float, 3, elements=st.floats(-1.0, 1.0)), vectors)
 def test_torque_and_thrust_are_those_of_the_motion(velocity, rate, thrust, rotvec, coming):
-    """Twice kR times the sine of the turn, and kw times the rates: written out, not as the trade computes them."""
+    """Twice kR times the sine of the turn from the attitude believed, 7 ms old, and kw times the rates: written out."""
     motion = motion_of(velocity, rate, thrust, rotvec)
     sent = trade_rates(motion, coming[None])
-    turned = (Rotation.from_quat(motion.quaternion).inv() * Rotation.from_quat(sent.quaternion)).as_rotvec()[0]
+    believed = Rotation.from_quat(motion.quaternion) * Rotation.from_rotvec([-0.007 * rate * (1.0, 1.0, 0.0)])
+    turned = (believed.inv() * Rotation.from_quat(sent.quaternion)).as_rotvec()[0]
     size = np.linalg.norm(turned)
     sine = np.sin(size) / size * turned if size else turned
     torque = 2 * 70000.0 * sine[:2] + 20000.0 * sent.body_rate[0, :2]
