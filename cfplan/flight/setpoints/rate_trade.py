@@ -46,7 +46,7 @@ WALL_LEAD = 0.3  # s by which the place that tells how near a wall will be is ah
 WALL_REACH = 1.5  # m from a wall, within which level-out leans away from it
 WALL_PULL_MAX = 0.45  # m/s²; 2.6° of tilt
 TRADED_RATE_MAX = 4.5  # rad/s; what exceeds it is sent as a rate, as φ grows to 90° at 7 rad/s
-LEAN_MAX = math.radians(65.0)  # of the thrust that is sent; plans under the shipped limits reach 45°
+LEAN_MAX = math.radians(60.0)  # of the thrust that is sent; plans under the shipped limits reach 45°
 _LEAST_LIFT = math.cos(LEAN_MAX)
 ATTITUDE_AGE = 0.007
 """s, τ: age of the attitude by which the controller goes, as the firmware's filter predicts it every 10 ms only. In the
