@@ -115,11 +115,28 @@ def _hold_at_points(task: PlanningTask, segment: Segment, near: NDArray) -> _Hel
     agrees = not ends.end and (ends.continues or not ends.start)  # with the boundary states
     rate, angle, capped = segment.unit**0.5 / step, task.yaw_angle, segment.caps is not None
     problem = build_problem(segment, angle, coefficients=lowered(near, SLOWER, ends.held, rate) if agrees else None)
-    attempt = solve(problem, problem.coefficients, refining_starts(interval, capped=capped), task.deadline)
+    attempt = _search(problem, interval, capped, task.deadline)
     if rejection_reason(attempt, segment) and not task.deadline.passed:  # not near enough
         problem = build_problem(segment, angle)
         attempt = solve(problem, problem.coefficients, COLD_START, task.deadline)
     return rejection_reason(attempt, segment) or _HeldAtPoints(attempt, problem, interval)
+
+
+def _search(problem: Problem, interval: float, capped: bool, deadline: Deadline) -> Attempt:
+    """Search as the first of refining_starts() that succeeds, and on from there if that stops far from the optimum."""
+    first, *others = refining_starts(interval, capped=capped)
+    attempt = solve(problem, problem.coefficients, (first,), deadline)
+    steps = attempt.iterations
+    if attempt.solved or deadline.passed:
+        return attempt
+    attempt = solve(problem, problem.coefficients, others, deadline)
+    steps += attempt.iterations
+    if attempt.solved:
+        on = refining_restarts(interval, capped=capped)[:1]
+        nearer = solve(problem, attempt.coefficients, on, deadline, attempt.multipliers)
+        steps += nearer.iterations
+        attempt = nearer if nearer.solved else attempt
+    return attempt._replace(iterations=steps)
 
 
 def _refine_window(task: PlanningTask, segment: Segment, near: NDArray) -> Tightened | str:
