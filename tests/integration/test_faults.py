@@ -18,6 +18,7 @@ from cfplan.preparation.replan import replan
 from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.studies.fault_scenarios import ASKED, ASKED_AFTER, FOR_GOOD, SCENARIOS, Scenario
@@ -241,3 +242,13 @@ def test_results_of_several_runs_make_one_and_no_flight_counts_twice(missions):
 
 def test_no_flight_begins_when_the_time_is_up(missions):
     assert random_flights(missions, seeds=range(5), minutes=0.0).table("all").rows == ()
+
+
+@pytest.mark.parametrize("moment", [3.0, 3.2])
+def test_a_vehicle_that_believes_itself_beneath_the_floor_gets_no_more_thrust(moment, line):
+    """After a fall its estimate sinks on, poses are gone, and the setpoints would lift it to where it thinks it was."""
+    tumbles = VehicleFault(VehicleFaultKind.TUMBLE, 0.0, 0.05), ViconFault(FaultKind.FREEZE, 0.1, FOR_GOOD)
+    alone = {"pilot_killed": True, "pilot_killed_after": 1.18}
+    flown = fly_scenario(Scenario("fell", Rung.NONE, tumbles, Phase.LAND, moment, **alone), line)
+    assert flown.to_wall > 0.5
+    assert (flown.landed, flown.disarmed, flown.readable) == (True, True, True)

@@ -69,7 +69,7 @@ def flown(monkeypatch):
     def lab(mission, conditions):
         labs.append(conditions)
         told = real_time.decode(mission.payloads)
-        time = START + np.arange(len(mission.payloads)) / 100
+        time = START + mission.lead + np.arange(len(mission.payloads)) / 100  # setpoints are ahead of the plan
         beside = told.position + np.array([OFF, 0.0, 0.0])
         zero = np.zeros(len(time))
         return Lab(Truth(time, beside, told.velocity, told.quaternion, told.body_rate, zero, zero, zero, False))

@@ -1,7 +1,7 @@
 """The landing: down by setpoints, and motors off once the vehicle stands.
 
 The vehicle is never given to its on-board commander, which has no time-out: while setpoints fly it, a vehicle whose
-pilot or radio dies levels out after 0.5 s and stops its motors after 2 s, at any height.
+pilot or radio dies levels out after 0.5 s and stops its motors after a second, at any height.
 
 The setpoints sink on beneath the floor. A vehicle that no longer follows them stands, be it on a box or lower than
 where it took off, and its motors are stopped. Without poses only its own estimate is left, whose height goes wrong with
@@ -33,6 +33,7 @@ _SEEN_FOR = 0.1  # s of good poses after which they are believed again
 _MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
 _LOOK_AGAIN = 0.05  # s
 _LATEST_ESTIMATE = 0.1  # s
+_BENEATH = 0.3  # m below the floor: an estimate that has the vehicle there is worth nothing
 _IDLE_FOR = 0.2  # s without any thrust, which no descent asks for
 
 
@@ -104,7 +105,7 @@ class Landing:
             return loop.now() - seen_since > _SEEN_FOR
 
         def over() -> bool:
-            return self._sunk() or loop.blind_for > _BLIND_FOR
+            return self._sunk() or loop.blind_for > _BLIND_FOR or self._beneath_by_estimate()
 
         loop.until(lambda: self._stands_by_estimate() or over() or seen() or loop.left_alone, math.inf)
         if not (seen() or loop.left_alone):
@@ -134,6 +135,14 @@ class Landing:
         height = pose.position[2]
         near = height - self._floor < _NEAR_FLOOR
         return height - wanted[2] > (_NOT_FOLLOWING if near else _NOT_HELD)
+
+    def _beneath_by_estimate(self) -> bool:
+        """Return whether the vehicle believes itself far beneath the floor, and would climb from there.
+
+        It stands then, after a fall that its sensors did not follow, or is as low as its estimate was wrong.
+        """
+        estimate = self._loop.link.estimate
+        return estimate is not None and estimate.position[2] < self._floor - _BENEATH
 
     def _stands_by_estimate(self) -> bool:
         """Return whether the estimate is so far above its setpoint, or the motors are off for so long, that it stands.
