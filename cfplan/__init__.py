@@ -1,19 +1,35 @@
 """cfplan: plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from cfplan.version import __version__
 
 if TYPE_CHECKING:
+    from cfplan.preparation.from_programs import load_path, plan, rehearse
+    from cfplan.preparation.plan_flight import PlannedFlight as Plan
+    from cfplan.safety.limits_file import load_limits
     from cfplan.steering.connect import connect
 
-__all__ = ["__version__", "connect"]
+__all__ = ["Plan", "__version__", "connect", "load_limits", "load_path", "plan", "rehearse"]
+
+_PLACES = {
+    "Plan": ("cfplan.preparation.plan_flight", "PlannedFlight"),
+    "connect": ("cfplan.steering.connect", "connect"),
+    "load_limits": ("cfplan.safety.limits_file", "load_limits"),
+    "load_path": ("cfplan.preparation.from_programs", "load_path"),
+    "plan": ("cfplan.preparation.from_programs", "plan"),
+    "rehearse": ("cfplan.preparation.from_programs", "rehearse"),
+}
 
 
 def __getattr__(name: str) -> Any:
     """Import what programs use when they ask for it: commands must begin at once."""
-    if name == "connect":
-        from cfplan.steering.connect import connect
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, inside = _PLACES[name]
+    return getattr(import_module(module), inside)
 
-        return connect
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

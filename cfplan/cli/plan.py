@@ -37,10 +37,8 @@ def plan(
         bound = planned.lower_bound()
         results.append(_compared(planned.plan.trajectory.duration, bound, planned.plan.speed_factor))
     if output is not None:
-        from cfplan.planning.plan_file import save_plan
-
         with steps.step("save") as results:
-            save_plan(planned.plan, output, {"name": planned.name, "path file": str(path_file)})
+            planned.save(output, {"path file": str(path_file)})
             results.append(str(output))
     if as_json:
         print_json(planned.to_dict() | {"lower_bound": bound} | ({"file": str(output)} if output else {}))

@@ -11,11 +11,12 @@ place: {x: 0, y: 0, z: 0, yaw_deg: 90}  # turned about z through the origin, the
 
 import math
 import pathlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from cfplan.errors import InputError
@@ -28,6 +29,7 @@ from cfplan.geometry.yaw import YawMode
 
 _DENSE = 8  # points: fewer are waypoints with room between them to gather speed
 _MAX_POINTS = 50_000  # over all laps
+_POINTS_HINT = "give x, y, z in metres, as [[0, 0, 1], [1, 0, 1]]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +124,27 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
     )
 
 
+def path_through(points: ArrayLike, name: str = "points") -> PathFile:
+    """Return the path through points, (K, 3) m, as a file with `points` gives it: at yaw 0, at full speed, one lap.
+
+    Raises:
+        InputError: no numbers, another shape, too few, too near to one another, too many, or too far away.
+    """
+    try:
+        rows = np.array(points, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError("points must be rows of three numbers", where=name, hint=_POINTS_HINT) from None
+    if rows.ndim != 2 or rows.shape[1] != 3:
+        raise InputError(f"points must have the shape (K, 3), not {rows.shape}", where=name, hint=_POINTS_HINT)
+    if len(rows) > _MAX_POINTS:
+        raise InputError(f"more than {_MAX_POINTS} points", where=name, hint="give fewer points")
+    spacing, through = _curve_of(rows)
+    check_points(rows, spacing, lambda index: f"{name}, row {index + 1}")
+    path = through(rows)
+    path.check(where=name)
+    return PathFile(name, path, YawMode.FIXED, 0.0, 1.0, 1, rows, pathlib.Path(name))
+
+
 def read_points(file: pathlib.Path) -> tuple[NDArray, list[int]]:
     """Read points, (K, 3) m, from rows of x, y, z, and the line number of each."""
     return read_table(file, 3, "x, y, z")
@@ -173,10 +196,15 @@ def _from_points(content: _Content, places: Places) -> tuple[Path, NDArray]:
         raise InputError(
             f"a path needs at least two points, not {len(points)}", where=str(file), hint="add rows x, y, z to the file"
         )
-    dense = len(points) >= _DENSE
-    check_points(points, MIN_DENSE_SPACING if dense else MIN_SPACING, lambda index: f"{file}:{lines[index]}")
+    spacing, through = _curve_of(points)
+    check_points(points, spacing, lambda index: f"{file}:{lines[index]}")
     points = _repeated(points, content.laps, places)
-    return (smooth_through(points) if dense else min_snap(points)), points
+    return through(points), points
+
+
+def _curve_of(points: NDArray) -> tuple[float, Callable[[NDArray], Path]]:
+    """Return how near points may be, m, and the curve through them: many are samples, few are waypoints."""
+    return (MIN_DENSE_SPACING, smooth_through) if len(points) >= _DENSE else (MIN_SPACING, min_snap)
 
 
 def _from_polynomials(content: _Content, places: Places) -> tuple[Path, NDArray]:

@@ -50,7 +50,8 @@ def find_planner(name: str) -> Planner:
     if name not in PLANNERS:
         near = difflib.get_close_matches(name, [AUTO, *PLANNERS], n=1)
         guess = f"did you mean {near[0]}? " if near else ""
-        raise InputError(f"unknown planner {name!r}", hint=f"{guess}known: {', '.join([AUTO, *PLANNERS])}")
+        known = ", ".join([AUTO, *PLANNERS])
+        raise InputError(f"unknown planner {name!r}", where="planner", hint=f"{guess}known: {known}")
     module, function = PLANNERS[name].function.split(":")
     planner: Planner = getattr(import_module(module), function)
     return planner

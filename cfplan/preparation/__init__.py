@@ -1,3 +1,12 @@
 """From a path file to a mission: planned, certified, encoded, rehearsed, with a way to stop from every setpoint."""
 
-__all__ = ["air_planner", "compiled_calls", "plan_flight", "prepare_flight", "replan", "stepped_planner", "steps"]
+__all__ = [
+    "air_planner",
+    "compiled_calls",
+    "from_programs",
+    "plan_flight",
+    "prepare_flight",
+    "replan",
+    "stepped_planner",
+    "steps",
+]

@@ -1,5 +1,6 @@
 """From a path file or a plan file to a plan that is certified under today's limits."""
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,19 +10,19 @@ from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InputError
 from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
-from cfplan.geometry.path_file import load_path_file
+from cfplan.geometry.path_file import PathFile, load_path_file
 from cfplan.machine_code import compile_from_here, interprets
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import default_budget, plan
-from cfplan.planning.plan_file import load_plan
+from cfplan.planning.plan_file import load_plan, save_plan
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO
 from cfplan.preparation.glitch_assessment import assess_glitches
 from cfplan.preparation.link_loss_assessment import MARGIN, assess_link_loss, assess_link_loss_of_stops
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss, slow_locally
 from cfplan.preparation.steps import OnStep, ignore_steps, step
-from cfplan.safety.certificate import certify
+from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import check_space
 from cfplan.vehicle.trajectory import Trajectory
@@ -53,6 +54,22 @@ class PlannedFlight:
     link_loss: SimulatedLinkLoss | None = None  # of the plan's bytes, where planning looked at it
     was_read: bool = False  # from a plan file, so that nothing but its limits was checked yet
 
+    @property
+    def certificate(self) -> Certificate:
+        """Return the plan's certificate."""
+        return self.plan.certificate
+
+    @property
+    def duration(self) -> float:
+        """Return the time of flight along the path, s."""
+        return self.plan.trajectory.duration
+
+    def save(self, file: Path | str, provenance: Mapping[str, str] | None = None) -> None:
+        """Write the plan as a Parquet file that `plan_flight` reads. Raises InputError where it cannot."""
+        if Path(file).suffix != PLAN_SUFFIX:
+            raise InputError(f"a plan's file ends in {PLAN_SUFFIX}", where=str(file), hint=f"add {PLAN_SUFFIX}")
+        save_plan(self.plan, file, {"name": self.name} | dict(provenance or {}))
+
     def lower_bound(self) -> float:
         """Return the time, s, that no flight along the path beats at the plan's speed factor; takes up to a second."""
         plan = self.plan
@@ -80,7 +97,7 @@ class PlannedFlight:
 
 
 def plan_flight(
-    source: Path, limits: Limits, options: FlightOptions | None = None, on_step: OnStep = ignore_steps
+    source: Path | PathFile, limits: Limits, options: FlightOptions | None = None, on_step: OnStep = ignore_steps
 ) -> PlannedFlight:
     """Plan a path file, or read a plan file and certify it anew. The certificate may fail: look at it.
 
@@ -88,12 +105,12 @@ def plan_flight(
         InputError: a file or an option is wrong.
         InfeasibleError: the path leaves the space, no profile keeps the limits, or link loss takes the vehicle outside.
     """
-    if source.suffix == PLAN_SUFFIX:
+    if isinstance(source, Path) and source.suffix == PLAN_SUFFIX:
         return _read_plan(source, limits, on_step)
     options = options or FlightOptions()
     with step(on_step, "path") as results:
-        path_file = load_path_file(source)
-        check_space(path_file.path, limits.space, waypoints=path_file.waypoints, where=str(source))
+        path_file = load_path_file(source) if isinstance(source, Path) else source
+        check_space(path_file.path, limits.space, waypoints=path_file.waypoints, where=str(path_file.source))
         results.append(f"{path_file.name}, {path_file.path.length:.1f} m, {len(path_file.waypoints)} waypoints")
     if path_file.path.length > LONG:
         compile_from_here()

@@ -43,6 +43,15 @@ def test_a_gate_that_moves_is_flown_through(vehicle):
     assert max(missed) < 0.1
 
 
+def test_a_plan_is_made_saved_and_rehearsed(tmp_path):
+    duration, deviation = example("plan_and_rehearse").plan_and_rehearse(
+        [[0, 0, 1], [1, 0, 1], [1, 1, 1.2]], str(EXAMPLES.parent / "safety.yaml"), str(tmp_path / "plan.parquet")
+    )
+    assert 0.5 < duration < 10.0
+    assert 0.0 < deviation < 0.15
+    assert (tmp_path / "plan.parquet").exists()
+
+
 def test_every_example_is_tested():
     here = Path(__file__).read_text()
     assert all(f'example("{file.stem}")' in here for file in EXAMPLES.glob("*.py"))

@@ -1,0 +1,76 @@
+"""Planning and rehearsing from programs, by the functions that commands use: `import cfplan` offers them."""
+
+from pathlib import Path
+
+from numpy.typing import ArrayLike
+
+from cfplan.errors import InputError
+from cfplan.geometry import path_file
+from cfplan.geometry.path_file import PathFile
+from cfplan.planning.planners import AUTO
+from cfplan.preparation import prepare_flight
+from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
+from cfplan.preparation.steps import OnStep, ignore_steps
+from cfplan.safety.limits import Limits
+from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.dry_run import DryRun
+
+
+def load_path(source: Path | str | ArrayLike) -> PathFile:
+    """Return the path of a path file, or through points, (K, 3) m, at yaw 0: from 8 points on they are samples of it.
+
+    Raises InputError, with place and hint, where there is no such file, it has a mistake, or the points are none.
+    """
+    return path_file.load_path_file(source) if isinstance(source, Path | str) else path_file.path_through(source)
+
+
+def plan(
+    path: PathFile | Path | str,
+    limits: Limits | Path | str,
+    *,
+    planner: str = AUTO,
+    speed_factor: float | None = None,
+    budget: float | None = None,
+    on_step: OnStep = ignore_steps,
+) -> PlannedFlight:
+    """Plan a path under limits and certify it, as `cfplan plan` does; or read a plan file and certify it anew.
+
+    Args:
+        path: from load_path, or a path file, or a plan file (.parquet).
+        limits: from load_limits, or a safety.yaml.
+        planner: "auto", "learned", "expert", "convex", …; docs/planning.md has them.
+        speed_factor: of the speed that the limits allow, above 0 and at most 1; None takes the path's own.
+        budget: s that planning may take, and giving way as much again; None chooses it by the path's length.
+        on_step: hears of the steps of planning.
+
+    Raises:
+        InputError: a file or an argument is wrong.
+        InfeasibleError: the path leaves the space, no profile keeps the limits, or link loss takes the vehicle outside.
+    """
+    if not isinstance(path, PathFile | Path | str):
+        raise InputError(
+            f"{type(path).__name__} is neither a path nor a file",
+            where="path",
+            hint="make it one with cfplan.load_path(points)",
+        )
+    if not isinstance(limits, Limits):
+        if not isinstance(limits, Path | str):
+            raise InputError(
+                f"{type(limits).__name__} is neither limits nor a file", where="limits", hint='give "safety.yaml"'
+            )
+        limits = load_limits(limits)
+    source = Path(path) if isinstance(path, str) else path
+    options = FlightOptions(planner=planner, speed_factor=speed_factor, budget=budget)
+    return plan_flight(source, limits, options, on_step)
+
+
+def rehearse(plan: PlannedFlight, *, on_step: OnStep = ignore_steps) -> DryRun:
+    """Fly the plan's very setpoints in the simulator, as the dry run of `cfplan fly`; `.deviation` is the worst, m.
+
+    Raises NotCertifiedError where the certificate, the setpoints or the dry run do not pass.
+    """
+    if not isinstance(plan, PlannedFlight):
+        raise InputError(
+            f"{type(plan).__name__} is no plan", where="plan", hint="make it with cfplan.plan(path, limits)"
+        )
+    return prepare_flight.rehearse(plan, prepare_flight.encode_flight(plan, on_step), on_step)
