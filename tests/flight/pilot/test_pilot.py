@@ -7,6 +7,7 @@ from itertools import pairwise
 import pytest
 
 from cfplan.errors import ExitCode, InputError
+from cfplan.flight.pilot import landing
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase, PoseReceived, SetpointSent
@@ -343,7 +344,16 @@ def test_poses_that_go_in_landing_make_it_quick_and_those_that_come_back_gentle(
     assert world.motors_off_in_the_air == 0.0
 
 
-def test_without_poses_the_motors_stop_in_time_wherever_the_vehicle_is(world, fly):
+def test_without_poses_the_motors_stop_where_the_vehicle_believes_itself_beneath_the_floor(world, fly):
+    standing = world.floor
+    world.when(Phase.HOLD, 0.0, lambda: setattr(world, "floor", -10.0))
+    world.when(Phase.HOLD, 0.0, lambda: stop_poses(world))
+    assert fly().rung is Rung.LAND
+    assert -0.05 < world.position[2] - (standing - 0.3) < 0.0
+
+
+def test_without_poses_the_motors_stop_in_time_wherever_the_vehicle_is(world, fly, monkeypatch):
+    monkeypatch.setattr(landing, "_BENEATH", math.inf)  # as if it were higher and still above the floor
     world.when(Phase.HOLD, 0.0, lambda: setattr(world, "floor", -10.0))
     world.when(Phase.HOLD, 0.0, lambda: stop_poses(world))
     outcome = fly()
