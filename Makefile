@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --editable
 
-.PHONY: install fly test slow fuzz pictures lint clean
+.PHONY: install fly test slow fuzz dist pictures lint clean
 
 install: $(VENV)/installed
 
@@ -29,6 +29,10 @@ slow: $(VENV)/installed-tests
 
 fuzz: $(VENV)/installed-tests
 	$(BIN)/python -m tests.fuzzing --inputs 100000
+
+# An archive of the sources, and the wheel made from that archive, in dist/.
+dist: $(VENV)/installed-tests
+	$(BIN)/python -m build
 
 # The pictures of docs/; needs a Vulkan driver (mesa-vulkan-drivers) and chromium, and a computer that does nothing else.
 pictures: install

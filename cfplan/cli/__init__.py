@@ -36,8 +36,27 @@ Exit codes: 0 ok, 2 usage, 3 infeasible, 4 certificate or dry run failed, 5 pref
 6 ended by the operator, 7 ended by a safety rule, 8 link lost."""
 
 
+def _print_version(context: click.Context, _: click.Parameter, asked: bool) -> None:
+    if not asked:
+        return
+    from cfplan.learning.model_files import load_card, models_folder
+    from cfplan.version import commit
+
+    cards = [load_card(file.parent) for file in sorted(models_folder().glob("*/card.json"))]
+    models = ", ".join(f"{card.name} ({card.weights_sha256[:12]}, {card.date[:10]})" for card in cards)
+    click.echo(f"cfplan {__version__}, commit {commit()[:12]}; models: {models}")
+    context.exit()
+
+
 @click.group(epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
-@click.version_option(__version__)
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_version,
+    help="Show version, commit and model.",
+)
 def cfplan() -> None:
     """Plan, certify, rehearse, fly and replay time-optimal Crazyflie flights."""
 

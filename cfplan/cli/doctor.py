@@ -12,8 +12,10 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import print_json, print_table
 from cfplan.errors import CfplanError
+from cfplan.files.nearest import nearest
+from cfplan.files.shipped import example_limits
 from cfplan.steering.starting_vehicle import SIMULATED
-from cfplan.version import __version__
+from cfplan.version import __version__, commit
 
 NEEDED = ("numpy", "scipy", "numba", "casadi", "cflib", "pydantic", "mcap", "pyarrow", "rerun-sdk")
 OPTIONAL = {
@@ -34,7 +36,7 @@ def doctor(warm: bool, safety_file: Path | None, uri: str | None, as_json: bool)
     if warm:
         from cfplan.cli.warm_up import warm_up
 
-        warm_up(options.find_safety_file(safety_file, Path.cwd()), os.cpu_count() or 1)
+        warm_up(safety_file or nearest(options.SAFETY_FILE, Path.cwd()) or example_limits(), os.cpu_count() or 1)
     checks = [
         _python(),
         *map(_package, NEEDED),
@@ -46,10 +48,14 @@ def doctor(warm: bool, safety_file: Path | None, uri: str | None, as_json: bool)
     ]
     missing = [check for check in checks if check["verdict"] in ("missing", "refused")]
     if as_json:
-        print_json({"cfplan": __version__, "checks": checks, "ok": not missing})
+        print_json({"cfplan": __version__, "commit": commit(), "checks": checks, "ok": not missing})
     else:
         rows = [[str(check[key]) for key in ("name", "found", "verdict", "hint")] for check in checks]
-        print_table(f"cfplan {__version__} on {platform.platform()}", ["", "found", "verdict", "hint"], rows)
+        print_table(
+            f"cfplan {__version__}, commit {commit()[:12]}, on {platform.platform()}",
+            ["", "found", "verdict", "hint"],
+            rows,
+        )
     return 5 if missing else 0
 
 

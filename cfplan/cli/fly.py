@@ -78,9 +78,9 @@ def fly(
     from cfplan.steering.starting_vehicle import StartingVehicle, check_uris, look_at_hardware
 
     steps, watched = Steps(as_json=as_json), Watched(live, mavlink)
+    options.check_place(uri, safety_file, records)
     check_uris(uri, mocap_uri)
     check_watchers(watched)
-    options.check_records_folder(records)
     if path_or_plan is None or lines is not None:
         return _steer(path_or_plan, lines, safety_file, uri, mocap_uri, records, watched, yes, as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.FLIGHT)
@@ -109,7 +109,7 @@ def _steer(path_or_plan: Path | None, lines: str | None, *flight: Any) -> int:
         raise InputError(
             "neither a path nor waypoints" if lines is None else "both a path and waypoints",
             where=str(path_or_plan or "cfplan fly"),
-            hint="name a path file, or give --waypoints -",
+            hint="name a path file, or --example figure8, or give --waypoints -",
         )
     return fly_waypoints(lines, *flight)
 

@@ -22,11 +22,51 @@ if TYPE_CHECKING:
 SAFETY_FILE = "safety.yaml"
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
-path_file = click.argument("path_file", metavar="PATH", type=click.Path(path_type=Path))
-path_or_plan = click.argument("path_or_plan", metavar="PATH_OR_PLAN", type=click.Path(path_type=Path))
-path_or_plan_or_none = click.argument(
-    "path_or_plan", metavar="PATH_OR_PLAN", type=click.Path(path_type=Path), required=False
-)
+_EXAMPLE = f"{__name__}.example"
+
+
+def _remember_example(context: click.Context, _: click.Parameter, name: str | None) -> None:
+    if name is not None:
+        from cfplan.files.shipped import example
+
+        context.meta[_EXAMPLE] = example(name)
+
+
+def _or_example(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
+    found: Path | None = context.meta.get(_EXAMPLE)
+    if found is not None and path is not None:
+        raise InputError("both a path and an example", where=str(path), hint="leave one of them out")
+    return found or path
+
+
+def _needed(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path:
+    found = _or_example(context, parameter, path)
+    if found is None:
+        hint = f"'{parameter.make_metavar(context).strip('[]')}' (or --example)"
+        raise click.MissingParameter(ctx=context, param=parameter, param_hint=hint)
+    return found
+
+
+def _path(name: str, check: Callable) -> Callable:
+    """Return what adds a path as an argument, and --example in its place, to a command."""
+    kind = click.Path(path_type=Path)
+    argument = click.argument(
+        name, metavar=f"[{name.removesuffix('_file').upper()}]", type=kind, required=False, callback=check
+    )
+    instead = click.option(
+        "--example",
+        metavar="NAME",
+        is_eager=True,  # read before the path, which it stands for
+        expose_value=False,
+        callback=_remember_example,
+        help="Instead of a path: one that comes with cfplan, as figure8.",
+    )
+    return lambda command: instead(argument(command))
+
+
+path_file = _path("path_file", _needed)
+path_or_plan = _path("path_or_plan", _needed)
+path_or_plan_or_none = _path("path_or_plan", _or_example)
 
 
 def _remember_verbose(context: click.Context, _: click.Parameter, verbose: bool) -> None:
@@ -98,7 +138,18 @@ def find_safety_file(given: Path | None, path_file: Path) -> Path:
     )
 
 
-def check_records_folder(root: Path) -> None:
+def check_place(uri: str, given: Path | None, records: Path) -> None:
+    """Raise InputError where an example would fly hardware in a room that nobody has named, or no record be kept."""
+    if _EXAMPLE in click.get_current_context().meta and not uri.startswith("sim://") and given is None:
+        raise InputError(
+            "an example flies a vehicle of yours only in a room of yours",
+            where=uri,
+            hint="name your safety.yaml with --safety; `cfplan init` writes one",
+        )
+    _check_records_folder(records)
+
+
+def _check_records_folder(root: Path) -> None:
     """Raise InputError where no record could be written under `root`, which need not exist yet."""
     there = root.absolute()
     while not there.exists() and there != there.parent:

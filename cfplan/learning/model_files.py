@@ -8,7 +8,6 @@ the plan says so; what flies is certified either way.
 import hashlib
 import json
 import math
-import sysconfig
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
+from cfplan.files.shipped import shipped_folder
 from cfplan.learning import features
 from cfplan.learning.features import LOGARITHMS, NUMBERS, ScaledLimits, scaled_limits
 from cfplan.learning.inference import NETWORKS, Network, tensor_shapes
@@ -168,13 +168,9 @@ def load_model(folder: Path) -> Model:
     return Model(card, NETWORKS[card.architecture](weights))
 
 
-@lru_cache(maxsize=1)
 def models_folder() -> Path:
-    """Return the folder of the models that come with cfplan: beside the package in a checkout, else as pip put it."""
-    checkout = Path(__file__).parents[2]
-    if (checkout / "pyproject.toml").is_file():
-        return checkout / "models"
-    return Path(sysconfig.get_path("data")) / "share" / "cfplan" / "models"
+    """Return the folder of the models that come with cfplan."""
+    return shipped_folder() / "models"
 
 
 def find_model(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...] = ()) -> Model | None:

@@ -1,20 +1,17 @@
 """Where a measurement comes from: the command, the date, the commit of cfplan and the machine."""
 
 import shlex
-import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
-from pathlib import Path
 from typing import Any
 
+from cfplan import version
 from cfplan.studies.machine import Machine, this_machine
 
-REPOSITORY = Path(__file__).parents[2]
 DECIDES = ("cfplan", "models", "flights", "safety.yaml")  # what a study's figures depend on
-UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,21 +36,7 @@ def provenance() -> Provenance:
     return Provenance(
         command=shlex.join(["cfplan", *sys.argv[1:]]),
         date=datetime.now(UTC).isoformat(timespec="seconds"),
-        commit=_commit(),
-        modified=bool(_git("status", "--porcelain", "--", *DECIDES)),
+        commit=version.commit(),
+        modified=bool(version.git("status", "--porcelain", "--", *DECIDES)),
         machine=this_machine(),
     )
-
-
-def _commit() -> str:
-    top, commit = _git("rev-parse", "--show-toplevel"), _git("rev-parse", "HEAD")
-    return commit if commit and Path(top).resolve() == REPOSITORY.resolve() else UNKNOWN
-
-
-def _git(*arguments: str) -> str:
-    """Return what git says of the folder in which cfplan lies; "" where there is no git or no repository."""
-    command = ["git", "-C", str(REPOSITORY), *arguments]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return ""

@@ -1,0 +1,52 @@
+"""What pip installs is whole: the wheel holds the models and examples, and flies from a folder of its own."""
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import venv
+from pathlib import Path
+
+import pytest
+
+from cfplan.errors import InputError
+from cfplan.files.shipped import example, shipped_folder
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+def test_a_wheel_takes_every_model_and_example_along():
+    packed = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]["data-files"]
+    found = {file for patterns in packed.values() for pattern in patterns for file in REPOSITORY.glob(pattern)}
+    wanted = {REPOSITORY / "safety.yaml", *(REPOSITORY / "flights").iterdir()}
+    wanted |= {file for file in (REPOSITORY / "models").glob("*/*") if file.suffix in (".safetensors", ".json")}
+    assert wanted == found
+
+
+def test_examples_are_found_by_name_and_listed_where_there_is_none():
+    assert example("figure8") == shipped_folder() / "flights" / "figure8.yaml"
+    with pytest.raises(InputError, match="there are circle, figure8"):
+        example("figure9")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)  # it downloads and installs what flying needs
+def test_a_wheel_in_an_empty_environment_flies_an_example(tmp_path):
+    def run(*words: object) -> str:
+        environment = {**os.environ, "HOME": str(tmp_path), "PYTHONPATH": ""}
+        done = subprocess.run(
+            list(map(str, words)), capture_output=True, text=True, cwd=tmp_path, env=environment, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout + done.stderr
+
+    run(sys.executable, "-m", "build", "--outdir", tmp_path, REPOSITORY)
+    venv.create(tmp_path / "env", with_pip=True)
+    tools = tmp_path / "env" / "bin"
+    run(tools / "python", "-m", "pip", "install", "--quiet", *tmp_path.glob("cfplan-*.whl"))
+    assert re.match(r"cfplan \S+, commit [0-9a-f]{12}; models: any \(", run(tools / "cfplan", "--version"))
+    said = run(tools / "cfplan", "fly", "--example", "line")
+    assert "by learned" in said
+    (record,) = (tmp_path / "records").iterdir()
+    assert f"record: records/{record.name}" in said
