@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @click.group(short_help="Labelled paths for training.")
 def dataset() -> None:
-    """Make datasets of paths labelled by the expert, and look into them."""
+    """Make datasets of paths labelled by the expert or TOPPQuad, and look into them."""
 
 
 def _boxes(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> tuple[tuple[float, ...], ...]:
@@ -51,7 +51,7 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
     "--limits",
     default="drawn",
     show_default=True,
-    help="Limits and vehicle: drawn for each path, or a set, hardware (2 m/s) or simulation (5 m/s).",
+    help="Limits and vehicle: drawn for each path, or a set: hardware (2 m/s), simulation or paper (5 m/s).",
 )
 @click.option("--safety", type=click.Path(path_type=Path), help="Vehicle and plan limits of this safety.yaml instead.")
 @click.option("--seed", type=int, default=0, show_default=True)
@@ -73,6 +73,9 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
     default="solve",
     show_default=True,
     help="Solve each copy, or keep the clean path's label.",
+)
+@click.option(
+    "--planner", type=click.Choice(["expert", "toppquad"]), default="expert", show_default=True, help="That labels."
 )
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine.")
 @click.option("--scheduler", help="Label on a Dask cluster instead: tcp://host:port.")
@@ -104,13 +107,13 @@ def _spec(what: dict[str, Any]) -> "DatasetSpec":
     """Return the spec that the options make."""
     from cfplan.geometry.path_families import USUAL
     from cfplan.geometry.yaw import YawMode
-    from cfplan.learning.dataset_spec import DRAWN, GIVEN, DatasetSpec, Relabel
-    from cfplan.safety.limit_sets import LIMIT_SETS
+    from cfplan.learning.dataset_spec import DRAWN, GIVEN, DatasetSpec, Labeller, Relabel
+    from cfplan.safety.limit_sets import DATA_SETS
     from cfplan.safety.limits_file import load_limits
 
     file, limits, yaw = what.pop("safety"), what["limits"], what["yaw"]
-    if limits not in (DRAWN, *LIMIT_SETS):
-        known = ", ".join((DRAWN, *LIMIT_SETS))
+    if limits not in (DRAWN, *DATA_SETS):
+        known = ", ".join((DRAWN, *DATA_SETS))
         raise InputError(f"no limit set {limits!r}", where="--limits", hint=f"one of {known}; or --safety FILE")
     if file is not None and limits != DRAWN:
         raise InputError("limits are given twice", where="--safety", hint="leave --limits out")
@@ -121,7 +124,7 @@ def _spec(what: dict[str, Any]) -> "DatasetSpec":
     return DatasetSpec(
         **what | given | {
             "families": () if what["boxes"] else USUAL, "yaw": None if yaw == "any" else YawMode(yaw),
-            "relabel": Relabel(what["relabel"]),
+            "relabel": Relabel(what["relabel"]), "planner": Labeller(what["planner"]),
         },
     )  # fmt: skip
 

@@ -12,7 +12,7 @@ from cfplan import __version__
 from cfplan.errors import InputError
 from cfplan.geometry.path_families import USUAL, Family
 from cfplan.geometry.yaw import YawMode
-from cfplan.safety.limit_sets import LIMIT_SETS, LimitSet
+from cfplan.safety.limit_sets import DATA_SETS, LimitSet
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 
@@ -20,6 +20,7 @@ SPEC_FILE = "dataset.json"
 DRAWN, GIVEN = "drawn", "given"  # limits that are no set by name
 _MOST = 10_000_000  # paths, copies of one, rows of a shard
 _MOST_WAYPOINTS, _MOST_NODES = 1000, 100_000
+_SINCE = {"planner"}  # keys that datasets of older versions lack
 _REMEDY = "give another folder, or make the dataset again"
 
 
@@ -28,6 +29,13 @@ class Relabel(StrEnum):
 
     SOLVE = "solve"  # its own solution
     KEEP = "keep"  # the clean path's label, as the paper's noise injection has it
+
+
+class Labeller(StrEnum):
+    """The planner whose solution is a path's label."""
+
+    EXPERT = "expert"
+    TOPPQUAD = "toppquad"  # the paper's
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +57,7 @@ class DatasetSpec:
     epsilon: float = 0.0  # m, perturbation of the copies at each node
     copies: int = 0  # perturbed, of each path
     relabel: Relabel = Relabel.SOLVE
+    planner: Labeller = Labeller.EXPERT
     shard_rows: int = 100
     version: str = __version__
 
@@ -57,7 +66,7 @@ class DatasetSpec:
         wrong = [
             ("count", not 1 <= self.count <= _MOST, f"from 1 to {_MOST}"),
             ("seed", self.seed < 0, "at least 0"),
-            ("limits", self.limits not in (*LIMIT_SETS, DRAWN, GIVEN), f"one of {', '.join((*LIMIT_SETS, DRAWN))}"),
+            ("limits", self.limits not in (*DATA_SETS, DRAWN, GIVEN), f"one of {', '.join((*DATA_SETS, DRAWN))}"),
             ("plan", (self.limits == GIVEN) != (None not in (self.plan, self.airframe)), "there with given limits"),
             ("boxes", not all(_is_box(box) for box in self.boxes), "of three lengths in m each"),
             ("families", bool(self.families) == bool(self.boxes), "there unless boxes are"),
@@ -81,7 +90,7 @@ class DatasetSpec:
         """Return the vehicle and the limits of all rows; None where they are drawn."""
         if self.airframe is not None and self.plan is not None:
             return LimitSet(GIVEN, self.airframe, self.plan)
-        return LIMIT_SETS.get(self.limits)
+        return DATA_SETS.get(self.limits)
 
     @property
     def rows(self) -> int:
@@ -121,7 +130,7 @@ def load_spec(folder: Path) -> DatasetSpec:
         text = file.read_text(encoding="utf-8")
         content = json.loads(text)
         known = {field.name for field in fields(DatasetSpec)}
-        if not isinstance(content, dict) or set(content) != known:
+        if not isinstance(content, dict) or not known - _SINCE <= set(content) <= known:
             raise ValueError(f"its keys are not those of cfplan {__version__}")
         return TypeAdapter(DatasetSpec).validate_json(text, strict=True)
     except InputError as error:

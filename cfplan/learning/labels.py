@@ -1,4 +1,4 @@
-"""Label a row of a dataset: a path from its seed, and the expert's solution."""
+"""Label a row of a dataset: a path from its seed, and the solution of the expert or of TOPPQuad."""
 
 import math
 from dataclasses import asdict, fields
@@ -14,7 +14,7 @@ from cfplan.geometry.path import Path
 from cfplan.geometry.path_families import Family, family_path
 from cfplan.geometry.random_paths import generator, perturbed, random_waypoints
 from cfplan.geometry.yaw import YawMode
-from cfplan.learning.dataset_spec import DatasetSpec, Relabel
+from cfplan.learning.dataset_spec import DatasetSpec, Labeller, Relabel
 from cfplan.learning.draws import draw_limit_set
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.solution import Solution, Status
@@ -147,7 +147,12 @@ def _row(spec: DatasetSpec, row: int) -> tuple[dict[str, Any], float]:
 
 def _solve(spec: DatasetSpec, number: int, path: Path) -> Solution:
     chosen, mode, angle = row_limits(spec, number)
-    return plan_expert(PlanningTask(path, chosen.airframe, chosen.limits, nodes=spec.nodes, yaw=mode, yaw_angle=angle))
+    task = PlanningTask(path, chosen.airframe, chosen.limits, nodes=spec.nodes, yaw=mode, yaw_angle=angle)
+    if spec.planner is Labeller.TOPPQUAD:
+        from cfplan.planners.baselines.toppquad import plan_toppquad  # with CasADi, which takes its time to import
+
+        return plan_toppquad(task)
+    return plan_expert(task)
 
 
 @lru_cache(maxsize=1)

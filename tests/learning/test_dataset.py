@@ -16,7 +16,7 @@ from cfplan.geometry.path_families import Family
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import dataset
 from cfplan.learning.dataset import SchedulerError, describe, label_shard, make_dataset, read_dataset, read_timing
-from cfplan.learning.dataset_spec import DatasetSpec, Relabel, load_spec
+from cfplan.learning.dataset_spec import DatasetSpec, Labeller, Relabel, load_spec
 from cfplan.learning.labels import row_limits, row_path
 from cfplan.safety.feasibility import infeasible_limit
 from cfplan.vehicle.airframes import AIRFRAMES
@@ -276,3 +276,23 @@ def test_a_cluster_makes_the_same_bytes_also_when_a_worker_is_killed(made, tmp_p
         )
     assert killed
     assert shard_bytes(tmp_path) == shard_bytes(made)
+
+
+def test_toppquad_labels_the_same_paths(tmp_path):
+    spec = replace(SMALL, count=2, limits="paper", waypoints=(4, 4), yaw=YawMode.FREE)
+    make_dataset(tmp_path / "expert", spec)
+    make_dataset(tmp_path / "toppquad", replace(spec, planner=Labeller.TOPPQUAD))
+    assert load_spec(tmp_path / "toppquad").planner is Labeller.TOPPQUAD
+    (_, by_expert), (_, by_toppquad) = read_dataset(tmp_path / "expert"), read_dataset(tmp_path / "toppquad")
+    assert by_expert["coefficients"].equals(by_toppquad["coefficients"])
+    assert set(by_toppquad["solver"].to_pylist()) == {"IPOPT"}
+    assert 0.0 <= min(yaw[0] for yaw in by_toppquad["yaw"].to_pylist()) <= np.pi / 2  # as the paper has it
+    for ours, theirs in zip(by_expert["travel_time"].to_pylist(), by_toppquad["travel_time"].to_pylist(), strict=True):
+        assert theirs == pytest.approx(ours, rel=0.03)
+
+
+def test_a_dataset_from_before_planners_were_named_is_the_experts(made, tmp_path):
+    content = json.loads((made / "dataset.json").read_text())
+    del content["planner"]
+    (tmp_path / "dataset.json").write_text(json.dumps(content))
+    assert load_spec(tmp_path) == SMALL
