@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --editable
 
-.PHONY: install fly test slow fuzz dist pictures lint clean
+.PHONY: install fly test slow fuzz dist site pictures lint clean
 
 install: $(VENV)/installed
 
@@ -33,6 +33,10 @@ fuzz: $(VENV)/installed-tests
 # An archive of the sources, and the wheel made from that archive, in dist/.
 dist: $(VENV)/installed-tests
 	$(BIN)/python -m build
+
+# The documentation as a site, in build/site.
+site: $(VENV)/installed-tests
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # The pictures of docs/; needs a Vulkan driver (mesa-vulkan-drivers) and chromium, and a computer that does nothing else.
 pictures: install
