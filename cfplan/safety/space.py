@@ -53,7 +53,7 @@ def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None,
     between = np.repeat(step[:, None] ** 2 / 8 * bend, _SAMPLES, axis=0)
     worst = int(np.argmax((space.beyond(points) + between).max(axis=1)))
     if not np.all(space.beyond(points[worst]) + between[worst] <= 0.0):
-        _refuse(space, points[worst], f"the path at s = {s[worst]:.2f} of {path.end:.2f}", where)
+        _refuse(space, points[worst], f"the path at s = {s[worst]:.2f} of {path.end:.2f} m", where)
 
 
 def _refuse(space: Space, point: NDArray, what: str, where: str) -> None:
