@@ -25,6 +25,11 @@ _nodes = click.option("--nodes", type=int, default=100, show_default=True, help=
 _path = click.argument("path_file", metavar="PATH", type=click.Path(path_type=Path))
 _paths = click.argument("path_files", metavar="PATH...", type=click.Path(path_type=Path), nargs=-1, required=True)
 
+_earlier = click.option(
+    "--add", "earlier_files", type=click.Path(path_type=Path), multiple=True,
+    help="A result of other seeds, which the tables then count as well; may be given several times.",
+)  # fmt: skip
+
 
 def _count(default: int, text: str) -> Callable[..., Any]:
     return click.option("--paths", type=int, default=default, show_default=True, help=text)
@@ -212,10 +217,7 @@ def faults(path_file: Path, only: tuple[str, ...], **given: Any) -> None:
     help="Small paths of two or three waypoints, beside those given.",
 )  # fmt: skip
 @click.option("--minutes", type=click.FloatRange(0, min_open=True), help="Begin no flight after them.  [default: all]")
-@click.option(
-    "--add", "earlier_files", type=click.Path(path_type=Path), multiple=True,
-    help="A result of other seeds, which the tables then count as well; may be given several times.",
-)  # fmt: skip
+@_earlier
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
 @_output
 @options.as_json
@@ -241,6 +243,38 @@ def random_faults(**given: Any) -> None:
         missions = prepare_missions(path_files, _safety_file, random_paths)
         seeds = range(first_seed, first_seed + count)
         return random_flights(missions, seeds=seeds, minutes=minutes or math.inf, earlier=earlier, **rest)
+
+    _measure(run, "flying", given)
+
+
+@study.command(epilog="Example: cfplan study steering --flights 40 --jobs 2 -o results/steering.json")
+@click.option("--flights", "count", type=click.IntRange(1), default=40, show_default=True)
+@click.option("--requests", type=click.IntRange(1), default=250, show_default=True, help="Of each flight.")
+@click.option(
+    "--seconds", type=click.FloatRange(1), default=90.0, show_default=True,
+    help="Of each flight, in which they are asked for.",
+)  # fmt: skip
+@_seed(0, "Of the first flight.")
+@click.option("--minutes", type=click.FloatRange(0, min_open=True), help="Begin no flight after them.  [default: all]")
+@_earlier
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@_output
+@options.as_json
+def steering(**given: Any) -> None:
+    """Steer the virtual Crazyflie by random requests, and judge every setpoint that was streamed.
+
+    Requests extend, replace, stop, ask for what cannot be flown, or are garbage, at any moment and in bursts.
+    """
+    _use_one_thread()
+    from cfplan.studies.result import read_result
+    from cfplan.studies.steering import steering as run_steering
+
+    def run(
+        count: int, first_seed: int, earlier_files: tuple[Path, ...] = (), minutes: float | None = None, **rest: Any
+    ) -> "StudyResult":
+        earlier = [read_result(file) for file in earlier_files]
+        seeds = range(first_seed, first_seed + count)
+        return run_steering(_safety_file(Path()), seeds=seeds, minutes=minutes or math.inf, earlier=earlier, **rest)
 
     _measure(run, "flying", given)
 

@@ -184,7 +184,9 @@ def _slowing_to(speed: float, way: _Way) -> SpeedCaps:
     moving = np.linalg.norm(way.path(s, 1), axis=1)
     length = np.append(0.0, np.cumsum((moving[1:] + moving[:-1]) / 2.0 * np.diff(s)))
     first = moving[0] * way.start.h**0.5
-    gaining = moving[0] * way.start.dh / 2.0 + way.start.h * float(way.path(0.0, 1) @ way.path(0.0, 2)) / moving[0]
+    gaining = moving[0] * way.start.dh / 2.0
+    if moving[0] > 0.0:  # else it begins at rest, where γ' and γ'' are 0
+        gaining += way.start.h * float(way.path(0.0, 1) @ way.path(0.0, 2)) / moving[0]
     highest = first + 0.1 + OVERSHOOT * max(gaining, 0.0)
     falling = np.sqrt(np.maximum(highest**2 - 2.0 * SLOWING * np.maximum(length - LEVEL_FOR * first, 0.0), 0.0))
     return SpeedCaps.of(s, np.maximum(falling, speed))

@@ -2,9 +2,11 @@
 
 __all__ = [
     "connect",
+    "flight_in_progress",
     "recertify",
     "recorded_steering",
     "starting_vehicle",
     "steered_vehicle",
+    "stepped_steering",
     "waypoint_lines",
 ]

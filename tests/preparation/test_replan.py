@@ -10,7 +10,7 @@ from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.continuation import continue_plan
 from cfplan.planning.plan import plan
-from cfplan.preparation.replan import accepted, hold, replan
+from cfplan.preparation.replan import accepted, at_pace, hold, hold_hover, replan
 from cfplan.safety.certificate import certify
 from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.glitches import glitch_at_every_setpoint
@@ -150,3 +150,14 @@ def test_what_cannot_be_flown_is_refused_in_words(held, limits, waypoints, error
         replan(held, NOW, waypoints, limits)
     assert isinstance(refused.value, CfplanError)
     assert refused.value.hint
+
+
+def test_a_slow_flight_is_replaced_before_it_has_left_its_hover(limits):
+    """Its joint is where the plan begins: at rest, where the speed has no direction to grow in."""
+    hovering = at_pace(hold_hover((0.0, 0.0, 0.8), 0.0, limits), 1.0)
+    held = after(hovering, limits, replan(hovering, 30, [[0.5, 1.5, 1.0]], limits), 20)
+    again = replan(held, 30, [[-0.5, 1.5, 1.0]], limits)
+    after(held, limits, again, 20)
+    assert again.plan is not None
+    moments = np.linspace(0.0, again.plan.trajectory.duration, 300)
+    assert np.linalg.norm(again.plan.trajectory.at(moments).velocity, axis=1).max() == pytest.approx(1.0, abs=0.02)

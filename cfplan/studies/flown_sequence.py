@@ -1,0 +1,212 @@
+"""Judge what a steered flight streamed, from its first setpoint to its last, against the limits of plans and of stops.
+
+Nothing that planner or pilot computed is believed: the bytes that the pilot says it is bound to are laid together to
+one sequence, what was sent is compared with it, and that sequence is held against the motions that were committed, and
+against what its own velocities and positions say by differences.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import NotCertifiedError
+from cfplan.flight.setpoints.commitment import QUANTUM
+from cfplan.flight.setpoints.encoding import (
+    ATTITUDE_QUANTUM,
+    HALF_QUANTUM,
+    LEAD,
+    RATE,
+    RATE_LEAD,
+    THRUST_LEAD,
+    EncodedFlight,
+    check_bytes,
+)
+from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
+from cfplan.flight.setpoints.rate_trade import gains_under
+from cfplan.flight.telemetry import SetpointSent
+from cfplan.safety.certificate import certify
+from cfplan.safety.limits import Limits
+from cfplan.vehicle.joint import JoinedTrajectory
+
+_FIELDS = ("position", "velocity", "acceleration", "body_rate")
+_SPAN = 2  # setpoints on each side, over which velocities are differentiated
+_ROUNDED = np.sqrt(3.0) * 2.0 * HALF_QUANTUM * RATE / (2.0 * _SPAN)  # m/s², by which such a difference is off
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Committed:
+    """One plan or stop that the pilot accepted, or what the flight began with."""
+
+    splice: int  # number of its first setpoint
+    payloads: NDArray  # (K, 29) uint8
+    stops: NDArray  # (K, 2, 29) uint8, the first and the last setpoint of the stop from each
+    flown: JoinedTrajectory  # all motion of the flight with it, on a clock that is 0 at setpoint 0
+    stop_until: int = 0  # number of the setpoint at which a stop that was asked for rests; 0 for a plan
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceVerdict:
+    """The worst of a flown sequence."""
+
+    setpoints: int  # that were sent
+    missing: int  # between the first and the last, that were not sent, of those that move
+    differing: int  # from those that were committed
+    plan_share: float  # of a limit, the most that the dense certificate finds in a committed plan
+    speed: float  # m/s
+    acceleration: float  # m/s², by differences of velocity outside stops, less what packets round
+    stop_acceleration: float  # m/s², likewise in stops
+    share_fast: float  # of the time, faster than nine tenths of the limit
+    joint: float  # quanta, the most that a field jumps by at a splice
+    without_stop: int  # setpoints that were sent without a committed stop that begins there and rests inside
+    faults: tuple[str, ...]  # what exceeds a limit, in words
+
+
+def judge_sequence(
+    sent: Mapping[int, SetpointSent], commitments: Sequence[Committed], limits: Limits
+) -> SequenceVerdict:
+    """Judge setpoints as they were sent, by their numbers; `commitments` in order, the first begins the flight."""
+    sequence, stops, joint = _laid_together(commitments)
+    numbers = np.array(sorted(sent), dtype=int)
+    rows = np.minimum(numbers, len(sequence) - 1)  # after its end the vehicle hovers
+    flown, planned = _of_messages([sent[number] for number in numbers]), _rows(decode(sequence), rows)
+    off = np.max([np.abs(getattr(flown, name) - getattr(planned, name)).max(axis=1) for name in _FIELDS], axis=0)
+    in_stop = np.zeros(len(sequence), dtype=bool)
+    for each in commitments:
+        in_stop[each.splice :] = False
+        in_stop[each.splice : each.stop_until] = True
+    faults = _byte_faults_between_stops(commitments, sequence, limits)
+    speed = np.linalg.norm(flown.velocity, axis=1)
+    accelerating = _differentiated(flown.velocity, numbers)
+    stopping = _widened(in_stop)[rows]
+    verdict = SequenceVerdict(
+        setpoints=len(numbers),
+        missing=_missing(sequence, numbers),
+        differing=int((off > 1e-9).sum()),
+        plan_share=_plan_share(commitments, limits),
+        speed=float(speed.max()),
+        acceleration=float(accelerating[~stopping].max(initial=0.0)),
+        stop_acceleration=float(accelerating[stopping].max(initial=0.0)),
+        share_fast=float((speed > 0.9 * limits.plan.speed).mean()),
+        joint=joint,
+        without_stop=_without_stop(flown, stops[rows], limits),
+        faults=(),
+    )
+    return replace(verdict, faults=(*faults, *_exceeded(verdict, limits)))
+
+
+def _missing(sequence: NDArray, numbers: NDArray) -> int:
+    """Return how many moving setpoints were left out; where it waits at the end, the pilot repeats the last."""
+    moving = np.array(decode(sequence).velocity.any(axis=1))
+    moving[numbers[numbers < len(moving)]] = False
+    return int(moving[numbers[0] : numbers[-1]].sum())
+
+
+def _exceeded(verdict: SequenceVerdict, limits: Limits) -> list[str]:
+    bounds = (
+        ("share of a limit in a plan", verdict.plan_share, 1.0),
+        ("speed", verdict.speed, limits.plan.speed + 2.0 * HALF_QUANTUM),
+        ("acceleration by differences", verdict.acceleration, limits.plan.acceleration),
+        ("acceleration by differences in a stop", verdict.stop_acceleration, limits.flight.acceleration.brake),
+        ("jump at a splice, in quanta", verdict.joint, 1.0),
+        ("setpoints left out", verdict.missing, 0),
+        ("setpoints sent that were not committed", verdict.differing, 0),
+        ("setpoints sent without a committed stop", verdict.without_stop, 0),
+    )
+    return [f"{what}: {value:.6g}, allowed {most:g}" for what, value, most in bounds if not value <= most]
+
+
+def _laid_together(commitments: Sequence[Committed]) -> tuple[NDArray, NDArray, float]:
+    """Return all setpoints (N, 29) as they were committed last, their stops, and the largest jump at a splice."""
+    sequence, stops, worst = commitments[0].payloads, commitments[0].stops, 0.0
+    for each in commitments[1:]:
+        waits = max(each.splice - len(sequence) + 1, 0)  # it hovers at the end of what was held
+        sequence = np.concatenate([sequence, np.repeat(sequence[-1:], waits, axis=0)])
+        stops = np.concatenate([stops, np.repeat(stops[-1:], waits, axis=0)])
+        worst = max(worst, _jump(sequence[each.splice], each.payloads[0]))
+        sequence = np.concatenate([sequence[: each.splice], each.payloads])
+        stops = np.concatenate([stops[: each.splice], each.stops])
+    return sequence, stops, worst
+
+
+def _jump(before: NDArray, after: NDArray) -> float:
+    """Return by how many quanta two setpoints, (29,), differ; those of attitude are what its bits may be off by."""
+    both = decode(np.stack([before, after]))
+    fields = max(float(np.abs(np.subtract(*getattr(both, name))).max()) for name in _FIELDS) / QUANTUM
+    turned = 2.0 * np.arccos(min(abs(float(both.quaternion[0] @ both.quaternion[1])), 1.0))
+    return float(max(round(fields, 6), turned / (2.0 * ATTITUDE_QUANTUM)))
+
+
+def _plan_share(commitments: Sequence[Committed], limits: Limits) -> float:
+    """Return the largest share of a limit that the dense certificate finds in any motion that was committed."""
+    trajectories = {id(each): each for committed in commitments for each in committed.flown.trajectories}
+    return max(certify(each, limits.plan, limits.space).worst.share for each in trajectories.values())
+
+
+def _byte_faults_between_stops(commitments: Sequence[Committed], sequence: NDArray, limits: Limits) -> list[str]:
+    """Return what the check of bytes finds in the flown sequence, stretch by stretch between stops.
+
+    A stretch goes on, behind the splice of the stop that ends it, as it was committed before.
+    """
+    found, begin = [], 0
+    for number, each in enumerate(commitments):
+        following = commitments[number + 1] if number + 1 < len(commitments) else None
+        if each.stop_until:
+            begin = each.stop_until
+        if following is not None and not following.stop_until:
+            continue
+        so_far = sequence if following is None else np.concatenate([sequence[: each.splice], each.payloads])
+        if following is None or begin < following.splice:
+            found += _byte_faults(so_far[begin:], begin, each.flown, limits)
+    return found
+
+
+def _byte_faults(payloads: NDArray, begin: int, flown: JoinedTrajectory, limits: Limits) -> list[str]:
+    times, since = np.arange(len(payloads)) / RATE, flown.since(begin / RATE)
+    decoded = decode(payloads)
+    encoded = EncodedFlight(
+        times, payloads, decoded, decoded, LEAD, RATE_LEAD, THRUST_LEAD, gains_under(limits), limits.space
+    )
+    try:
+        check_bytes(encoded, since, limits.plan)
+    except NotCertifiedError as error:
+        return [f"{error.where} behind {begin}: {error.what}"]
+    return []
+
+
+def _without_stop(flown: FullStateSetpoints, stops: NDArray, limits: Limits) -> int:
+    begin, end = decode(stops[:, 0]), decode(stops[:, 1])
+    off = np.maximum(
+        np.abs(begin.position - flown.position).max(axis=1), np.abs(begin.velocity - flown.velocity).max(axis=1)
+    )
+    inside = limits.space.beyond(end.position).max(axis=1) <= QUANTUM
+    return int((~((off <= 1.001 * QUANTUM) & inside & ~end.velocity.any(axis=1))).sum())
+
+
+def _differentiated(velocity: NDArray, numbers: NDArray) -> NDArray:
+    """Return (N,) m/s²: the change of velocity about each setpoint, less what packets round, at least 0."""
+    out = np.zeros(len(numbers))
+    ahead, behind = np.arange(2 * _SPAN, len(numbers)), np.arange(len(numbers) - 2 * _SPAN)
+    change = np.linalg.norm(velocity[ahead] - velocity[behind], axis=1) * RATE / (numbers[ahead] - numbers[behind])
+    out[_SPAN : len(numbers) - _SPAN] = np.maximum(change - _ROUNDED, 0.0)
+    return out
+
+
+def _widened(rows: NDArray) -> NDArray:
+    """Return (N,) whether any row within _SPAN of each is True."""
+    wide = rows.copy()
+    for by in range(1, _SPAN + 1):
+        wide[by:] |= rows[:-by]
+        wide[:-by] |= rows[by:]
+    return wide
+
+
+def _of_messages(messages: Sequence[SetpointSent]) -> FullStateSetpoints:
+    return FullStateSetpoints(
+        *(np.array([getattr(message, name) for message in messages]) for name in FullStateSetpoints.__slots__)
+    )
+
+
+def _rows(setpoints: FullStateSetpoints, rows: NDArray) -> FullStateSetpoints:
+    return FullStateSetpoints(*(getattr(setpoints, name)[rows] for name in FullStateSetpoints.__slots__))

@@ -1,0 +1,95 @@
+"""The study of random requests: a flight passes, and what is wrong with a flown sequence is found."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.errors import InputError
+from cfplan.flight.setpoints.packets import decode
+from cfplan.studies import steering as study
+from cfplan.studies.flown_sequence import judge_sequence
+from cfplan.studies.result import read_result
+
+SAFETY = Path(__file__).parents[2] / "safety.yaml"
+
+
+@pytest.fixture(scope="module")
+def flown(limits):
+    """A flight of some requests, and what was sent and committed in it."""
+    kept = []
+
+    def judge(*given):
+        kept.append(given)
+        return judge_sequence(*given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "judge_sequence", judge)
+        flight = study.fly_steered(4, limits, requests=14, seconds=8.0)
+    return flight, *kept[0][:2]
+
+
+def test_random_requests_are_flown_or_refused_within_every_limit(flown):
+    flight, sent, commitments = flown
+    assert not flight.bad, flight
+    answered = flight.accepted + flight.refused + flight.late + flight.superseded + flight.invalid
+    assert answered == flight.requests >= 14
+    assert len(commitments) > 4
+    assert len(sent) > 300
+    assert 0.5 < flight.plan_share <= 1.0
+    assert 0.5 < flight.speed <= 2.001
+    assert 0.0 < flight.deviation < 0.1
+    assert flight.to_wall > 0.0
+
+
+def test_the_same_seed_flies_the_same(flown, limits):
+    assert study.fly_steered(4, limits, requests=14, seconds=8.0) == flown[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda one: {"position": (one.position[0] + 0.001, *one.position[1:])}, "not committed: 1"),
+        (lambda one: {"velocity": (one.velocity[0] + 0.2, *one.velocity[1:])}, "acceleration by differences"),
+        (lambda one: {"velocity": (2.5, 0.0, 0.0)}, "speed: 2.5"),
+    ],
+)
+def test_a_setpoint_that_was_not_committed_is_found(flown, limits, change, words):
+    _, sent, commitments = flown
+    number = sorted(sent)[len(sent) // 2]
+    spoilt = {**sent, number: dataclasses.replace(sent[number], **change(sent[number]))}
+    assert any(words in fault for fault in judge_sequence(spoilt, commitments, limits).faults)
+
+
+def test_what_is_wrong_with_a_commitment_is_found(flown, limits):
+    _, sent, commitments = flown
+    plans = [number for number, each in enumerate(commitments) if not each.stop_until]
+    at = next(number for number in plans if decode(commitments[number].payloads).velocity[0].any())
+    each = commitments[at]
+    later = np.concatenate([each.payloads[1:], each.payloads[-1:]])
+    none = np.repeat(each.stops[-1:], len(each.stops), axis=0)
+    for change, words in (
+        ({"payloads": later}, "jump at a splice"),
+        ({"payloads": later}, "in the packet is not that of the trajectory"),
+        ({"stops": none}, "without a committed stop"),
+    ):
+        spoilt = [*commitments[:at], dataclasses.replace(each, **change), *commitments[at + 1 :]]
+        assert any(words in fault for fault in judge_sequence(sent, spoilt, limits).faults), words
+    slower = dataclasses.replace(limits, plan=dataclasses.replace(limits.plan, acceleration=2.0))
+    assert any("share of a limit" in fault for fault in judge_sequence(sent, commitments, slower).faults)
+    gone = {number: one for number, one in sent.items() if number != max(sent) // 2}
+    assert any("left out: 1" in fault for fault in judge_sequence(gone, commitments, limits).faults)
+
+
+def test_results_are_added_up_and_a_seed_counts_once(tmp_path):
+    first = study.steering(SAFETY, seeds=[7], requests=2, seconds=1.0)
+    first.write(tmp_path / "first.json")
+    earlier = [read_result(tmp_path / "first.json")]
+    both = study.steering(SAFETY, seeds=[8], requests=2, seconds=1.0, earlier=earlier)
+    assert [row["seed"] for row in both.table("flights").rows] == [7, 8]
+    assert both.table("requests").rows[0]["flights"] == 2
+    json.dumps(both.to_json(), allow_nan=False)
+    with pytest.raises(InputError, match="count twice"):
+        study.steering(SAFETY, seeds=[8], earlier=[both])
