@@ -17,21 +17,27 @@ from cfplan.preparation.compiled_calls import Stage
 @options.path_file
 @options.planning
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the plan here, as Parquet.")
-@click.option("--force", is_flag=True, help="Overwrite the output.")
+@click.option("--figure", type=click.Path(path_type=Path), help="Draw the plan in its room here: .png, .pdf or .svg.")
+@click.option("--force", is_flag=True, help="Overwrite the files.")
 @options.as_json
 def plan(
-    path_file: Path, safety_file: Path | None, output: Path | None, force: bool, as_json: bool, **planning: Any
+    path_file: Path,
+    safety_file: Path | None,
+    output: Path | None,
+    figure: Path | None,
+    force: bool,
+    as_json: bool,
+    **planning: Any,
 ) -> None:
     """Plan the fastest flight along PATH within every limit, and print its certificate."""
-    if output is not None:
-        _check_output(output, force)
+    _check_files(output, figure, force)
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_file, steps, compile_to=Stage.PLAN)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate
         from cfplan.preparation.plan_flight import plan_flight
 
-    flight = options.flight_options(planning, safety_file, path_file, only_shown=output is None)
+    flight = options.flight_options(planning, safety_file, path_file, only_shown=output is None and figure is None)
     planned = plan_flight(path_file, limits, flight, steps)
     with steps.step("bound") as results:
         bound = planned.lower_bound()
@@ -40,6 +46,10 @@ def plan(
         with steps.step("save") as results:
             planned.save(output, {"path file": str(path_file)})
             results.append(str(output))
+    if figure is not None:
+        with steps.step("figure") as results:
+            planned.save_figure(figure, overwrite=force)
+            results.append(str(figure))
     if as_json:
         print_json(planned.to_dict() | {"lower_bound": bound} | ({"file": str(output)} if output else {}))
     else:
@@ -52,8 +62,14 @@ def _compared(duration: float, bound: float, speed_factor: float) -> str:
     return f"{100 * (duration / bound - 1.0):.1f} % above {bound:.2f} s, which no flight{at_share} beats"
 
 
-def _check_output(output: Path, force: bool) -> None:
-    """Raise InputError, before anything is planned, where the plan could not be written or not be read again."""
+def _check_files(output: Path | None, figure: Path | None, force: bool) -> None:
+    """Raise InputError, before anything is planned, where a file could not be written or the plan not be read again."""
+    if figure is not None:
+        from cfplan.planning.figure import check_figure_file
+
+        check_figure_file(figure, overwrite=force)
+    if output is None:
+        return
     from cfplan.preparation.plan_flight import PLAN_SUFFIX
 
     if output.suffix != PLAN_SUFFIX:

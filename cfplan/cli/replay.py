@@ -45,6 +45,7 @@ Examples:
 )
 @click.option("--save", type=click.Path(path_type=Path), help="Write a rerun file here instead of opening the viewer.")
 @click.option("--png", type=click.Path(path_type=Path), help="Draw the view into this picture; needs no screen.")
+@click.option("--figure", type=click.Path(path_type=Path), help="Draw a record for print here: .png, .pdf or .svg.")
 @click.option("--at", "moment", type=float, help="s on the timeline, of the picture; else amid the path.")
 @click.option("--force", is_flag=True, help="Overwrite the file.")
 @options.as_json
@@ -56,6 +57,7 @@ def replay(
     angles: str | None,
     save: Path | None,
     png: Path | None,
+    figure: Path | None,
     moment: float | None,
     force: bool,
     as_json: bool,
@@ -71,21 +73,24 @@ def replay(
     if len(flights) == 1 and (records := flights_in(flights[0])):
         print_flights(records, as_json=as_json)
         return
-    if moment is not None and (png is None or not abs(moment) < 1e6):
-        raise InputError("--at says when a picture is taken, in s", hint="add --png flight.png")
     steps = Steps(as_json=as_json)
-    files = Files(save, png, moment, force)
-    if len(flights) == 1 and plan_file is None and is_record(flights[0]):
+    files = Files(save, png, figure, moment, force)
+    one_record = len(flights) == 1 and plan_file is None and is_record(flights[0])
+    files.check(one_record=one_record)
+    if one_record:
         document = _replay_record(flights[0], files, steps)
     else:
-        reference = None
-        if plan_file is not None:
-            from cfplan.cli.reference_plan import reference_plan
-
-            reference = reference_plan(plan_file, safety_file, steps)
+        reference = _reference(plan_file, safety_file, steps)
         document = _replay_trials(flights, reference, names, angles, files, steps)
     if as_json:
-        print_json({**document, "rrd": str(save) if save else None, "png": str(png) if png else None})
+        print_json(
+            {
+                **document,
+                "rrd": str(save) if save else None,
+                "png": str(png) if png else None,
+                "figure": str(figure) if figure else None,
+            }
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +99,22 @@ class Files:
 
     save: Path | None
     png: Path | None
-    moment: float | None
-    # s
+    figure: Path | None  # of one record
+    moment: float | None  # s, of the picture
     force: bool
+
+    def check(self, *, one_record: bool) -> None:
+        """Raise InputError where they do not go together, or a figure could not be written."""
+        if self.moment is not None and (self.png is None or not abs(self.moment) < 1e6):
+            raise InputError("--at says when a picture is taken, in s", hint="add --png flight.png")
+        if self.figure is not None:
+            from cfplan.planning.figure import check_figure_file
+
+            check_figure_file(self.figure, overwrite=self.force)
+            if not one_record:
+                raise InputError(
+                    "a figure is of one record", where=str(self.figure), hint="name one record, without --plan"
+                )
 
     def make(
         self, steps: Steps, write: "Callable[..., None]", picture: "Callable[..., tuple[str, ...]]", show: Callable
@@ -111,7 +129,7 @@ class Files:
                 complaints = picture(self.png, moment=self.moment, overwrite=self.force)
                 said.append(f"{self.png} ({_size(self.png)})")
                 said.extend(complaints)
-        if self.save is None and self.png is None:
+        if self.save is None and self.png is None and self.figure is None:
             with steps.step("viewer"):
                 show()
 
@@ -130,8 +148,23 @@ def _replay_record(place: Path, files: Files, steps: Steps) -> dict[str, Any]:
         said.append(f"{flight.header.name}, {flight.duration:.1f} s, {len(flight.setpoints.time)} setpoints")
         if flight.truncated:
             said.append("truncated: what follows the last whole chunk is lost")
+    if files.figure is not None:
+        from cfplan.planning.figure import save_figure
+        from cfplan.recording.flight_figure import draw_flight
+
+        with steps.step("figure") as said:
+            save_figure(draw_flight(flight), files.figure, overwrite=files.force)
+            said.append(str(files.figure))
     files.make(steps, partial(write_rrd, flight), partial(picture, flight), partial(show, flight))
     return {"record": str(place), **(summarise(flight).to_json() if steps.as_json else {})}
+
+
+def _reference(plan_file: Path | None, safety_file: Path | None, steps: Steps) -> "Reference | None":
+    if plan_file is None:
+        return None
+    from cfplan.cli.reference_plan import reference_plan
+
+    return reference_plan(plan_file, safety_file, steps)
 
 
 def _replay_trials(

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InputError
@@ -26,6 +26,9 @@ from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import check_space
 from cfplan.vehicle.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PLAN_SUFFIX = ".parquet"
 LONG = 40.0  # m of path, from which on compiling takes less time than planning without
@@ -69,6 +72,18 @@ class PlannedFlight:
         if Path(file).suffix != PLAN_SUFFIX:
             raise InputError(f"a plan's file ends in {PLAN_SUFFIX}", where=str(file), hint=f"add {PLAN_SUFFIX}")
         save_plan(self.plan, file, {"name": self.name} | dict(provenance or {}))
+
+    def plot(self) -> "Figure":
+        """Return the plan drawn in its room, with what holds it back: a matplotlib figure, for `.savefig(file)`."""
+        from cfplan.planning.figure import draw_plan
+
+        return draw_plan(self.plan, self.name)
+
+    def save_figure(self, file: Path, *, overwrite: bool = False) -> None:
+        """Write the drawing as .png, .pdf or .svg. Raises InputError where it cannot."""
+        from cfplan.planning.figure import save_figure
+
+        save_figure(self.plot(), file, overwrite=overwrite)
 
     def lower_bound(self) -> float:
         """Return the time, s, that no flight along the path beats at the plan's speed factor; takes up to a second."""

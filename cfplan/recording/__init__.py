@@ -2,6 +2,7 @@
 
 __all__ = [
     "commitments",
+    "flight_figure",
     "header",
     "importers",
     "mavlink",

@@ -12,9 +12,14 @@ from cfplan.cli import cfplan
 from cfplan.cli.output import Steps
 from cfplan.cli.reference_plan import reference_plan
 from cfplan.errors import InputError
+from cfplan.geometry.min_snap import min_snap
+from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.plan_flight import plan_flight
+from cfplan.recording.flight_figure import draw_flight
+from cfplan.recording.reader import read_record
 from cfplan.recording.rerun.record_view import write_rrd
+from cfplan.recording.summary import summarise
 from cfplan.recording.writer import write_summary
 from cfplan.safety.limits_file import load_limits
 
@@ -46,6 +51,27 @@ def test_a_picture_is_overwritten_only_when_told(flight, tmp_path):
     (tmp_path / "a.png").write_text("mine")
     assert "--force" in refused("replay", flight.folder, "--png", tmp_path / "a.png").hint
     assert (tmp_path / "a.png").read_text() == "mine"
+
+
+def test_a_figure_of_a_flight_lies_over_its_plan(flight, tmp_path):
+    limits = load_limits(REPOSITORY / "safety.yaml")
+    place = shutil.copytree(flight.folder, tmp_path / "flown")
+    made = plan(min_snap([[-1, -1, 0.8], [1, -0.5, 0.9]]), limits.airframe, limits, planner="minsnap", nodes=40)
+    save_plan(made, place / "plan.parquet")
+    file = tmp_path / "a.svg"
+    result = CliRunner().invoke(cfplan, ["replay", str(place), "--figure", str(file)])
+    assert result.exit_code == 0, result.output
+    record = read_record(place)
+    worst = summarise(record).max_deviation
+    (off,) = [axes for axes in draw_flight(record).axes if axes.get_ylabel() == "deviation, cm"]
+    assert off.lines[0].get_ydata().max() == pytest.approx(100 * worst)
+    assert "deviation, cm" in file.read_text()
+
+
+def test_a_figure_is_of_one_record(flight, tmp_path):
+    assert "one record" in refused("replay", flight.folder, flight.folder, "--figure", tmp_path / "a.svg").what
+    assert "plan.parquet" in refused("replay", flight.folder, "--figure", tmp_path / "a.svg").where
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("moment", ["12", "nan"])

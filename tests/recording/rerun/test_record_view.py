@@ -17,6 +17,7 @@ from rerun.components import AggregationPolicy
 
 from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
+from cfplan.planning.active_limits import ACTIVE, FREE, active_limits
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import save_plan
 from cfplan.recording.plots import motor_thrust, near_limits, plots
@@ -24,7 +25,6 @@ from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE, meant_motion
 from cfplan.recording.rerun import layout
 from cfplan.recording.rerun.picture import SIZE, HeadlessViewer
-from cfplan.recording.rerun.plan_view import ACTIVE, FREE, active_limits
 from cfplan.recording.rerun.record_view import HOVER_ARROW, floor_lines, picture, show, vehicle_outline, write_rrd
 from cfplan.recording.writer import RecordWriter
 from cfplan.safety.limits_file import load_limits

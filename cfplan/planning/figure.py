@@ -1,0 +1,175 @@
+"""A plan, and a flight of it, as a figure for print: the room from above and from the side, and what holds it back.
+
+White ground, labelled axes in metres of one scale, and for each limit the colour that it has in the rerun view.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import InputError
+from cfplan.planning.active_limits import FREE, FREE_COLOUR, LIMIT_COLOURS, ActiveLimits, Colour, active_limits
+from cfplan.planning.plan_result import Plan
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SUFFIXES = (".png", ".pdf", ".svg")
+SHOWN = 0.5  # share that a limit comes to somewhere, from which on it gets a curve
+INSET = 0.06  # m at least, half of the side of what is magnified
+FLOWN: Colour = (20, 20, 20)
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flown:
+    """What was flown of a plan."""
+
+    time: NDArray  # (N,) s from the begin of the path
+    position: NDArray  # (N, 3) m
+    deviation: NDArray  # (N,) m, from where the vehicle should have been at that time
+
+
+def check_figure_file(file: Path, *, overwrite: bool) -> None:
+    """Raise InputError where no figure can be written there."""
+    if file.suffix not in SUFFIXES:
+        raise InputError(f"a figure ends in {', '.join(SUFFIXES)}", where=str(file), hint=f"name it {file.stem}.pdf")
+    if not file.parent.is_dir():
+        raise InputError("no such folder", where=str(file.parent), hint="make it first")
+    if file.exists() and not overwrite:
+        raise InputError("there is such a file already", where=str(file), hint="name another, or add --force")
+
+
+def draw_plan(plan: Plan, name: str, flown: Flown | None = None) -> "Figure":
+    """Return the figure of a plan, with what was flown over it."""
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    active = active_limits(plan)
+    low, high = np.array(plan.limits.space.low), np.array(plan.limits.space.high)
+    wide = int(np.argmax((high - low)[:2]))  # the horizontal axis along the page
+    size = high - low
+    figure = Figure(figsize=(11.0, 6.5), layout="constrained")
+    views, curves = np.asarray(figure.subfigures(1, 2, width_ratios=(1.25, 1.0))).tolist()
+    above, aside = views.subplots(2, 1, height_ratios=(size[1 - wide] + 0.6, size[2] + 0.6))
+    for axes, (across, up) in ((above, (wide, 1 - wide)), (aside, (wide, 2))):
+        _draw_view(axes, plan, active, flown, across, up)
+    above.set_title("from above", loc="left", fontsize=9)
+    aside.set_title("from the side", loc="left", fontsize=9)
+    rows: Sequence[Axes] = curves.subplots(2 if flown is None else 3, 1, sharex=True).tolist()
+    _draw_speed(rows[0], plan, active, flown)
+    _draw_shares(rows[1], active)
+    if flown is not None:
+        rows[2].plot(flown.time, 100.0 * flown.deviation, color=_hex(FLOWN), lw=1.0)
+        rows[2].set(ylabel="deviation, cm", ylim=(0.0, None))
+    rows[-1].set_xlabel("time from the begin of the path, s")
+    for axes in (above, aside, *rows):
+        axes.grid(alpha=0.25)
+    said = f"{plan.path.length:.1f} m in {plan.trajectory.duration:.2f} s, {plan.airframe.name}"
+    figure.suptitle(f"{name}: {said}", fontsize=11)
+    handles, labels = above.get_legend_handles_labels()
+    names = _shown(active) + ([FREE] if FREE in active.name else [])
+    handles += [Line2D([], [], color=_colour(name), lw=2.6) for name in names]
+    labels += ["no limit" if name == FREE else name for name in names]
+    views.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
+def save_figure(figure: "Figure", file: Path, *, overwrite: bool = False) -> None:
+    """Write a figure whole or not at all. Raises InputError where it cannot be written."""
+    from io import BytesIO
+
+    check_figure_file(file, overwrite=overwrite)
+    content = BytesIO()
+    figure.savefig(content, format=file.suffix[1:], dpi=150)
+    unfinished = file.with_name(f".{file.name}.new")
+    try:
+        unfinished.write_bytes(content.getvalue())
+        unfinished.replace(file)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise InputError(
+            f"cannot be written: {error.strerror}", where=str(file), hint="free some space, or name another folder"
+        ) from None
+
+
+def _draw_view(axes: "Axes", plan: Plan, active: ActiveLimits, flown: Flown | None, across: int, up: int) -> None:
+    """Draw the room and what is in it along two of its axes."""
+    from matplotlib.patches import Rectangle
+
+    space = plan.limits.space
+    low, high = np.array(space.low)[[across, up]], np.array(space.high)[[across, up]]
+    for inset, style in ((0.0, {"lw": 1.4}), (space.margin, {"lw": 0.8, "ls": "--"})):
+        corner, size = low + inset, high - low - 2 * inset
+        axes.add_patch(Rectangle((corner[0], corner[1]), size[0], size[1], fill=False, ec="0.35", **style))
+    axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
+    if across == 1:  # with x up the page, y grows to the left
+        axes.invert_xaxis()
+    axes.set(xlabel=f"{AXES[across]}, m", ylabel=f"{AXES[up]}, m")
+    _draw_path(axes, active, across, up)
+    begin, end = active.position[0], active.position[-1]
+    axes.plot(begin[across], begin[up], "o", color="black", mfc="white", ms=6, label="begin")
+    axes.plot(end[across], end[up], "s", color="black", ms=5, label="end")
+    if flown is None:
+        return
+    axes.plot(flown.position[:, across], flown.position[:, up], color=_hex(FLOWN), lw=0.8, label="flown")
+    if up != 2:  # the largest deviation, magnified, from above
+        _magnify(axes, active, flown, across, up)
+
+
+def _draw_path(axes: "Axes", active: ActiveLimits, across: int, up: int) -> None:
+    """Draw the path in the colours of the limits that hold it back."""
+    for name, rows in active.stretches():
+        axes.plot(active.position[rows, across], active.position[rows, up], color=_colour(name), lw=2.6)
+
+
+def _magnify(axes: "Axes", active: ActiveLimits, flown: Flown, across: int, up: int) -> None:
+    """Show the largest deviation larger, in the corner that has least of the path in it."""
+    worst = int(np.argmax(flown.deviation))
+    centre = flown.position[worst, [across, up]]
+    half = max(INSET, 2.5 * float(flown.deviation[worst]))
+    shown = axes.transAxes.inverted().transform(axes.transData.transform(active.position[:, [across, up]]))
+    size = np.array([0.27, 0.31])
+    corners = [np.array([x, y]) for y in (0.67, 0.02) for x in (0.02, 0.71)]
+    free = min(corners, key=lambda corner: int(np.all((shown > corner) & (shown < corner + size), axis=1).sum()))
+    inset = axes.inset_axes((*free, *size), xticks=[], yticks=[])
+    _draw_path(inset, active, across, up)
+    inset.plot(flown.position[:, across], flown.position[:, up], color=_hex(FLOWN), lw=0.8)
+    inset.set(xlim=centre[0] + np.array([-half, half]), ylim=centre[1] + np.array([-half, half]), aspect="equal")
+    if axes.xaxis_inverted():
+        inset.invert_xaxis()
+    inset.text(
+        0.5, 0.04, f"{100 * flown.deviation[worst]:.1f} cm off", transform=inset.transAxes, ha="center", fontsize=7
+    )
+    axes.indicate_inset_zoom(inset, edgecolor="0.3")
+
+
+def _draw_speed(axes: "Axes", plan: Plan, active: ActiveLimits, flown: Flown | None) -> None:
+    speed = np.linalg.norm(plan.trajectory.at(active.time).velocity, axis=1)
+    axes.plot(active.time, speed, color=_colour("speed"), lw=1.4)
+    axes.axhline(plan.limits.plan.speed, color="0.35", lw=0.8, ls="--")
+    axes.set(ylabel="speed, m/s", ylim=(0.0, None))
+
+
+def _draw_shares(axes: "Axes", active: ActiveLimits) -> None:
+    for name in _shown(active):
+        axes.plot(active.time, 100.0 * active.shares[name], color=_colour(name), lw=1.0)
+    axes.axhline(100.0, color="0.35", lw=0.8, ls="--")
+    axes.set(ylabel="share of the limit, %", ylim=(0.0, 108.0))
+
+
+def _shown(active: ActiveLimits) -> list[str]:
+    return [name for name, share in active.shares.items() if share.max() >= SHOWN]
+
+
+def _colour(name: str) -> Any:
+    return _hex(FREE_COLOUR if name == FREE else LIMIT_COLOURS[name])
+
+
+def _hex(colour: Colour) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)
