@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Derivatives, Path, derivatives_of, horner_step
 from cfplan.machine_code import njit
-from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.flatness import ROUNDING, Body, Flat, compiled_body, flat_state
 from cfplan.vehicle.measures import MEASURES, measures
 from cfplan.vehicle.profile import SpeedProfile, h_within, yaw_within
@@ -33,6 +33,9 @@ STATES: dict[str, slice | int] = {
     "quaternion": slice(31, 35), "yaw": 35, "specific_thrust": 36,
 }  # fmt: skip
 STATE_ROWS = 37
+
+_WHOLE, _THRUST, _RATE, _ACCELERATION = 0, 1, 2, 3  # parts of the full state
+_FIND = np.empty(0, dtype=np.int64)  # in place of intervals: they are to be found
 
 WIDTH = 64
 LANES = 4  # points that the compiler may want to take at once: the places in use are a multiple
@@ -80,28 +83,54 @@ def dense_rows(
     return out
 
 
-def flat_states(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray, interval: NDArray) -> NDArray:
+def flat_states(
+    airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray, interval: NDArray | None = None
+) -> NDArray:
     """Return (STATE_ROWS, N): position, the full state, and the attitude at each s, (N,).
 
-    `interval` tells whose polynomials of the profile hold; a break of the path belongs to the piece on its right.
+    `interval` tells whose polynomials of the profile hold, that on the right of a grid point where it is not given; a
+    break of the path belongs to the piece on its right.
     """
-    count = len(s)
-    if count < LANES:
-        more = np.r_[:count, np.zeros(LANES - count, dtype=int)]
-        return flat_states(airframe, path, profile, s[more], interval[more])[:, :count]
-    out = np.empty((STATE_ROWS, count))
-    curves = path.derivatives(s).reshape(15, count)
-    _states(out, compiled_body(airframe), curves, profile.table(), s - profile.s[interval], interval)
+    return _filled(np.empty((STATE_ROWS, len(s))), _WHOLE, airframe, path, profile, s, interval)
+
+
+def thrusts_at(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray) -> NDArray:
+    """Return the specific thrust, m/s², at each s, (N,), and nothing else of the full state."""
+    return np.asarray(_filled(np.empty((1, len(s))), _THRUST, airframe, path, profile, s)[0])
+
+
+def body_rates_at(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray) -> NDArray:
+    """Return the body rates, (3, N) rad/s, at each s, (N,), and nothing else of the full state."""
+    return _filled(np.empty((3, len(s))), _RATE, airframe, path, profile, s)
+
+
+def accelerations_at(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray) -> NDArray:
+    """Return the acceleration, (3, N) m/s², at each s, (N,), and nothing else of the full state."""
+    return _filled(np.empty((3, len(s))), _ACCELERATION, airframe, path, profile, s)
+
+
+def _filled(
+    out: NDArray, part: int, airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray,
+    interval: NDArray | None = None,
+) -> NDArray:  # fmt: skip
+    _states(
+        out, part, compiled_body(airframe), path.breaks, path.origins, _whole_blocks(path.coefficients),
+        profile.table(), s, _FIND if interval is None else interval,
+    )  # fmt: skip
     return out
 
 
 def sample_source(airframe: Airframe, path: Path, profile: SpeedProfile) -> SampleSource:
     """Return what sample() reads of a trajectory."""
-    coefficients = path.coefficients
+    return SampleSource(compiled_body(airframe), _whole_blocks(path.coefficients), path.origins, profile.table())
+
+
+def _whole_blocks(coefficients: NDArray) -> NDArray:
+    """Return a path's coefficients, (M, D, 3), with D a multiple of _BLOCK."""
     if missing := -coefficients.shape[1] % _BLOCK:
         coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
         coefficients.setflags(write=False)  # as a path's are: one type for the compiler
-    return SampleSource(compiled_body(airframe), coefficients, path.origins, profile.table())
+    return coefficients
 
 
 def _flat_interpreted(body: Body, curves: NDArray, node: NDArray, x: NDArray) -> Flat:
@@ -137,19 +166,83 @@ def _at_points(
 
 
 @njit(error_model="numpy", fastmath=ROUNDING)
-def _states(out: NDArray, body: Body, curves: NDArray, nodes: NDArray, places: NDArray, interval: NDArray) -> None:
+def _states(
+    out: NDArray, part: int, body: Body, breaks: NDArray, origins: NDArray, coefficients: NDArray, nodes: NDArray,
+    s: NDArray, given: NDArray,
+) -> None:  # fmt: skip
+    """Fill in a part of the full state, consecutive points of one piece of the path together, up to WIDTH of them.
+
+    Each point lies in the interval of the profile that is `given`; where none are, they are found.
+    """
     panel = np.empty(_SIZE)
-    for start in range(0, len(places), WIDTH):
-        lanes = min(WIDTH, _whole(len(places) - start))
-        begin = min(start, len(places) - lanes)
-        _place(panel, 0, curves, nodes, places, interval, begin, lanes)
-        _flatten_whole(panel, body, lanes)
-        for row in range(3):
-            for n in range(lanes):
-                out[row, begin + n] = panel[(_CURVE + row) * WIDTH + n]
-        for row in range(3, STATE_ROWS):
-            for n in range(lanes):
-                out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
+    begin, piece, interval, last, finds = 0, 0, 0, len(origins) - 1, len(given) != len(s)
+    while begin < len(s):
+        if s[begin] < breaks[piece]:
+            piece = 0
+        while piece < last and s[begin] >= breaks[piece + 1]:
+            piece += 1
+        count, room = 1, min(WIDTH, len(s) - begin)
+        while (
+            count < room
+            and (piece == 0 or breaks[piece] <= s[begin + count])
+            and (piece == last or s[begin + count] < breaks[piece + 1])
+        ):
+            count += 1
+        lanes = min(_whole(count), WIDTH)
+        for n in range(lanes):  # those beyond the last point repeat it
+            panel[_X * WIDTH + n] = min(max(s[begin + min(n, count - 1)], 0.0), breaks[-1]) - origins[piece]
+        _trace(panel, coefficients[piece], lanes)
+        for n in range(lanes):
+            at = begin + min(n, count - 1)
+            interval = _interval(nodes, s[at], interval) if finds else given[at]
+            panel[_X * WIDTH + n] = s[at] - nodes[interval, 0]
+            for row in range(7):
+                panel[(_NODE + row) * WIDTH + n] = nodes[interval, 1 + row]
+        _flatten_part(panel, part, body, lanes)
+        if part == _WHOLE:
+            for row in range(3):
+                for n in range(count):
+                    out[row, begin + n] = panel[(_CURVE + row) * WIDTH + n]
+            for row in range(3, STATE_ROWS):
+                for n in range(count):
+                    out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
+        else:
+            for row in range(len(out)):
+                for n in range(count):
+                    out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
+        begin += count
+
+
+@register_jitable
+def _interval(nodes: NDArray, s: float, guess: int) -> int:
+    """Return the interval of the profile that holds s, of a grid point that on its right; fast near the guess."""
+    last = len(nodes) - 2
+    if nodes[guess, 0] <= s:
+        for interval in range(guess, min(guess + 4, last)):
+            if s < nodes[interval + 1, 0]:
+                return interval
+    below, above = 0, last + 1
+    while above - below > 1:
+        middle = (below + above) // 2
+        if nodes[middle, 0] <= s:
+            below = middle
+        else:
+            above = middle
+    return below
+
+
+@njit(error_model="numpy")
+def rest_outside(table: NDArray, times: NDArray, duration: float, hover_thrust: float) -> None:
+    """Turn the full states, (STATE_ROWS, N), at times before 0 and after the duration, s, to level hover there."""
+    for n in range(len(times)):
+        if not 0.0 <= times[n] <= duration:
+            for row in range(3, STATE_ROWS - 2):
+                table[row, n] = 0.0
+            table[17, n] = 1.0  # the thrust axis
+            for row in range(27, 31):
+                table[row, n] = hover_thrust
+            table[33, n], table[34, n] = np.sin(table[35, n] / 2.0), np.cos(table[35, n] / 2.0)
+            table[36, n] = GRAVITY
 
 
 @register_jitable(fastmath=ROUNDING)
@@ -322,6 +415,26 @@ def _flatten_whole(panel: NDArray, body: Body, lanes: int) -> None:
         quaternion = hopf_quaternion(flat.thrust_axis, cosine(yaw / 2), sine(yaw / 2))
         _write(panel, 31, n, quaternion[:3])
         _write(panel, 34, n, (quaternion[3], yaw, flat.specific_thrust))
+
+
+@register_jitable(fastmath=ROUNDING)
+def _flatten_part(panel: NDArray, part: int, body: Body, lanes: int) -> None:
+    """Write a part of the full state; what only other parts need is not computed."""
+    lanes = min(lanes, WIDTH)
+    if part == _WHOLE:
+        _flatten_whole(panel, body, lanes)
+    elif part == _THRUST:
+        for n in range(lanes):
+            flat, _ = _flat_at(panel, body, _node_at(panel, n), n)
+            panel[_RESULT * WIDTH + n] = flat.specific_thrust
+    elif part == _RATE:
+        for n in range(lanes):
+            flat, _ = _flat_at(panel, body, _node_at(panel, n), n)
+            _write(panel, 0, n, flat.body_rate)
+    else:
+        for n in range(lanes):
+            flat, _ = _flat_at(panel, body, _node_at(panel, n), n)
+            _write(panel, 0, n, flat.acceleration)
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)

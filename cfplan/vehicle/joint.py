@@ -5,8 +5,10 @@ Position, velocity, acceleration, jerk, attitude and body rates are then continu
 acceleration and motor thrust, may jump by what h''' and ψ'' jump, as at every grid point of a profile.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +18,7 @@ from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import FullState, Trajectory
 
 _ORDERS = 5  # γ and four derivatives
+_Answer = TypeVar("_Answer")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,20 +86,35 @@ class JoinedTrajectory:
     def at(self, time: ArrayLike) -> FullState:
         """Return the full state at each time, (N,) s; before the first start and after the end it hovers."""
         times = np.atleast_1d(np.asarray(time, dtype=float))
-        leg = np.clip(np.searchsorted(self.starts, times, side="right") - 1, 0, len(self.starts) - 1)
-        flown = [np.flatnonzero(leg == each) for each in np.unique(leg)]
-        states = [self.trajectories[leg[rows[0]]].at(times[rows] - self.starts[leg[rows[0]]]) for rows in flown]
-        if len(states) == 1:
-            merged = {field.name: getattr(states[0], field.name) for field in fields(FullState)}
-        else:
-            order = np.argsort(np.concatenate(flown), kind="stable")
-            merged = {
-                field.name: np.concatenate([getattr(each, field.name) for each in states])[order]
-                for field in fields(FullState)
-            }
+        order, parts = self._on_legs(times, Trajectory.at)
+        merged = {
+            field.name: _merged([getattr(each, field.name) for each in parts], order) for field in fields(FullState)
+        }
         merged["time"] = times
         state = FullState(**merged)
         return state if np.ndim(time) else FullState(*(getattr(state, name)[0] for name in FullState.__slots__))
+
+    def specific_thrust_at(self, times: NDArray) -> NDArray:
+        """Return (N,) m/s²: what at() gives of it at each time, (N,) s, in a third of the time."""
+        order, parts = self._on_legs(times, Trajectory.specific_thrust_at)
+        return _merged(parts, order)
+
+    def body_rate_at(self, times: NDArray) -> NDArray:
+        """Return (N, 3) rad/s likewise."""
+        order, parts = self._on_legs(times, Trajectory.body_rate_at)
+        return _merged(parts, order)
+
+    def acceleration_at(self, times: NDArray) -> NDArray:
+        """Return (N, 3) m/s² likewise."""
+        order, parts = self._on_legs(times, Trajectory.acceleration_at)
+        return _merged(parts, order)
+
+    def _on_legs(self, times: NDArray, ask: Callable[[Trajectory, NDArray], _Answer]) -> tuple[NDArray, list[_Answer]]:
+        """Ask each trajectory about the times at which it is flown; return their order, and the answers."""
+        leg = np.clip(np.searchsorted(self.starts, times, side="right") - 1, 0, len(self.starts) - 1)
+        flown = [np.flatnonzero(leg == each) for each in np.unique(leg)]
+        answers = [ask(self.trajectories[leg[rows[0]]], times[rows] - self.starts[leg[rows[0]]]) for rows in flown]
+        return np.argsort(np.concatenate(flown), kind="stable"), answers
 
     def since(self, time: float) -> "JoinedTrajectory":
         """Return the same flight on a clock that is 0 at `time`, s, without what is flown before."""
@@ -107,3 +125,7 @@ class JoinedTrajectory:
         """Return the flight that is this one until `time`, s, and then the trajectory."""
         kept = int(np.searchsorted(self.starts, time, side="left"))
         return JoinedTrajectory((*self.trajectories[:kept], trajectory), (*self.starts[:kept], time))
+
+
+def _merged(parts: list[NDArray], order: NDArray) -> NDArray:
+    return parts[0] if len(parts) == 1 else np.asarray(np.concatenate(parts)[order])

@@ -91,7 +91,7 @@ def axes_of(x: float, y: float, z: float, w: float) -> tuple[Vector, Vector, Vec
 def matrix_of(quaternion: NDArray) -> NDArray:
     """Return the (3, 3) matrix of a unit quaternion, (4,): its columns are the body's axes."""
     matrix = np.empty((3, 3))
-    _write_matrix(matrix, quaternion, 2.0)
+    write_matrix(matrix, quaternion, 2.0)
     return matrix
 
 
@@ -101,12 +101,12 @@ def matrices_of(quaternions: NDArray) -> NDArray:
     out = np.empty((len(quaternions), 3, 3))
     for n in range(len(quaternions)):
         x, y, z, w = quaternions[n, 0], quaternions[n, 1], quaternions[n, 2], quaternions[n, 3]
-        _write_matrix(out[n], quaternions[n], 2.0 / (x * x + y * y + z * z + w * w))
+        write_matrix(out[n], quaternions[n], 2.0 / (x * x + y * y + z * z + w * w))
     return out
 
 
 @register_jitable
-def _write_matrix(out: NDArray, quaternion: NDArray, scale: float) -> None:
+def write_matrix(out: NDArray, quaternion: NDArray, scale: float) -> None:
     """Write the matrix of a quaternion; `scale` is 2 over its squared length."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     out[0, 0], out[0, 1], out[0, 2] = 1 - scale * (y * y + z * z), scale * (x * y - z * w), scale * (x * z + y * w)
@@ -148,19 +148,24 @@ def rotations_of(vectors: NDArray) -> NDArray:
     """Return the (N, 3, 3) matrices of rotation vectors, (N, 3) rad (Rodrigues)."""
     out = np.empty((len(vectors), 3, 3))
     for n in range(len(vectors)):
-        x, y, z = vectors[n, 0], vectors[n, 1], vectors[n, 2]
-        angle = math.sqrt(x * x + y * y + z * z)
-        sine = math.sin(angle) / angle if angle > 1e-12 else 1.0
-        versine = 2.0 * (math.sin(angle / 2) / angle) ** 2 if angle > 1e-12 else 0.5
-        out[n, 0, 0], out[n, 1, 1], out[n, 2, 2] = (
-            1 - versine * (y * y + z * z),
-            1 - versine * (x * x + z * z),
-            1 - versine * (x * x + y * y),
-        )
-        out[n, 0, 1], out[n, 1, 0] = versine * x * y - sine * z, versine * x * y + sine * z
-        out[n, 0, 2], out[n, 2, 0] = versine * x * z + sine * y, versine * x * z - sine * y
-        out[n, 1, 2], out[n, 2, 1] = versine * y * z - sine * x, versine * y * z + sine * x
+        write_rotation(out[n], vectors[n, 0], vectors[n, 1], vectors[n, 2])
     return out
+
+
+@register_jitable
+def write_rotation(out: NDArray, x: float, y: float, z: float) -> None:
+    """Write the matrix, (3, 3), of a rotation vector, rad (Rodrigues)."""
+    angle = math.sqrt(x * x + y * y + z * z)
+    sine = math.sin(angle) / angle if angle > 1e-12 else 1.0
+    versine = 2.0 * (math.sin(angle / 2) / angle) ** 2 if angle > 1e-12 else 0.5
+    out[0, 0], out[1, 1], out[2, 2] = (
+        1 - versine * (y * y + z * z),
+        1 - versine * (x * x + z * z),
+        1 - versine * (x * x + y * y),
+    )
+    out[0, 1], out[1, 0] = versine * x * y - sine * z, versine * x * y + sine * z
+    out[0, 2], out[2, 0] = versine * x * z + sine * y, versine * x * z - sine * y
+    out[1, 2], out[2, 1] = versine * y * z - sine * x, versine * y * z + sine * x
 
 
 def norms(vectors: NDArray) -> NDArray:

@@ -8,9 +8,15 @@ from numpy.typing import ArrayLike, NDArray
 from cfplan.errors import NotCertifiedError
 from cfplan.geometry.path import Path
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.dense import STATES, flat_states
+from cfplan.vehicle.dense import (
+    STATES,
+    accelerations_at,
+    body_rates_at,
+    flat_states,
+    rest_outside,
+    thrusts_at,
+)
 from cfplan.vehicle.profile import SpeedProfile
-from cfplan.vehicle.rotations import about_z
 from cfplan.vehicle.timing import Timing, measure
 
 _SAME_S = 1e-9  # ends of path and profile nearer than this are the same
@@ -77,11 +83,31 @@ class Trajectory:
         times = np.asarray(time, dtype=float)
         flat = times.reshape(-1)
         s = self.s_at(flat)
-        state = state_at(self.path, self.profile, self.airframe, s, time=flat)
-        resting = np.flatnonzero(~((flat >= 0.0) & (flat <= self.duration)))
-        if len(resting):
-            _hover(state, resting, self.airframe)
+        table = flat_states(self.airframe, self.path, self.profile, s)
+        rest_outside(table, flat, self.duration, self.airframe.hover_thrust)
+        state = _of_table(table, s, flat)
         return state if times.ndim else FullState(*(getattr(state, name)[0] for name in FullState.__slots__))
+
+    def specific_thrust_at(self, times: NDArray) -> NDArray:
+        """Return (N,) m/s²: what at() gives of it at each time, (N,) s, in a third of the time."""
+        thrust = thrusts_at(self.airframe, self.path, self.profile, self.s_at(times))
+        thrust[self._resting(times)] = GRAVITY
+        return thrust
+
+    def body_rate_at(self, times: NDArray) -> NDArray:
+        """Return (N, 3) rad/s likewise."""
+        rate = body_rates_at(self.airframe, self.path, self.profile, self.s_at(times))
+        rate[:, self._resting(times)] = 0.0
+        return rate.T
+
+    def acceleration_at(self, times: NDArray) -> NDArray:
+        """Return (N, 3) m/s² likewise."""
+        acceleration = accelerations_at(self.airframe, self.path, self.profile, self.s_at(times))
+        acceleration[:, self._resting(times)] = 0.0
+        return acceleration.T
+
+    def _resting(self, times: NDArray) -> NDArray:
+        return ~((times >= 0.0) & (times <= self.duration))
 
 
 def state_at(
@@ -94,18 +120,8 @@ def state_at(
     interval: NDArray | None = None,
 ) -> FullState:
     """Return the full state at s, (N,), by the polynomials of `interval` where given (see SpeedProfile.at)."""
-    if interval is None:
-        interval = profile.interval(s)
-    table = flat_states(airframe, path, profile, s, interval)
+    return _of_table(flat_states(airframe, path, profile, s, interval), s, time)
+
+
+def _of_table(table: NDArray, s: NDArray, time: NDArray) -> FullState:
     return FullState(time=time, s=s, **{name: table[rows].T for name, rows in STATES.items()})
-
-
-def _hover(state: FullState, ascending: NDArray, airframe: Airframe) -> None:
-    first, last = int(ascending[0]), int(ascending[-1])
-    rows = slice(first, last + 1) if last - first == len(ascending) - 1 else ascending  # a slice is written faster
-    for name in ("velocity", "acceleration", "jerk", "snap", "body_rate", "angular_acceleration", "torque"):
-        getattr(state, name)[rows] = 0.0
-    state.specific_thrust[rows] = GRAVITY
-    state.motor_thrust[rows] = airframe.hover_thrust
-    state.thrust_axis[rows] = (0.0, 0.0, 1.0)
-    state.quaternion[rows] = about_z(state.yaw[rows])

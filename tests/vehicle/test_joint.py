@@ -99,3 +99,11 @@ def test_starts_that_do_not_fit_are_refused(trajectory):
         JoinedTrajectory((trajectory,), (0.0, 1.0))
     with pytest.raises(InputError, match="do not ascend"):
         JoinedTrajectory((trajectory, trajectory), (1.0, 1.0))
+
+
+@pytest.mark.parametrize("name", ["specific_thrust", "body_rate", "acceleration"])
+def test_a_part_of_the_state_is_that_of_the_trajectory_flown_then(trajectory, name):
+    joined = JoinedTrajectory((trajectory, trajectory, trajectory), (0.0, 1.1, 2.3))
+    times = np.random.default_rng(7).uniform(-0.5, joined.duration + 0.5, 200)
+    part = getattr(joined, f"{name}_at")
+    np.testing.assert_allclose(part(times), getattr(joined.at(times), name), rtol=1e-12, atol=1e-12)

@@ -149,3 +149,11 @@ def test_the_quaternion_is_continuous(trajectory):
 def test_a_profile_of_another_path_is_refused(make_profile):
     with pytest.raises(NotCertifiedError, match="goes from s = 0 to 3"):
         Trajectory(min_snap(WAYPOINTS), make_profile(3.0, np.ones(20)), AIRFRAMES["crazyflie-2.1+"])
+
+
+@pytest.mark.parametrize("name", ["specific_thrust", "body_rate", "acceleration"])
+def test_a_part_of_the_state_is_that_of_the_whole_at_any_times_in_any_order(trajectory, name):
+    times = np.random.default_rng(6).uniform(-0.5, trajectory.duration + 0.5, 300)
+    part = getattr(trajectory, f"{name}_at")
+    np.testing.assert_allclose(part(times), getattr(trajectory.at(times), name), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(part(times[:1]), part(times)[:1], rtol=1e-12, atol=1e-12)

@@ -22,13 +22,12 @@ from numpy.typing import NDArray
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, encode
 from cfplan.flight.setpoints.rate_trade import (
+    ATTITUDE_AGE,
     BRAKE_LEAD,
     FIRMWARE_GAINS,
     AttitudeGains,
     harmless_rates,
     trade_rates,
-    turns_for,
-    turns_seen,
 )
 from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
@@ -37,7 +36,7 @@ from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.measures import measures_of
-from cfplan.vehicle.rotations import heading_of, matrices_of, norms, rotations_of, write_quaternion
+from cfplan.vehicle.rotations import heading_of, matrices_of, norms, write_quaternion, write_rotation
 from cfplan.vehicle.trajectory import Trajectory
 
 RATE = 100.0  # Hz
@@ -58,6 +57,8 @@ THRUST_LEAD = 0.077
 HALF_QUANTUM = 0.5e-3  # of position m, velocity m/s, acceleration m/s², body rate rad/s
 ATTITUDE_QUANTUM = np.radians(0.25)  # the largest angle by which compressing turns a quaternion
 _ROUNDING = 1e-9
+_ROUNDED = HALF_QUANTUM + _ROUNDING
+_OFF = "{} in the packet is not that of the trajectory, off by"
 _LEAST_LIFT = math.cos(math.radians(75.0))  # the controller's heading is not defined at a tilt of 90°
 _BATCH = 4096  # setpoints at a time, so that memory does not grow with the states of a long flight
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
@@ -112,7 +113,7 @@ def encode_trajectory(
     for rows in _batches(len(times)):
         moments = times[rows] + lead
         motion = motion_at(trajectory, moments, rate_lead, thrust_lead)
-        coming = trajectory.at(moments + BRAKE_LEAD).acceleration
+        coming = trajectory.acceleration_at(moments + BRAKE_LEAD)
         payloads.append(encode_motion(motion, coming, gains, rows.start, space=space))
     sent = np.concatenate(payloads)
     planned = motion_at(trajectory, times + lead, 0.0, 0.0)
@@ -130,15 +131,16 @@ def motion_at(
     The acceleration is that of the thrust, less gravity: it includes the compensation for drag.
     """
     states = trajectory.at(times)
-    ahead, turning = (trajectory.at(times + by) if by else states for by in (thrust_lead, rate_lead))
-    acceleration = ahead.specific_thrust[:, None] * states.thrust_axis
+    thrust = trajectory.specific_thrust_at(times + thrust_lead) if thrust_lead else states.specific_thrust
+    turning = trajectory.body_rate_at(times + rate_lead) if rate_lead else states.body_rate
+    acceleration = thrust[:, None] * states.thrust_axis
     acceleration[:, 2] -= GRAVITY
     return FullStateSetpoints(
         position=states.position,
         velocity=states.velocity,
         acceleration=acceleration,
         quaternion=states.quaternion,
-        body_rate=turning.body_rate,
+        body_rate=turning,
     )
 
 
@@ -192,15 +194,15 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajector
     for rows in _batches(len(payloads)):
         times = encoded.times[rows] + encoded.lead
         planned = trajectory.at(times)
-        thrust = trajectory.at(times + encoded.thrust_lead).specific_thrust
+        thrust = trajectory.specific_thrust_at(times + encoded.thrust_lead)
         motion = FullStateSetpoints(
             position=planned.position,
             velocity=planned.velocity,
             acceleration=thrust[:, None] * planned.thrust_axis - _GRAVITY,
             quaternion=planned.quaternion,
-            body_rate=trajectory.at(times + encoded.rate_lead).body_rate,
+            body_rate=trajectory.body_rate_at(times + encoded.rate_lead),
         )
-        coming = trajectory.at(times + BRAKE_LEAD).acceleration
+        coming = trajectory.acceleration_at(times + BRAKE_LEAD)
         flown = check_motion(payloads[rows], motion, coming, encoded.gains, rows.start, space=encoded.space)
         # What is sent makes up for drag besides, so the planned acceleration is judged, with the packet's error.
         acceleration = planned.acceleration + flown.acceleration - motion.acceleration
@@ -225,47 +227,31 @@ def check_motion(
     """
     require = partial(_require, first=first)
     require(payloads[:, 0] == FULL_STATE_TYPE, "the payload is no full state", payloads[:, 0])
-    decoded, frames = decode(payloads), matrices_of(motion.quaternion)
+    decoded = decode(payloads)
     _check_values("position", decoded.position - motion.position, require)
     _check_values("velocity", decoded.velocity - motion.velocity, require)
     harmless = harmless_rates(motion, acceleration_ahead, gains, space)
     sent_rate = np.concatenate([harmless, motion.body_rate[:, 2:]], axis=1)
     _check_values("body_rate", decoded.body_rate - sent_rate, require)
 
-    traded = motion.body_rate[:, :2] - decoded.body_rate[:, :2]
-    seen = rotations_of(turns_seen(motion.body_rate))
-    turn = seen @ rotations_of(turns_for(traded, gains))
-    wanted, along = frames @ turn, turn[:, 2, 2]  # cosine between thrust as flown and as sent
-    force = decoded.acceleration + _GRAVITY
-    thrust = norms(motion.acceleration + _GRAVITY) / along
-    _check_values("acceleration", force - thrust[:, None] * wanted[:, :, 2], require)
-    sent, quaternion = (np.ascontiguousarray(values) for values in (force, decoded.quaternion))
-    turned, off, flown, attitude = _turned_back(sent, quaternion, wanted, turn, frames)
-    _check_attitude(turned, off, force, require)
-
-    # The rates that setpoints ask for at the attitude that the controller believes in the motion.
-    lean = np.einsum("nij,ni->nj", frames @ seen, force) / norms(force)[:, None]
-    rates = gains.full_rate * np.stack([-lean[:, 1], lean[:, 0], np.zeros(len(lean))], axis=1)
-    return replace(decoded, acceleration=flown - _GRAVITY, quaternion=attitude, body_rate=decoded.body_rate + rates)
+    planned = (motion.acceleration, motion.quaternion, motion.body_rate)
+    thrust, turned, off, level, flown, attitude, rate = _made(
+        decoded.acceleration, decoded.quaternion, decoded.body_rate,
+        *(np.array(each, dtype=float, order="C") for each in planned), gains.full_rate,
+    )  # fmt: skip
+    require(thrust <= _ROUNDED, _OFF.format("acceleration"), thrust)
+    require(turned <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", turned)
+    require(level >= _LEAST_LIFT, "the thrust that is sent leans too far, with a vertical share of", level)
+    # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(tilt) as far.
+    require(off * level <= ATTITUDE_QUANTUM, "the controller would not make the planned torque, off by rad", off)
+    return replace(decoded, acceleration=flown, quaternion=attitude, body_rate=rate)
 
 
 def _check_values(name: str, error: NDArray, require: Callable[..., None]) -> None:
     """Check that the errors, (N, 3), of a field are those of rounding."""
     x, y, z = np.abs(error).T  # a maximum over an axis of three is slow
     largest = np.maximum(x, np.maximum(y, z))
-    require(largest <= HALF_QUANTUM + _ROUNDING, f"{name} in the packet is not that of the trajectory, off by", largest)
-
-
-def _check_attitude(turned: NDArray, off: NDArray, force: NDArray, require: Callable[..., None]) -> None:
-    """Check by what angles, (N,) rad, the quaternion and the controller's attitude are off, as _turned_back gives them.
-
-    The thrust vectors that are sent, (N, 3), may not lean too far.
-    """
-    require(turned <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", turned)
-    # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(tilt) as far.
-    level = force[:, 2] / norms(force)
-    require(level >= _LEAST_LIFT, "the thrust that is sent leans too far, with a vertical share of", level)
-    require(off * level <= ATTITUDE_QUANTUM, "the controller would not make the planned torque, off by rad", off)
+    require(largest <= _ROUNDED, _OFF.format(name), largest)
 
 
 def _check_limits(
@@ -274,7 +260,7 @@ def _check_limits(
     """Check that the motion of setpoints keeps the limits; `acceleration`, (N, 3), is that of the motion alone."""
     quantum = np.sqrt(3) * HALF_QUANTUM + _ROUNDING
     force = flown.acceleration + _GRAVITY
-    thrust = np.linalg.norm(force, axis=1)
+    thrust = norms(force)
     measured = measures_of(
         velocity=flown.velocity,
         acceleration=acceleration,
@@ -323,33 +309,68 @@ def _require(good: NDArray, what: str, values: NDArray, first: int = 0) -> None:
 
 
 @njit(error_model="numpy")
-def _turned_back(
-    force: NDArray, quaternion: NDArray, wanted: NDArray, turn: NDArray, frames: NDArray
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Hold thrust vectors, (N, 3), and quaternions, (N, 4), as sent against the attitudes that they are to make.
+def _made(
+    acceleration: NDArray, quaternion: NDArray, body_rate: NDArray, planned_acceleration: NDArray,
+    planned_quaternion: NDArray, planned_rate: NDArray, full_rate: float,
+) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:  # fmt: skip
+    """Hold setpoints as decoded against the motion that they are to make, N of each.
 
-    `wanted`, (N, 3, 3), is `frames`, the attitudes to fly, with the `turn` that stands for rates. Returned are by what
-    angles, (N,) rad, the quaternions are off, and the controller's attitudes turned back; and the thrust vectors and
-    attitudes, (N, 3) and (N, 4), that these make the vehicle fly.
+    Returned are: by how much the thrust vectors are off, m/s² in their worst component; by what angles, rad, the
+    quaternions are, and the controller's attitudes turned back by what stands for rates; the vertical share of the
+    thrust; and the motion made: accelerations (N, 3), attitudes (N, 4) and body rates (N, 3).
     """
-    count = len(force)
-    turned, off, flown, attitude = np.empty(count), np.empty(count), np.empty((count, 3)), np.empty((count, 4))
-    sent, made = matrices_of(quaternion), _attitudes(force, quaternion)
-    command, planned, back = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    count = len(acceleration)
+    thrust_off, turned, off, level = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    flown, attitude, rate = np.empty((count, 3)), np.empty((count, 4)), body_rate.copy()
+    sent, frames, force = matrices_of(quaternion), matrices_of(planned_quaternion), acceleration + _GRAVITY
+    made = _attitudes(force, quaternion)
+    seen, turn, wanted = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    believed, planned, back = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for n in range(count):
-        command[:] = wanted[n]
-        _point_to_yaw(command)
-        turned[n] = _angle(sent[n], command)
-        _multiply_transposed(planned, made[n], turn[n])
-        off[n] = _angle(planned, frames[n])
-        _multiply_transposed(back, frames[n], wanted[n])
+        frame = frames[n]
+        wx, wy = planned_rate[n, 0], planned_rate[n, 1]
+        write_rotation(seen, -ATTITUDE_AGE * wx, -ATTITUDE_AGE * wy, 0.0)
+        dx, dy = wx - body_rate[n, 0], wy - body_rate[n, 1]
+        size = math.sqrt(dx * dx + dy * dy)
+        share = math.asin(min(size / full_rate, 1.0)) / size if size > 0.0 else 0.0
+        write_rotation(back, share * dx, share * dy, 0.0)
+        _multiply(turn, seen, back)
+        _multiply(wanted, frame, turn)
+        _multiply(believed, frame, seen)
+
+        fx, fy, fz = planned_acceleration[n, 0], planned_acceleration[n, 1], planned_acceleration[n, 2] + GRAVITY
+        along = turn[2, 2]  # cosine between thrust as flown and as sent
+        thrust, worst = math.sqrt(fx * fx + fy * fy + fz * fz) / along, 0.0
         for i in range(3):
-            thrust = back[i, 0] * force[n, 0] + back[i, 1] * force[n, 1] + back[i, 2] * force[n, 2]
-            flown[n, i] = thrust * turn[n, 2, 2]
-            for j in range(3):
-                planned[i, j] = back[i, 0] * made[n, 0, j] + back[i, 1] * made[n, 1, j] + back[i, 2] * made[n, 2, j]
+            error = abs(force[n, i] - thrust * wanted[i, 2])
+            worst = worst if error <= worst else error  # also what is not a number
+        thrust_off[n] = worst
+        size = math.sqrt(force[n, 0] ** 2 + force[n, 1] ** 2 + force[n, 2] ** 2)
+        level[n] = force[n, 2] / size
+        # The rates that the setpoint asks for at the attitude that the controller believes in the motion.
+        for k in range(2):
+            lean = believed[0, k] * force[n, 0] + believed[1, k] * force[n, 1] + believed[2, k] * force[n, 2]
+            rate[n, 1 - k] += (2 * (1 - k) - 1) * full_rate * lean / size
+
+        _multiply_transposed(back, frame, wanted)
+        _point_to_yaw(wanted)
+        turned[n] = _angle(sent[n], wanted)
+        _multiply_transposed(planned, made[n], turn)
+        off[n] = _angle(planned, frame)
+        for i in range(3):
+            flown[n, i] = (back[i, 0] * force[n, 0] + back[i, 1] * force[n, 1] + back[i, 2] * force[n, 2]) * along
+        flown[n, 2] -= GRAVITY
+        _multiply(planned, back, made[n])
         write_quaternion(attitude[n], planned)
-    return turned, off, flown, attitude
+    return thrust_off, turned, off, level, flown, attitude, rate
+
+
+@register_jitable
+def _multiply(out: NDArray, first: NDArray, second: NDArray) -> None:
+    """Write the product of two matrices, (3, 3) each."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = first[i, 0] * second[0, j] + first[i, 1] * second[1, j] + first[i, 2] * second[2, j]
 
 
 @register_jitable

@@ -19,18 +19,11 @@ CRTP_PORT = 7
 FULL_STATE_TYPE = 6
 LARGEST = 32.767  # the largest value that 16 bits hold, in m, m/s, m/s² or rad/s
 
-_WIRE = np.dtype(
-    [
-        ("type", "u1"),
-        ("position", "<i2", 3),
-        ("velocity", "<i2", 3),
-        ("acceleration", "<i2", 3),
-        ("quaternion", "<u4"),
-        ("body_rate", "<i2", 3),
-    ]
-)
 _WIRE_OF_ONE = Struct("<B9hI3h")
-PAYLOAD_SIZE = _WIRE.itemsize
+PAYLOAD_SIZE = _WIRE_OF_ONE.size
+_IN_MILLI = ("position", "velocity", "acceleration", "body_rate")
+_FIELD_PLACES = (1, 7, 13, 23)  # of these in a payload
+_QUATERNION_PLACE = 19
 _MAGNITUDES = 511  # nine bits for a component in [0, 1/√2]
 
 
@@ -50,12 +43,17 @@ def encode(setpoints: FullStateSetpoints, first: int = 0) -> NDArray:
 
     `first` is the number of the first setpoint, for the error's text.
     """
-    rows = np.zeros(len(setpoints.position), dtype=_WIRE)
-    rows["type"] = FULL_STATE_TYPE
-    for name in ("position", "velocity", "acceleration", "body_rate"):
-        rows[name] = _milli(name, getattr(setpoints, name), first)
-    rows["quaternion"] = compress_quaternion(setpoints.quaternion, first)
-    return rows.view(np.uint8).reshape(-1, PAYLOAD_SIZE)
+    compressed = compress_quaternion(setpoints.quaternion, first)
+    payloads = np.empty((len(compressed), PAYLOAD_SIZE), dtype=np.uint8)
+    values = np.stack([getattr(setpoints, name) for name in _IN_MILLI]).astype(float, copy=False)
+    bad, field = _packed(payloads, values, compressed)
+    if bad >= 0:
+        raise NotCertifiedError(
+            f"{_IN_MILLI[field]} {values[field, bad]} does not fit a packet (at most {LARGEST})",
+            where=f"setpoint {first + bad}",
+            hint="keep the flight within that of the room's origin, and its limits below that",
+        )
+    return payloads
 
 
 def decode(payloads: NDArray) -> FullStateSetpoints:
@@ -64,13 +62,14 @@ def decode(payloads: NDArray) -> FullStateSetpoints:
     Encoding that again may give other bytes that read alike: a zero in the quaternion has two signs, and of two
     components that tie for the largest either may be left out.
     """
-    rows = np.ascontiguousarray(payloads, dtype=np.uint8).reshape(-1).view(_WIRE)
+    rows = np.ascontiguousarray(payloads, dtype=np.uint8).reshape(-1, PAYLOAD_SIZE)
+    numbers, compressed = _unpacked(rows)
     return FullStateSetpoints(
-        position=rows["position"] / 1000.0,
-        velocity=rows["velocity"] / 1000.0,
-        acceleration=rows["acceleration"] / 1000.0,
-        quaternion=decompress_quaternion(rows["quaternion"]),
-        body_rate=rows["body_rate"] / 1000.0,
+        position=numbers[0],
+        velocity=numbers[1],
+        acceleration=numbers[2],
+        quaternion=_decompressed(compressed),
+        body_rate=numbers[3],
     )
 
 
@@ -79,18 +78,6 @@ def decode_one(payload: bytes) -> list[float]:
     _, *milli, quaternion, roll, pitch, yaw = _WIRE_OF_ONE.unpack(payload)
     turn = decompress_quaternion([quaternion])[0].tolist()
     return [*(value / 1000.0 for value in milli), *turn, roll / 1000.0, pitch / 1000.0, yaw / 1000.0]
-
-
-def _milli(name: str, values: NDArray, first: int) -> NDArray:
-    bad = ~(np.abs(values) <= LARGEST)
-    if np.any(bad):
-        row = int(np.flatnonzero(bad.any(axis=1))[0])
-        raise NotCertifiedError(
-            f"{name} {np.asarray(values)[row]} does not fit a packet (at most {LARGEST})",
-            where=f"setpoint {first + row}",
-            hint="keep the flight within that of the room's origin, and its limits below that",
-        )
-    return np.round(np.asarray(values) * 1000.0).astype("<i2")
 
 
 def compress_quaternion(quaternion: NDArray, first: int = 0) -> NDArray:
@@ -109,6 +96,43 @@ def compress_quaternion(quaternion: NDArray, first: int = 0) -> NDArray:
 def decompress_quaternion(compressed: ArrayLike) -> NDArray:
     """Decompress (N,) u32 to (N, 4) unit quaternions x y z w, the largest component positive."""
     return _decompressed(np.array(compressed, dtype=np.int64))
+
+
+@njit(error_model="numpy")
+def _packed(out: NDArray, values: NDArray, compressed: NDArray) -> tuple[int, int]:
+    """Write the payloads, (N, 29), from the fields of _IN_MILLI, (4, N, 3), and the compressed quaternions, (N,).
+
+    Returned are the first row that does not fit, -1 where all do, and its field.
+    """
+    for n in range(len(out)):
+        out[n, 0] = FULL_STATE_TYPE
+        for field in range(4):
+            for axis in range(3):
+                value = values[field, n, axis]
+                if not abs(value) <= LARGEST:
+                    return n, field
+                milli, place = int(np.rint(value * 1000.0)), _FIELD_PLACES[field] + 2 * axis
+                out[n, place], out[n, place + 1] = milli & 255, (milli >> 8) & 255
+        for byte in range(4):
+            out[n, _QUATERNION_PLACE + byte] = (compressed[n] >> (8 * byte)) & 255
+    return -1, 0
+
+
+@njit(error_model="numpy")
+def _unpacked(payloads: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the fields of _IN_MILLI, (4, N, 3), in m, m/s, m/s² and rad/s, and the compressed quaternions, (N,)."""
+    numbers, compressed = np.empty((4, len(payloads), 3)), np.empty(len(payloads), dtype=np.int64)
+    for n in range(len(payloads)):
+        for field in range(4):
+            for axis in range(3):
+                place = _FIELD_PLACES[field] + 2 * axis
+                bits = int(payloads[n, place]) | int(payloads[n, place + 1]) << 8
+                numbers[field, n, axis] = (bits - 65536 if bits >= 32768 else bits) / 1000.0
+        bits = 0
+        for byte in range(4):
+            bits |= int(payloads[n, _QUATERNION_PLACE + byte]) << (8 * byte)
+        compressed[n] = bits
+    return numbers, compressed
 
 
 @njit(error_model="numpy")

@@ -29,6 +29,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.flight.firmware import MellingerGains
@@ -37,7 +38,8 @@ from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import heading_of, matrices_of, norms, product, rotations_of, yaw_of
+from cfplan.vehicle.rotations import heading_of, norms, product, write_matrix, write_rotation
+from cfplan.vehicle.trigonometry import cosine, sine
 
 BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ahead of the setpoint
 SPEED_LEFT = 0.41  # share of the velocity that is left when the firmware begins to level out
@@ -108,12 +110,12 @@ def trade_rates(
     lean away from. The rates come out in whole millirad/s, as packets hold them, and the attitudes make up for those.
     """
     rate, quaternion, acceleration = _traded(
-        np.array(motion.position, dtype=float),
-        np.array(motion.velocity, dtype=float),
-        np.array(motion.acceleration, dtype=float),
-        np.array(acceleration_ahead, dtype=float),
-        np.array(motion.quaternion, dtype=float),
-        np.array(motion.body_rate, dtype=float),
+        np.array(motion.position, dtype=float, order="C"),
+        np.array(motion.velocity, dtype=float, order="C"),
+        np.array(motion.acceleration, dtype=float, order="C"),
+        np.array(acceleration_ahead, dtype=float, order="C"),
+        np.array(motion.quaternion, dtype=float, order="C"),
+        np.array(motion.body_rate, dtype=float, order="C"),
         _walls(space),
         gains.full_rate,
         np.array([gains.level_out.braking, gains.level_out.rate_max, gains.level_out.wall_stiffness]),
@@ -131,35 +133,16 @@ def harmless_rates(
 
     The check of the bytes compares with these, so they are computed apart from trade_rates, from a(t) to tilt to rate.
     """
-    low, high = _walls(space)
-    place = motion.position[:, :2] + WALL_LEAD * motion.velocity[:, :2]
-    off_low, off_high = (
-        np.minimum(gains.level_out.wall_stiffness * np.maximum(WALL_REACH - far, 0.0), WALL_PULL_MAX)
-        for far in (place - low, high - place)
+    return _harmless(
+        np.array(motion.position, dtype=float, order="C"),
+        np.array(motion.velocity, dtype=float, order="C"),
+        np.array(acceleration_ahead, dtype=float, order="C"),
+        np.array(motion.quaternion, dtype=float, order="C"),
+        np.array(motion.body_rate, dtype=float, order="C"),
+        _walls(space),
+        gains.full_rate,
+        np.array([gains.level_out.braking, gains.level_out.rate_max, gains.level_out.wall_stiffness]),
     )
-    speed_left = SPEED_LEFT * motion.velocity[:, :2] + SPEED_GAINED * acceleration_ahead[:, :2]
-    yaw = yaw_of(motion.quaternion.T)
-    forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-    left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
-    wanted = off_low - off_high - gains.level_out.braking * speed_left
-    pull = np.stack([np.sum(wanted * forward, axis=1), np.sum(wanted * left, axis=1)], axis=1)
-    size = np.maximum(norms(pull), 1e-12)
-    rate = np.minimum(gains.full_rate * np.sin(np.arctan2(size, GRAVITY)), gains.level_out.rate_max)
-    good = (rate / size)[:, None] * np.stack([-pull[:, 1], pull[:, 0]], axis=1)
-    traded = motion.body_rate[:, :2] - good
-    size = norms(traded)
-    up = (matrices_of(motion.quaternion) @ rotations_of(turns_seen(motion.body_rate)))[:, 2]  # in the axes believed
-    aside = np.sum(up[:, :2] * np.stack([traded[:, 1], -traded[:, 0]], axis=1), axis=1) / np.maximum(size, 1e-12)
-    upright = np.arctan2(aside, up[:, 2])  # the turn after which the axis leans least, by acos(reached)
-    reached = np.hypot(aside, up[:, 2])
-    widest = np.clip(upright + np.arccos(np.minimum(math.cos(LEAN_MAX) / reached, 1.0)), 0.0, np.pi / 2)
-    most = np.minimum(TRADED_RATE_MAX, gains.full_rate * np.sin(widest))
-    return np.asarray(motion.body_rate[:, :2] - (np.minimum(size, most) / np.maximum(size, 1e-12))[:, None] * traded)
-
-
-def turns_seen(body_rate: NDArray) -> NDArray:
-    """Return the rotation vectors, (N, 3) rad, from the attitude to the one that the controller believes, at rates."""
-    return np.asarray(-ATTITUDE_AGE * body_rate * (1.0, 1.0, 0.0))
 
 
 def turns_for(rate: NDArray, gains: AttitudeGains = FIRMWARE_GAINS) -> NDArray:
@@ -243,7 +226,8 @@ def _traded(
         good_x, good_y = _good_rate(
             position[n], velocity[n], acceleration_ahead[n], quaternion[n], walls, full_rate, level_out
         )
-        back = _turn(-0.5 * ATTITUDE_AGE * math.sqrt(wx * wx + wy * wy), wx, wy)
+        half = -0.5 * ATTITUDE_AGE * math.sqrt(wx * wx + wy * wy)
+        back = _turn(sine(half), cosine(half), wx, wy)
         dx, dy = wx - good_x, wy - good_y
         size = math.sqrt(dx * dx + dy * dy)
         most = min(TRADED_RATE_MAX, _most_by_lean(product(quaternion[n], back), dx, dy, size, full_rate))
@@ -253,7 +237,9 @@ def _traded(
 
         dx, dy = wx - rates[n, 0], wy - rates[n, 1]
         size = math.sqrt(dx * dx + dy * dy)
-        turn = product(back, _turn(0.5 * math.asin(min(size / full_rate, 1.0)), dx, dy))
+        share = min(size / full_rate, 1.0)  # the sine of the turn
+        half = math.sqrt(0.5 + 0.5 * math.sqrt(1.0 - share * share))  # the cosine of half of it
+        turn = product(back, _turn(0.5 * share / half, half, dx, dy))
         turned = product(quaternion[n], turn)
         for k in range(4):
             attitudes[n, k] = turned[k]
@@ -268,25 +254,31 @@ def _traded(
     return rates, attitudes, accelerations
 
 
-@njit(error_model="numpy")
-def _turn(half: float, x: float, y: float) -> tuple[float, float, float, float]:
-    """Return the quaternion that turns about (x, y, 0) by twice an angle, rad; none where that is zero."""
+@register_jitable
+def _turn(sin_half: float, cos_half: float, x: float, y: float) -> tuple[float, float, float, float]:
+    """Return the quaternion that turns about (x, y, 0), by twice the angle with that sine and cosine."""
     size = math.sqrt(x * x + y * y)
-    along = math.sin(half) / size if size > 0.0 else 0.0
-    return along * x, along * y, 0.0, math.cos(half)
+    along = sin_half / size if size > 0.0 else 0.0
+    return along * x, along * y, 0.0, cos_half
 
 
-@njit(error_model="numpy")
+@register_jitable
 def _most_by_lean(
     quaternion: tuple[float, float, float, float], dx: float, dy: float, size: float, full_rate: float
 ) -> float:
-    """Return how much of a rate along (dx, dy), of that size, rad/s, may be traded until the thrust leans too far."""
+    """Return how much of a rate along (dx, dy), of that size, rad/s, may be traded until the thrust leans too far.
+
+    Where all of it may, or TRADED_RATE_MAX, which is seen without an angle, that is said to be the full rate.
+    """
     if size == 0.0:
         return full_rate
     x, y, z, w = quaternion
     square = x * x + y * y + z * z + w * w
     aside = 2.0 * ((x * z - y * w) * dy - (y * z + x * w) * dx) / (size * square)
     lift = 1.0 - 2.0 * (x * x + y * y) / square
+    share = min(size, TRADED_RATE_MAX) / full_rate  # the sine of the turn
+    if share < 1.0 and lift * math.sqrt(1.0 - share * share) + aside * share >= _LEAST_LIFT:
+        return full_rate
     reached = math.sqrt(aside * aside + lift * lift)
     turn = math.atan2(aside, lift)
     if reached > _LEAST_LIFT:
@@ -294,7 +286,7 @@ def _most_by_lean(
     return full_rate * math.sin(min(max(turn, 0.0), 0.5 * math.pi))
 
 
-@njit(error_model="numpy")
+@register_jitable
 def _good_rate(
     position: NDArray,
     velocity: NDArray,
@@ -321,9 +313,57 @@ def _good_rate(
     return -scale * left, scale * forward
 
 
-@njit(error_model="numpy")
+@register_jitable
 def _pull_off(place: float, low: float, high: float, stiffness: float) -> float:
     """Return the acceleration, m/s², away from two opposite walls."""
     off_low = min(max(stiffness * (WALL_REACH - (place - low)), 0.0), WALL_PULL_MAX)
     off_high = min(max(stiffness * (WALL_REACH - (high - place)), 0.0), WALL_PULL_MAX)
     return off_low - off_high
+
+
+@njit(error_model="numpy")
+def _harmless(
+    position: NDArray,
+    velocity: NDArray,
+    acceleration_ahead: NDArray,
+    quaternion: NDArray,
+    body_rate: NDArray,
+    walls: NDArray,
+    full_rate: float,
+    level_out: NDArray,
+) -> NDArray:
+    """Return what harmless_rates gives, (N, 2) rad/s."""
+    out = np.empty((len(position), 2))
+    braking, rate_max, stiffness = level_out
+    frame, seen, wanted = np.empty((3, 3)), np.empty((3, 3)), np.empty(2)
+    for n in range(len(position)):
+        for k in range(2):
+            place = position[n, k] + WALL_LEAD * velocity[n, k]
+            off_low = min(stiffness * max(WALL_REACH - (place - walls[0, k]), 0.0), WALL_PULL_MAX)
+            off_high = min(stiffness * max(WALL_REACH - (walls[1, k] - place), 0.0), WALL_PULL_MAX)
+            speed_left = SPEED_LEFT * velocity[n, k] + SPEED_GAINED * acceleration_ahead[n, k]
+            wanted[k] = off_low - off_high - braking * speed_left
+        x, y = heading_of(quaternion[n])
+        size = max(math.sqrt(x * x + y * y), 1e-12)
+        cos, sin = x / size, y / size
+        forward, left = wanted[0] * cos + wanted[1] * sin, wanted[1] * cos - wanted[0] * sin
+        size = max(math.sqrt(forward * forward + left * left), 1e-12)
+        rate = min(full_rate * math.sin(math.atan(size / GRAVITY)), rate_max) / size
+        wx, wy = body_rate[n, 0], body_rate[n, 1]
+        dx, dy = wx + rate * left, wy - rate * forward
+        size = max(math.sqrt(dx * dx + dy * dy), 1e-12)
+        x, y, z, w = quaternion[n]
+        write_matrix(frame, quaternion[n], 2.0 / (x * x + y * y + z * z + w * w))
+        write_rotation(seen, -ATTITUDE_AGE * wx, -ATTITUDE_AGE * wy, 0.0)
+        up_x, up_y, up_z = (  # in the axes believed
+            frame[2, 0] * seen[0, 0] + frame[2, 1] * seen[1, 0] + frame[2, 2] * seen[2, 0],
+            frame[2, 0] * seen[0, 1] + frame[2, 1] * seen[1, 1] + frame[2, 2] * seen[2, 1],
+            frame[2, 0] * seen[0, 2] + frame[2, 1] * seen[1, 2] + frame[2, 2] * seen[2, 2],
+        )
+        aside = (up_x * dy - up_y * dx) / size
+        upright = math.atan2(aside, up_z)  # the turn after which the axis leans least, by acos(reached)
+        reached = math.sqrt(aside * aside + up_z * up_z)
+        widest = upright + math.acos(min(_LEAST_LIFT / reached, 1.0))
+        most = min(TRADED_RATE_MAX, full_rate * math.sin(min(max(widest, 0.0), 0.5 * math.pi)))
+        out[n, 0], out[n, 1] = wx - min(size, most) / size * dx, wy - min(size, most) / size * dy
+    return out
