@@ -83,14 +83,7 @@ def replay(
         reference = _reference(plan_file, safety_file, steps)
         document = _replay_trials(flights, reference, names, angles, files, steps)
     if as_json:
-        print_json(
-            {
-                **document,
-                "rrd": str(save) if save else None,
-                "png": str(png) if png else None,
-                "figure": str(figure) if figure else None,
-            }
-        )
+        print_json(document | files.to_json())
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +108,11 @@ class Files:
                 raise InputError(
                     "a figure is of one record", where=str(self.figure), hint="name one record, without --plan"
                 )
+
+    def to_json(self) -> dict[str, str | None]:
+        """Return the names of the files; null where one was not asked for."""
+        files = {"rrd": self.save, "png": self.png, "figure": self.figure}
+        return {kind: str(file) if file else None for kind, file in files.items()}
 
     def make(
         self, steps: Steps, write: "Callable[..., None]", picture: "Callable[..., tuple[str, ...]]", show: Callable
