@@ -76,7 +76,7 @@ def judge_sequence(
     for each in commitments:
         in_stop[each.splice :] = False
         in_stop[each.splice : each.stop_until] = True
-    faults = _byte_faults_between_stops(commitments, sequence, limits)
+    faults = _byte_faults_between_stops(commitments, limits)
     speed = np.linalg.norm(flown.velocity, axis=1)
     accelerating = _differentiated(flown.velocity, numbers)
     stopping = _widened(in_stop)[rows]
@@ -144,20 +144,20 @@ def _plan_share(commitments: Sequence[Committed], limits: Limits) -> float:
     return max(certify(each, limits.plan, limits.space).worst.share for each in trajectories.values())
 
 
-def _byte_faults_between_stops(commitments: Sequence[Committed], sequence: NDArray, limits: Limits) -> list[str]:
-    """Return what the check of bytes finds in the flown sequence, stretch by stretch between stops.
+def _byte_faults_between_stops(commitments: Sequence[Committed], limits: Limits) -> list[str]:
+    """Return what the check of bytes finds in the flown sequence, from the first plan to a stop, and behind each stop.
 
-    A stretch goes on, behind the splice of the stop that ends it, as it was committed before.
+    Such a stretch goes on, behind the splice of the stop that ends it, as it was committed before.
     """
-    found, begin = [], 0
+    found, begin = [], -1
     for number, each in enumerate(commitments):
-        following = commitments[number + 1] if number + 1 < len(commitments) else None
         if each.stop_until:
-            begin = each.stop_until
-        if following is not None and not following.stop_until:
+            begin = -1
             continue
-        so_far = sequence if following is None else np.concatenate([sequence[: each.splice], each.payloads])
-        if following is None or begin < following.splice:
+        begin = each.splice if begin < 0 else min(begin, each.splice)
+        following = commitments[number + 1] if number + 1 < len(commitments) else None
+        if following is None or following.stop_until:
+            so_far, _, _ = _laid_together(commitments[: number + 1])
             found += _byte_faults(so_far[begin:], begin, each.flown, limits)
     return found
 

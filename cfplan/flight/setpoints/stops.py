@@ -9,9 +9,11 @@ r falls as a quintic smoothstep, so the braking deceleration is at most 1.875 v�
 stop that begins at once, or is shorter, turns the vehicle so fast that link loss within it ends outside the walls.
 """
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.encoding import (
@@ -23,9 +25,10 @@ from cfplan.flight.setpoints.encoding import (
 )
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains, ahead
+from cfplan.machine_code import njit
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import about_z, norms, quaternions_of, yaw_of
+from cfplan.vehicle.rotations import about_z, norms, quaternions_of, write_quaternion, yaw_of
 
 DURATION = 1.2  # s, from full speed to rest: 3.1 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
@@ -72,12 +75,48 @@ def stop_motion(
     With it comes the acceleration of each row BRAKE_LEAD later, (K · M, 3). Body rates and the length of the thrust
     vector are ahead by the leads, s, as in the setpoints of a plan.
     """
-    steps, count = round(duration * rate), len(motion.position)
+    steps = round(duration * rate)
     share = np.arange(steps + 1) / steps
     clock_rate = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     slowing = -30.0 * share**2 * (1.0 - share) ** 2 / duration
     elapsed = share - 2.5 * share**4 + 3.0 * share**5 - share**6  # the integral of clock_rate
     elapsed *= duration * rate  # in setpoints
+    yaw = np.unwrap(yaw_of(command_quaternion(motion.quaternion).T))
+    position, velocity, sent, attitude, body_rate, acceleration = _stop_rows(
+        np.array(motion.position, dtype=float),
+        np.array(motion.velocity, dtype=float),
+        np.array(motion.acceleration, dtype=float),
+        np.array(yaw, dtype=float),
+        np.array(begin, dtype=np.int64),
+        np.stack([elapsed, clock_rate, slowing]),
+        rate,
+        np.array([rate_lead * rate, thrust_lead * rate]),
+    )
+    stops = FullStateSetpoints(
+        position=position.reshape(-1, 3),
+        velocity=velocity.reshape(-1, 3),
+        acceleration=sent.reshape(-1, 3),
+        quaternion=attitude.reshape(-1, 4),
+        body_rate=body_rate.reshape(-1, 3),
+    )
+    return stops, ahead(acceleration, rate).reshape(-1, 3)
+
+
+_Rows = tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]
+
+
+def _stop_rows_interpreted(
+    position: NDArray,
+    velocity: NDArray,
+    acceleration: NDArray,
+    yaw: NDArray,
+    begin: NDArray,
+    clock: NDArray,
+    rate: float,
+    leads: NDArray,
+) -> _Rows:
+    """Return what _stop_rows gives, by numpy."""
+    count, (elapsed, clock_rate, slowing) = len(position), clock
     place = np.minimum(begin[:, None] + elapsed, count - 1.0)
     row = np.minimum(place.astype(int), max(count - 2, 0))
     between = (place - row)[..., None]
@@ -86,24 +125,104 @@ def stop_motion(
         after = values[np.minimum(row + 1, len(values) - 1)]
         return values[row] + between * (after - values[row])
 
-    velocity = at(motion.velocity)
-    acceleration = clock_rate[:, None] ** 2 * at(motion.acceleration) + slowing[:, None] * velocity
-    turn = at(np.unwrap(yaw_of(command_quaternion(motion.quaternion).T))[:, None])[..., 0].reshape(-1)
-    made = controller_attitude(acceleration.reshape(-1, 3) + _GRAVITY, about_z(turn))
-    attitude = quaternions_of(made)
-    body_rate = _ahead(_turn_rates(attitude.reshape(len(begin), steps + 1, 4), rate), rate_lead * rate)
+    speed = at(velocity)
+    made = clock_rate[:, None] ** 2 * at(acceleration) + slowing[:, None] * speed
+    turn = at(yaw[:, None])[..., 0].reshape(-1)
+    attitude = quaternions_of(controller_attitude(made.reshape(-1, 3) + _GRAVITY, about_z(turn)))
+    attitude = attitude.reshape(*place.shape, 4)
+    body_rate = _ahead(_turn_rates(attitude, rate), leads[0])
     body_rate[:, -1] = 0.0  # the vehicle may be left with the last setpoint
-    force = acceleration + _GRAVITY
+    force = made + _GRAVITY
     thrust = norms(force)[..., None]
-    sent = _ahead(thrust, thrust_lead * rate) / thrust * force - _GRAVITY
-    stops = FullStateSetpoints(
-        position=at(motion.position).reshape(-1, 3),
-        velocity=(clock_rate[:, None] * velocity).reshape(-1, 3),
-        acceleration=sent.reshape(-1, 3),
-        quaternion=attitude,
-        body_rate=body_rate.reshape(-1, 3),
-    )
-    return stops, ahead(acceleration, rate).reshape(-1, 3)
+    sent = _ahead(thrust, leads[1]) / thrust * force - _GRAVITY
+    return at(position), clock_rate[:, None] * speed, sent, attitude, body_rate, made
+
+
+@njit(interpreted=_stop_rows_interpreted, error_model="numpy", nogil=True)
+def _stop_rows(
+    position: NDArray,
+    velocity: NDArray,
+    acceleration: NDArray,
+    yaw: NDArray,
+    begin: NDArray,
+    clock: NDArray,
+    rate: float,
+    leads: NDArray,
+) -> _Rows:
+    """Return position, velocity, acceleration as sent, attitude, body rate, and acceleration, (K, M, …), of K stops.
+
+    The motion has N rows; `clock`, (3, M), is its time elapsed, in rows, its rate and how that falls, 1/s; the `leads`
+    of rates and of thrust are in rows.
+    """
+    count, stops, length = len(position), len(begin), clock.shape[1]
+    places, speeds, sent, made, rates = (
+        np.empty((stops, length, 3)), np.empty((stops, length, 3)), np.empty((stops, length, 3)),
+        np.empty((stops, length, 3)), np.empty((stops, length, 3)),
+    )  # fmt: skip
+    attitudes, thrust, turning, matrix = (
+        np.empty((stops, length, 4)), np.empty(length), np.empty((length, 3)), np.empty((3, 3)),
+    )  # fmt: skip
+    for k in range(stops):
+        for m in range(length):
+            place = min(begin[k] + clock[0, m], count - 1.0)
+            row = min(int(place), max(count - 2, 0))
+            after, between = min(row + 1, count - 1), place - row
+            for i in range(3):
+                speed = velocity[row, i] + between * (velocity[after, i] - velocity[row, i])
+                along = acceleration[row, i] + between * (acceleration[after, i] - acceleration[row, i])
+                places[k, m, i] = position[row, i] + between * (position[after, i] - position[row, i])
+                speeds[k, m, i] = clock[1, m] * speed
+                made[k, m, i] = clock[1, m] ** 2 * along + clock[2, m] * speed
+            turn = yaw[row] + between * (yaw[after] - yaw[row])
+            thrust[m] = _write_attitude(matrix, made[k, m], math.cos(turn), math.sin(turn))
+            write_quaternion(attitudes[k, m], matrix)
+        for m in range(length):
+            periods = 1.0 if m == 0 or m == length - 1 else 2.0
+            _write_turn(turning[m], attitudes[k, max(m - 1, 0)], attitudes[k, min(m + 1, length - 1)], rate / periods)
+        for m in range(length):
+            place = min(m + leads[0], length - 1.0)
+            row = int(place)
+            after, between = min(row + 1, length - 1), place - row
+            for i in range(3):
+                rates[k, m, i] = turning[row, i] + between * (turning[after, i] - turning[row, i])
+            place = min(m + leads[1], length - 1.0)
+            row = int(place)
+            after, between = min(row + 1, length - 1), place - row
+            scale = (thrust[row] + between * (thrust[after] - thrust[row])) / thrust[m]
+            sent[k, m, 0], sent[k, m, 1] = scale * made[k, m, 0], scale * made[k, m, 1]
+            sent[k, m, 2] = scale * (made[k, m, 2] + GRAVITY) - GRAVITY
+        rates[k, length - 1] = 0.0  # the vehicle may be left with the last setpoint
+    return places, speeds, sent, attitudes, rates, made
+
+
+@register_jitable
+def _write_attitude(out: NDArray, acceleration: NDArray, cos: float, sin: float) -> float:
+    """Write the controller's attitude, (3, 3), of an acceleration and a yaw; return the specific thrust, m/s²."""
+    a, b, c = acceleration[0], acceleration[1], acceleration[2] + GRAVITY
+    thrust = math.sqrt(a * a + b * b + c * c)
+    a, b, c = a / thrust, b / thrust, c / thrust
+    p, q, r = -c * sin, c * cos, a * sin - b * cos
+    norm = math.sqrt(p * p + q * q + r * r)
+    p, q, r = p / norm, q / norm, r / norm
+    out[0, 0], out[1, 0], out[2, 0] = q * c - r * b, r * a - p * c, p * b - q * a
+    out[0, 1], out[1, 1], out[2, 1] = p, q, r
+    out[0, 2], out[1, 2], out[2, 2] = a, b, c
+    return thrust
+
+
+@register_jitable
+def _write_turn(out: NDArray, before: NDArray, after: NDArray, rate: float) -> None:
+    """Write the turn, (3,), from one attitude to another, (4,) each, times a rate."""
+    x0, y0, z0, w0 = before[0], before[1], before[2], before[3]
+    x1, y1, z1, w1 = after[0], after[1], after[2], after[3]
+    x = w0 * x1 - w1 * x0 - (y0 * z1 - z0 * y1)
+    y = w0 * y1 - w1 * y0 - (z0 * x1 - x0 * z1)
+    z = w0 * z1 - w1 * z0 - (x0 * y1 - y0 * x1)
+    scalar = w0 * w1 + x0 * x1 + y0 * y1 + z0 * z1
+    sine = math.sqrt(x * x + y * y + z * z)
+    angle = 2.0 * math.atan2(sine, abs(scalar))
+    scale = (-angle if scalar < 0.0 else angle) / max(sine, 1e-12) * rate
+    out[0], out[1], out[2] = x * scale, y * scale, z * scale
 
 
 def _ahead(values: NDArray, by: float) -> NDArray:
