@@ -20,6 +20,7 @@ import numpy as np
 from cfplan.errors import CfplanError, ExitCode, InputError
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry
 from cfplan.preparation.air_planner import PathAnswer, PathVerdict, Wish
 from cfplan.preparation.replan import HeldFlight
@@ -159,12 +160,20 @@ class _WatchedSteering(SteppedSteering):
         super().start(mission, held, Listeners(hear, hear_answer))
 
     def _keep(self, held: HeldFlight, splice: int, *, stop: bool) -> None:
-        """Keep what is held with a commitment from a splice on, of its stops their ends."""
-        commitment = held.commitment
-        rows = slice(splice - commitment.first, None)
+        """Keep what is held with a commitment from a splice on, of its stops their ends.
+
+        In a hover the pilot takes a proposal that begins elsewhere than it was made for: all of it is flown later then.
+        """
+        commitment, flown = held.commitment, held.flown
+        later = commitment.splices[-1] - splice if commitment.splices else 0
+        if self.commitments:
+            begins = flown.starts[-1] + later / RATE
+            flown = self.commitments[-1].flown.continued(begins, flown.trajectories[-1])
+        rows = slice(splice + later - commitment.first, None)
         ends = np.array(commitment.stops[rows][:, [0, -1]])
         payloads = np.array(commitment.payloads[rows])
-        self.commitments.append(Committed(splice, payloads, ends, held.flown, held.exact_from if stop else 0))
+        rests = held.exact_from + later if stop else 0
+        self.commitments.append(Committed(splice + later, payloads, ends, flown, rests))
 
 
 def fly_steered(seed: int, limits: Limits, *, requests: int = REQUESTS, seconds: float = SECONDS) -> SteeredFlight:
@@ -194,7 +203,7 @@ def fly_steered(seed: int, limits: Limits, *, requests: int = REQUESTS, seconds:
     return SteeredFlight(
         seed=seed,
         planning=planning,
-        seconds=verdict.setpoints / 100.0,
+        seconds=verdict.setpoints / RATE,
         requests=len(asked) + invalid,
         accepted=answers[PathVerdict.ACCEPTED],
         refused=answers[PathVerdict.REFUSED],
