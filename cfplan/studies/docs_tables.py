@@ -1,8 +1,9 @@
-"""Write the tables of the pages in docs/ from the JSON in results/, between markers that name them.
+"""Write the tables and figures of README and docs/ from the JSON in results/, between markers that name them.
 
 <!-- table: results/bench.json#time-4.5x8x2-hardware -->     its title and its cells
 <!-- columns: results/bench.json#time-4.5x8x2-hardware -->   what its columns mean
 <!-- measured: results/bench.json -->                        command, date, commit and machine
+<!-- figure: results/bench.json#TABLE/ROW/COLUMN -->        one cell, within a line; ROW is what its first column says
 <!-- preflight: parameters -->                               what preflight requires on board; also signs, unknowable,
                                                              time-outs
 <!-- end -->                                                 ends any of them
@@ -21,6 +22,10 @@ _BLOCK = re.compile(
     r"(?P<begin><!-- (?P<kind>table|columns|measured): (?P<file>[^#\s]+)(?:#(?P<name>\S+))? -->\n).*?"
     r"(?P<end><!-- end -->)",
     re.DOTALL,
+)
+_FIGURE = re.compile(
+    r"(?P<begin><!-- figure: (?P<file>[^#\s]+)#(?P<table>[^/]+)/(?P<row>.+?)/(?P<column>\w+) -->)"
+    r".*?(?P<end><!-- end -->)"
 )
 _RULES = re.compile(
     r"(?P<begin><!-- preflight: (?P<name>\S+) -->\n).*?(?P<end><!-- end -->)",
@@ -46,13 +51,20 @@ def with_tables(page: str, folder: Path) -> str:
         titles, cells = RULES[match["name"]]()
         return f"{match['begin']}\n{_grid(titles, cells)}\n\n{match['end']}"
 
-    return _RULES.sub(rules, _BLOCK.sub(block, page))
+    def figure(match: re.Match[str]) -> str:
+        table = read_result(folder / match["file"]).table(match["table"])
+        return f"{match['begin']}{_cell(table, match['row'], match['column'])}{match['end']}"
+
+    return _RULES.sub(rules, _FIGURE.sub(figure, _BLOCK.sub(block, page)))
 
 
 def write_tables(folder: Path) -> list[Path]:
-    """Make the tables of every page under docs/ of `folder` anew; return the pages that changed. Raises InputError."""
-    pages = sorted((folder / "docs").rglob("*.md"))
-    if not pages:
+    """Make the tables of README and of every page under docs/ of `folder` anew; return the pages that changed.
+
+    Raises InputError.
+    """
+    pages = pages_of(folder)
+    if not (folder / "docs").is_dir():
         raise InputError("no pages", where=str(folder / "docs"), hint="run this in the repository's root")
     changed = []
     for page in pages:
@@ -62,6 +74,21 @@ def write_tables(folder: Path) -> list[Path]:
             page.write_text(new, encoding="utf-8")
             changed.append(page)
     return changed
+
+
+def pages_of(folder: Path) -> list[Path]:
+    """Return the pages that may have tables."""
+    return [*folder.glob("README.md"), *sorted((folder / "docs").rglob("*.md"))]
+
+
+def _cell(table: Table, name: str, key: str) -> str:
+    """Return one cell as it is shown. Raises InputError where there is none."""
+    first = table.columns[0].key
+    rows = [row for row in table.rows if str(row[first]) == name]
+    columns = [column for column in table.columns if column.key == key]
+    if len(rows) != 1 or not columns:
+        raise InputError(f"the table {table.name!r} has no cell {name}/{key}", hint="see the table's JSON")
+    return columns[0].text(rows[0])
 
 
 def _cells(table: Table) -> str:

@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.studies.docs_tables import with_tables
+from cfplan.studies.docs_tables import pages_of, with_tables
 from cfplan.studies.provenance import provenance
 from cfplan.studies.result import Column, StudyResult, Table, collect, read_result
 
 pytestmark = pytest.mark.unit
 REPOSITORY = Path(__file__).parents[2]
-PAGES = sorted((REPOSITORY / "docs").rglob("*.md"))
+PAGES = pages_of(REPOSITORY)
 COLUMNS = (
     Column("path", "path"),
     Column("landed", "landed", of="flights", meaning="at the end of its plan"),
@@ -48,6 +48,15 @@ def test_every_result_says_of_which_commit_it_is():
 def test_a_result_survives_its_file(tmp_path):
     result().write(tmp_path / "flights.json")
     assert read_result(tmp_path / "flights.json") == result()
+
+
+def test_a_figure_within_a_line_is_that_of_its_cell(tmp_path):
+    result().write(tmp_path / "flights.json")
+    deviation, landed = (f"<!-- figure: flights.json#all/line/{key} -->" for key in ("deviation", "landed"))
+    line = f"off by {deviation}?<!-- end -->, {landed}<!-- end --> landed"
+    assert with_tables(line, tmp_path) == f"off by {deviation}3.1 cm<!-- end -->, {landed}4/5<!-- end --> landed"
+    with pytest.raises(InputError, match="no cell circle/deviation"):
+        with_tables(line.replace("/line/", "/circle/"), tmp_path)
 
 
 def test_a_block_is_replaced_by_title_and_cells_and_nothing_else_changes(tmp_path):
