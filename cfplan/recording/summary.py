@@ -20,6 +20,7 @@ from cfplan.safety.limits import PlanLimits
 
 UNKNOWN = "–"
 SETTLED = 0.03  # m from the end of the path: close enough to call the flight settled
+SPEED_SPAN = 0.06  # s over which poses tell speed: 1 mm of noise is 0.02 m/s
 DROPOUT = 3.0  # usual intervals between poses: a longer gap is a dropout
 
 
@@ -36,6 +37,7 @@ class FlightSummary:
     rms_deviation: float  # m
     max_deviation_to_path: float  # m, from the nearest point of the path
     rms_deviation_to_path: float  # m
+    estimated_speed: float  # share by which the vehicle's estimate is faster than the poses, along the path
     peak_speed: float  # m/s, by the vehicle's estimate, along the path
     peak_acceleration: float  # m/s², gravity not counted, by the vehicle's estimate, along the path
     peak_body_rate: float  # rad/s, norm, along the path
@@ -79,6 +81,7 @@ def summarise(record: Record) -> FlightSummary:
         rms_deviation=_rms(along.in_time),
         max_deviation_to_path=_worst(along.to_path),
         rms_deviation_to_path=_rms(along.to_path),
+        estimated_speed=estimated_speed(record, begin, end),
         peak_speed=_peak(record.estimates.time, record.estimates.velocity, begin, end),
         peak_acceleration=_peak(record.estimates.time, record.estimates.acceleration, begin, end),
         peak_body_rate=_peak(record.status.time, record.status.body_rate, begin, end),
@@ -142,6 +145,24 @@ def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -
     path = path[np.all(np.isfinite(path), axis=1)]
     path = path if len(path) else record.setpoints.position
     return PoseDeviations(time, np.linalg.norm(position - reference, axis=1), distance_to_path(position, path))
+
+
+def estimated_speed(record: Record, begin: float, end: float) -> float:
+    """Return by which share the vehicle's estimate is faster than the poses between begin and end.
+
+    A vehicle that believes itself slower than it is flies ahead of its setpoints. NaN where nothing moves or is known.
+    """
+    estimates, time = record.estimates, record.poses.time
+    seen = np.isfinite(time) & np.all(np.isfinite(record.poses.position), axis=1)
+    inside = (estimates.time >= begin) & (estimates.time <= end) & np.all(np.isfinite(estimates.velocity), axis=1)
+    if not (seen.any() and inside.any()):
+        return math.nan
+    before, after = estimates.time[inside] - SPEED_SPAN / 2, estimates.time[inside] + SPEED_SPAN / 2
+    axes = record.poses.position[seen].T
+    moved = [np.interp(after, time[seen], axis) - np.interp(before, time[seen], axis) for axis in axes]
+    velocity = np.stack(moved, axis=1) / SPEED_SPAN
+    square = float(np.sum(velocity**2))
+    return float(np.sum(estimates.velocity[inside] * velocity)) / square - 1.0 if square > 0.0 else math.nan
 
 
 def settling(record: Record) -> float:
@@ -231,6 +252,7 @@ def summary_rows(summary: FlightSummary, limits: PlanLimits) -> list[tuple[str, 
         ("deviation in time, rms", _text(100 * summary.rms_deviation, "cm", 1)),
         ("deviation from the path, max", _text(100 * summary.max_deviation_to_path, "cm", 1)),
         ("deviation from the path, rms", _text(100 * summary.rms_deviation_to_path, "cm", 1)),
+        ("speed by the estimate, over that by poses", _text(100 * summary.estimated_speed, "%", 1)),
         ("peak speed", peak("peak_speed", "m/s")),
         ("peak acceleration", peak("peak_acceleration", "m/s²")),
         ("peak body rate", peak("peak_body_rate", "rad/s")),

@@ -152,6 +152,23 @@ def test_peaks_lateness_and_battery_are_those_of_the_streams(flight):
     assert summary.battery_end == pytest.approx(4.0 - 0.1 * (TRAVEL + HELD))
 
 
+@pytest.mark.parametrize(("lag", "share"), [(0.0, -0.05), (0.1, -0.05), (0.0, 0.02)])
+def test_a_vehicle_that_believes_itself_slower_than_its_poses_are_says_so(flight, lag, share):
+    record = straight_flight(flight.header, lag=lag)
+    moving = (record.estimates.time > BEGIN + lag) & (record.estimates.time < BEGIN + lag + TRAVEL)
+    velocity = np.where(moving[:, None], [(1.0 + share) * SPEED, 0.0, 0.0], 0.0)
+    believed = dataclasses.replace(record, estimates=dataclasses.replace(record.estimates, velocity=velocity))
+    found = summarise(believed).estimated_speed
+    assert found == pytest.approx(share, abs=0.002)
+    assert f"| speed by the estimate, over that by poses | {100 * found:.1f} % |" in summary_text(believed)
+
+
+def test_nothing_is_said_of_speed_where_nothing_moves(flight):
+    record = straight_flight(flight.header)
+    still = dataclasses.replace(record.poses, position=np.ones_like(record.poses.position))
+    assert math.isnan(summarise(dataclasses.replace(record, poses=still)).estimated_speed)
+
+
 def test_the_made_up_flight_shows_its_dropout_and_its_late_setpoint(flight):
     summary = summarise(flight.record)
     assert summary.pose_dropouts == 1
