@@ -1,5 +1,6 @@
 """`cfplan fly --waypoints`: the path comes a line at a time, while the vehicle flies."""
 
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -59,6 +60,7 @@ def fly_waypoints(
         from cfplan.steering.connect import connect
         from cfplan.steering.waypoint_lines import STANDARD_INPUT, opened_lines, steer_by_lines
     answers: list[str] = []
+    typed = place == STANDARD_INPUT and sys.stdin.isatty()  # the lines, so keys are none
 
     def reply(text: str) -> None:
         answers.append(text)
@@ -67,7 +69,7 @@ def fly_waypoints(
     with ExitStack() as stack:
         lines, watchers = stack.enter_context(opened_lines(place, reply)), _Watchers(watched, stack)
         vehicle = connect(
-            uri, mocap=mocap_uri, safety=limits, records=records, name=NAME, keys=place != STANDARD_INPUT,
+            uri, mocap=mocap_uri, safety=limits, records=records, name=NAME, keys=not typed,
             on_step=steps, on_record=watchers.open, more_orders=watchers.orders,
         )  # fmt: skip
         try:

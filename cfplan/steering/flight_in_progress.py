@@ -43,6 +43,9 @@ class FlightInProgress(Protocol):
     def order(self, order: Order) -> None:
         """Give the pilot an order."""
 
+    def typed(self) -> list[str]:
+        """Return the keys that were typed since the last call and are no orders."""
+
     def wait(self, done: Callable[[], bool], patience: float) -> bool:
         """Let time pass until `done`, asked after each message, or the flight's end, at most for `patience`, s.
 

@@ -141,6 +141,9 @@ class RealTimeSteering:
     def order(self, order: Order) -> None:
         self._orders.append(order)
 
+    def typed(self) -> list[str]:
+        return self._keyboard.typed()
+
     def wait(self, done: Callable[[], bool], patience: float) -> bool:
         with self._change:
             self._change.wait_for(lambda: done() or self.outcome is not None, timeout=patience)

@@ -213,6 +213,13 @@ class SteeredVehicle:
         unread, self._unread = self._unread, []
         return unread
 
+    def keys(self) -> list[str]:
+        """Return the keys typed since the last call: up, down, left, right, and characters.
+
+        Space and Esc are not among them: they land and cut. Keys are read while the vehicle flies in real time.
+        """
+        return self._flight.typed()
+
     def wait(self, patience: float = math.inf) -> bool:
         """Wait until all that was asked for is flown and the vehicle hovers, at most for `patience`, s.
 

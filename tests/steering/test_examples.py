@@ -43,6 +43,24 @@ def test_a_gate_that_moves_is_flown_through(vehicle):
     assert max(missed) < 0.1
 
 
+def test_keys_move_the_vehicle_and_what_cannot_be_flown_is_refused(vehicle, capsys):
+    held = [["up"] * 3] * 6 + [[]] * 6 + [["a"] * 2, ["r"]] * 3 + [[]] * 8 + [["x"], ["f"] * 20, [], [], ["q"]]
+    places = []
+
+    def keys():
+        places.append(vehicle.position)
+        return held[len(places) - 1]
+
+    accepted = example("teleoperate").fly(vehicle, keys)
+    assert accepted >= 8
+    begun, reached = places[0], places[26]
+    assert 0.9 < reached[0] - begun[0] < 1.9
+    assert 0.4 < reached[1] - begun[1] < 0.8
+    assert 0.2 < reached[2] - begun[2] < 0.4
+    assert "too far out" in capsys.readouterr().out
+    assert len(places) == len(held)
+
+
 def test_a_plan_is_made_saved_and_rehearsed(tmp_path):
     duration, deviation = example("plan_and_rehearse").plan_and_rehearse(
         [[0, 0, 1], [1, 0, 1], [1, 1, 1.2]], str(EXAMPLES.parent / "safety.yaml"), str(tmp_path / "plan.parquet")

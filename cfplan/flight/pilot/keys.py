@@ -20,6 +20,12 @@ _LONGEST_BURST = 1 << 16  # bytes that are read in one go
 _SEQUENCE = re.compile(rb"\x1b?\x1b(\[[0-?]*[!-/]*[@-~]?|O[0-9;]*[A-Za-z]?)")  # an arrow or function key, or its start
 _KEYS = re.compile(rb"(?P<escapes>\x1b+)(?P<next>[^\x1b])?|(?P<space> )", re.DOTALL)
 _ALT = b"\x00"  # stands for a sequence: Esc before it is Alt
+_ARROWS = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}  # by the letter that ends the sequence
+_TYPED = re.compile(
+    rb"\x1b+(?:\[[0-9;]*|O)(?P<arrow>[A-D])|\x1b+(?:\[[0-?]*[!-/]*[@-~]?|O[0-9;]*[A-Za-z]?|.)?|(?P<other>[!-~])",
+    re.DOTALL,
+)
+_MOST_TYPED = 1000  # keys that are kept until somebody asks for them
 
 
 class Order(IntEnum):
@@ -61,9 +67,17 @@ def orders_of(keys: bytes) -> list[Order]:
     return orders
 
 
+def keys_of(keys: bytes) -> list[str]:
+    """Return the keys of a burst that are no orders: up, down, left, right, and printable characters but for space."""
+    typed = _TYPED.finditer(keys)
+    names = [_ARROWS[key["arrow"]] if key["arrow"] else (key["other"] or b"").decode("ascii") for key in typed]
+    return [name for name in names if name]
+
+
 class Keyboard:
     """Collects orders while it is entered. Without a terminal only signals give any.
 
+    Keys are read from the terminal that started the program where standard input is a pipe or a file.
     Space lands, Esc cuts; Ctrl-C lands the first time and cuts the second; SIGTERM and SIGHUP land.
     Ctrl-Z and Ctrl-S are off: they would stop the program in the air, Ctrl-S at its next line of output. If the
     terminal closes, that lands too, and what is still printed to it is dropped.
@@ -73,6 +87,8 @@ class Keyboard:
         """Take `keys` too, or leave what is typed to another reader; signals count either way."""
         self._keys = keys
         self._orders: deque[Order] = deque()
+        self._typed: deque[str] = deque(maxlen=_MOST_TYPED)
+        self._opened: int | None = None  # the program's own terminal, where standard input is another
         self._interrupts = 0
         self._terminal: tuple[int, list[Any]] | None = None
         self._handlers: dict[int, Any] = {}
@@ -84,6 +100,8 @@ class Keyboard:
         # No terminal, or not in its foreground: signals alone.
         with contextlib.suppress(termios.error, OSError, ValueError, AttributeError):
             descriptor = sys.stdin.fileno()
+            if self._keys and not os.isatty(descriptor):
+                self._opened = descriptor = os.open(os.ctermid(), os.O_RDWR | os.O_NOCTTY)
             if self._keys and os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp():
                 self._terminal = descriptor, termios.tcgetattr(descriptor)
                 self._read_keys_at_once(descriptor)
@@ -105,6 +123,9 @@ class Keyboard:
             with contextlib.suppress(termios.error):  # it has closed
                 termios.tcsetattr(self._terminal[0], termios.TCSAFLUSH, self._terminal[1])
             self._terminal = None
+        if self._opened is not None:
+            os.close(self._opened)
+            self._opened = None
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         self._handlers.clear()
@@ -122,7 +143,9 @@ class Keyboard:
     def orders(self) -> list[Order]:
         """Return the orders since the last call. Takes 30 ms after an Esc, else does not wait."""
         if self._terminal is not None:
-            self._orders.extend(orders_of(_burst(self._terminal[0])))
+            burst = _burst(self._terminal[0])
+            self._orders.extend(orders_of(burst))
+            self._typed.extend(keys_of(burst))
             if not os.isatty(self._terminal[0]):
                 self._terminal = None
                 self._orders.append(Order.LAND)
@@ -130,6 +153,13 @@ class Keyboard:
         given = list(self._orders)
         self._orders.clear()
         return given
+
+    def typed(self) -> list[str]:
+        """Return the keys since the last call that were no orders, as orders() has read them; from any thread."""
+        keys = []
+        while self._typed:
+            keys.append(self._typed.popleft())
+        return keys
 
 
 def _burst(terminal: int) -> bytes:

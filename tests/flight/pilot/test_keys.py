@@ -11,7 +11,7 @@ import textwrap
 import pytest
 from waiting import until
 
-from cfplan.flight.pilot.keys import Keyboard, Order, orders_of
+from cfplan.flight.pilot.keys import Keyboard, Order, keys_of, orders_of
 
 
 @pytest.mark.parametrize(
@@ -43,6 +43,24 @@ from cfplan.flight.pilot.keys import Keyboard, Order, orders_of
 )
 def test_space_lands_and_esc_cuts_and_arrows_do_neither(keys, orders):
     assert orders_of(keys) == orders
+
+
+@pytest.mark.parametrize(
+    ("keys", "names"),
+    [
+        (b"", []),
+        (b"\x1b[A\x1b[B\x1b[C\x1b[D", ["up", "down", "right", "left"]),
+        (b"\x1bOA\x1b[1;5D", ["up", "left"]),
+        (b"wW1;", ["w", "W", "1", ";"]),
+        (b"a b\x1b", ["a", "b"]),
+        (b"\x1bxa", ["a"]),
+        (b"\x1b[15~\x1bOPa", ["a"]),
+        (b"\r\n\t\x00\xc3\xa9", []),
+        (b"\x1b[", []),
+    ],
+)
+def test_other_keys_have_names(keys, names):
+    assert keys_of(keys) == names
 
 
 def test_the_first_interrupt_lands_and_the_second_cuts():
@@ -147,6 +165,37 @@ def test_a_terminal_that_closes_lands_and_output_to_it_ends_nothing(tmp_path):
     os.close(terminal)
     assert os.waitpid(child, 0)[1] == 0
     assert said.read_text() == "LAND\n"
+
+
+_PIPED = """
+import os, sys, time
+from cfplan.flight.pilot.keys import Keyboard
+reading, writing = os.pipe()
+os.write(writing, b"0 1 2 \\x1b")
+os.dup2(reading, 0)
+with Keyboard() as keyboard:
+    print("ready", flush=True)
+    seen, typed = [], []
+    while len(seen) < 2:
+        seen += keyboard.orders()
+        typed += keyboard.typed()
+        time.sleep(0.01)
+print(*(order.name for order in seen), *typed, os.read(0, 100), flush=True)
+"""
+
+
+def test_where_lines_come_by_a_pipe_keys_are_those_of_the_terminal():
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, [sys.executable, "-c", textwrap.dedent(_PIPED)])
+    try:
+        _read_until(terminal, "ready")
+        os.write(terminal, b"\x1b[Aq ")
+        os.write(terminal, b"\x1b")
+        _read_until(terminal, "LAND CUT up q b'0 1 2 \\x1b'")
+    finally:
+        os.close(terminal)
+        os.waitpid(child, 0)
 
 
 def _read_until(descriptor: int, text: str) -> str:
