@@ -344,6 +344,53 @@ def hard_paths(**given: Any) -> None:
     _measure(partial(run, _safety_file(Path())), "planning", given)
 
 
+_quick = click.option("--quick", is_flag=True, help="A few paths and epochs on data of its own: does it run?")
+_data = click.option(
+    "--data", type=click.Path(path_type=Path), default=Path("datasets/paper"), show_default=True,
+    help="Dataset; its first 100 paths are for testing.",
+)  # fmt: skip
+_epochs = click.option("--epochs", type=click.IntRange(1), help="Of each training.  [default: 14]")
+_networks = click.option(
+    "--networks", type=click.Path(path_type=Path), default=Path("datasets/paper-networks"), show_default=True,
+    help="Where networks are kept; those not there are trained.",
+)  # fmt: skip
+
+
+@study.command(epilog="Example: cfplan study architectures -o results/architectures.json")
+@_count(100, "For training and for testing each.")
+@_data
+@_networks
+@_epochs
+@_quick
+@_output
+@options.as_json
+def architectures(**given: Any) -> None:
+    """Make the paper's Table 1: networks of four architectures, TOPPQuad, the expert and the network that ships.
+
+    Training that was stopped goes on from its last epoch.
+    """
+    _use_one_thread()
+    from cfplan.studies.paper.architectures import architectures as run
+
+    _measure(run, "training and planning", given)
+
+
+@study.command(epilog="Example: cfplan study inputs -o results/inputs.json")
+@_count(100, "For training and for testing each.")
+@_data
+@_networks
+@_epochs
+@_quick
+@_output
+@options.as_json
+def inputs(**given: Any) -> None:
+    """Make the paper's table of inputs: an LSTM that sees position, velocity and acceleration of a path, or less."""
+    _use_one_thread()
+    from cfplan.studies.paper.inputs import inputs_study
+
+    _measure(inputs_study, "training and planning", given)
+
+
 @study.command(short_help="Write the tables of docs/ from results/.")
 @click.argument("folder", metavar="[REPOSITORY]", type=click.Path(path_type=Path), default=Path())
 def docs(folder: Path) -> None:
@@ -379,7 +426,9 @@ def _measure(run: Callable[..., "StudyResult"], what: str, given: dict[str, Any]
     if output is not None and not output.parent.is_dir():  # before an hour is spent measuring
         raise InputError("no such folder", where=str(output.parent), hint="make it first")
     provenance()  # of the beginning
-    chosen = {name: value for name, value in given.items() if value != ()}  # the rest is the study's own default
+    chosen = {
+        name: value for name, value in given.items() if value not in ((), None)
+    }  # the rest is the study's own default
     if "yaw" in chosen:
         from cfplan.geometry.yaw import YawMode
 

@@ -9,5 +9,6 @@ __all__ = [
     "learned",
     "model_files",
     "networks",
+    "paper",
     "training",
 ]

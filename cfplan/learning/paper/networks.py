@@ -1,0 +1,201 @@
+"""The networks of the paper's Table 1 in torch: LSTM and Transformer encoder-decoders, an encoder, a per-step MLP.
+
+Each maps the derivatives of a path at N nodes, (B, N, I), to h and cos ψ there, (B, N, 2); means and scales are stored
+with the weights. Inside, h is its logarithm: at rest ends h is ten times and more what it is elsewhere, and would
+outweigh it. That, the sizes, and what the MLP sees are not in the paper: see `SIZES` and `REACH`.
+
+Where `answers` are given, the answer before is the true one (teacher forcing), else the network's.
+"""
+
+import math
+from enum import StrEnum
+from itertools import pairwise
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+OUTPUTS = 2  # h and cos ψ
+REACH = 8  # nodes on either side of its own that the MLP sees, and answers before its own that it is fed
+
+
+class Kind(StrEnum):
+    """The architectures of Table 1."""
+
+    LSTM = "LSTM"
+    TRANSFORMER = "Transformer"
+    ENCODER = "ETransformer"
+    MLP = "MLP"
+
+
+class Size(NamedTuple):
+    """Width and number of layers, of each of encoder and decoder."""
+
+    width: int
+    layers: int
+
+
+SIZES = MappingProxyType({
+    Kind.LSTM: Size(96, 1), Kind.TRANSFORMER: Size(64, 2), Kind.ENCODER: Size(64, 3), Kind.MLP: Size(192, 3),
+})  # fmt: skip
+HEADS = 4
+MOST_LOG = 10.0  # of h: farther out are no answers but accidents
+
+
+class SequenceNetwork(nn.Module):
+    """What the networks have in common: the normalisation of what they see and say."""
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.mean, self.scale = nn.Buffer(torch.zeros(inputs)), nn.Buffer(torch.ones(inputs))
+        self.middle, self.spread = nn.Buffer(torch.zeros(OUTPUTS)), nn.Buffer(torch.ones(OUTPUTS))
+
+    def set_units(self, inputs: Tensor, answers: Tensor) -> None:
+        """Take means and scales from data, (R, N, I) and (R, N, 2)."""
+        self.mean.copy_(inputs.mean((0, 1)))
+        self.scale.copy_(inputs.std((0, 1)).clamp_min(1e-6))
+        logs = _with_logarithm(answers)
+        self.middle.copy_(logs.mean((0, 1)))
+        self.spread.copy_(logs.std((0, 1)).clamp_min(1e-6))
+
+    def forward(self, inputs: Tensor, answers: Tensor | None = None) -> Tensor:
+        """Map (B, N, I) to (B, N, 2); with `answers`, (B, N, 2), by teacher forcing."""
+        seen = (inputs - self.mean) / self.scale
+        fed = None if answers is None else self.scaled(answers)
+        found = self.middle + self.spread * self.answer(seen, fed)
+        return torch.stack([found[..., 0].clamp(-MOST_LOG, MOST_LOG).exp(), found[..., 1]], -1)
+
+    def scaled(self, answers: Tensor) -> Tensor:
+        """Return answers as the network has them, in which errors are measured."""
+        return (_with_logarithm(answers) - self.middle) / self.spread
+
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """Map what is scaled to what is scaled."""
+        raise NotImplementedError
+
+
+class LstmEncoderDecoder(SequenceNetwork):
+    """The paper's choice: attention between decoder and encoder has no parameters, answers are fed back."""
+
+    def __init__(self, inputs: int, size: Size) -> None:
+        super().__init__(inputs)
+        self.encoder = nn.LSTM(inputs, size.width, size.layers, batch_first=True)
+        self.decoder = nn.LSTM(OUTPUTS + inputs, size.width, size.layers, batch_first=True)
+        self.head = nn.Linear(2 * size.width, OUTPUTS)
+
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """See SequenceNetwork."""
+        memory, state = self.encoder(seen)
+        first = seen.new_zeros(len(seen), 1, OUTPUTS)
+        if fed is not None:
+            decoded, _ = self.decoder(torch.cat([torch.cat([first, fed[:, :-1]], 1), seen], 2), state)
+            return self._head(memory, decoded)
+        answers = [first]
+        for n in range(seen.shape[1]):
+            decoded, state = self.decoder(torch.cat([answers[-1], seen[:, n : n + 1]], 2), state)
+            answers.append(self._head(memory, decoded))
+        return torch.cat(answers[1:], 1)
+
+    def _head(self, memory: Tensor, decoded: Tensor) -> Tensor:
+        weights = torch.softmax(decoded @ memory.transpose(1, 2) / memory.shape[2] ** 0.5, 2)
+        answers: Tensor = self.head(torch.cat([decoded, weights @ memory], 2))
+        return answers
+
+
+class TransformerEncoderDecoder(SequenceNetwork):
+    """Self-attention over the path, a decoder with a causal mask and cross-attention, fed its answers."""
+
+    def __init__(self, inputs: int, size: Size) -> None:
+        super().__init__(inputs)
+        self.enter, self.enter_answers = nn.Linear(inputs, size.width), nn.Linear(OUTPUTS, size.width)
+        options: dict[str, Any] = {"dropout": 0.0, "batch_first": True, "norm_first": True}
+        encoding = nn.TransformerEncoderLayer(size.width, HEADS, 4 * size.width, **options)
+        decoding = nn.TransformerDecoderLayer(size.width, HEADS, 4 * size.width, **options)
+        norms = nn.LayerNorm(size.width), nn.LayerNorm(size.width)
+        self.encoder = nn.TransformerEncoder(encoding, size.layers, norms[0], enable_nested_tensor=False)
+        self.decoder = nn.TransformerDecoder(decoding, size.layers, norms[1])
+        self.head = nn.Linear(size.width, OUTPUTS)
+
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """See SequenceNetwork."""
+        memory = self.encoder(placed(self.enter(seen)))
+        first = seen.new_zeros(len(seen), 1, OUTPUTS)
+        if fed is not None:
+            return self._decode(torch.cat([first, fed[:, :-1]], 1), memory)
+        answers = first
+        for _ in range(seen.shape[1]):
+            answers = torch.cat([answers, self._decode(answers, memory)[:, -1:]], 1)
+        return answers[:, 1:]
+
+    def _decode(self, before: Tensor, memory: Tensor) -> Tensor:
+        mask = nn.Transformer.generate_square_subsequent_mask(before.shape[1], device=before.device)
+        entered = placed(self.enter_answers(before))
+        answers: Tensor = self.head(self.decoder(entered, memory, tgt_mask=mask, tgt_is_causal=True))
+        return answers
+
+
+class EncoderTransformer(SequenceNetwork):
+    """Self-attention over the path and a head at each node: nothing is fed back."""
+
+    def __init__(self, inputs: int, size: Size) -> None:
+        super().__init__(inputs)
+        self.enter = nn.Linear(inputs, size.width)
+        layer = nn.TransformerEncoderLayer(
+            size.width, HEADS, 4 * size.width, dropout=0.0, batch_first=True, norm_first=True
+        )
+        norm = nn.LayerNorm(size.width)
+        self.encoder = nn.TransformerEncoder(layer, size.layers, norm, enable_nested_tensor=False)
+        self.head = nn.Linear(size.width, OUTPUTS)
+
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """See SequenceNetwork."""
+        answers: Tensor = self.head(self.encoder(placed(self.enter(seen))))
+        return answers
+
+
+class StepMlp(SequenceNetwork):
+    """One node after the other: from the path within REACH nodes and the last REACH answers."""
+
+    def __init__(self, inputs: int, size: Size) -> None:
+        super().__init__(inputs)
+        widths = [(2 * REACH + 1) * (inputs + 1) + REACH * OUTPUTS] + [size.width] * size.layers
+        layers = [part for i, o in pairwise(widths) for part in (nn.Linear(i, o), nn.ReLU())]
+        self.layers = nn.Sequential(*layers, nn.Linear(size.width, OUTPUTS))
+
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """See SequenceNetwork."""
+        there = torch.cat([seen, torch.ones_like(seen[..., :1])], 2)  # zeros where the path has ended
+        around = nn.functional.pad(there, (0, 0, REACH, REACH)).unfold(1, 2 * REACH + 1, 1).flatten(2)
+        before = seen.new_zeros(len(seen), REACH, OUTPUTS)
+        if fed is not None:
+            last = torch.cat([before, fed[:, :-1]], 1).unfold(1, REACH, 1).flatten(2)
+            answers: Tensor = self.layers(torch.cat([around, last], 2))
+            return answers
+        for n in range(seen.shape[1]):
+            known = torch.cat([around[:, n], before[:, -REACH:].transpose(1, 2).flatten(1)], 1)
+            before = torch.cat([before, self.layers(known)[:, None]], 1)
+        return before[:, REACH:]
+
+
+_NETWORKS = {
+    Kind.LSTM: LstmEncoderDecoder, Kind.TRANSFORMER: TransformerEncoderDecoder, Kind.ENCODER: EncoderTransformer,
+    Kind.MLP: StepMlp,
+}  # fmt: skip
+
+
+def build_network(kind: Kind, inputs: int, size: Size | None = None) -> SequenceNetwork:
+    """Return a network with random weights, by torch's seed."""
+    return _NETWORKS[kind](inputs, size or SIZES[kind])
+
+
+def _with_logarithm(answers: Tensor) -> Tensor:
+    return torch.stack([answers[..., 0].clamp_min(math.exp(-MOST_LOG)).log(), answers[..., 1]], -1)
+
+
+def placed(values: Tensor) -> Tensor:
+    """Add to (B, N, W) the sines and cosines by which attention knows a node's place."""
+    count, width = values.shape[1:]
+    rates = torch.exp(torch.arange(0, width, 2) * (-math.log(1e4) / width))
+    angles = torch.arange(count)[:, None] * rates
+    return values + torch.stack([angles.sin(), angles.cos()], 2).flatten(1).to(values)

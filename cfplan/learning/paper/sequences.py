@@ -1,0 +1,115 @@
+"""Sequences: the paths of a dataset as the paper's networks see them, [γ, γ', γ''] at each node, with [h, cos ψ].
+
+Nothing is scaled by limits or made relative to a place, as the features of cfplan's own networks are: the paper's
+networks know one vehicle, one set of limits and one box.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path as FilePath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import CfplanError, InputError
+from cfplan.geometry.path import Path
+from cfplan.geometry.random_paths import perturbed
+from cfplan.learning.dataset import read_dataset
+from cfplan.learning.dataset_spec import DatasetSpec
+from cfplan.planners.solution import Status
+
+MAX_LENGTH = 60.0  # m: the few longer paths are excursions of min-snap, far out of the box
+
+
+class Inputs(StrEnum):
+    """What networks see of a path, as the paper's table of inputs names it."""
+
+    ALL = "pos/vel/acc"
+    VELOCITY = "pos/vel"
+    ACCELERATION = "pos/acc"
+    POSITION = "pos"
+
+    @property
+    def orders(self) -> list[int]:
+        """Return the orders of the derivatives by s."""
+        return [["pos", "vel", "acc"].index(name) for name in self.value.split("/")]
+
+    @property
+    def width(self) -> int:
+        """Return the numbers at a node."""
+        return 3 * len(self.orders)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sequences:
+    """R paths with their labels at N nodes."""
+
+    spec: DatasetSpec
+    rows: NDArray  # (R,) numbers of the dataset's rows
+    paths: tuple[Path, ...]
+    inputs: NDArray  # (R, N, 9) float32
+    answers: NDArray  # (R, N, 2) float32, h and cos ψ
+    end: NDArray  # (R,) s where each path ends
+    length: NDArray  # (R,) m
+    travel_time: NDArray  # (R,) s
+
+    def part(self, chosen: NDArray | slice) -> "Sequences":
+        """Return some of the rows, by index."""
+        numbers = np.arange(len(self.rows))[chosen]
+        paths = tuple(self.paths[k] for k in numbers)
+        return Sequences(
+            self.spec, self.rows[chosen], paths, self.inputs[chosen], self.answers[chosen], self.end[chosen],
+            self.length[chosen], self.travel_time[chosen],
+        )  # fmt: skip
+
+    def tested(self, count: int) -> "Sequences":
+        """Return the first `count` rows, from which nothing is learned."""
+        return self.part(self.rows < count)
+
+    def learned_from(self, first: int) -> "Sequences":
+        """Return the rows from number `first` on, without those longer than MAX_LENGTH."""
+        return self.part((self.rows >= first) & (self.length <= MAX_LENGTH))
+
+    def perturbed_inputs(self, epsilon: float, seed: np.random.SeedSequence) -> NDArray:
+        """Return (R, N, 9): what networks see of every path when it is perturbed by at most epsilon, m."""
+        noisy = (
+            perturbed(path, epsilon, own) for path, own in zip(self.paths, seed.spawn(len(self.paths)), strict=True)
+        )
+        return np.stack([path_inputs(path, self.inputs.shape[1]) for path in noisy])
+
+
+def path_inputs(path: Path, nodes: int) -> NDArray:
+    """Return (N, 9) float32: γ, γ' and γ'' at N nodes, both ends counted."""
+    s = np.linspace(0.0, path.end, nodes)
+    return np.concatenate([path(s, order) for order in range(3)], axis=1).astype(np.float32)
+
+
+def select_inputs(inputs: NDArray, chosen: Inputs) -> NDArray:
+    """Return (..., N, I) of (..., N, 9)."""
+    return inputs[..., [3 * order + axis for order in chosen.orders for axis in range(3)]]
+
+
+def read_sequences(folder: FilePath, *, most: int | None = None) -> Sequences:
+    """Read the solved paths among the first `most` rows of a dataset.
+
+    Raises InputError where the folder is no dataset, is damaged, or holds no solved path.
+    """
+    spec, rows = read_dataset(folder)
+    solved = [row for row in rows.slice(0, most).to_pylist() if row["status"] == Status.SOLVED.name]
+    if not solved:
+        raise InputError("no solved path", where=str(folder), hint="make another with `cfplan dataset make`")
+    try:
+        paths = tuple(
+            Path(np.array(row["breaks"]), np.array(row["coefficients"]).reshape(len(row["breaks"]) - 1, -1, 3))
+            for row in solved
+        )
+        h, yaw = (np.array([row[name] for row in solved], dtype=float) for name in ("h", "yaw"))
+        lengths, times = (np.array([row[name] for row in solved], dtype=float) for name in ("length", "travel_time"))
+        if not (np.isfinite(h).all() and np.isfinite(yaw).all() and (h >= 0.0).all() and (times > 0.0).all()):
+            raise ValueError("h, yaw or travel time is not that of a flight")
+    except (CfplanError, ValueError, TypeError) as error:
+        raise InputError(f"damaged: {error}", where=str(folder), hint="make the dataset again") from None
+    answers = np.stack([h, np.cos(yaw)], axis=2).astype(np.float32)
+    inputs = np.stack([path_inputs(path, spec.nodes + 1) for path in paths])
+    numbers, ends = np.array([row["row"] for row in solved]), np.array([path.end for path in paths])
+    return Sequences(spec, numbers, paths, inputs, answers, ends, lengths, times)

@@ -1,0 +1,69 @@
+"""Flights under a geometric controller, as in the paper's simulations: deviation, thrust asked, states reached.
+
+They say how well a motion can be followed at all, by a controller that knows the true state and the trajectory itself.
+How a Crazyflie follows the bytes that it is sent is for the dry run.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.simulation.dynamics.body import POSITION, TIME_STEP, VELOCITY, hovering
+from cfplan.simulation.dynamics.geometric import CONTROL_STEPS, GeometricFlight, follow, reference_rows
+from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.trajectory import Trajectory
+
+LOST = 1.0  # m: a flight that is farther from its place has failed, and is over (the paper's failure)
+SETTLING = 1.0  # s simulated after the end of the motion
+
+
+@dataclass(frozen=True, slots=True)
+class FollowedFlight:
+    """How a trajectory was followed."""
+
+    deviation: float  # m, largest distance from where the trajectory is at that time; LOST where it failed
+    asked_violation: float  # N, mean over time and motors of what was asked beyond a motor's range
+    flight: GeometricFlight
+
+    @property
+    def failed(self) -> bool:
+        """Return whether it crashed or was LOST."""
+        return self.deviation >= LOST
+
+
+def fly_geometric(trajectory: Trajectory, airframe: Airframe) -> FollowedFlight:
+    """Follow the trajectory from a hover at its start, on `airframe`, for SETTLING longer than it lasts."""
+    times = np.arange(0.0, trajectory.duration + SETTLING, CONTROL_STEPS * TIME_STEP)
+    wanted = trajectory.at(times)
+    flight = follow(reference_rows(wanted), airframe, hovering(airframe, wanted.position[0], float(wanted.yaw[0])))
+    away = np.linalg.norm(flight.states[:-1:CONTROL_STEPS, POSITION] - wanted.position, axis=1)
+    lost = np.flatnonzero(~(away < LOST))
+    last = int(lost[0]) if len(lost) else len(away)
+    asked = flight.asked[: max(CONTROL_STEPS * last, 1)]
+    return FollowedFlight(LOST if len(lost) else float(away.max()), thrust_violation(asked, airframe), flight)
+
+
+def thrust_violation(thrust: NDArray, airframe: Airframe) -> float:
+    """Return the mean over time and motors of what thrusts, (N, 4) N, exceed the motors' range by."""
+    low, high = airframe.motor_thrust_min, airframe.motor_thrust_max
+    return float(np.mean(np.maximum(thrust - high, 0.0) + np.maximum(low - thrust, 0.0)))
+
+
+def nearest_states(flight: GeometricFlight, trajectory: Trajectory, times: NDArray) -> tuple[NDArray, NDArray]:
+    """Return how near the flight comes to each planned state in the time before it: metres and m/s, (N-1,) each.
+
+    `times`, (N,) s ascending, are those of the planned states r(sᵢ). From the state reached at tᵢ the controller goes
+    on towards r(sᵢ₊₁) until tᵢ₊₁; of the states on the way the one is taken whose position is nearest.
+    """
+    planned = trajectory.at(times[1:])
+    places, speeds = np.full(len(times) - 1, np.inf), np.full(len(times) - 1, np.inf)
+    for n, (begin, end) in enumerate(pairwise(times)):
+        way = slice(int(begin / TIME_STEP), int(np.ceil(end / TIME_STEP)) + 1)
+        away = np.linalg.norm(flight.states[way, POSITION] - planned.position[n], axis=1)
+        if len(away) and np.isfinite(away).all():
+            best = int(np.argmin(away))
+            places[n] = away[best]
+            speeds[n] = np.linalg.norm(flight.states[way, VELOCITY][best] - planned.velocity[n])
+    return places, speeds

@@ -1,0 +1,112 @@
+"""The networks of the paper's studies: read where they are trained, else trained first, resumed if need be."""
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from cfplan.errors import InputError
+from cfplan.geometry.yaw import YawMode
+from cfplan.learning.checkpoints import Epoch
+from cfplan.learning.dataset import make_dataset
+from cfplan.learning.dataset_spec import DatasetSpec
+from cfplan.learning.paper.networks import SequenceNetwork
+from cfplan.learning.paper.sequences import Sequences, read_sequences
+from cfplan.learning.paper.training import SequenceOptions, load_network, train_network
+from cfplan.safety.limit_sets import BOXES, PAPER
+from cfplan.studies.paper.printed import TEST, TRAIN
+
+DATA, NETWORKS = Path("datasets/paper"), Path("datasets/paper-networks")
+TESTED = 100  # first rows of the dataset, from which nothing is learned
+WAYPOINTS = 4
+NODES = 99  # intervals: 100 points
+DATA_COMMAND = (
+    "cfplan dataset make datasets/paper --count 10100 --seed 1 --limits paper --box 10x10x10 --waypoints 4-4 "
+    "--nodes 99 --yaw free"
+)
+QUICK_PATHS, QUICK_EPOCHS = 40, 2
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class PaperData:
+    """The paths of the paper's studies, and where their networks are kept."""
+
+    parts: dict[str, Sequences]  # TRAIN: of those learned from the first ones; TEST
+    learned_from: Sequences
+    folder: Path
+    epochs: int | None = None  # None: as many as the options say
+
+
+@dataclass(frozen=True, slots=True)
+class TrainedNetwork:
+    """A network ready to be asked."""
+
+    name: str
+    options: SequenceOptions
+    network: SequenceNetwork
+    training_seconds: float  # of the processor
+
+
+@contextmanager
+def paper_data(
+    data: Path, networks: Path, paths: int, *, epochs: int | None = None, quick: bool = False
+) -> Iterator[PaperData]:
+    """Yield `paths` paths for training and for testing each; `quick`: a few of its own, in a folder that goes away.
+
+    Raises InputError where there is no such dataset, or too small a one; says which command makes it.
+    """
+    if quick:
+        with tempfile.TemporaryDirectory() as folder:
+            made = Path(folder) / "data"
+            make_dataset(made, quick_spec())
+            yield _parts(read_sequences(made), Path(folder), min(paths, 4), QUICK_PATHS // 2, QUICK_EPOCHS)
+        return
+    if not data.is_dir():
+        raise InputError("no such dataset", where=str(data), hint=f"make it: {DATA_COMMAND}")
+    yield _parts(read_sequences(data), networks, paths, TESTED, epochs)
+
+
+def quick_spec() -> DatasetSpec:
+    """Return a dataset of the paper's kind that is made in a second."""
+    return DatasetSpec(
+        count=QUICK_PATHS, seed=1, limits=PAPER.name, families=(), boxes=(BOXES["10x10x10"],),
+        waypoints=(WAYPOINTS, WAYPOINTS), nodes=NODES, yaw=YawMode.FREE,
+    )  # fmt: skip
+
+
+def _parts(read: Sequences, folder: Path, paths: int, tested: int, epochs: int | None) -> PaperData:
+    known, unseen = read.learned_from(tested), read.tested(tested)
+    if not 1 <= paths <= min(len(known.rows), len(unseen.rows)):
+        raise InputError(
+            f"{paths} paths of {len(unseen.rows)} for testing and {len(known.rows)} for training",
+            where="paths",
+            hint=f"give fewer, at least 1, or make more: {DATA_COMMAND}",
+        )
+    parts = {TRAIN: known.part(slice(0, paths)), TEST: unseen.part(slice(0, paths))}
+    return PaperData(parts, known, folder, epochs)
+
+
+def trained_networks(
+    data: PaperData, wanted: Sequence[SequenceOptions], progress: Progress, more: int
+) -> list[TrainedNetwork]:
+    """Return the networks, those not trained yet after training; `more` steps of progress follow after these."""
+    options = [replace(each, epochs=data.epochs) if data.epochs else each for each in wanted]
+    total, done = sum(each.epochs for each in options) + more, 0
+    found = []
+    for each in options:
+
+        def show(epoch: Epoch, before: int = done) -> None:
+            progress(before + epoch.epoch, total)
+
+        folder = data.folder / each.name
+        loaded = load_network(folder, data.learned_from, each)
+        if loaded is None:
+            train_network(data.learned_from, folder, each, on_epoch=show)
+            loaded = load_network(folder, data.learned_from, each)
+        assert loaded is not None
+        done += each.epochs
+        progress(done, total)
+        found.append(TrainedNetwork(each.name, each, *loaded))
+    return found
