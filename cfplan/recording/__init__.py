@@ -7,6 +7,7 @@ __all__ = [
     "importers",
     "mavlink",
     "overlay",
+    "public_topics",
     "reader",
     "record",
     "report",

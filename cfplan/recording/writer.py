@@ -22,6 +22,7 @@ from cfplan.errors import InputError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.telemetry import Telemetry
 from cfplan.recording.header import RecordHeader, header_to_json
+from cfplan.recording.public_topics import PublicTopics
 from cfplan.recording.record import FLIGHT_FILE, SUMMARY_FILE
 from cfplan.recording.topics import FORMAT, METADATA, PROFILE, TOPICS, json_schema, message_to_json
 
@@ -102,6 +103,7 @@ class RecordWriter:
             self._sink = _Sink(open_file(path))
             self._mcap = Writer(cast(IO[bytes], self._sink), chunk_size=1 << 24, compression=CompressionType.ZSTD)
             self._channels = _begin(self._mcap, header)
+            self._public = PublicTopics(self._mcap, header, self._nanoseconds)
         except FileExistsError as error:
             raise InputError(
                 "the folder holds a record already", where=str(path), hint="name another folder"
@@ -152,6 +154,7 @@ class RecordWriter:
             publish_time=self._nanoseconds(message.time),
             data=message_to_json(message),
         )
+        self._public.add(message)
 
     def _nanoseconds(self, monotonic: float) -> int:
         return max(0, int((self._zero + monotonic) * 1e9))

@@ -85,6 +85,7 @@ def test_a_record_opens_by_its_folder_and_by_its_file(flight):
 def test_other_mcap_readers_see_the_messages_on_one_clock(flight):
     with open(flight.folder / "flight.mcap", "rb") as file:
         seen = list(make_reader(file, validate_crcs=True).iter_messages())
+    seen = [(schema, channel, message) for schema, channel, message in seen if channel.message_encoding == "json"]
     assert len(seen) == len(flight.messages)
     assert {channel.topic for _, channel, _ in seen} == {topic.name for topic in TOPICS} - {"/committed"}
     assert all(schema.encoding == "jsonschema" for schema, _, _ in seen)
