@@ -18,6 +18,7 @@ from cfplan.cli.output import print_error
 from cfplan.cli.plan import plan
 from cfplan.cli.replay import replay
 from cfplan.cli.report import report
+from cfplan.cli.robustness import robustness
 from cfplan.cli.sim import sim
 from cfplan.cli.train import train
 from cfplan.cli.virtual import virtual
@@ -62,7 +63,8 @@ def cfplan() -> None:
 
 
 COMMANDS = (
-    init, plan, check, sim, fly, virtual, replay, report, identify, mocap, dataset, train, bench, study, doctor,
+    init, plan, check, sim, robustness, fly, virtual, replay, report, identify, mocap, dataset, train, bench, study,
+    doctor,
 )  # fmt: skip
 for command in COMMANDS:
     cfplan.add_command(command)

@@ -391,6 +391,28 @@ def inputs(**given: Any) -> None:
     _measure(inputs_study, "training and planning", given)
 
 
+@study.command(epilog="Example: cfplan study robustness -o results/robustness.json")
+@_count(100, "For testing.")
+@click.option("--draws", type=click.IntRange(1), default=10, show_default=True, help="Perturbations of each, each ε.")
+@click.option("--model", "models", multiple=True, help="LSTM, LSTM-0.001, LSTM-0.01 or LSTM-0.1.  [default: all]")
+@click.option(
+    "--reference", type=click.Choice(["toppquad", "expert"]), default="toppquad", show_default=True,
+    help="Whose travel times are compared with, on the path and on the perturbed one.",
+)  # fmt: skip
+@_data
+@_networks
+@_epochs
+@_quick
+@_output
+@options.as_json
+def robustness(**given: Any) -> None:
+    """Make the paper's Table 2: networks and the planner that ships, asked about perturbed paths."""
+    _use_one_thread()
+    from cfplan.studies.paper.robustness import robustness as run
+
+    _measure(run, "training and planning", given)
+
+
 @study.command(short_help="Write the tables of docs/ from results/.")
 @click.argument("folder", metavar="[REPOSITORY]", type=click.Path(path_type=Path), default=Path())
 def docs(folder: Path) -> None:

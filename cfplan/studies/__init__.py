@@ -23,6 +23,7 @@ __all__ = [
     "long_paths",
     "machine",
     "paper",
+    "path_robustness",
     "proposals",
     "provenance",
     "random_faults",

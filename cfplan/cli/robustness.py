@@ -1,0 +1,51 @@
+"""`cfplan robustness`: how a plan changes with its path."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from cfplan.cli import options
+from cfplan.cli.output import Steps, print_json, print_table
+from cfplan.preparation.compiled_calls import Stage
+
+
+@click.command(short_help="How a plan changes with its path.", epilog="Example: cfplan robustness flights/slalom.yaml")
+@options.path_file
+@click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="Limits; else the nearest safety.yaml.")
+@click.option("--planner", default="auto", show_default=True, help="auto, learned, expert, convex or minsnap.")
+@click.option(
+    "--epsilon", "scales", type=click.FloatRange(0, min_open=True), multiple=True,
+    help="m by which the path is moved at most; may be given several times.  [default: 0.001, 0.01, 0.1]",
+)  # fmt: skip
+@click.option("--draws", type=click.IntRange(1), default=10, show_default=True, help="Perturbed paths of each.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@options.as_json
+def robustness(
+    path_file: Path, safety_file: Path | None, as_json: bool, scales: tuple[float, ...], **given: Any
+) -> None:
+    """Move a path a little, plan it again, and rehearse that: how time, speed, yaw and deviation change.
+
+    What is moved stays smooth, at rest where it was, and nowhere farther away than --epsilon.
+    """
+    steps = Steps(as_json=as_json)
+    limits = options.read_limits(safety_file, path_file, steps, compile_to=Stage.REHEARSAL)
+    with steps.waiting("loading planners and simulator"):
+        from cfplan.geometry.path_file import load_path_file
+        from cfplan.machine_code import compile_from_here
+        from cfplan.studies.path_robustness import path_robustness
+
+    compile_from_here()  # without, simulating takes minutes
+    with steps.step("robustness") as results:
+        chosen: dict[str, Any] = {"scales": scales} if scales else {}
+        result = path_robustness(load_path_file(path_file), limits, **chosen, **given)
+        plans = result.table("plans").rows
+        fit = sum(not plan["reason"] for plan in plans)
+        results.append(f"{fit} of {len(plans)} plans are certified and pass the dry run")
+    if as_json:
+        print_json(result.to_json())
+        return
+    for table in result.tables:
+        print_table(table.title, *table.cells())
+    for reason in dict.fromkeys(plan["reason"] for plan in plans if plan["reason"]):
+        click.echo(f"refused: {reason}")

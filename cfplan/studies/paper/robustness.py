@@ -1,0 +1,250 @@
+"""The paper's Table 2: networks trained on clean and on perturbed paths, asked about perturbed ones.
+
+For each path and each of its perturbations by at most ε: the plan is flown by the geometric controller with the paper's
+motor lag. Beside the networks, as they are, the planner that ships, certified.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import CfplanError, InputError
+from cfplan.geometry.path import Path
+from cfplan.geometry.random_paths import perturbed
+from cfplan.learning.learned import plan_learned
+from cfplan.learning.paper.recovery import recover_profile
+from cfplan.learning.paper.sequences import Sequences, path_inputs
+from cfplan.learning.paper.training import SequenceOptions, answer
+from cfplan.planners.baselines.toppquad import plan_toppquad
+from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.task import Planner
+from cfplan.planning.repair import repair
+from cfplan.safety.limit_sets import PAPER
+from cfplan.simulation.geometric_flight import LOST, fly_geometric, nearest_states
+from cfplan.studies.paper.architectures import settings_of, training_table
+from cfplan.studies.paper.networks import (
+    DATA,
+    NETWORKS,
+    Progress,
+    TrainedNetwork,
+    paper_data,
+    trained_networks,
+)
+from cfplan.studies.paper.printed import ROBUSTNESS, TEST
+from cfplan.studies.paper.trials import FLOWN, NODES, PAPER_LAG, paper_task
+from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
+from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.trajectory import Trajectory
+
+SCALES = (0.0, 0.001, 0.01, 0.1)  # m
+MODELS = MappingProxyType({"LSTM": 0.0, "LSTM-0.001": 0.001, "LSTM-0.01": 0.01, "LSTM-0.1": 0.1})
+SHIPPED = "the shipped planner, certified"
+REFERENCES = MappingProxyType({"toppquad": plan_toppquad, "expert": plan_expert})
+TOLERANCES = ((0.02, 0.1), (0.05, 0.25), (0.1, 0.5))  # m and m/s, within which a planned state counts as reached
+
+
+class Answered(NamedTuple):
+    """What a model answers: a profile, and h and yaw at the nodes as it says them."""
+
+    profile: SpeedProfile
+    h: NDArray  # (N,)
+    yaw: NDArray  # (N,) rad, or cos ψ of a network, which says no more
+
+
+@dataclass(frozen=True, slots=True)
+class RobustnessTrial:
+    """One path, perturbed once, planned by one model. NaN where there was nothing to measure."""
+
+    model: str
+    epsilon: float  # m
+    row: int  # of the dataset
+    draw: int
+    reason: str = ""  # why there is no flight
+    travel_time: float = np.nan  # s
+    own_time: float = np.nan  # s, of the reference on the same perturbed path
+    clean_time: float = np.nan  # s, of the reference on the clean path
+    deviation: float = np.nan  # m, LOST where it failed
+    h_variation: float = np.nan  # largest relative difference of h from that on the clean path
+    yaw_variation: float = np.nan  # largest difference of yaw, rad, or of cos ψ
+    reached: tuple[float, ...] = (np.nan,) * len(TOLERANCES)
+    """Share of planned states that are reached in the time before them, by tolerance."""
+
+    @property
+    def failed(self) -> bool:
+        """Return whether there was no flight, or one that crashed or was LOST."""
+        return not self.deviation < LOST
+
+
+def robustness(
+    *,
+    paths: int = 100,
+    draws: int = 10,
+    models: Sequence[str] = tuple(MODELS),
+    reference: str = "toppquad",
+    data: FilePath = DATA,
+    networks: FilePath = NETWORKS,
+    epochs: int | None = None,
+    quick: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> StudyResult:
+    """Perturb `paths` paths for testing, `draws` times each; networks are trained if need be.
+
+    `reference` says whose travel times are compared with, toppquad or expert.
+
+    Raises:
+        InputError: an unknown model, no such dataset, or fewer paths in it.
+    """
+    for name in models:
+        if name not in MODELS:
+            raise InputError(f"unknown model {name!r}", where="models", hint=f"known: {', '.join(MODELS)}")
+    if draws < 1:
+        raise InputError("draws must be at least 1", where="draws", hint="give --draws 10, as is usual")
+    wanted = [SequenceOptions(epsilon=MODELS[name]) for name in models]
+    with paper_data(data, networks, paths, epochs=epochs, quick=quick) as material:
+        more = len(material.parts[TEST].rows)
+        trained = trained_networks(material, wanted, progress, more)
+        begun = sum(each.options.epochs for each in trained)
+        asked = {each.name: _network(each) for each in trained} | {SHIPPED: _shipped}
+
+        def show(done: int) -> None:
+            progress(begun + done, begun + more)
+
+        trials, interrupted = collect(_trials(asked, material.parts[TEST], draws, REFERENCES[reference], show))
+    settings = settings_of(material, quick) | {"draws": draws, "reference": reference}
+    tables = (robustness_table(trials, list(asked), reference), training_table(trained, material))
+    return StudyResult("robustness", settings, tables, (detail_table("trials", trials),), interrupted)
+
+
+def _trials(
+    asked: Mapping[str, Callable[[Path], Answered]], sequences: Sequences, draws: int, reference: Planner,
+    progress: Callable[[int], None],
+) -> Iterator[RobustnessTrial]:  # fmt: skip
+    for done, (row, path) in enumerate(zip(sequences.rows, sequences.paths, strict=True)):
+        clean = {name: _answered(ask, path) for name, ask in asked.items()}
+        clean_time = _time(reference, path)
+        for epsilon in SCALES:
+            for draw in range(draws if epsilon else 1):
+                seed = np.random.SeedSequence(int(row), spawn_key=(SCALES.index(epsilon), draw))
+                moved = perturbed(path, epsilon, seed) if epsilon else path
+                own_time = _time(reference, moved) if epsilon else clean_time
+                for name, ask in asked.items():
+                    begun = RobustnessTrial(name, epsilon, int(row), draw, own_time=own_time, clean_time=clean_time)
+                    yield _flown(begun, moved, _answered(ask, moved), clean[name])
+        progress(done + 1)
+
+
+def _flown(begun: RobustnessTrial, path: Path, found: Answered | str, clean: Answered | str) -> RobustnessTrial:
+    if isinstance(found, str):
+        return replace(begun, reason=found)
+    trajectory = Trajectory(path, found.profile, PAPER.airframe)
+    flight = fly_geometric(trajectory, FLOWN)
+    places, speeds = nearest_states(flight.flight, trajectory, trajectory.time_at(found.profile.s))
+    reached = tuple(float(np.mean((places <= place) & (speeds <= speed))) for place, speed in TOLERANCES)
+    trial = replace(begun, travel_time=trajectory.duration, deviation=flight.deviation, reached=reached)
+    if isinstance(clean, str):
+        return trial
+    moved = np.abs(found.yaw - clean.yaw).max()
+    return replace(trial, h_variation=float(np.abs(found.h / clean.h - 1.0).max()), yaw_variation=float(moved))
+
+
+def _answered(ask: Callable[[Path], Answered], path: Path) -> Answered | str:
+    """Return the answer, or why there is none."""
+    try:
+        return ask(path)
+    except CfplanError as error:
+        return str(error)
+
+
+def _network(trained: TrainedNetwork) -> Callable[[Path], Answered]:
+    def ask(path: Path) -> Answered:
+        answers = answer(trained.network, path_inputs(path, NODES + 1)[None], trained.options.inputs)[0]
+        return Answered(recover_profile(answers, path.end), answers[:, 0], answers[:, 1])
+
+    return ask
+
+
+def _shipped(path: Path) -> Answered:
+    task = paper_task(path)
+    solution = plan_learned(task)
+    if solution.profile is None:
+        raise CfplanError(solution.reason or str(solution.status), hint="plan by the expert")
+    profile = repair(task, solution.profile).trajectory.profile
+    return Answered(profile, profile.h, profile.yaw)
+
+
+def _time(planner: Planner, path: Path) -> float:
+    profile = planner(paper_task(path)).profile
+    return float("nan") if profile is None else Trajectory(path, profile, PAPER.airframe).duration
+
+
+def robustness_table(trials: Sequence[RobustnessTrial], names: Iterable[str], reference: str) -> Table:
+    """Return the paper's Table 2 with the paper's numbers beside."""
+    first, second, third = (f"{100 * place:g} cm, {100 * speed:g} cm/s" for place, speed in TOLERANCES)
+    columns = (
+        Column("model", "model"),
+        Column("epsilon", "ε", "m", "g"),
+        Column("trials"),
+        Column("deviation", "largest deviation", "m", ".3f", meaning=f"mean; a failure counts as {LOST:g} m"),
+        Column("deviation_flown", "without failures", "m", ".3f"),
+        Column("paper_deviation", "paper", "m", ".3f"),
+        Column("failed", "failures", of="trials", meaning=f"no plan, a crash, or {LOST:g} m from its place"),
+        Column("slower", f"time over {reference}, same path", "%", "+.2f"),
+        Column("slower_clean", "clean path", "%", "+.2f"),
+        Column("paper_slower", "paper", "%", "+.2f", meaning="it does not say on which of the two"),
+        Column(
+            "h_variation", "variation of h", "", ".4f", meaning="largest relative change at a node, mean over trials"
+        ),
+        Column(
+            "yaw_variation", "variation of yaw", "", ".4f",
+            meaning="the same, absolute: of cos ψ for networks, of ψ in rad for the planner that ships",
+        ),
+        Column("paper_variation", "paper", "", ".3f", meaning="of both outputs, in units that it does not name"),
+        Column("reached_1", f"in BRT: {first}", "%", ".1f"),
+        Column(
+            "reached_2", second, "%", ".1f",
+            meaning="share of planned states whose position is passed within that in the time before, at a velocity "
+            "within that, by the controller from where it is",
+        ),
+        Column("reached_3", third, "%", ".1f"),
+        Column("paper_in_brt", "paper", "%", ".1f", meaning="within a tolerance that it does not name"),
+    )  # fmt: skip
+    rows = []
+    for name in names:
+        for epsilon in SCALES:
+            own = [trial for trial in trials if (trial.model, trial.epsilon) == (name, epsilon)]
+            if own:
+                rows.append(_row(own))
+    title = f"Perturbed paths, {PAPER.limits.speed:g} m/s, motor lag {PAPER_LAG:g} s"
+    return Table("robustness", title, columns, tuple(rows))
+
+
+def _row(own: Sequence[RobustnessTrial]) -> dict[str, Any]:
+    printed = ROBUSTNESS.get((own[0].model, own[0].epsilon))
+    reached = np.array([trial.reached if not trial.reason else (0.0,) * len(TOLERANCES) for trial in own])
+    return {
+        "model": own[0].model,
+        "epsilon": own[0].epsilon,
+        "trials": len(own),
+        "deviation": _mean(LOST if trial.failed else trial.deviation for trial in own),
+        "deviation_flown": _mean(trial.deviation for trial in own if not trial.failed),
+        "failed": sum(trial.failed for trial in own),
+        "slower": _mean(trial.travel_time / trial.own_time - 1.0 for trial in own),
+        "slower_clean": _mean(trial.travel_time / trial.clean_time - 1.0 for trial in own),
+        "h_variation": _mean(trial.h_variation for trial in own),
+        "yaw_variation": _mean(trial.yaw_variation for trial in own),
+        **{f"reached_{k + 1}": float(share) for k, share in enumerate(reached.mean(axis=0))},
+        "paper_deviation": printed.deviation if printed else None,
+        "paper_slower": printed.slower if printed else None,
+        "paper_variation": printed.variation if printed else None,
+        "paper_in_brt": printed.in_brt if printed else None,
+    }
+
+
+def _mean(values: Iterable[float]) -> float:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else float("nan")
