@@ -413,6 +413,19 @@ def robustness(**given: Any) -> None:
     _measure(run, "training and planning", given)
 
 
+@study.command(name="yaw-consistency", epilog="Example: cfplan study yaw-consistency -o results/yaw-consistency.json")
+@click.option("--pairs", type=click.IntRange(1), default=100, show_default=True, help="Of random paths.")
+@_seed(50_000)
+@_output
+@options.as_json
+def yaw_consistency(**given: Any) -> None:
+    """Make the paper's figure of yaw consistency: TOPPQuad on pairs of paths whose first waypoint is 0.1 m apart."""
+    _use_one_thread()
+    from cfplan.studies.paper.yaw_consistency import yaw_consistency as run
+
+    _measure(run, "planning", given)
+
+
 @study.command(short_help="Write the tables of docs/ from results/.")
 @click.argument("folder", metavar="[REPOSITORY]", type=click.Path(path_type=Path), default=Path())
 def docs(folder: Path) -> None:

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.baselines.selection import select_fastest
-from cfplan.planners.baselines.toppquad_nlp import H_LEAST, ROWS, STEP_ROWS, VARIABLES, ToppquadNlp, build_toppquad
+from cfplan.planners.baselines.toppquad_nlp import (
+    H_LEAST,
+    PENALTY,
+    ROWS,
+    STEP_ROWS,
+    VARIABLES,
+    ToppquadNlp,
+    build_toppquad,
+)
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.feasibility import spare_turning
@@ -40,8 +48,8 @@ H_STIFFNESSES = (1e-2, 1e-1, 1.0, 10.0, 100.0)
 YAW_STIFFNESS = 1e-2
 
 
-def plan_toppquad(task: PlanningTask) -> Solution:
-    """Solve the paper's problem. Free yaw, which is the paper's, starts in [0, π/2].
+def plan_toppquad(task: PlanningTask, *, penalty: float = PENALTY) -> Solution:
+    """Solve the paper's problem, λ being the penalty. Free yaw, which is the paper's, starts in [0, π/2].
 
     Of a boundary state h and h' are met, and yaw at the start: the problem's states have no more.
     """
@@ -50,7 +58,7 @@ def plan_toppquad(task: PlanningTask) -> Solution:
     if nodes < NODES_LEAST:
         return Solution(Status.NOT_CONVERGED, None, f"{nodes} intervals are too few, take {NODES_LEAST} at least")
     begun = time.process_time()
-    nlp = build_toppquad(nodes + 1, airframe, limits.angular_acceleration, MAX_ITERATIONS, MAX_SECONDS)
+    nlp = build_toppquad(nodes + 1, airframe, limits.angular_acceleration, MAX_ITERATIONS, MAX_SECONDS, penalty)
     built = time.process_time()
     grid = np.linspace(0.0, path.end, nodes + 1)
     if task.start is not None and yaw is YawMode.FREE:

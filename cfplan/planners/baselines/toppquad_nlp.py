@@ -44,9 +44,14 @@ class ToppquadNlp:
 
 @lru_cache(maxsize=CACHED_PROBLEMS)
 def build_toppquad(
-    nodes: int, airframe: Airframe, angular_acceleration: float, max_iterations: int, max_seconds: float
+    nodes: int,
+    airframe: Airframe,
+    angular_acceleration: float,
+    max_iterations: int,
+    max_seconds: float,
+    penalty: float = PENALTY,
 ) -> ToppquadNlp:
-    """Build the program, once for a number of grid points, an airframe and a limit of angular acceleration, rad/s².
+    """Build the program, once for a number of grid points, an airframe, a limit of angular acceleration, rad/s², and λ.
 
     Path, grid and the other limits are parameters and bounds. That limit is not, because without one its row must go:
     left in, but unbounded, it takes IPOPT ten times as long.
@@ -65,7 +70,7 @@ def build_toppquad(
     nlp: Any = {
         "x": casadi.vec(x),
         "p": casadi.vertcat(step, casadi.vec(path)),
-        "f": duration + PENALTY * casadi.sumsqr(alpha),
+        "f": duration + penalty * casadi.sumsqr(alpha),
         "g": casadi.vertcat(casadi.vec(rows), casadi.vec(steps), first),
     }
     options: Any = {
