@@ -44,7 +44,7 @@ from cfplan.vehicle.trajectory import Trajectory
 SCALES = (0.0, 0.001, 0.01, 0.1)  # m
 MODELS = MappingProxyType({"LSTM": 0.0, "LSTM-0.001": 0.001, "LSTM-0.01": 0.01, "LSTM-0.1": 0.1})
 SHIPPED = "the shipped planner, certified"
-REFERENCES = MappingProxyType({"toppquad": plan_toppquad, "expert": plan_expert})
+REFERENCES: Mapping[str, Planner] = MappingProxyType({"toppquad": plan_toppquad, "expert": plan_expert})
 TOLERANCES = ((0.02, 0.1), (0.05, 0.25), (0.1, 0.5))  # m and m/s, within which a planned state counts as reached
 
 
