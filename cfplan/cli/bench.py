@@ -112,6 +112,33 @@ def proposals(**given: Any) -> None:
     _measure(run, "planning", given)
 
 
+@study.command(name="unseen-limits", epilog="Example: cfplan study unseen-limits -o results/unseen-limits.json")
+@_count(1000, "In each of four groups.")
+@_output
+@options.as_json
+def unseen_limits(**given: Any) -> None:
+    """Try the learned planner under limits and for vehicles that it has not learned from, against the expert."""
+    _use_one_thread()
+    from cfplan.studies.unseen_limits import unseen_limits as run
+
+    _measure(run, "planning", given)
+
+
+@study.command(epilog="Example: cfplan study ablation datasets/any -o results/ablation.json")
+@click.argument("dataset", metavar="DATASET", type=click.Path(path_type=Path))
+@click.option("--rows", type=int, default=10_000, show_default=True, help="Of the dataset, from which each learns.")
+@click.option("--epochs", type=click.IntRange(1), default=6, show_default=True)
+@_count(300, "Unseen, each under other limits.")
+@_output
+@options.as_json
+def ablation(dataset: Path, **given: Any) -> None:
+    """Train networks on DATASET for a short time, each without a part of what it sees of limits, and compare them."""
+    _use_one_thread()
+    from cfplan.studies.ablation import ablation as run
+
+    _measure(partial(run, dataset), "training and planning", given)
+
+
 @study.command(epilog="Example: cfplan study scaling -o results/scaling.json")
 @click.option("--planner", default="expert", show_default=True)
 @click.option("--repeats", type=int, default=5, show_default=True, help="Paths of each size.")

@@ -6,9 +6,11 @@ __all__ = [
     "dataset_spec",
     "draws",
     "features",
+    "labels",
     "learned",
     "model_files",
     "networks",
     "paper",
     "training",
+    "training_set",
 ]

@@ -11,6 +11,7 @@ has the same bounds). Where the path rests, only its fourth derivative bounds th
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -74,6 +75,9 @@ class ScaledLimits(NamedTuple):
     def smoothing(self) -> float:
         """Return the time over which answers are smoothed, in units of time."""
         return SMOOTHING / math.sqrt(float(self.bounds[3]))
+
+
+View = Callable[[Airframe, PlanLimits], ScaledLimits]  # what a network sees of vehicle and limits
 
 
 def scaled_limits(airframe: Airframe, limits: PlanLimits) -> ScaledLimits:

@@ -22,6 +22,7 @@ from cfplan.learning.features import (
     LEAST_SHARE,
     REFERENCE,
     ScaledLimits,
+    View,
     fill_inputs,
     node_features,
     rests,
@@ -72,10 +73,11 @@ class _Windows(NamedTuple):
     reference: NDArray  # (N+1,) log rates, in units of time
 
 
-def plan_learned(task: PlanningTask, *, model: Model | None = None) -> Solution:
+def plan_learned(task: PlanningTask, *, model: Model | None = None, view: View = scaled_limits) -> Solution:
     """Plan by the network over the task's intervals, or over one window's where those are more.
 
-    On a finer grid than the network needs it is asked on a coarser one, and its answer laid over the grid.
+    On a finer grid than the network needs it is asked on a coarser one, and its answer laid over the grid. `view` is
+    what the network was trained to see of limits and vehicle.
 
     Raises:
         InputError: fewer than ten nodes, or than the path needs, or no model.
@@ -93,7 +95,7 @@ def plan_learned(task: PlanningTask, *, model: Model | None = None) -> Solution:
     task.check_nodes()
     if task.refusal:
         return task.refusal
-    coefficients, yaw = propose(task, model)
+    coefficients, yaw = propose(task, model, view)
     if not (np.isfinite(coefficients).all() and np.isfinite(yaw.yaw).all() and (coefficients[1:-1] > 0).all()):
         return Solution(Status.NOT_CONVERGED, None, f"the network {model.name} answered what is not a number")
     stats: dict[str, float | int | str] = {
@@ -105,7 +107,7 @@ def plan_learned(task: PlanningTask, *, model: Model | None = None) -> Solution:
     return Solution(Status.SOLVED, spline_profile(coefficients, task.path.end, yaw), "", stats)
 
 
-def propose(task: PlanningTask, model: Model) -> tuple[NDArray, YawSpline]:
+def propose(task: PlanningTask, model: Model, view: View = scaled_limits) -> tuple[NDArray, YawSpline]:
     """Return the (N+3,) coefficients of h that a model proposes, not finite where it fails, and yaw."""
     path, nodes, start, end = task.path, task.nodes, task.start, task.end
     asked = min(nodes, max(model.window, math.ceil(path.length / SPACING), len(path.breaks) - 1))
@@ -113,7 +115,7 @@ def propose(task: PlanningTask, model: Model) -> tuple[NDArray, YawSpline]:
         None if task.yaw is YawMode.FREE else YawSpline.along(path, count, task.yaw, task.yaw_angle, start, end)
         for count in dict.fromkeys((asked, nodes))
     ]
-    known = scaled_limits(task.airframe, task.limits)
+    known = view(task.airframe, task.limits)
     question = Question(path, known, asked, start, end, tracks[0], task.yaw_angle)
     ((coefficients, turned),) = predict([question], model.network, model.window)
     yaw = tracks[-1]

@@ -95,7 +95,19 @@ def train(
         InputError: a dataset without usable rows, another training in the folder, a device that is not there, or
             a loss that is not a number.
     """
-    training_set = read_training_set(dataset)
+    return train_on(read_training_set(dataset), folder, options, device=device, command=command, on_epoch=on_epoch)
+
+
+def train_on(
+    training_set: TrainingSet,
+    folder: Path,
+    options: Options,
+    *,
+    device: str = "cpu",
+    command: str = "",
+    on_epoch: Callable[[Epoch], None] = lambda _: None,
+) -> Card | None:
+    """Train on rows that are read already, else as train() does."""
     with processes(device) as (rank, world, place):
         run = _Run(training_set, folder, options, rank, world, place)
         try:

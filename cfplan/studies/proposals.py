@@ -97,7 +97,7 @@ def proposals(
     return StudyResult("proposals", settings, (Table("speeds", title, COLUMNS, tuple(rows)),), interrupted=interrupted)
 
 
-def _cold_restarts(interval: float, *, capped: bool = False) -> Sequence[Start]:
+def cold_restarts(interval: float, *, capped: bool = False) -> Sequence[Start]:
     return [start for start in refining_restarts(interval, capped=capped) if not start.goes_on]
 
 
@@ -125,7 +125,7 @@ def _repair(task: PlanningTask, solution: Solution) -> tuple[float, float]:
 
 WAYS: dict[str, tuple[Planner, Callable[[PlanningTask, Solution], tuple[float, float]]]] = {
     "network": (plan_learned, _refine),
-    "network, multipliers not kept": (plan_learned, partial(_refine, restarts=_cold_restarts)),
+    "network, multipliers not kept": (plan_learned, partial(_refine, restarts=cold_restarts)),
     "convex": (plan_convex, _refine),
     EXPERT: (plan_expert, _repair),
 }

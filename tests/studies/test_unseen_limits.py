@@ -1,0 +1,37 @@
+"""What the study of unseen limits calls outside."""
+
+import numpy as np
+import pytest
+
+from cfplan.learning.dataset_spec import DatasetSpec
+from cfplan.learning.features import scaled_limits
+from cfplan.learning.labels import row_limits
+from cfplan.studies import unseen_limits
+from cfplan.studies.unseen_limits import LIMITS, VEHICLES, Neighbourhoods
+
+SPEC = DatasetSpec(count=300, seed=5)
+
+
+@pytest.fixture(scope="module")
+def around():
+    return Neighbourhoods(SPEC)
+
+
+def test_neighbourhoods_hold_their_own_draws_and_reach_99_of_100_others(around):
+    drawn = [row_limits(SPEC, number)[0] for number in range(SPEC.count)]
+    numbers = np.array([scaled_limits(each.airframe, each.limits).numbers for each in drawn])
+    assert max(around.distance(each) for each in numbers) == pytest.approx(0.0, abs=1e-9)
+    apart = np.linalg.norm((numbers[:, None] - numbers) / numbers.std(axis=0), axis=2)
+    np.fill_diagonal(apart, np.inf)
+    assert np.mean(apart.min(axis=1) <= around.radius) == pytest.approx(0.99, abs=0.005)
+
+
+@pytest.mark.parametrize("group", [VEHICLES, LIMITS])
+def test_a_draw_outside_is_outside_of_all_and_can_hover(around, group):
+    other = DatasetSpec(count=10_000, seed=6)
+    for number in range(10):
+        chosen, _, _ = unseen_limits._DRAW[group](other, number, around)
+        numbers = scaled_limits(chosen.airframe, chosen.limits).numbers
+        assert around.distance(numbers) > around.radius
+        assert chosen.limits.motor_thrust_min < chosen.airframe.hover_thrust < chosen.limits.motor_thrust_max
+        assert chosen == unseen_limits._DRAW[group](other, number, around)[0]  # by seed
