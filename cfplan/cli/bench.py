@@ -453,6 +453,35 @@ def yaw_consistency(**given: Any) -> None:
     _measure(run, "planning", given)
 
 
+@study.command(epilog="Example: cfplan study paper results")
+@click.argument("folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path("results"))
+@_quick
+def paper(folder: Path, quick: bool) -> None:
+    """Make all tables of the paper: architectures, inputs, robustness, yaw consistency; a result each in DIR.
+
+    What was made by the same commit is kept, so that a run that was stopped goes on.
+    """
+    _use_one_thread()
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from cfplan.studies.paper.all_tables import paper_tables
+
+    with Progress(console=Console(stderr=True)) as bar:
+
+        def begin(name: str) -> Callable[[int, int], None]:
+            task = bar.add_task(name, total=None)
+            return lambda done, total: bar.update(task, completed=done, total=total)
+
+        made = paper_tables(folder, quick=quick, begin=begin)
+    for each in made:
+        for table in each.result.tables:
+            print_table(table.title, *table.cells())
+    for each in made:
+        how = "kept, of this commit" if each.kept else f"{each.seconds:.0f} s of the processor"
+        click.echo(f"{each.file}: {how}")
+
+
 @study.command(short_help="Write the tables of docs/ from results/.")
 @click.argument("folder", metavar="[REPOSITORY]", type=click.Path(path_type=Path), default=Path())
 def docs(folder: Path) -> None:

@@ -1,0 +1,74 @@
+"""All tables of the paper that cfplan makes, one study after the other, each with its result in a file of its own.
+
+A run that was stopped goes on: results of the same commit are kept, those of another are made anew, none are mixed.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from cfplan.errors import InputError
+from cfplan.studies.paper.architectures import architectures
+from cfplan.studies.paper.inputs import inputs_study
+from cfplan.studies.paper.networks import Progress
+from cfplan.studies.paper.robustness import robustness
+from cfplan.studies.paper.yaw_consistency import yaw_consistency
+from cfplan.studies.provenance import provenance
+from cfplan.studies.result import StudyResult, read_result
+from cfplan.version import UNKNOWN
+
+TABLES: MappingProxyType[str, Callable[..., StudyResult]] = MappingProxyType({
+    "architectures": architectures, "inputs": inputs_study, "robustness": robustness,
+    "yaw-consistency": yaw_consistency,
+})  # fmt: skip
+QUICK: MappingProxyType[str, dict[str, Any]] = MappingProxyType({
+    "architectures": {"paths": 2, "quick": True}, "inputs": {"paths": 2, "quick": True},
+    "robustness": {"paths": 1, "draws": 1, "quick": True}, "yaw-consistency": {"pairs": 2},
+})  # fmt: skip
+
+
+class MadeTables(NamedTuple):
+    """What became of one study."""
+
+    result: StudyResult
+    file: Path
+    kept: bool  # as it was made before
+    seconds: float  # of the processor
+
+
+def paper_tables(
+    folder: Path,
+    *,
+    quick: bool = False,
+    begin: Callable[[str], Progress] = lambda name: lambda done, total: None,
+    tables: MappingProxyType[str, Callable[..., StudyResult]] = TABLES,
+) -> list[MadeTables]:
+    """Make every table's study and write its result to `folder`; an interrupt ends it after the study under way.
+
+    `begin` is told the name of each study and returns what is told of its progress.
+
+    Raises:
+        InputError: no such folder or no dataset; what was made by then is kept.
+    """
+    if not folder.is_dir():
+        raise InputError("no such folder", where=str(folder), hint="make it first")
+    made = []
+    for name, study in tables.items():
+        file, begun = folder / f"{name}.json", time.process_time()
+        kept = file.is_file() and _is_current(read_result(file), quick=quick)
+        result = read_result(file) if kept else study(**(QUICK[name] if quick else {}), progress=begin(name))
+        if not kept:
+            result.write(file)
+        made.append(MadeTables(result, file, kept, time.process_time() - begun))
+        if result.interrupted:
+            break
+    return made
+
+
+def _is_current(result: StudyResult, *, quick: bool) -> bool:
+    """Return whether it is whole and of this commit, with nothing changed then or now."""
+    now, then = provenance(), result.provenance
+    same = then.commit == now.commit != UNKNOWN and not (then.modified or now.modified)
+    return same and not result.interrupted and bool(result.settings.get("quick", False)) == quick
