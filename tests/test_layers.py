@@ -14,7 +14,7 @@ LAYERS = [
 MODULES = "its other modules"
 ROOMS = {
     "planners": [MODULES, "solver", "expert", "baselines"],
-    "flight": [MODULES, "setpoints", "radio", "mocap", "pilot"],
+    "flight": [MODULES, "setpoints", "on_board", "radio", "mocap", "pilot"],
     "simulation": ["timed_fault", "dynamics", "virtual_crazyflie", "virtual_vicon", "lab", MODULES],
     "recording": ["plausible", "importers", MODULES, "rerun", "report", "mavlink"],
 }

@@ -10,6 +10,7 @@ from cfplan.cli.bench import bench, study
 from cfplan.cli.check import check
 from cfplan.cli.dataset import dataset
 from cfplan.cli.doctor import doctor
+from cfplan.cli.export import export
 from cfplan.cli.fly import fly
 from cfplan.cli.identify import identify
 from cfplan.cli.init import init
@@ -63,8 +64,8 @@ def cfplan() -> None:
 
 
 COMMANDS = (
-    init, plan, check, sim, robustness, fly, virtual, replay, report, identify, mocap, dataset, train, bench, study,
-    doctor,
+    init, plan, check, export, sim, robustness, fly, virtual, replay, report, identify, mocap, dataset, train, bench,
+    study, doctor,
 )  # fmt: skip
 for command in COMMANDS:
     cfplan.add_command(command)

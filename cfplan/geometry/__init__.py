@@ -1,3 +1,14 @@
 """Geometric paths γ(s): path files, min-snap, polynomial files, random paths at rest at both ends; continued paths."""
 
-__all__ = ["banded", "continued", "min_snap", "path", "path_families", "path_file", "random_paths", "yaw"]
+__all__ = [
+    "banded",
+    "continued",
+    "min_snap",
+    "path",
+    "path_families",
+    "path_file",
+    "polynomial_csv",
+    "polynomials",
+    "random_paths",
+    "yaw",
+]

@@ -16,6 +16,7 @@ _COLUMNS = 1 + 4 * 8
 _MIN_DURATION = 0.001  # s
 _POSITION_STEP = 0.001  # m allowed between pieces
 _DERIVATIVE_STEP = 0.02  # allowed between pieces, of the largest derivative of that order: covers six decimals
+_HEADER = ["duration", *(f"{axis}^{power}" for axis in ("x", "y", "z", "yaw") for power in range(8))]
 _NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
 _UNITS = ("m", "m/s", "m/s²", "m/s³", "m/s⁴")
 
@@ -42,6 +43,19 @@ def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> tuple[Path, NDArra
     _check_pieces(file, lines * laps, durations, table)
     corners = np.concatenate([table[:, 0], end_values(durations[-1:], table[-1:])[1][:, 0]])
     return with_rest_ends(*close_joints(durations, table)), corners
+
+
+def polynomial_rows(durations: NDArray, coefficients: NDArray) -> str:
+    """Return a polynomial file's text for pieces (K,) s and (K, 4, 8): with digits enough for every float32."""
+    rows = np.column_stack([durations, coefficients.reshape(len(durations), -1)])
+    lines = [",".join(f"{value:.9g}" for value in row) for row in rows.tolist()]
+    return "\n".join([",".join(_HEADER), *lines]) + "\n"
+
+
+def read_polynomial_rows(file: pathlib.Path) -> tuple[NDArray, NDArray]:
+    """Return durations (K,) s and coefficients (K, 4, 8) of a polynomial file, yaw too. Raises InputError."""
+    rows, _ = read_table(file, _COLUMNS, ROW)
+    return rows[:, 0], rows[:, 1:].reshape(-1, 4, 8)
 
 
 def _check_pieces(file: pathlib.Path, lines: list[int], durations: NDArray, table: NDArray) -> None:

@@ -3,6 +3,7 @@
 __all__ = [
     "air_planner",
     "compiled_calls",
+    "export_flight",
     "from_programs",
     "plan_flight",
     "prepare_flight",

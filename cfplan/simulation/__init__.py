@@ -1,3 +1,12 @@
 """Simulated flight: dynamics, the virtual Crazyflie and Vicon, the lab, the dry run and link loss."""
 
-__all__ = ["dry_run", "geometric_flight", "glitches", "lab", "link_loss", "virtual_crazyflie", "virtual_vicon"]
+__all__ = [
+    "dry_run",
+    "geometric_flight",
+    "glitches",
+    "lab",
+    "link_loss",
+    "on_board_run",
+    "virtual_crazyflie",
+    "virtual_vicon",
+]

@@ -6,6 +6,7 @@ the true state. Its motion is compared with the limits at which the pilot would 
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
@@ -31,7 +32,7 @@ SETTLING = 1.0  # s simulated after the last payload, which the vehicle keeps
 SETTLED = 0.02  # m, nearer than this to the end it has arrived
 ARRIVED = 0.05  # m, and no farther than this may it be at last
 _STRIDE = 5  # ms between the moments at which places are compared
-_NO_FLOOR = -np.inf  # a flight that sinks to the ground shows as a deviation
+NO_FLOOR = -np.inf  # a flight that sinks to the ground shows as a deviation
 _HINT = "plan with lower limits, or check mass, thrust and motor lag of the airframe"
 
 
@@ -112,16 +113,29 @@ def dry_run(
         airframe,
         state,
         gains=gains_for(believed or airframe),
-        floor=_NO_FLOOR,
+        floor=NO_FLOOR,
         delay=delay,
         estimate=estimate,
         memory=None if snapshot is None else snapshot[MEMORY:THRUSTS],
     )
+    return fly_and_judge(
+        fly, encoded.duration + SETTLING, lambda times: trajectory.at(times).position, trajectory.duration, limits
+    )
+
+
+def fly_and_judge(
+    fly: Callable[..., ClosedLoop],
+    duration: float,
+    wanted_at: Callable[[NDArray], NDArray],
+    moving: float,
+    limits: FlightLimits,
+) -> DryRun:
+    """Call fly(duration=…), s; compare with where the vehicle is wanted at times (N,), (N, 3) m, for `moving`, s."""
     fly(duration=0.0)  # compiles if need be, as does the next line
     _distances_to_path(np.zeros((1, 3)), np.zeros((1, 3)))
     begun = time.perf_counter()
-    loop = fly(duration=encoded.duration + SETTLING)
-    run = _judge(loop, trajectory, limits)
+    loop = fly(duration=duration)
+    run = _judge(loop, wanted_at, moving, limits)
     return replace(run, real_time_factor=loop.time[-1] / (time.perf_counter() - begun))
 
 
@@ -141,16 +155,16 @@ def stress(
     }
 
 
-def _judge(loop: ClosedLoop, trajectory: Trajectory | JoinedTrajectory, limits: FlightLimits) -> DryRun:
+def _judge(loop: ClosedLoop, wanted_at: Callable[[NDArray], NDArray], duration: float, limits: FlightLimits) -> DryRun:
     times, positions = loop.time[::_STRIDE], loop.position[::_STRIDE]
-    wanted = trajectory.at(times).position
+    wanted = wanted_at(times)
     error = np.linalg.norm(positions - wanted, axis=1)
     error = np.where(np.isfinite(error), error, np.inf)
     known = np.isfinite(positions).all(axis=1)
     nearest = np.where(known, _distances_to_path(np.where(known[:, None], positions, 0.0), wanted), np.inf)
-    moving = times <= trajectory.duration
+    moving = times <= duration
     late = np.flatnonzero(~moving & (error > SETTLED))
-    settled = times[late[-1]] - trajectory.duration if len(late) else 0.0
+    settled = times[late[-1]] - duration if len(late) else 0.0
     speed = np.linalg.norm(loop.velocity, axis=1)
     acceleration = np.linalg.norm(np.diff(loop.velocity, axis=0), axis=1) / TIME_STEP
     turning = np.linalg.norm(loop.body_rate, axis=1)

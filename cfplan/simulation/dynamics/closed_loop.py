@@ -99,11 +99,34 @@ def fly_setpoints(
     efficiency: NDArray = FULL_EFFICIENCY,
     memory: NDArray | None = None,
 ) -> ClosedLoop:
-    """Fly setpoints that arrive at `times` + `delay`, (N,) s, from the state `start`, (17,), for `duration` s.
+    """Fly full states that arrive at `times` + `delay`, (N,) s, as fly_rows() flies them."""
+    return fly_rows(
+        setpoint_rows(setpoints), FULL_STATE, times, airframe, start, duration=duration, gains=gains, floor=floor,
+        delay=delay, estimate=estimate, wind=wind, efficiency=efficiency, memory=memory,
+    )  # fmt: skip
 
-    Until the first arrives, the controller holds the first. `gains` are the airframe's where not given; `wind`
-    (3,) m/s and motor `efficiency` (4,) are constant. `memory`, (10,), is the controller's at the start, zeros
-    where not given.
+
+def fly_rows(
+    rows: NDArray,
+    mode: NDArray,
+    times: NDArray,
+    airframe: Airframe,
+    start: NDArray,
+    *,
+    duration: float,
+    gains: MellingerGains | None = None,
+    floor: float = 0.0,
+    delay: float = 0.0,
+    estimate: EstimateErrors = PERFECT,
+    wind: NDArray = STILL_AIR,
+    efficiency: NDArray = FULL_EFFICIENCY,
+    memory: NDArray | None = None,
+) -> ClosedLoop:
+    """Fly setpoints as `mellinger` has them, (N, 20) in a mode (7,), from the state `start`, (17,), for `duration` s.
+
+    They arrive at `times` + `delay`, (N,) s; until the first does, the controller holds the first. `gains` are the
+    airframe's where not given; `wind` (3,) m/s and motor `efficiency` (4,) are constant. `memory`, (10,), is the
+    controller's at the start, zeros where not given.
     """
     steps = round(duration / TIME_STEP)
     arrivals = np.round((np.asarray(times) + delay) / TIME_STEP).astype(np.int64)
@@ -116,7 +139,7 @@ def fly_setpoints(
     _run(
         states,
         commands,
-        setpoint_rows(setpoints),
+        rows,
         arrivals,
         (gains or gains_for(airframe)).pack(),
         pack_body(airframe, floor=floor),
@@ -124,7 +147,7 @@ def fly_setpoints(
         noise,
         np.asarray(wind, dtype=float),
         np.asarray(efficiency, dtype=float),
-        FULL_STATE,
+        mode,
         np.zeros(MEMORY_SIZE) if memory is None else memory.copy(),
     )
     return ClosedLoop(np.arange(steps + 1) * TIME_STEP, states, commands)

@@ -1,0 +1,88 @@
+"""`cfplan export`: a certified plan in the formats of other tools."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from cfplan.cli import options
+from cfplan.cli.output import Steps, print_json
+from cfplan.errors import InputError
+from cfplan.preparation.compiled_calls import Stage
+
+_FORMS = ("crazyswarm", "memory", "compressed", "samples")
+
+
+@click.command(
+    short_help="A certified plan for other tools.",
+    epilog="""\b
+Examples:
+  cfplan export flights/circle.yaml --to crazyswarm -o circle.csv
+  cfplan export flights/circle.yaml --to memory -o circle.bin
+  cfplan export plan.parquet --to samples -o samples.csv""",
+)
+@options.path_or_plan
+@options.planning
+@click.option(
+    "--to",
+    "form",
+    required=True,
+    type=click.Choice(_FORMS),
+    help="A polynomial CSV; the vehicle's trajectory memory, compressed where need be or always; or a CSV of states.",
+)
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Write this file.")
+@click.option("--plain", is_flag=True, help="The plan's own motion, without what makes the firmware fly it.")
+@click.option("--pieces", type=click.IntRange(1, 255), help="Polynomials, at most.  [default: 31, as a vehicle holds]")
+@click.option("--rate", type=click.FloatRange(1, 1000), default=100.0, show_default=True, help="Hz, of samples.")
+@click.option("--force", is_flag=True, help="Overwrite the output.")
+@options.as_json
+def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path, as_json: bool, **rest: Any) -> None:
+    """Write a plan for other tools, certified as they will read it.
+
+    Polynomials stay within 2 cm of the plan and within every limit; where they cannot, the whole is slowed. They are
+    flown in the simulator as the vehicle's own commander flies them.
+    """
+    plain, pieces, rate, force = (rest.pop(name) for name in ("plain", "pieces", "rate", "force"))
+    _check(form, output, force, pieces)
+    steps = Steps(as_json=as_json)
+    limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.PLAN)
+    with steps.waiting("loading planners"):
+        from cfplan.cli.certificate_table import print_certificate
+        from cfplan.preparation import export_flight
+        from cfplan.preparation.plan_flight import plan_flight
+
+    flight, kind = options.flight_options(rest, safety_file, path_or_plan), export_flight.Form(form)
+    if kind is export_flight.Form.SAMPLES:
+        planned = plan_flight(path_or_plan, limits, flight, steps)
+        with steps.step("save") as results:
+            count = export_flight.write_samples(planned, rate, output)
+            results.append(f"{output}, {count} samples")
+        document, certificate = planned.to_dict() | {"samples": count}, planned.certificate
+    else:
+        planned = export_flight.plan_for_polynomials(path_or_plan, limits, flight, steps)
+        most = pieces or export_flight.MOST_PIECES
+        exported = export_flight.fit_polynomials(planned, kind, leads=not plain, most=most, on_step=steps)
+        with steps.step("save") as results:
+            export_flight.write_polynomials(exported, kind, output)
+            results.append(str(output))
+        document, certificate = exported.to_dict(), exported.on_board.certificate
+    if as_json:
+        print_json(document | {"file": str(output)})
+    else:
+        print_certificate(certificate)
+
+
+def _check(form: str, output: Path, force: bool, pieces: int | None) -> None:
+    """Raise InputError, before anything is planned, where the file could not be written."""
+    suffix = ".bin" if form in ("memory", "compressed") else ".csv"
+    if output.suffix != suffix:
+        raise InputError(
+            f"{form} is written as {suffix}, not as {output.suffix or 'a file without suffix'}",
+            where=str(output), hint=f"name it {output.with_suffix(suffix).name}",
+        )  # fmt: skip
+    if pieces is not None and form != "crazyswarm" and pieces > 31:
+        raise InputError("a vehicle's memory holds 31 pieces", where="--pieces", hint="use --to compressed")
+    if output.exists() and not force:
+        raise InputError("there is a file already", where=str(output), hint="give --force to overwrite it")
+    if not output.absolute().parent.is_dir():
+        raise InputError("no such folder", where=str(output.parent), hint="make it first")

@@ -1,0 +1,175 @@
+"""Pieces for the vehicle's memory that are certified as it decodes them: more of them, or slower, until they are.
+
+Plans jump in angular acceleration, polynomials cannot. Where they overshoot a limit the whole is slowed: fits of
+several counts are made, each slowed until its certificate passes, and the nearest to the plan among the fastest is
+taken.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import NotCertifiedError
+from cfplan.flight.on_board.fitting import drawn_knots, even_knots, fit_control_points, fit_pieces
+from cfplan.flight.on_board.memory_format import (
+    MEMORY_SIZE,
+    MOST_PIECES,
+    compressed_bytes,
+    raw_bytes,
+    read_compressed,
+    read_raw,
+)
+from cfplan.flight.on_board.piece_certificate import certify_pieces, certify_samples, sample_pieces
+from cfplan.flight.on_board.pieces import Pieces
+from cfplan.flight.on_board.reference import PolynomialReference
+from cfplan.safety.certificate import Certificate
+from cfplan.safety.limits import Limits
+from cfplan.vehicle.trajectory import Trajectory
+
+FARTHEST = 0.02  # m from the reference
+SLOWEST = 1.5  # times the plan's duration
+_SHARES = (0.25, 0.5, 0.75, 1.0)  # of the pieces that there may be, that are tried
+_AS_FAST = 1.01  # times the least duration, within which the nearest to the plan is preferred
+_LENGTHS = (
+    1.2,
+    1.0,
+    0.9,
+    0.8,
+    0.7,
+    0.6,
+    0.5,
+    0.4,
+)  # s of a compressed piece, about: shorter ones suffer from whole millimetres
+_COARSE = 0.004  # s between samples while the slowing is searched for
+_HALVINGS = 7
+_NUDGE, _TRIES = 1.003, 6  # where the fine certificate does not pass at what the coarse one found
+
+
+@dataclass(frozen=True, slots=True)
+class OnBoardTrajectory:
+    """A trajectory in the vehicle's memory, and what it decodes from that."""
+
+    memory: bytes  # from byte 0 of the memory on; empty where there are more pieces than it holds
+    compressed: bool
+    pieces: Pieces
+    certificate: Certificate  # of the pieces
+    reference: PolynomialReference  # what was fitted
+    error: float  # m, farthest from the reference
+
+    @property
+    def duration(self) -> float:
+        """Return how long it takes, s."""
+        return self.pieces.duration
+
+
+@dataclass(frozen=True, slots=True)
+class _Made:
+    memory: bytes
+    compressed: bool
+    pieces: Pieces
+
+
+_Maker = Callable[[PolynomialReference], _Made]
+
+
+def certified_pieces(
+    trajectory: Trajectory, limits: Limits, *, leads: bool = True, most: int = MOST_PIECES
+) -> OnBoardTrajectory:
+    """Return at most `most` pieces, uncompressed, that fly a trajectory within the limits.
+
+    `leads` puts them ahead of it, so that the vehicle, which drag holds back, is on it; see reference.py. Raises
+    NotCertifiedError where they would stray by more than FARTHEST from what they are to be, or take longer than SLOWEST
+    times as long.
+    """
+
+    def maker(knots_of: Callable[[PolynomialReference, int], NDArray], count: int) -> _Maker:
+        def make(reference: PolynomialReference) -> _Made:
+            pieces = fit_pieces(reference, knots_of(reference, count))
+            if count > MOST_PIECES:
+                return _Made(b"", False, pieces)
+            memory = raw_bytes(pieces)
+            return _Made(memory, False, read_raw(memory, count))
+
+        return make
+
+    counts = sorted({max(1, round(most * share)) for share in _SHARES})
+    makers = (maker(knots_of, count) for count in counts for knots_of in (even_knots, drawn_knots))
+    return _best(makers, PolynomialReference(trajectory, leads=leads), limits, f"{most} pieces")
+
+
+def certified_compressed(trajectory: Trajectory, limits: Limits, *, leads: bool = True) -> OnBoardTrajectory:
+    """Return compressed pieces that fly a trajectory within the limits. Raises NotCertifiedError as above."""
+
+    def maker(count: int) -> _Maker:
+        def make(reference: PolynomialReference) -> _Made:
+            memory = compressed_bytes(fit_control_points(reference, count))
+            return _Made(memory, True, read_compressed(memory))
+
+        return make
+
+    reference = PolynomialReference(trajectory, leads=leads)
+    counts = sorted({max(1, int(np.ceil(reference.duration / length))) for length in _LENGTHS})
+    return _best(map(maker, counts), reference, limits, f"{MEMORY_SIZE} bytes")
+
+
+def _best(makers: Iterable[_Maker], reference: PolynomialReference, limits: Limits, room: str) -> OnBoardTrajectory:
+    """Return the nearest to the reference among the fastest that pass. Raises NotCertifiedError where none does."""
+    good: list[OnBoardTrajectory] = []
+    flaws: list[tuple[float, str]] = []  # how bad, and what
+    for make in makers:
+        try:
+            made = _certified(make, reference, limits)
+        except NotCertifiedError as error:
+            flaws.append((np.inf, error.what))
+            continue
+        if flaw := _flaw(made):
+            flaws.append((max(made.error / FARTHEST, made.certificate.worst.share), flaw))
+        else:
+            good.append(made)
+    if not good:
+        raise NotCertifiedError(
+            f"within {room}: {min(flaws)[1]}", where="polynomials",
+            hint="use more pieces, compressed ones if need be, or plan with lower limits",
+        )  # fmt: skip
+    least = min(made.duration for made in good)
+    return min((made for made in good if made.duration <= _AS_FAST * least), key=lambda made: made.error)
+
+
+def _certified(make: _Maker, reference: PolynomialReference, limits: Limits) -> OnBoardTrajectory:
+    """Return what is made at about the least slowing at which its certificate passes, if it does at all."""
+    samples = sample_pieces(make(reference).pieces, _COARSE)
+    slowing = _least(lambda factor: certify_samples(samples.slowed(factor), limits.airframe, limits.plan).passed)
+    for _ in range(_TRIES):
+        slowed = replace(reference, slowing=slowing)
+        made = make(slowed)
+        certificate = certify_pieces(made.pieces, limits.airframe, limits.plan, limits.space)
+        if certificate.passed:
+            break
+        slowing *= _NUDGE
+    samples = sample_pieces(made.pieces, _COARSE)
+    off = samples.derivatives[:, 0, :3] - slowed.at(samples.time)[:, 0, :3]
+    error = float(np.linalg.norm(off, axis=1).max())
+    return OnBoardTrajectory(made.memory, made.compressed, made.pieces, certificate, slowed, error)
+
+
+def _flaw(made: OnBoardTrajectory) -> str:
+    """Return why a trajectory may not fly; empty where it may."""
+    if not made.error <= FARTHEST:
+        return f"polynomials stray {made.error:.2f} m from the plan, {FARTHEST:g} m are allowed"
+    worst = made.certificate.worst
+    if not made.certificate.passed:
+        return f"polynomials reach {100 * worst.share:.1f} % of the limit on {worst.name} at {worst.time:.2f} s"
+    return ""
+
+
+def _least(passes: Callable[[float], bool]) -> float:
+    """Return the least factor from 1 to SLOWEST at which something passes, found by halving; SLOWEST where none is."""
+    if passes(1.0):
+        return 1.0
+    low, high = 1.0, SLOWEST
+    for _ in range(_HALVINGS):
+        middle = (low * high) ** 0.5
+        low, high = (low, middle) if passes(middle) else (middle, high)
+    return high

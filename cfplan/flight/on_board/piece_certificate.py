@@ -1,0 +1,201 @@
+"""The certificate of on-board pieces: the motion that a vehicle must make to fly what it decoded, held to every limit.
+
+The commander asks for position, velocity and acceleration, and for the yaw at which the controller turns its x axis; so
+the attitude is that with z along the thrust and y along z × [cos yaw, sin yaw, 0]. Thrust, attitude, body rates and
+motor thrusts follow from the pieces' derivatives up to snap, drag included. Samples and the allowance for what lies
+between them are those of the certificate of trajectories.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import NotCertifiedError
+from cfplan.flight.on_board.pieces import Pieces, body_rates, derivatives_of, goals_at
+from cfplan.safety.certificate import LEAST_POINTS, TIME_STEP, WALLS, Certificate, Margin
+from cfplan.safety.limits import PlanLimits
+from cfplan.safety.quantities import AT_LEAST, QUANTITIES, Quantity
+from cfplan.safety.space import Space
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.flatness import motor_thrusts
+from cfplan.vehicle.measures import measures_of
+
+_ALLOWANCE = 2.0 / 8.0  # of the second difference, twice what is needed
+# What position, velocity, acceleration and jerk may jump by between two pieces: roundings of float32, and of the time.
+_JUMPS = np.array([1e-4, 1e-3, 0.01, 0.5])
+_NAMES = ("position", "velocity", "acceleration", "jerk")
+_UNITS = ("m", "m/s", "m/s²", "m/s³")
+_ARITHMETIC = np.array([1e-4, 1e-3, 0.01, 0.05])  # m, m/s, m/s², rad/s, by which float32 may be off
+_STEP = 0.0101  # s between moments at which its arithmetic is looked at
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Closely spaced moments of pieces, both ends of each included."""
+
+    time: NDArray  # (N,) s
+    derivatives: NDArray  # (N, 5, 4): position and yaw, and four derivatives by time
+    ends: NDArray  # (N,) bool: first or last of a piece
+
+    def slowed(self, factor: float) -> "Samples":
+        """Return the same of a flight that takes `factor` times as long."""
+        return Samples(self.time * factor, self.derivatives / factor ** np.arange(5)[:, None], self.ends)
+
+
+def sample_pieces(pieces: Pieces, step: float = TIME_STEP) -> Samples:
+    """Return samples at most `step`, s, apart, and LEAST_POINTS of each piece at least."""
+    times, derivatives, ends = [], [], []
+    for k, (begin, duration) in enumerate(zip(pieces.begins, pieces.durations.astype(float), strict=True)):
+        count = max(int(np.ceil(duration / step)) + 1, LEAST_POINTS)
+        own = np.linspace(0.0, duration, count)
+        times.append(begin + own)
+        derivatives.append(derivatives_of(pieces, k, own))
+        at_end = np.zeros(count, dtype=bool)
+        at_end[[0, -1]] = True
+        ends.append(at_end)
+    return Samples(np.concatenate(times), np.concatenate(derivatives), np.concatenate(ends))
+
+
+def certify_pieces(pieces: Pieces, airframe: Airframe, limits: PlanLimits, space: Space | None = None) -> Certificate:
+    """Check every limit, and the space where given, everywhere along the pieces.
+
+    Raises NotCertifiedError where two pieces do not meet, or the commander's float32 would say something else.
+    """
+    check_joints(pieces)
+    check_arithmetic(pieces)
+    return certify_samples(sample_pieces(pieces), airframe, limits, space)
+
+
+def certify_samples(
+    samples: Samples, airframe: Airframe, limits: PlanLimits, space: Space | None = None
+) -> Certificate:
+    """Return the certificate of samples; what is not a number fails."""
+    measured = measures_along(samples, airframe)
+    margins = []
+    for quantity in QUANTITIES:
+        limit = quantity.allowed(limits)
+        if limit != math.inf:
+            rows = measured[quantity.which]
+            margins.append(_margin(samples, rows, quantity, limit, quantity.unused(airframe)))
+    if space is not None:
+        low, high = np.array(space.low)[:, None], np.array(space.high)[:, None]
+        position = samples.derivatives[:, 0, :3].T
+        walls = Quantity(WALLS, "m", "", "", AT_LEAST, 0, 3)
+        rows = np.minimum(position - low, high - position)
+        margins.append(_margin(samples, rows, walls, space.margin, float((high - low).min()) / 2))
+    return Certificate(tuple(margins), float(samples.time[-1]), len(samples.time))
+
+
+def _margin(samples: Samples, rows: NDArray, quantity: Quantity, limit: float, unused: float) -> Margin:
+    """Return the margin of a quantity, whose measures are `rows`, (count, N)."""
+    signed = quantity.side * rows
+    before, here, after = signed[:, :-2], signed[:, 1:-1], signed[:, 2:]
+    bounds = np.maximum(here, np.maximum(before, after)) + _ALLOWANCE * np.maximum(2.0 * here - before - after, 0.0)
+    bounds = np.where(samples.ends[1:-1], -np.inf, bounds)
+    bounds = np.where(np.isnan(bounds), np.inf, bounds).max(axis=0)
+    at = int(np.argmax(bounds)) + 1
+    peak = float(bounds[at - 1]) if math.isfinite(bounds[at - 1]) else math.nan
+    worst = float(quantity.value(quantity.side * peak))
+    room = limit - unused
+    share = (worst - unused) / room if room * quantity.side > 0 else math.inf
+    x, y, z = samples.derivatives[at, 0, :3].tolist()
+    time = float(samples.time[at])
+    return Margin(
+        quantity.name, quantity.unit, worst, limit, max(0.0, float(share)) if math.isfinite(worst) else math.nan,
+        time, time, (x, y, z),
+    )  # fmt: skip
+
+
+def measures_along(samples: Samples, airframe: Airframe) -> NDArray:
+    """Return (MEASURES, N) of the motion that flies the samples."""
+    velocity, acceleration, jerk, snap = (samples.derivatives[:, order, :3] for order in range(1, 5))
+    yaw, yaw_rate, yaw_acceleration = (samples.derivatives[:, order, 3] for order in range(3))
+    drag, axial_drag = airframe.drag[0] / airframe.mass, airframe.drag[1] / airframe.mass
+
+    # The thrust axis z and two derivatives, as in vehicle/flatness.py.
+    force = acceleration + drag * velocity + np.array([0.0, 0.0, GRAVITY])
+    force_dt, force_ddt = jerk + drag * acceleration, snap + drag * jerk
+    size = np.sqrt(_dot(force, force))
+    z = force / size
+    size_dt = _dot(z, force_dt)
+    z_dt = (force_dt - size_dt * z) / size
+    size_ddt = _dot(z, force_ddt) + size * _dot(z_dt, z_dt)
+    z_ddt = (force_ddt - 2.0 * size_dt * z_dt - size_ddt * z) / size
+
+    # n = z × e with e the direction of yaw; y = n/|n|.
+    zero = np.zeros_like(yaw)
+    e = np.stack([np.cos(yaw), np.sin(yaw), zero], axis=1)
+    across = np.stack([-e[:, 1], e[:, 0], zero], axis=1)
+    e_dt = across * yaw_rate[:, None]
+    e_ddt = across * yaw_acceleration[:, None] - e * yaw_rate[:, None] ** 2
+    n = np.cross(z, e)
+    n_dt = np.cross(z_dt, e) + np.cross(z, e_dt)
+    n_ddt = np.cross(z_ddt, e) + 2.0 * np.cross(z_dt, e_dt) + np.cross(z, e_ddt)
+    length = np.sqrt(_dot(n, n))
+    y = n / length
+    x = np.cross(y, z)
+
+    # With R = [x y z] and R' = R ω^:  ω = (-z'·y, z'·x, -y'·x), and the same again for ω'.
+    roll, pitch, turn = -_dot(z_dt, y), _dot(z_dt, x), -_dot(n_dt, x) / length
+    x_dt = turn * y - pitch * z
+    roll_dt = -_dot(z_ddt, y) + turn * pitch
+    pitch_dt = _dot(z_ddt, x) - turn * roll
+    turn_dt = -(_dot(n_ddt, x) + _dot(n_dt, x_dt)) / length + _dot(n_dt, x) * _dot(y, n_dt) / length**2
+    rate = np.concatenate([roll, pitch, turn], axis=1)
+    turning = np.concatenate([roll_dt, pitch_dt, turn_dt], axis=1)
+
+    thrust = (size + (axial_drag - drag) * _dot(z, velocity))[:, 0]
+    inertia = np.array(airframe.inertia)
+    torque = inertia * turning + np.cross(rate, inertia * rate)
+    motors = motor_thrusts(airframe, airframe.mass * thrust, (torque[:, 0], torque[:, 1], torque[:, 2]))
+    return measures_of(velocity, acceleration, rate, z, thrust, turning, np.stack(motors, axis=1))
+
+
+def _dot(first: NDArray, second: NDArray) -> NDArray:
+    return np.asarray((first * second).sum(axis=1)[:, None])
+
+
+def check_joints(pieces: Pieces) -> None:
+    """Check that the pieces meet, begin and end at rest. Raises NotCertifiedError with the place."""
+    ends = [
+        derivatives_of(pieces, k, np.array([0.0, float(duration)]), 4)[:, :, :3]
+        for k, duration in enumerate(pieces.durations)
+    ]
+    moving = np.array([1.0, 1.0, 1.0, 0.0])  # jerk may begin and end at once
+    for k in range(len(ends) + 1):
+        left = ends[k - 1][1] if k else ends[0][0] * [[1], [0], [0], [0]]
+        right = ends[k][0] if k < len(ends) else ends[-1][1] * [[1], [0], [0], [0]]
+        jump = np.abs(left - right).max(axis=1) * (moving if k in (0, len(ends)) else 1.0)
+        if not (jump <= _JUMPS).all():
+            order = int(np.argmax(jump / _JUMPS))
+            raise NotCertifiedError(
+                f"{_NAMES[order]} jumps by {jump[order]:.3g} {_UNITS[order]}",
+                where=f"the pieces, where piece {k + 1} begins" if k < len(ends) else "the end of the last piece",
+                hint="use fewer, longer pieces",
+            )  # fmt: skip
+
+
+def check_arithmetic(pieces: Pieces) -> None:
+    """Check that what the commander computes in float32 is what was certified. Raises NotCertifiedError."""
+    times = np.arange(0.0, pieces.duration - _STEP, _STEP)  # at the very end float32 decides whether it has ended
+    exact = np.concatenate(
+        [
+            derivatives_of(pieces, k, times[(times >= begin) & (times < begin + duration)] - begin, 4)
+            for k, (begin, duration) in enumerate(zip(pieces.begins, pieces.durations.astype(float), strict=True))
+        ]
+    )
+    goals = goals_at(pieces, times)
+    rates = body_rates(exact[:, 2, :3], exact[:, 3, :3], exact[:, 0, 3], exact[:, 1, 3])
+    off = [
+        goals.position - exact[:, 0, :3], goals.velocity - exact[:, 1, :3],
+        goals.acceleration - exact[:, 2, :3], goals.body_rate - rates,
+    ]  # fmt: skip
+    share = (np.abs(off) / _ARITHMETIC[:, None, None]).max(axis=(0, 2))
+    if not (share <= 1.0).all():
+        at = int(np.argmax(np.where(np.isfinite(share), share, np.inf)))
+        raise NotCertifiedError(
+            f"the vehicle's single precision is off by {share[at]:.3g} times what it may at {times[at]:.2f} s",
+            where="the pieces", hint="use shorter pieces, or fly nearer to the origin",
+        )  # fmt: skip

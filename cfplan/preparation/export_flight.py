@@ -1,0 +1,204 @@
+"""Export: a certified plan for other tools, as polynomials of Crazyswarm, as the vehicle's memory, or as samples.
+
+What is written is read again as its receiver reads it, and that is certified. Polynomials are then flown in the
+simulator as the vehicle's own commander flies them.
+"""
+
+import os
+import tempfile
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import InputError, NotCertifiedError
+from cfplan.files.text import read_table
+from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory, certified_compressed, certified_pieces
+from cfplan.flight.on_board.memory_format import MOST_PIECES
+from cfplan.flight.on_board.pieces import Pieces
+from cfplan.geometry.polynomial_csv import polynomial_rows, read_polynomial_rows
+from cfplan.machine_code import compile_from_here
+from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, PlannedFlight, plan_flight
+from cfplan.preparation.steps import OnStep, ignore_steps, step
+from cfplan.safety.limits import Limits
+from cfplan.safety.quantities import INSTANT
+from cfplan.simulation.dry_run import DryRun
+from cfplan.simulation.on_board_run import on_board_run
+from cfplan.vehicle.measures import measures_of
+from cfplan.vehicle.trajectory import Trajectory
+
+GENTLE = 0.57  # of the limit on angular acceleration: polynomials cannot follow its jumps, and overshoot by as much
+COLUMNS = ["t", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "yaw", "wx", "wy", "wz", "qx", "qy", "qz", "qw"]
+_DIGITS = 6
+_ROUNDING = 0.5 * 10.0**-_DIGITS
+
+
+class Form(Enum):
+    """What an export is for."""
+
+    CRAZYSWARM = "crazyswarm"
+    MEMORY = "memory"
+    COMPRESSED = "compressed"
+    SAMPLES = "samples"
+
+    @property
+    def suffix(self) -> str:
+        """Return how its file's name ends."""
+        return ".bin" if self in (Form.MEMORY, Form.COMPRESSED) else ".csv"
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedFlight:
+    """Polynomials that may fly, and what they were made from and checked by."""
+
+    planned: PlannedFlight
+    on_board: OnBoardTrajectory
+    dry_run: DryRun
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its figures, for JSON."""
+        made = self.on_board
+        return {
+            "name": self.planned.name,
+            "pieces": len(made.pieces.durations),
+            "compressed": made.compressed,
+            "bytes": len(made.memory),
+            "duration": made.duration,
+            "plan_duration": self.planned.duration,
+            "slowing": made.reference.slowing,
+            "leads": made.reference.leads,
+            "fit_error": made.error,
+            "start": made.pieces.coefficients[0, :, 0].astype(float).tolist(),
+            "certificate": made.certificate.to_dict(),
+            "dry_run": self.dry_run.summary(),
+        }
+
+
+def plan_for_polynomials(
+    source: Path, limits: Limits, options: FlightOptions, on_step: OnStep = ignore_steps
+) -> PlannedFlight:
+    """Plan a path for polynomials, with less angular acceleration; or read a plan as it is. Raises as plan_flight()."""
+    if source.suffix == PLAN_SUFFIX:
+        return plan_flight(source, limits, options, on_step)
+    gentle = replace(limits.plan, angular_acceleration=GENTLE * limits.plan.angular_acceleration)
+    streamed_loss = replace(limits.link_loss, only_warn=True)  # of a stream, which there is none of
+    planned = plan_flight(source, replace(limits, plan=gentle, link_loss=streamed_loss), options, on_step)
+    return replace(planned, limits=limits)
+
+
+def fit_polynomials(
+    planned: PlannedFlight, form: Form, *, leads: bool = True, most: int = MOST_PIECES, on_step: OnStep = ignore_steps
+) -> ExportedFlight:
+    """Fit certified polynomials to a plan, and fly them in the simulator.
+
+    The form MEMORY is compressed where `most` pieces are too few. Raises NotCertifiedError where no polynomials keep
+    the limits near the plan, or the dry run fails.
+    """
+    trajectory, limits = planned.plan.trajectory, planned.limits
+    with step(on_step, "polynomials") as results:
+        if form is Form.COMPRESSED:
+            made = certified_compressed(trajectory, limits, leads=leads)
+        else:
+            try:
+                made = certified_pieces(trajectory, limits, leads=leads, most=most)
+            except NotCertifiedError:
+                if form is not Form.MEMORY:
+                    raise
+                made = certified_compressed(trajectory, limits, leads=leads)
+        kind = f"compressed, {len(made.memory)} bytes" if made.compressed else f"{len(made.memory)} bytes"
+        longer = made.duration / planned.duration - 1.0
+        results.append(f"{len(made.pieces.durations)} pieces, {kind}, {made.duration:.2f} s ({100 * longer:+.1f} %)")
+        results.append(f"within {1000 * made.error:.0f} mm")
+    compile_from_here()
+    with step(on_step, "dry run") as results:
+        run = on_board_run(made, limits.airframe, limits.flight)
+        results.append(f"deviation {100 * run.deviation:.1f} cm at most, {100 * run.deviation_rms:.1f} cm rms")
+        run.require_passed()
+    return ExportedFlight(planned, made, run)
+
+
+def write_polynomials(exported: ExportedFlight, form: Form, file: Path) -> None:
+    """Write polynomials, and read them again as their receiver does. Raises InputError, or NotCertifiedError."""
+    pieces = exported.on_board.pieces
+    if form is not Form.CRAZYSWARM:
+        write_whole(file, exported.on_board.memory)
+        return
+    write_whole(file, polynomial_rows(pieces.durations, pieces.coefficients).encode())
+    read = Pieces(*read_polynomial_rows(file))
+    if not (
+        np.array_equal(read.durations, pieces.durations) and np.array_equal(read.coefficients, pieces.coefficients)
+    ):
+        raise NotCertifiedError("what was written reads otherwise", where=str(file), hint="please report this")
+
+
+def write_samples(planned: PlannedFlight, rate: float, file: Path) -> int:
+    """Write a plan's states at `rate`, Hz, with its end, and check what was written; return how many.
+
+    Raises InputError, or NotCertifiedError where the plan's certificate or a sample does not keep the limits.
+    """
+    trajectory, limits = planned.plan.trajectory, planned.limits
+    worst = planned.certificate.worst
+    if not planned.certificate.passed:
+        raise NotCertifiedError(
+            f"{worst.name} reaches {100 * worst.share:.1f} % of its limit at {worst.time:.2f} s",
+            where=planned.name, hint="plan the path again under this safety.yaml",
+        )  # fmt: skip
+    rows = sample_rows(trajectory, rate)
+    lines = [",".join(f"{value:.{_DIGITS}f}" for value in row) for row in rows.tolist()]
+    write_whole(file, ("\n".join([",".join(COLUMNS), *lines]) + "\n").encode())
+    read, _ = read_table(file, len(COLUMNS), ", ".join(COLUMNS))
+    check_samples(read, trajectory, limits, str(file))
+    return len(read)
+
+
+def sample_rows(trajectory: Trajectory, rate: float) -> NDArray:
+    """Return (N, 18): the columns of a file of samples, SI units and rad, the quaternion body to world."""
+    times = np.append(np.arange(np.ceil(trajectory.duration * rate)) / rate, trajectory.duration)
+    state = trajectory.at(times)
+    return np.column_stack(
+        [
+            times, state.position, state.velocity, state.acceleration, state.yaw, state.body_rate, state.quaternion,
+        ]
+    )  # fmt: skip
+
+
+def check_samples(rows: NDArray, trajectory: Trajectory, limits: Limits, where: str) -> None:
+    """Check that samples, (N, 18), are those of a trajectory at their times, and within the limits; but for rounding.
+
+    Raises NotCertifiedError with the line.
+    """
+    state = trajectory.at(rows[:, 0])
+    expected = [
+        state.position, state.velocity, state.acceleration, state.yaw, state.body_rate, state.quaternion,
+    ]  # fmt: skip
+    slack = 50.0 * _ROUNDING  # the time is rounded too, and what it moves by meanwhile
+    measured = measures_of(rows[:, 4:7], rows[:, 7:10], rows[:, 11:14], state.thrust_axis, state.specific_thrust)
+    exceeded = [q.excess(q.worst(measured), q.allowed(limits.plan)) > slack for q in INSTANT]
+    wrong = np.abs(rows[:, 1:] - np.column_stack(expected)).max(axis=1) > slack
+    bad = wrong | np.any(exceeded, axis=0) | (limits.space.beyond(rows[:, 1:4]) > slack).any(axis=1)
+    if bad.any():
+        raise NotCertifiedError(
+            "the sample is not that of the plan, or exceeds a limit",
+            where=f"{where}:{int(np.argmax(bad)) + 2}", hint="plan the path again, and export that",
+        )  # fmt: skip
+
+
+def write_whole(file: Path, content: bytes) -> None:
+    """Write a file that appears whole or not at all. Raises InputError where it cannot be written."""
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.absolute().parent)
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(content)
+            os.chmod(name, 0o644)
+            os.replace(name, file)
+        except BaseException:
+            os.unlink(name)
+            raise
+    except OSError as error:
+        raise InputError(
+            f"cannot be written: {error.strerror or error}", where=str(file), hint="name another file with -o"
+        ) from None

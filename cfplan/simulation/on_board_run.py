@@ -1,0 +1,41 @@
+"""Dry run of on-board pieces: polynomials flown by the simulated vehicle as its high-level commander flies them.
+
+It starts in hover where they begin. The commander evaluates them 100 times a second, as it decodes them, and hands the
+controller position, velocity, acceleration, yaw and body rates; the controller sees the true state.
+"""
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.flight.firmware import gains_for
+from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory
+from cfplan.flight.on_board.pieces import RATE, Pieces, goals_at
+from cfplan.safety.limits import FlightLimits
+from cfplan.simulation.dry_run import NO_FLOOR, SETTLING, DryRun, fly_and_judge
+from cfplan.simulation.dynamics.body import hovering
+from cfplan.simulation.dynamics.closed_loop import fly_rows
+from cfplan.simulation.dynamics.mellinger import ON_BOARD, SETPOINT_SIZE
+from cfplan.vehicle.airframe import Airframe
+
+
+def on_board_run(flight: OnBoardTrajectory, airframe: Airframe, limits: FlightLimits) -> DryRun:
+    """Fly the pieces, and hover for SETTLING s behind them; deviations are from the plan, slowed as they are."""
+    pieces = flight.pieces
+    times = np.arange(int(np.ceil((pieces.duration + SETTLING) * RATE))) / RATE
+    rows = goal_rows(pieces, times)
+    start = hovering(airframe, rows[0, :3], float(rows[0, 18]))
+
+    fly = partial(fly_rows, rows, ON_BOARD, times, airframe, start, gains=gains_for(airframe), floor=NO_FLOOR)
+    duration = pieces.duration + SETTLING
+    return fly_and_judge(fly, duration, lambda at: flight.reference.plan_at(at)[:, 0, :3], pieces.duration, limits)
+
+
+def goal_rows(pieces: Pieces, times: NDArray) -> NDArray:
+    """Return (N, 20): what the commander hands to the controller at times, (N,) s, as `mellinger` has setpoints."""
+    goals = goals_at(pieces, times)
+    rows = np.zeros((len(times), SETPOINT_SIZE))
+    rows[:, 0:3], rows[:, 3:6], rows[:, 6:9] = goals.position, goals.velocity, goals.acceleration
+    rows[:, 13:16], rows[:, 18] = goals.body_rate, goals.yaw
+    return rows
