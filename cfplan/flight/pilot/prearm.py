@@ -6,12 +6,13 @@ from collections.abc import Callable
 from cfplan.errors import InputError, PreflightError
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.flight_loop import TRIES, FlightLoop
-from cfplan.flight.pilot.preflight import PreflightSnapshot, check_traffic, run_checks
+from cfplan.flight.pilot.outcome import Check
+from cfplan.flight.pilot.preflight import PreflightSnapshot, check_traffic, run_checks, standing_check
 from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES, Action, Traffic
 from cfplan.flight.radio.link import Link
 from cfplan.flight.radio.supervisor_bits import ARMED, CAN_BE_ARMED, CAN_FLY
 from cfplan.flight.real_time import uses_fifo_scheduling
-from cfplan.flight.telemetry import Level, Phase
+from cfplan.flight.telemetry import Level, Phase, Triple
 from cfplan.vehicle.rotations import yaw_of
 
 CONVERGED_WITHIN = 0.03  # m, estimate from pose
@@ -43,8 +44,8 @@ def prepare(
         raise InputError("the vehicle sends no log", where=loop.link.uri, hint="restart the vehicle")
     enter_real_time()
     _feed(loop)
-    _converge(loop)
-    _preflight(loop, read)
+    stood = _converge(loop)
+    _preflight(loop, read, stood)
     loop.history.enter(Phase.ARM)
     loop.restart_deadlines()
     floor = loop.pose().position[2]
@@ -52,6 +53,7 @@ def prepare(
         loop.link.arm(True)
         if loop.until(lambda: loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, 1.0):
             _listen_while_armed(loop)
+            _require(standing_check(stood, loop.pose().position, loop.mission.limits), "motion capture")
             return floor
     raise PreflightError("the vehicle does not arm", hint="restart the vehicle")
 
@@ -79,8 +81,8 @@ def _feed(loop: FlightLoop) -> None:
         )
 
 
-def _converge(loop: FlightLoop) -> None:
-    """Set the vehicle's filter to the pose of motion capture, and wait until both agree."""
+def _converge(loop: FlightLoop) -> Triple:
+    """Set the vehicle's filter to the pose of motion capture, and wait until both agree. Return the place, m."""
     loop.history.enter(Phase.CONVERGE)
     pose = loop.pose()
     for name, value in zip(("X", "Y", "Z"), pose.position, strict=True):
@@ -107,13 +109,14 @@ def _converge(loop: FlightLoop) -> None:
 
     if not loop.until(agreed, 10.0):
         loop.history.say(Level.WARNING, "the vehicle's estimate does not settle")
+    return pose.position
 
 
-def _preflight(loop: FlightLoop, read: dict[str, float]) -> None:
+def _preflight(loop: FlightLoop, read: dict[str, float], stood: Triple) -> None:
     """Run the preflight checks, up to three times: an auto-arming vehicle is briefly not ready."""
     loop.history.enter(Phase.PREFLIGHT)
     for _ in range(TRIES):
-        loop.history.checks = run_checks(_observe(loop, read))
+        loop.history.checks = run_checks(_observe(loop, read, stood))
         if all(check.passed for check in loop.history.checks):
             break
     for check in loop.history.checks:
@@ -128,7 +131,7 @@ def _preflight(loop: FlightLoop, read: dict[str, float]) -> None:
         )
 
 
-def _observe(loop: FlightLoop, read: dict[str, float]) -> PreflightSnapshot:
+def _observe(loop: FlightLoop, read: dict[str, float], stood: Triple) -> PreflightSnapshot:
     """Observe for a second and return what is known of the vehicle."""
     traffic = _listen(loop, _OBSERVED_FOR)
     link = loop.link
@@ -145,6 +148,7 @@ def _observe(loop: FlightLoop, read: dict[str, float]) -> PreflightSnapshot:
         parameters=read,
         poses=tuple(loop.recent),
         pose_age=loop.now() - loop.pose().time,
+        stood=stood,
         estimate=link.estimate,
         variance=link.position_variance or (math.inf,),
         waking=Lateness.of(tuple(loop.waking), 0),
@@ -170,7 +174,10 @@ def _listen_while_armed(loop: FlightLoop) -> None:
     """Listen once more: a vehicle that is not armed drops setpoints and shows none. Raises PreflightError."""
     heard = check_traffic(_listen(loop, _LISTENS_ARMED_FOR))
     loop.link.stop_preflight_logs()
-    if not heard.passed:
-        raise PreflightError(
-            f"{heard.name}: {heard.value}, must be {heard.threshold}", where="vehicle", hint=heard.hint
-        )
+    _require(heard, "vehicle")
+
+
+def _require(check: Check, where: str) -> None:
+    """Raise PreflightError unless a check passed."""
+    if not check.passed:
+        raise PreflightError(f"{check.name}: {check.value}, must be {check.threshold}", where=where, hint=check.hint)

@@ -15,7 +15,7 @@ from cfplan.flight.pilot.outcome import Check
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, ParameterRule, Traffic
 from cfplan.flight.radio.supervisor_bits import FAULTS, FLYING
 from cfplan.flight.setpoints.packets import decode
-from cfplan.flight.telemetry import Estimate, VehicleStatus
+from cfplan.flight.telemetry import Estimate, Triple, VehicleStatus
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.rotations import tilt_of, yaw_of
 
@@ -41,6 +41,7 @@ class PreflightSnapshot:
     parameters: Mapping[str, float]  # those of the table, as the vehicle has them; without those that it lacks
     poses: Sequence[Pose]  # of about the last second, oldest first
     pose_age: float  # s, of the newest
+    stood: Triple  # m, where the vehicle stood when its filter was set to its pose
     estimate: Estimate
     variance: Sequence[float]  # m², of position along x, y, z
     waking: Lateness  # how late this computer met its deadlines in the last second
@@ -180,6 +181,23 @@ def check_agreement(snapshot: PreflightSnapshot) -> Check:
     )  # fmt: skip
 
 
+def check_standing(snapshot: PreflightSnapshot) -> Check:
+    return standing_check(snapshot.stood, snapshot.poses[-1].position, snapshot.mission.limits)
+
+
+def standing_check(stood: Triple, seen: Triple, limits: Limits) -> Check:
+    """A body that is elsewhere now than where it stood, m, was not carried there: nobody is near an armed vehicle.
+
+    After a gap motion capture has taken something else for it, or shifted its frame: then all it says may be wrong.
+    """
+    most, moved = limits.pose.agreement, math.dist(stood, seen)
+    return Check(
+        "way that the standing body went", f"{moved * 1e3:.0f} mm", f"≤ {most * 1e3:.0f} mm", moved <= most,
+        "if nobody moved the vehicle, motion capture has taken another body for it or shifted its frame: check both, "
+        "then start again",
+    )  # fmt: skip
+
+
 def check_yaw_agreement(snapshot: PreflightSnapshot) -> Check:
     most = snapshot.mission.limits.pose.yaw_agreement
     apart = yaw_of(snapshot.estimate.quaternion) - yaw_of(snapshot.poses[-1].quaternion)
@@ -252,6 +270,7 @@ CHECKS: tuple[Callable[[PreflightSnapshot], Check], ...] = (
     check_pose_rate,
     check_pose_age,
     check_agreement,
+    check_standing,
     check_yaw_agreement,
     check_tilt,
     check_variance,

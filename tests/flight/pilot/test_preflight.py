@@ -47,6 +47,7 @@ def ground(mission):
         parameters={rule.name: rule.value(mission.limits) for rule in PARAMETER_RULES},
         poses=poses(),
         pose_age=0.01,
+        stood=PLACE,
         estimate=Estimate(1.0, PLACE, STILL, STILL, LEVEL),
         variance=(1e-5, 1e-5, 1e-5),
         waking=Lateness(1e-4, 3e-4, 1e-3, 100, 0),
@@ -65,6 +66,7 @@ def test_a_vehicle_in_order_passes_every_line(ground):
     ("name", "change"),
     [
         ("radio protocol", {"protocol": 7}),
+        ("way that the standing body went", {"stood": (0.06, 0.0, 0.02)}),
         ("firmware", {"firmware": "2025.02"}),
         ("firmware", {"firmware": "2025.09"}),
         ("link round trip", {"round_trip": 0.2}),
@@ -193,7 +195,7 @@ def test_versions_are_read_as_bitcraze_writes_them():
 
 def test_a_vehicle_near_the_wall_may_not_take_off(ground):
     place = (2.9, 0.0, 0.02)
-    away = replace(ground, poses=poses(place=place), estimate=replace(ground.estimate, position=place))
+    away = replace(ground, poses=poses(place=place), stood=place, estimate=replace(ground.estimate, position=place))
     assert failures(away) == ["place of take-off"]
 
 
