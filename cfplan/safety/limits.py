@@ -88,6 +88,7 @@ class LinkLossLimits:
     motor_lags: tuple[float, ...] = (0.07, 0.105, 0.13)  # s, with which this is simulated besides the airframe's own
     attitude_error: float = math.radians(1.0)  # by which the vehicle has its attitude wrong, to any side
     vertical_acceleration_error: float = 0.08  # m/s², that its accelerometer says too little or too much
+    velocity_error: float = 0.1  # m/s, by which it has its velocity wrong, to any side, when the link is lost
     only_warn: bool = (
         False  # of a flight after which that is outside the walls, for rooms with nets; else it is refused
     )

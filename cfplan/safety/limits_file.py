@@ -117,6 +117,7 @@ class _LinkLoss(_Section):
     motor_lags: Annotated[tuple[_MotorLag, ...], Field(min_length=1, max_length=5)]
     attitude_error_deg: Annotated[float, Field(ge=0.0, le=10.0)]
     vertical_acceleration_error: Annotated[float, Field(ge=0.0, le=2.0)]
+    velocity_error: Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class _Firmware(_Section):
@@ -209,6 +210,7 @@ def load_limits(file: Path | str) -> Limits:
             motor_lags=content.link_loss.motor_lags,
             attitude_error=math.radians(content.link_loss.attitude_error_deg),
             vertical_acceleration_error=content.link_loss.vertical_acceleration_error,
+            velocity_error=content.link_loss.velocity_error,
         ),
         lateness=content.lateness,
     )

@@ -1,16 +1,21 @@
-"""Link loss: where the vehicle goes by itself when its pilot or its radio dies, by the firmware's own time-outs.
+"""Link loss: where the vehicle goes by itself when its pilot or its radio dies, or its motors stop at once.
 
-It holds the last setpoint, then its supervisor levels it out at that height, then it stops the motors. While it levels
-out, the controller keeps the body rates of that last setpoint, which is why setpoints carry rates that brake (see
-flight/setpoints/rate_trade.py). Where it comes down depends on the moment, so every setpoint is made the last one: the
-flight before is simulated once, in steps of 1 ms, and branches off at each setpoint in steps of 4 ms, until the vehicle
-has settled in its level-out; from there on its attitude stands still, and only its place is followed.
+By the firmware's own time-outs it holds the last setpoint, then levels out at that height, then stops its motors. While
+it levels out, the controller keeps the body rates of that last setpoint, which is why setpoints carry rates that brake
+(see flight/setpoints/rate_trade.py). Where it comes down depends on the moment, so every setpoint is made the last one:
+the flight before is simulated once, in steps of 1 ms, and branches off at each setpoint in steps of 4 ms, until the
+vehicle has settled in its level-out; from there on its attitude stands still, and only its place is followed.
+
+The motors may also stop at once, because the pilot cuts them, or the supervisor locks. Then the vehicle falls with the
+speed that it has, which from 2 m/s and a height of 1.2 m is a metre on: where it brakes late before a wall, farther
+than link loss takes it. So the box that it sweeps holds the fall from each setpoint too.
 
 No poses come any more either. The vehicle then flies by gyroscope and accelerometer. An attitude that it has wrong by
-a little makes it drift to a side, by as much wherever it is, so each place widens the box that the vehicle sweeps by
-how far that drift has come until then. An accelerometer that says too little makes it believe that it sinks, and climb:
-it is simulated so. One that says too much makes it come down sooner, with less thrust to brake by, which takes it some
-millimetres farther to the sides; that is simulated as well where the vehicle comes near a wall.
+a little, and a velocity that it has wrong already, make it drift to a side, by as much wherever it is, so each place
+widens the box that the vehicle sweeps by how far that drift has come until then. An accelerometer that says too little
+makes it believe that it sinks, and climb: it is simulated so. One that says too much makes it come down sooner, with
+less thrust to brake by, which takes it some millimetres farther to the sides; that is simulated as well where the
+vehicle comes near a wall.
 """
 
 import math
@@ -68,7 +73,7 @@ _SLOW_EVERY, _SLOW_ALLOWANCE = (
     8,
     0.02,
 )  # both for motions at 0.9 m/s and 2 m/s²; m, of which 6 mm were seen in 240 motions
-_PUSH, _DAMPING, _LIFT = range(3)  # as _wrong packs what the vehicle has wrong
+_PUSH, _DAMPING, _LIFT, _SPEED = range(4)  # as _wrong packs what the vehicle has wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +184,7 @@ def _lose_link(
     found = _judge(time, state.position, boxes, limits, snapshots)
     near = forks & ~(found.beyond < -_NEAR)
     if wrong[_LIFT] and near.any():
-        also, _ = swept(near, wrong * (1.0, 1.0, -1.0))
+        also, _ = swept(near, wrong * (1.0, 1.0, -1.0, 1.0))
         sinking = [np.where(near[:, None, None], box, boxes[0]) for box in also]
         found = _judge(time, state.position, boxes + sinking, limits, snapshots)
     return found if seen is None else replace(found, beyond=np.where(forks, found.beyond, found.beyond + ALLOWANCE))
@@ -248,10 +253,13 @@ def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RA
 
 
 def _wrong(limits: Limits) -> NDArray:
-    """Return what the vehicle has wrong: m/s² to a side, the damping of that motion by drag in 1/s, m/s² upwards."""
+    """Return what the vehicle has wrong, (4,).
+
+    That is m/s² to a side, the damping of that motion by drag in 1/s, m/s² upwards, and m/s to a side.
+    """
     wrong, drag = limits.link_loss, limits.airframe.drag[0]
-    push = GRAVITY * math.tan(wrong.attitude_error)
-    return np.array([push, max(drag / limits.airframe.mass, 1e-6), wrong.vertical_acceleration_error])
+    push, damping = GRAVITY * math.tan(wrong.attitude_error), max(drag / limits.airframe.mass, 1e-6)
+    return np.array([push, damping, wrong.vertical_acceleration_error, wrong.velocity_error])
 
 
 def _judge(
@@ -271,16 +279,21 @@ def _judge(
 
 
 def _bodies(limits: Limits) -> list[tuple[NDArray, NDArray]]:
-    """Return the parameters of the body, for each motor lag, for steps before and after the last setpoint."""
+    """Return for each motor lag the parameters of the body for steps before the last setpoint, (P,), and after it.
+
+    The latter, (2, P), are of the vehicle that goes on alone, and of the one whose motors stop.
+    """
     airframes: list[Airframe] = [replace(limits.airframe, motor_time_constant=lag) for lag in _lags(limits)]
-    return [(pack_body(airframe), pack_body(airframe, step=_STEP)) for airframe in airframes]
+    return [(pack_body(airframe), np.stack([pack_body(airframe, step=_STEP)] * 2)) for airframe in airframes]
 
 
 def _coarse_body(limits: Limits) -> tuple[NDArray, NDArray]:
-    """Return the parameters of the body for coarse steps, with the motor lag in the middle."""
+    """Return the same for coarse steps, with the motor lag in the middle; falls, (3, P) in all, with both extremes."""
     lags = _lags(limits)
-    airframe = replace(limits.airframe, motor_time_constant=lags[len(lags) // 2])
-    return pack_body(airframe), pack_body(airframe, step=_COARSE_STEP)
+    middle, *falling = (
+        replace(limits.airframe, motor_time_constant=lag) for lag in (lags[len(lags) // 2], lags[0], lags[-1])
+    )
+    return pack_body(middle), np.stack([pack_body(each, step=_COARSE_STEP) for each in (middle, *falling)])
 
 
 def _lags(limits: Limits) -> list[float]:
@@ -323,7 +336,7 @@ def _fly_stops(
     forks: NDArray,
     gains: NDArray,
     body: NDArray,
-    later_body: NDArray,
+    later_bodies: NDArray,
     level_after: int,
     off_after: int,
     arrivals: NDArray,
@@ -335,7 +348,7 @@ def _fly_stops(
         while end > 0 and not forks[n, end - 1]:
             end -= 1
         _fly(
-            swept[n], snapshots, stops[n, :end], starts[n], forks[n], gains, body, later_body, level_after, off_after,
+            swept[n], snapshots, stops[n, :end], starts[n], forks[n], gains, body, later_bodies, level_after, off_after,
             arrivals, wrong,
         )  # fmt: skip
 
@@ -349,7 +362,7 @@ def _fly(
     forks: NDArray,
     gains: NDArray,
     body: NDArray,
-    later_body: NDArray,
+    later_bodies: NDArray,
     level_after: int,
     off_after: int,
     arrivals: NDArray,
@@ -363,6 +376,12 @@ def _fly(
         for k in range(SNAPSHOT_SIZE):
             snapshots[newest, k] = now[k]
         if forks[newest]:
+            for k in range(3):
+                swept[newest, 0, k], swept[newest, 1, k] = now[k], now[k]
+            for falling in range(1, len(later_bodies)):
+                for k in range(SNAPSHOT_SIZE):
+                    branch[k] = now[k]
+                _fall(swept[newest], branch, later_bodies[falling])
             for k in range(SNAPSHOT_SIZE):
                 branch[k] = now[k]
             for k in range(SETPOINT_SIZE):
@@ -370,13 +389,25 @@ def _fly(
             for k in range(len(mode)):
                 mode[k] = full_state[k]
             _go_on_alone(
-                swept[newest], branch, setpoint, mode, gains, later_body, level_after, off_after, wrong, astray,
+                swept[newest], branch, setpoint, mode, gains, later_bodies[0], level_after, off_after, wrong, astray,
                 control, motors,
             )  # fmt: skip
         for step in range(arrivals[newest], arrivals[newest + 1]):
             if step % STEPS_A_CONTROL == 0:
                 step_control(now, now, gains, setpoints[newest], full_state, body, CONTROL_PERIOD, control, motors)
             step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
+
+
+@njit(allocates=False)
+def _fall(swept: NDArray, now: NDArray, body: NDArray) -> None:
+    """Fall, motors off, to the floor; widen the box swept. `now` is overwritten."""
+    for k in range(4):
+        now[THRUSTS + k] = 0.0
+    for _ in range(round(_LONGEST / body[STEP])):
+        step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
+        _widen(swept, now, 0.0)
+        if now[2] <= 0.0:
+            return
 
 
 @njit(allocates=False)
@@ -398,11 +429,10 @@ def _go_on_alone(
 
     `now`, `setpoint`, `mode`, `astray`, `control` and `motors` are overwritten.
     """
-    astray[0] = astray[1] = astray[2] = 0.0  # m, m/s: drift to a side, its speed; m/s: at which it believes to sink
+    astray[0], astray[1] = 0.0, wrong[_SPEED]  # m, m/s: drift to a side, its speed
+    astray[2] = 0.0  # m/s: at which it believes to sink
     period = body[STEP]
     settled_after = level_after + round(_SETTLED_AFTER / period)
-    for k in range(3):
-        swept[0, k], swept[1, k] = now[k], now[k]
     for after in range(round(_LONGEST / period)):
         if after == level_after:
             level_out(setpoint, mode)
@@ -455,7 +485,7 @@ def _coast(
             lift = (zx, zy, zz)[k] * push - (GRAVITY if k == 2 else 0.0)
             drag = (body[DRAG] if k < 2 else body[AXIAL_DRAG]) / mass
             speed = now[3 + k]
-            now[3 + k] += _COAST_STEP * (lift - drag * speed) / (1.0 + 0.5 * drag * _COAST_STEP)
+            now[3 + k] = _slowed(speed, lift, drag, _COAST_STEP)
             now[k] += _COAST_STEP * 0.5 * (speed + now[3 + k])
         _go_astray(astray, setpoint, wrong, time < powered, _COAST_STEP)
         _widen(swept, now, astray[0])
@@ -472,7 +502,7 @@ def _go_astray(astray: NDArray, setpoint: NDArray, wrong: NDArray, powered: bool
     """
     push = wrong[_PUSH] if powered else 0.0
     speed = astray[1]
-    astray[1] += step * (push - wrong[_DAMPING] * speed) / (1.0 + 0.5 * wrong[_DAMPING] * step)
+    astray[1] = _slowed(speed, push, wrong[_DAMPING], step)
     astray[0] += step * 0.5 * (speed + astray[1])
     setpoint[2] += step * (astray[2] + 0.5 * step * wrong[_LIFT])
     setpoint[5] += step * wrong[_LIFT]
@@ -484,7 +514,19 @@ def _widen(swept: NDArray, now: NDArray, astray: float) -> None:
     """Make a box, (2, 3), hold a place and all `astray`, m, to its sides; what is no number is taken over."""
     for k in range(3):
         aside = astray if k < 2 else 0.0
-        if not swept[0, k] <= now[k] - aside:
-            swept[0, k] = now[k] - aside
-        if not swept[1, k] >= now[k] + aside:
-            swept[1, k] = now[k] + aside
+        _hold(swept, k, now[k] - aside, now[k] + aside)
+
+
+@njit(allocates=False)
+def _hold(swept: NDArray, axis: int, low: float, high: float) -> None:
+    """Make a box, (2, 3), reach from `low` to `high`, m, along an axis."""
+    if not swept[0, axis] <= low:
+        swept[0, axis] = low
+    if not swept[1, axis] >= high:
+        swept[1, axis] = high
+
+
+@njit(allocates=False)
+def _slowed(speed: float, push: float, drag: float, step: float) -> float:
+    """Return a speed, m/s, after a step, s, of a push, m/s², and a drag in 1/s; midpoint, implicit in the drag."""
+    return speed + step * (push - drag * speed) / (1.0 + 0.5 * drag * step)

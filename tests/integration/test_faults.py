@@ -24,6 +24,7 @@ from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.studies.fault_scenarios import ASKED, ASKED_AFTER, FOR_GOOD, SCENARIOS, Scenario
 from cfplan.studies.faults import fly_scenario, fly_stepped, judge, prepare_held
 from cfplan.studies.random_faults import fly_random, prepare_missions, random_flights, random_scenario
+from cfplan.vehicle.airframe import GRAVITY
 
 REPOSITORY = Path(__file__).parents[2]
 pytestmark = pytest.mark.integration
@@ -252,3 +253,39 @@ def test_a_vehicle_that_believes_itself_beneath_the_floor_gets_no_more_thrust(mo
     flown = fly_scenario(Scenario("fell", Rung.NONE, tumbles, Phase.LAND, moment, **alone), line)
     assert flown.to_wall > 0.5
     assert (flown.landed, flown.disarmed, flown.readable) == (True, True, True)
+
+
+# Each left the walls before level-out leaned as far away from them as it does, and link loss reckoned with a velocity
+# that is wrong and with a fall: poses that come 30 ms late and then none; poses that waited in a radio that loses most;
+# a vehicle that tumbles and locks.
+LEFT_THE_WALLS = (("line", 8816), ("small-2", 5467), ("small-2", 7083))
+
+
+@pytest.mark.parametrize(("path", "seed"), LEFT_THE_WALLS)
+def test_random_faults_that_left_the_walls_end_inside(path, seed, missions):
+    flown = fly_scenario(random_scenario(seed, missions[path]), missions[path], seed)
+    assert flown.to_wall > 0.0
+    assert (flown.landed, flown.disarmed, flown.readable) == (True, True, True)
+
+
+@pytest.mark.parametrize("sooner", [0.0, -0.05])
+def test_a_vehicle_whose_motors_stop_as_it_flies_towards_a_wall_falls_inside(sooner, missions):
+    """At 1.8 m/s, 0.8 m from the wall, where it brakes."""
+    mission = missions["small-2"]
+    low, high, planned = mission.limits.space.low, mission.limits.space.high, decode(mission.payloads)
+    falls_to = planned.position + planned.velocity * np.sqrt(2.0 * planned.position[:, 2:] / GRAVITY)
+    beyond = np.maximum(low[:2] - falls_to[:, :2], falls_to[:, :2] - high[:2]).max(axis=1)
+    moment = float(beyond.argmax()) / mission.rate - sooner
+    locked = (VehicleFault(VehicleFaultKind.LOCK, 0.0, FOR_GOOD),)
+    flown = fly_scenario(Scenario("locked", Rung.CUT, locked, Phase.STREAM, moment), mission)
+    assert flown.to_wall > 0.05
+    assert (flown.landed, flown.disarmed) == (True, True)
+
+
+@pytest.mark.parametrize(("phase", "moment"), [(Phase.CONVERGE, 0.2), (Phase.PREFLIGHT, 0.1)])
+def test_a_body_that_is_elsewhere_after_a_gap_while_it_stands_does_not_take_off(phase, moment, line):
+    """Motion capture shows the vehicle where it is not from then on, and nothing in the air would tell."""
+    begins_anew = ViconFault(FaultKind.CLOSE, 0.0, 0.67), ViconFault(FaultKind.JUMP, 0.7, FOR_GOOD, 0.42)
+    flown = fly_scenario(Scenario("elsewhere", Rung.NONE, begins_anew, phase, moment), line)
+    assert flown.rung == "no take-off"
+    assert "way that the standing body went: 42" in flown.reason

@@ -71,7 +71,7 @@ def test_a_vehicle_file_lies_beside_the_safety_file(tmp_path):
 
 NO_POSITIVE_NUMBER = {
     "vehicle", "low", "high", "latency", "controller", "estimator", "watchdog", "outside", "attitude_error_deg",
-    "vertical_acceleration_error",
+    "vertical_acceleration_error", "velocity_error",
 }  # fmt: skip
 NEEDED = ("vehicle", "space", "space.low", "space.high")  # which nobody but the lab knows
 
@@ -169,6 +169,8 @@ def test_unknown_keys_are_errors(tmp_path, place):
         ({"link_loss.motor_lags": [0.1, 0.9]}, r"link_loss.motor_lags"),
         ({"link_loss.attitude_error_deg": 11}, r"link_loss.attitude_error_deg"),
         ({"link_loss.attitude_error_deg": -1}, r"link_loss.attitude_error_deg"),
+        ({"link_loss.velocity_error": 1.1}, r"link_loss.velocity_error"),
+        ({"link_loss.velocity_error": -0.1}, r"link_loss.velocity_error"),
         ({"link_loss.vertical_acceleration_error": 3}, r"link_loss.vertical_acceleration_error"),
         ({"link_loss.vertical_acceleration_error": -0.1}, r"link_loss.vertical_acceleration_error"),
     ],

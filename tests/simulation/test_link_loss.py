@@ -44,8 +44,8 @@ def unwatched(limits):
 
 
 def without_errors(limits: Limits, **changes) -> Limits:
-    """A vehicle that has attitude and acceleration right."""
-    right = {"attitude_error": 0.0, "vertical_acceleration_error": 0.0}
+    """A vehicle that has attitude, acceleration and velocity right."""
+    right = {"attitude_error": 0.0, "vertical_acceleration_error": 0.0, "velocity_error": 0.0}
     return replace(limits, link_loss=replace(limits.link_loss, **right | changes))
 
 
@@ -105,10 +105,43 @@ def test_it_sweeps_what_a_whole_simulation_sweeps(line, limits, unwatched, rates
         told.body_rate[last, :2] += rates
         sent = encode(told)
         found = link_loss_at_every_setpoint(sent, limits)
-        places = fly_on(sent, airframe, last, lag=lag, off_after=off_after)
+        alone = fly_on(sent, airframe, last, lag=lag, off_after=off_after)
+        places = np.concatenate([alone, fly_on(sent, airframe, last, lag=lag, off_after=0)])
         far = np.ptp(places[:, :2], axis=0).max()
         assert found.low[last, :2] == pytest.approx(places.min(axis=0)[:2], abs=0.01 + share * far)
         assert found.high[last] == pytest.approx(places.max(axis=0), abs=0.01 + share * far)
+
+
+@pytest.mark.parametrize("lag", [0.07, 0.13])
+def test_a_vehicle_whose_motors_stop_at_once_falls_inside_the_box(line, limits, lag):
+    """From 2 m/s, before it brakes, that takes it farther on than link loss does; the thrust fades while it falls."""
+    airframe = replace(limits.airframe, motor_time_constant=lag)
+    limits = replace(without_errors(limits, motor_lags=(lag,)), airframe=airframe)
+    found = link_loss_at_every_setpoint(line.payloads, limits)
+    fastest = int(np.abs(decode(line.payloads).velocity[:, 1]).argmax())
+    for last in (40, fastest, 260, 330):
+        fall = fly_on(line.payloads, airframe, last, lag=lag, off_after=0)
+        assert np.all(found.low[last, :2] <= fall.min(axis=0)[:2] + 0.02)
+        assert np.all(found.high[last] >= fall.max(axis=0) - 0.02)
+    on = fly_on(line.payloads, airframe, fastest, lag=lag, off_after=1040)[:, 1]
+    fall = fly_on(line.payloads, airframe, fastest, lag=lag, off_after=0)[:, 1]
+    side, begin = np.sign(fall[-1] - fall[0]), fall[0]
+    assert np.max(side * (fall - begin)) > np.max(side * (on - begin)) + 0.05
+    reached = (found.high if side > 0 else found.low)[fastest, 1]
+    assert reached == pytest.approx(fall[-1], abs=0.02)
+
+
+def test_a_velocity_that_is_wrong_carries_it_to_all_sides(limits):
+    """From hover at 1 m it is a second until the motors stop, and 0.45 s until it lies on the floor, less drag."""
+    hover = straight(0.0)
+    right, wrong = (
+        link_loss_at_every_setpoint(hover, without_errors(limits, velocity_error=error)) for error in (0.0, 0.2)
+    )
+    aside = right.low[0] - wrong.low[0]
+    assert aside == pytest.approx(wrong.high[0] - right.high[0])
+    assert aside[2] == 0.0
+    undamped = 0.2 * (1.04 + np.sqrt(2 * 1.0 / 9.81))
+    assert 0.7 * undamped < aside[0] < undamped
 
 
 def test_the_worst_of_all_motor_lags_counts(line, limits):
@@ -242,6 +275,9 @@ def test_the_virtual_crazyflie_goes_there_too(line, limits):
         row = round(100 * moment)
         flown = fly_stepped(replace(KILLED, moment=float(moment)), line)
         alone = flown.truth.position[flown.truth.time >= flown.struck]
-        # 0.2 m: its own estimate drifts so far in two seconds without poses.
-        assert alone.min(axis=0) == pytest.approx(right.low[row], abs=0.2)
-        assert alone.max(axis=0) == pytest.approx(right.high[row], abs=0.2)
+        # 0.2 m: its own estimate drifts so far without poses.
+        assert np.all(alone.min(axis=0) > right.low[row] - 0.2)
+        assert np.all(alone.max(axis=0) < right.high[row] + 0.2)
+        lag = limits.airframe.motor_time_constant
+        on = fly_on(line.payloads, limits.airframe, row, lag=lag, off_after=1040)
+        assert alone[-1] == pytest.approx(on[-1], abs=0.2)

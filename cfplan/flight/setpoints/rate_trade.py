@@ -45,8 +45,6 @@ BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ah
 SPEED_LEFT = 0.41  # share of the velocity that is left when the firmware begins to level out
 SPEED_GAINED = 0.089  # s, speed gained until then for each m/s² of acceleration
 WALL_LEAD = 0.3  # s by which the place that tells how near a wall will be is ahead of the setpoint
-WALL_REACH = 1.5  # m from a wall, within which level-out leans away from it
-WALL_PULL_MAX = 0.45  # m/s²; 2.6° of tilt
 TRADED_RATE_MAX = 4.5  # rad/s; what exceeds it is sent as a rate, as φ grows to 90° at 7 rad/s
 LEAN_MAX = math.radians(60.0)  # of the thrust that is sent; plans under the shipped limits reach 45°
 _LEAST_LIFT = math.cos(LEAN_MAX)
@@ -64,11 +62,18 @@ class LevelOut:
 
     braking: float  # 1/s, deceleration over the speed left
     rate_max: float  # rad/s, of the rates that are sent for it
-    wall_stiffness: float  # 1/s², acceleration away from a wall for each m nearer than WALL_REACH
+    wall_reach: float  # m from a wall, within which it leans away from it
+    wall_stiffness: float  # 1/s², acceleration away from a wall for each m nearer than that
+    wall_pull_max: float  # m/s², of that acceleration
+
+    def pack(self) -> NDArray:
+        """Return (5,), in the order of the fields."""
+        return np.array([self.braking, self.rate_max, self.wall_reach, self.wall_stiffness, self.wall_pull_max])
 
 
-UNTIL_WATCHDOG = LevelOut(braking=2.0, rate_max=1.2, wall_stiffness=0.2)  # half a second, at up to 10° of tilt
-UNTIL_TIMEOUT = LevelOut(braking=1.0, rate_max=0.6, wall_stiffness=0.35)  # 1.5 s, at up to 5°
+# Half a second, at up to 13° of tilt; and 1.5 s, at up to 5°.
+UNTIL_WATCHDOG = LevelOut(braking=2.0, rate_max=1.6, wall_reach=1.5, wall_stiffness=1.2, wall_pull_max=1.6)
+UNTIL_TIMEOUT = LevelOut(braking=1.0, rate_max=0.6, wall_reach=1.5, wall_stiffness=0.35, wall_pull_max=0.45)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +123,7 @@ def trade_rates(
         np.array(motion.body_rate, dtype=float, order="C"),
         _walls(space),
         gains.full_rate,
-        np.array([gains.level_out.braking, gains.level_out.rate_max, gains.level_out.wall_stiffness]),
+        gains.level_out.pack(),
     )
     return replace(motion, acceleration=acceleration, quaternion=quaternion, body_rate=rate)
 
@@ -141,7 +146,7 @@ def harmless_rates(
         np.array(motion.body_rate, dtype=float, order="C"),
         _walls(space),
         gains.full_rate,
-        np.array([gains.level_out.braking, gains.level_out.rate_max, gains.level_out.wall_stiffness]),
+        gains.level_out.pack(),
     )
 
 
@@ -297,14 +302,14 @@ def _good_rate(
     level_out: NDArray,
 ) -> tuple[float, float]:
     """Return the roll and pitch rates, rad/s, at which level-out brakes the speed left and leans away from walls."""
-    braking, rate_max, stiffness = level_out
+    braking, rate_max = level_out[0], level_out[1]
     x, y = heading_of(quaternion)
     size = math.sqrt(x * x + y * y)
     cos, sin = (x / size, y / size) if size > 0.0 else (1.0, 0.0)
     pull_x = -braking * (SPEED_LEFT * velocity[0] + SPEED_GAINED * acceleration_ahead[0])
     pull_y = -braking * (SPEED_LEFT * velocity[1] + SPEED_GAINED * acceleration_ahead[1])
-    pull_x += _pull_off(position[0] + WALL_LEAD * velocity[0], walls[0, 0], walls[1, 0], stiffness)
-    pull_y += _pull_off(position[1] + WALL_LEAD * velocity[1], walls[0, 1], walls[1, 1], stiffness)
+    pull_x += _pull_off(position[0] + WALL_LEAD * velocity[0], walls[0, 0], walls[1, 0], level_out)
+    pull_y += _pull_off(position[1] + WALL_LEAD * velocity[1], walls[0, 1], walls[1, 1], level_out)
     forward, left = cos * pull_x + sin * pull_y, cos * pull_y - sin * pull_x
     pull = math.sqrt(forward * forward + left * left)
     scale = full_rate / math.sqrt(GRAVITY * GRAVITY + pull * pull)  # sin(atan(pull / g)) / pull
@@ -314,10 +319,11 @@ def _good_rate(
 
 
 @register_jitable
-def _pull_off(place: float, low: float, high: float, stiffness: float) -> float:
+def _pull_off(place: float, low: float, high: float, level_out: NDArray) -> float:
     """Return the acceleration, m/s², away from two opposite walls."""
-    off_low = min(max(stiffness * (WALL_REACH - (place - low)), 0.0), WALL_PULL_MAX)
-    off_high = min(max(stiffness * (WALL_REACH - (high - place)), 0.0), WALL_PULL_MAX)
+    _, _, reach, stiffness, pull_max = level_out
+    off_low = min(max(stiffness * (reach - (place - low)), 0.0), pull_max)
+    off_high = min(max(stiffness * (reach - (high - place)), 0.0), pull_max)
     return off_low - off_high
 
 
@@ -334,13 +340,13 @@ def _harmless(
 ) -> NDArray:
     """Return what harmless_rates gives, (N, 2) rad/s."""
     out = np.empty((len(position), 2))
-    braking, rate_max, stiffness = level_out
+    braking, rate_max, reach, stiffness, pull_max = level_out
     frame, seen, wanted = np.empty((3, 3)), np.empty((3, 3)), np.empty(2)
     for n in range(len(position)):
         for k in range(2):
             place = position[n, k] + WALL_LEAD * velocity[n, k]
-            off_low = min(stiffness * max(WALL_REACH - (place - walls[0, k]), 0.0), WALL_PULL_MAX)
-            off_high = min(stiffness * max(WALL_REACH - (walls[1, k] - place), 0.0), WALL_PULL_MAX)
+            off_low = min(stiffness * max(reach - (place - walls[0, k]), 0.0), pull_max)
+            off_high = min(stiffness * max(reach - (walls[1, k] - place), 0.0), pull_max)
             speed_left = SPEED_LEFT * velocity[n, k] + SPEED_GAINED * acceleration_ahead[n, k]
             wanted[k] = off_low - off_high - braking * speed_left
         x, y = heading_of(quaternion[n])
