@@ -1,7 +1,8 @@
 """The high-level commander (CRTP port 8): take-off, landing and go-to as septics, and uploaded polynomials.
 
-Idle, it asks for nothing, which is motors off, every 10 ms at the lowest priority: the null-setpoint gap. Spirals,
-take-off and landing by speed, and compressed curves are not simulated; they answer ENOEXEC.
+Idle, it asks for nothing, which is motors off, every 10 ms at the lowest priority: the null-setpoint gap. Spirals and
+take-off and landing by speed are not simulated; they answer ENOEXEC. So do compressed pieces without an end, where the
+firmware would read on in its memory.
 """
 
 import errno
@@ -14,6 +15,8 @@ from struct import error, unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.errors import NotCertifiedError
+from cfplan.flight.on_board.memory_format import PIECE_SIZE, read_compressed
 from cfplan.simulation.dynamics.mellinger import ON_BOARD
 from cfplan.simulation.virtual_crazyflie.setpoints import (
     ACCELERATION,
@@ -31,8 +34,7 @@ from cfplan.vehicle.airframe import GRAVITY
 ) = range(14)  # fmt: skip
 _PLANNER_BUSY = 1
 _DEFINITIONS = 31
-_IN_MEMORY, _UNCOMPRESSED = 1, 0
-_PIECE_BYTES = 132  # 4 × 8 coefficients and a duration, float32
+_IN_MEMORY, _UNCOMPRESSED, _COMPRESSED = 1, 0, 1
 
 # The upper half of a septic on [0, 1] from what is left of value and derivatives 1 to 3 at its end.
 _UPPER = np.linalg.inv(
@@ -123,7 +125,7 @@ class HighLevelCommander:
         self._begin = 0.0
         self._last = _at_rest(np.zeros(4))
         self._group_mask = 0
-        self._definitions: dict[int, tuple[int, int]] = {}
+        self._definitions: dict[int, tuple[int, int, int]] = {}  # kind, offset and count of pieces
 
     def stop(self) -> None:
         """Become idle at once."""
@@ -241,11 +243,11 @@ class HighLevelCommander:
         return 0
 
     def _define(self, number: int, place: int, kind: int, offset: int, count: int) -> int:
-        if number >= _DEFINITIONS or place != _IN_MEMORY or kind != _UNCOMPRESSED:
+        if number >= _DEFINITIONS or place != _IN_MEMORY or kind not in (_UNCOMPRESSED, _COMPRESSED):
             return errno.ENOEXEC
-        if not count or offset + count * _PIECE_BYTES > len(self._memory):
+        if kind == _UNCOMPRESSED and (not count or offset + count * PIECE_SIZE > len(self._memory)):
             return errno.ENOEXEC
-        self._definitions[number] = offset, count
+        self._definitions[number] = kind, offset, count
         return 0
 
     def _start(
@@ -253,17 +255,31 @@ class HighLevelCommander:
     ) -> int:
         if number not in self._definitions or not scale > 0:
             return errno.ENOEXEC
-        offset, count = self._definitions[number]
-        table = np.frombuffer(self._memory, "<f4", count * _PIECE_BYTES // 4, offset).reshape(count, 33).astype(float)
-        pieces = [_Piece(row[32], row[:32].reshape(4, 8).T).stretched(scale) for row in table]
+        kind, offset, count = self._definitions[number]
+        if kind == _COMPRESSED and (scale != 1.0 or backwards):
+            return errno.ENOEXEC
+        try:
+            stored = self._compressed(offset) if kind == _COMPRESSED else self._uncompressed(offset, count)
+        except NotCertifiedError:
+            return errno.ENOEXEC
+        pieces = [piece.stretched(scale) for piece in stored]
         if backwards:
             pieces = [piece.reversed() for piece in reversed(pieces)]
         if relative:
             shift = self._last.position - pieces[0].coefficients[0]
-            shift[3] = _wrapped(shift[3]) if relative_yaw else 0.0
+            shift[3] = _wrapped(shift[3]) if relative_yaw and kind == _UNCOMPRESSED else 0.0
             pieces = [piece.moved(shift) for piece in pieces]
         self._pieces, self._begin, self.state = pieces, time, PlannerState.FLYING
         return 0
+
+    def _uncompressed(self, offset: int, count: int) -> list[_Piece]:
+        table = np.frombuffer(self._memory, "<f4", count * PIECE_SIZE // 4, offset).reshape(count, -1).astype(float)
+        return [_Piece(row[-1], row[:-1].reshape(4, 8).T) for row in table]
+
+    def _compressed(self, offset: int) -> list[_Piece]:
+        read = read_compressed(bytes(self._memory), offset)
+        table = zip(read.durations.tolist(), read.coefficients.astype(float), strict=True)
+        return [_Piece(duration, axes.T) for duration, axes in table]
 
 
 def _body_rate(goal: Goal) -> NDArray:

@@ -4,15 +4,22 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from cflib.crazyflie import Crazyflie
+from cflib.crazyflie.mem import MemoryElement
 from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 from cflib.crtp.crtpstack import CRTPPort
 from cflib.positioning.motion_commander import MotionCommander
 from waiting import until
 
+from cfplan.flight.on_board.certified_pieces import certified_compressed, certified_pieces
+from cfplan.geometry.path_file import path_through
+from cfplan.planning.plan import plan
+from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.room import RoomPoseSource
 from cfplan.vehicle.airframes import AIRFRAMES
 
@@ -95,6 +102,54 @@ def test_a_whole_flight_take_off_go_to_stream_hand_back_land(lab, link, set_and_
     assert truth.off_in_air[-1] == truth.off_in_air[begun_at]
     assert not truth.locked
     assert np.allclose(np.diff(truth.time[begun_at:]), 0.01, atol=1e-6)
+
+
+class Packed:
+    """Bytes for cflib's memory of trajectories, which asks its elements for them."""
+
+    def __init__(self, content):
+        self.content = content
+
+    def pack(self):
+        return bytearray(self.content)
+
+
+@pytest.mark.parametrize("make", [certified_pieces, certified_compressed])
+def test_cflib_uploads_a_plan_and_the_vehicle_flies_it_by_itself(lab, link, set_and_read_back, make):
+    limits = load_limits(Path(__file__).parents[3] / "safety.yaml")
+    gentle = replace(limits.plan, angular_acceleration=0.57 * limits.plan.angular_acceleration)
+    path = path_through([[-0.8, -0.8, 0.7], [0.2, 0.4, 1.1], [1.0, -0.6, 0.9]]).path
+    made = make(plan(path, limits.airframe, replace(limits, plan=gentle)).trajectory, limits)
+    feed = PoseFeed(link)
+    prepare(link, feed, set_and_read_back)
+    (memory,) = link.mem.get_mems(MemoryElement.TYPE_TRAJ)
+    memory.trajectory = [Packed(made.memory)]
+    assert memory.write_data_sync()
+    planner, codes = link.high_level_commander, []
+    link.add_port_callback(CRTPPort.SETPOINT_HL, lambda packet: codes.append(packet.data[3]))
+    planner.define_trajectory(1, 0, len(made.pieces.durations), int(made.compressed))
+    planner.takeoff(0.8, 1.5, yaw=None)
+    time.sleep(2.0)
+    x, y, z, yaw = (float(value) for value in made.pieces.coefficients[0, :, 0])
+    planner.go_to(x, y, z, yaw, 3.0)
+    time.sleep(4.5)
+    begun = time.monotonic()
+    planner.start_trajectory(1)
+    time.sleep(made.duration + 0.5)
+    planner.land(0.0, 1.5, yaw=None)
+    assert until(lambda: not link.supervisor.is_flying)
+    feed.stop.set()
+    feed.join()
+    assert codes == [0, 0, 0, 0, 0]
+
+    truth = lab.truth()
+    offsets = []
+    for late in np.arange(0.0, 0.2, 0.01):  # until the command took effect
+        here = (truth.time >= begun + late) & (truth.time < begun + late + made.duration)
+        wanted = made.reference.plan_at(truth.time[here] - begun - late)[:, 0, :3]
+        offsets.append(np.linalg.norm(truth.position[here] - wanted, axis=1).max())
+    assert min(offsets) < 0.05
+    assert not truth.locked
 
 
 def test_motion_commander_flies_with_the_default_controller(lab, link, set_and_read_back):

@@ -146,3 +146,27 @@ def test_an_uploaded_curve_is_flown_as_asked(uploaded, options, time, x, speed):
 def test_a_curve_that_was_never_defined_is_not_executed(planner):
     assert start(planner) == 8
     assert planner.receive(struct.pack("<BBBBIB", 6, 1, 1, 0, 4000, 2), 0.0, blocked=False)[3] == 8
+
+
+def test_compressed_pieces_are_flown_once_forwards_at_their_own_pace(planner):
+    """From (1, 0, 0.5) m by a straight piece to x = 2 m in 2 s, then at rest in x while y goes up a cubic."""
+    content = struct.pack("<4h", 1000, 0, 500, 0)
+    content += struct.pack("<BHh", 1, 2000, 2000) + struct.pack("<BH3h", 2 << 2, 1000, 0, 300, 300)
+    planner._memory[100 : 100 + len(content)] = content
+    planner._memory[100 + len(content) : 103 + len(content)] = bytes(3)
+    assert planner.receive(struct.pack("<BBBBIB", 6, 1, 1, 1, 100, 2), 0.0, blocked=False)[3] == 0
+    assert start(planner, scale=2.0) == 8
+    assert start(planner, backwards=1) == 8
+    assert start(planner) == 0
+    middle, later, end = (planner.setpoint(time).values for time in (1.0, 2.5, 9.0))
+    assert middle[POSITION] == pytest.approx([1.5, 0.0, 0.5], abs=1e-5)
+    assert middle[VELOCITY] == pytest.approx([0.5, 0.0, 0.0], abs=1e-5)
+    assert later[POSITION] == pytest.approx([2.0, 0.15, 0.5], abs=1e-5)
+    assert end[POSITION] == pytest.approx([2.0, 0.3, 0.5], abs=1e-5)
+    assert not end[VELOCITY].any()
+
+
+def test_compressed_pieces_that_do_not_end_are_not_executed(planner):
+    planner._memory[:] = b"\x01" * len(planner._memory)
+    assert planner.receive(struct.pack("<BBBBIB", 6, 1, 1, 1, 0, 2), 0.0, blocked=False)[3] == 0
+    assert start(planner) == 8
