@@ -177,11 +177,12 @@ def give_way(
         encoded = encode_trajectory(trajectory, gains=gains_under(limits), space=limits.space)
         if limits.link_loss.only_warn:
             return [assess_glitches(encoded, limits)]
-        with ThreadPoolExecutor() as pool:
-            glitches, link_loss = pool.map(lambda each: each(encoded, limits), (assess_glitches, assess_link_loss))
+        link_loss = assess_link_loss(encoded, limits)
         if not link_loss.passed or link_loss.simulated is None:
-            return [glitches, link_loss]  # which is mended first
-        return [glitches, link_loss, assess_link_loss_of_stops(encoded, limits, link_loss.simulated.moments)]
+            return [link_loss]  # which is mended first, and what else there is then looked at
+        with ThreadPoolExecutor() as pool:
+            stops = pool.submit(assess_link_loss_of_stops, encoded, limits, link_loss.simulated.moments)
+            return [assess_glitches(encoded, limits), link_loss, stops.result()]
 
     with step(on_step, "slowing") as results:
         slowed, (glitches, *link_loss) = slow_locally(planned, assess, deadline)
