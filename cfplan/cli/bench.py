@@ -385,6 +385,7 @@ _networks = click.option(
 
 @study.command(epilog="Example: cfplan study architectures -o results/architectures.json")
 @_count(100, "For training and for testing each.")
+@click.option("--kind", "kinds", multiple=True, help="LSTM, Transformer, ETransformer or MLP.  [default: all]")
 @_data
 @_networks
 @_epochs

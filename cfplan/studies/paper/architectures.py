@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cfplan.errors import CfplanError
+from cfplan.errors import CfplanError, InputError
 from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
@@ -81,6 +81,7 @@ SHIPPED_COLUMNS = (
 def architectures(
     *,
     paths: int = 100,
+    kinds: Sequence[str] = tuple(Kind),
     data: FilePath = DATA,
     networks: FilePath = NETWORKS,
     epochs: int | None = None,
@@ -90,9 +91,12 @@ def architectures(
     """Compare the architectures on `paths` paths for training and for testing each; networks are trained if need be.
 
     Raises:
-        InputError: no such dataset, or fewer paths in it.
+        InputError: an unknown architecture, no such dataset, or fewer paths in it.
     """
-    wanted = [SequenceOptions(kind=kind) for kind in Kind]
+    for name in kinds:
+        if name not in tuple(Kind):
+            raise InputError(f"unknown architecture {name!r}", where="kinds", hint=f"known: {', '.join(Kind)}")
+    wanted = [SequenceOptions(kind=Kind(name)) for name in kinds]
     with paper_data(data, networks, paths, epochs=epochs, quick=quick) as material:
         more = 2 * (len(wanted) + 3)
         trained = trained_networks(material, wanted, progress, more)

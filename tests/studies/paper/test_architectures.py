@@ -66,6 +66,12 @@ def test_the_quick_run_makes_all_tables(name, rows, tmp_path, monkeypatch):
         assert len(shipped["rows"]) == 2
 
 
+def test_unknown_architectures_are_named():
+    with pytest.raises(InputError, match="unknown architecture 'GRU'") as error:
+        architectures(kinds=["GRU"])
+    assert "ETransformer" in error.value.hint
+
+
 def test_without_data_the_command_that_makes_it_is_named(tmp_path):
     with pytest.raises(InputError, match="no such dataset") as error:
         architectures(data=tmp_path / "none")
