@@ -3,6 +3,7 @@
 name: figure eight
 waypoints: [[0, 0, 1], [1, 1, 1], …]    # or  points: file.csv  (x, y, z a row)
                                         # or  polynomials: file.csv  (as Crazyswarm writes them)
+                                        # or  samples: file.csv  (t, x, y, z a row; the way is kept, the timing not)
 yaw: {mode: fixed, angle_deg: 30}       # or  yaw: tangent,  yaw: free;  fixed at 0 if left out
 laps: 3                                 # of a closed path, flown through without a stop
 speed: 0.5                              # speed factor: 1 is as fast as the limits allow
@@ -25,6 +26,7 @@ from cfplan.files.yaml_with_places import HINT, Places, read_yaml_with_places
 from cfplan.geometry.min_snap import MIN_DENSE_SPACING, MIN_SPACING, check_points, min_snap, smooth_through
 from cfplan.geometry.path import Path, rotation_about_z
 from cfplan.geometry.polynomial_csv import read_polynomials
+from cfplan.geometry.timed_samples import timed_samples
 from cfplan.geometry.yaw import YawMode
 
 _DENSE = 8  # points: fewer are waypoints with room between them to gather speed
@@ -44,6 +46,7 @@ class PathFile:
     laps: int
     waypoints: NDArray  # (K, 3) m, in the frame of the room, all laps
     source: pathlib.Path
+    losses: tuple[str, ...] = ()  # what the path does not keep of what was given, a few words each
 
 
 class _Yaw(BaseModel):
@@ -84,6 +87,7 @@ class _Content(BaseModel):
     waypoints: list[list[float]] | None = None
     points: str | None = None
     polynomials: str | None = None
+    samples: str | None = None
     yaw: Annotated[_Yaw, BeforeValidator(_short_yaw)] = _Yaw(mode=YawMode.FIXED)
     laps: int = Field(default=1, ge=1, le=1000)
     speed: Annotated[float, Field(gt=0.0, le=1.0), BeforeValidator(_share)] = 1.0
@@ -99,7 +103,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
     file = pathlib.Path(file)
     content, places = read_yaml_with_places(file, _Content)
     given = _source(content, places)
-    path, waypoints = _SOURCES[given](content, places)
+    path, waypoints, *losses = _SOURCES[given](content, places)
     path.check(where=places.where(given))
 
     if content.yaw.angle_deg and content.yaw.mode is not YawMode.FIXED:
@@ -121,6 +125,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
         laps=content.laps,
         waypoints=waypoints @ rotation_about_z(turn).T + offset,
         source=file,
+        losses=tuple(losses),
     )
 
 
@@ -211,7 +216,20 @@ def _from_polynomials(content: _Content, places: Places) -> tuple[Path, NDArray]
     return read_polynomials(_beside(places, content.polynomials), laps=content.laps)
 
 
-_SOURCES = {"waypoints": _from_waypoints, "points": _from_points, "polynomials": _from_polynomials}
+def _from_samples(content: _Content, places: Places) -> tuple[Any, ...]:
+    """Return path and points, and what is lost."""
+    file = _beside(places, content.samples)
+    rows, lines = read_table(file, 4, "t, x, y, z")
+    motion = timed_samples(rows, lines, str(file))
+    points = _repeated(motion.points(), content.laps, places)
+    check_points(points, MIN_DENSE_SPACING, lambda _: str(file))
+    path = smooth_through(points)
+    return path, points, *motion.losses(path)
+
+
+_SOURCES: dict[str, Callable[[_Content, Places], tuple[Any, ...]]] = {
+    "waypoints": _from_waypoints, "points": _from_points, "polynomials": _from_polynomials, "samples": _from_samples,
+}  # fmt: skip
 
 
 def _beside(places: Places, name: str | None) -> pathlib.Path:

@@ -127,6 +127,8 @@ def plan_flight(
         path_file = load_path_file(source) if isinstance(source, Path) else source
         check_space(path_file.path, limits.space, waypoints=path_file.waypoints, where=str(path_file.source))
         results.append(f"{path_file.name}, {path_file.path.length:.1f} m, {len(path_file.waypoints)} waypoints")
+        for loss in path_file.losses:
+            results.append(loss)
     if path_file.path.length > LONG:
         compile_from_here()
     deadline = Deadline.after(default_budget(path_file.path) if options.budget is None else options.budget)

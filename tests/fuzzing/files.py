@@ -89,6 +89,17 @@ def _flights(kind: str, _: Path) -> list[dict[str, bytes]]:
     return found
 
 
+def _timed(folder: Path) -> list[dict[str, bytes]]:
+    """Return path files that give samples with times, each with its table: the points of others, 0.1 s apart."""
+    found = []
+    for files in _flights("points", folder):
+        (table,) = (content for name, content in files.items() if name.endswith(".csv"))
+        rows = np.loadtxt(table.decode().splitlines(), delimiter=",", comments=["#", "x"])
+        lines = [",".join(map(str, (n / 10, *row))) for n, row in enumerate(rows.tolist())]
+        found.append({"path.yaml": b"samples: log.csv\n", "log.csv": "\n".join(["t,x,y,z", *lines]).encode()})
+    return found
+
+
 def _spoil_path(sound: list[dict[str, bytes]], chance: Random, folder: Path) -> None:
     files = chance.choice(sound)
     wrong = chance.choice(sorted(files) + [name for name in files if name.endswith(".csv")] * 3)
@@ -389,6 +400,7 @@ FILES = {
     "paths": Reader(partial(_flights, "waypoints"), _spoil_path, _use_path, 1.5),
     "points": Reader(partial(_flights, "points"), _spoil_path, _use_path),
     "polynomials": Reader(partial(_flights, "polynomials"), _spoil_path, _use_path),
+    "samples": Reader(_timed, _spoil_path, _use_path),
     "safety": Reader(_safety, _spoil_safety, _use_safety, 1.5),
     "airframes": Reader(_airframe, _spoil_airframe, _use_safety, 1.5),
     "plans": Reader(_plan, _spoil_plan, _use_plan, 1.5),

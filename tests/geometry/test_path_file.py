@@ -102,7 +102,7 @@ def test_hundreds_of_points_keep_their_shape(load):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("name: x\n", ":1:1: one of waypoints, points, polynomials is needed"),
+        ("name: x\n", ":1:1: one of waypoints, points, polynomials, samples is needed"),
         ("points: a.csv\nwaypoints: [[0,0,1],[1,0,1]]\n", ":2:1: only one of waypoints and points may be given"),
         ("waypoints: []\n", ":1:12: a path needs at least two waypoints, not 0"),
         ("waypoints: [[0,0,1]]\n", ":1:12: a path needs at least two waypoints, not 1"),
@@ -145,6 +145,7 @@ contents = st.fixed_dictionaries(
         "waypoints": points | st.text(),
         "points": st.sampled_from(["knots.csv", "..", "", "x\0y"]) | st.text(),
         "polynomials": st.just("knots.csv") | st.text(),
+        "samples": st.just("knots.csv") | st.text(),
         "yaw": st.sampled_from([*YawMode]).map(str) | st.dictionaries(st.sampled_from(["mode", "angle_deg"]), numbers),
         "laps": st.integers(-1, 5),
         "speed": numbers,

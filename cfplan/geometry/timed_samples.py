@@ -1,0 +1,134 @@
+"""Samples of a motion with times, from Blender, a vehicle carried by hand or a motion capture log, as points of a path.
+
+The planner times a path, so only the way is kept. Samples lie as close as they were taken, noise and all, and where the
+motion rested they lie on a heap; so the way is cut into steps of equal length and the samples of each are averaged.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from cfplan.errors import InputError
+from cfplan.geometry.path import Path
+
+STEP = 0.08  # m along the way between points, and over which samples are averaged: bends of 0.5 m keep within 2 mm
+_SHORT = 24  # points of a way that is too short for so many steps
+_CHAIN = 0.25  # of a step: samples nearer than that to the last one that counted do not count as way
+_QUICKEST = 30.0  # m/s between two samples: faster is another marker, or another unit
+_RESTING = 0.03  # m/s, slower than which it rests
+_SHORTEST_REST = 0.3  # s
+_MANY = 10  # samples of which a mean is better than the first
+_LONGEST_GAP = 0.5  # s without samples that need not be told
+
+
+@dataclass(frozen=True, slots=True)
+class TimedSamples:
+    """A motion as it was taken."""
+
+    time: NDArray  # (N,) s, rising
+    position: NDArray  # (N, 3) m
+
+    def points(self) -> NDArray:
+        """Return points, (K, 3) m, along the way: the first and the last sample, and averages between."""
+        counts = _chain(self.position, STEP * _CHAIN)
+        way = float(np.linalg.norm(np.diff(self.position[counts], axis=0), axis=1).sum())
+        step = min(STEP, way / _SHORT)
+        if step < STEP:
+            counts = _chain(self.position, step * _CHAIN)
+        along = np.zeros(len(self.position))
+        lengths = np.linalg.norm(np.diff(self.position[counts], axis=0), axis=1)
+        along[counts[1:]] = lengths
+        along = np.cumsum(along)
+        bins = np.round(along / step).astype(int)
+        inner = (bins > 0) & (bins < bins[-1])
+        numbers, which = np.unique(bins[inner], return_inverse=True)
+        sums = np.zeros((len(numbers), 3))
+        np.add.at(sums, which, self.position[inner])
+        means = sums / np.bincount(which, minlength=len(numbers))[:, None]
+        first, last = self._end(bins == 0, 0), self._end(bins == bins[-1], -1)
+        points = np.concatenate([[first], means, [last]])
+        keep = np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > step / 4)
+        keep[-1] = True
+        return points[keep]
+
+    def _end(self, which: NDArray, index: int) -> NDArray:
+        """Return where the motion begins or ends, (3,) m: the mean of a rest, as noise averages out of that."""
+        place = self.position[which]
+        rests = len(place) > _MANY and float(np.ptp(place, axis=0).max()) < STEP / 4
+        return np.asarray(place.mean(axis=0) if rests else self.position[index])
+
+    def losses(self, path: Path) -> tuple[str, ...]:
+        """Return what the path does not keep of the motion, a few words each."""
+        told = [f"timing is not kept: {self.time[-1] - self.time[0]:.1f} s of {len(self.time)} samples"]
+        rests = self._rests()
+        if rests:
+            told.append(f"{len(rests)} rests are left out, {sum(rests):.1f} s together")
+        gap = float(np.diff(self.time).max())
+        if gap > _LONGEST_GAP:
+            told.append(f"nothing is known for {gap:.1f} s before {self.time[1 + np.argmax(np.diff(self.time))]:.1f} s")
+        dense = path(np.linspace(0.0, path.end, max(2, int(path.length / 0.005))))
+        off = KDTree(dense).query(self.position)[0]
+        told.append(
+            f"samples lie up to {1000 * off.max():.0f} mm from the path, {1000 * np.median(off):.1f} mm in median"
+        )
+        return tuple(told)
+
+    def _rests(self) -> list[float]:
+        """Return how long the motion rests, s, each time; at its ends too."""
+        if len(self.time) < 3:
+            return []
+        window = max(1, int(np.searchsorted(self.time - self.time[0], _SHORTEST_REST)))
+        if window >= len(self.time):
+            return []
+        pace = np.linalg.norm(self.position[window:] - self.position[:-window], axis=1)
+        slow = pace / (self.time[window:] - self.time[:-window]) < _RESTING
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], slow.astype(int), [0]])))
+        return [
+            float(self.time[min(b - 1 + window, len(self.time) - 1)] - self.time[a]) for a, b in edges.reshape(-1, 2)
+        ]
+
+
+def timed_samples(rows: NDArray, lines: list[int], file: str) -> TimedSamples:
+    """Return rows of t, x, y, z, (N, 4), as a motion.
+
+    Raises InputError with the line where time does not rise, or the motion jumps; and where there is none.
+    """
+    time, position = rows[:, 0], rows[:, 1:]
+    if len(rows) < 2:
+        raise InputError("a motion needs at least two samples", where=file, hint="add rows t, x, y, z to the file")
+    steps = np.diff(time)
+    if (steps <= 0.0).any():
+        bad = int(np.argmax(steps <= 0.0))
+        raise InputError(
+            f"time goes from {time[bad]:g} to {time[bad + 1]:g} s", where=f"{file}:{lines[bad + 1]}",
+            hint="the first number of a row is the time in seconds, and rises from row to row",
+        )  # fmt: skip
+    lengths = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    if (lengths > _QUICKEST * steps).any():
+        bad = int(np.argmax(lengths / steps))
+        raise InputError(
+            f"the motion jumps by {lengths[bad]:.3g} m within {steps[bad]:.3g} s",
+            where=f"{file}:{lines[bad + 1]}",
+            hint="give seconds and metres; remove rows where motion capture took another marker",
+        )  # fmt: skip
+    extent = float(np.ptp(position, axis=0).max())
+    if extent < STEP:
+        raise InputError(
+            f"the motion stays within {extent:.3f} m", where=file, hint="give metres, and a motion that goes somewhere"
+        )
+    return TimedSamples(time, position)
+
+
+def _chain(position: NDArray, least: float) -> NDArray:
+    """Return the indices of samples each at least so far, m, from the one before in the chain; and of the last."""
+    chosen, here = [0], position[0]
+    for index in range(1, len(position)):
+        off = position[index] - here
+        if off @ off >= least * least:
+            chosen.append(index)
+            here = position[index]
+    if chosen[-1] != len(position) - 1:
+        chosen.append(len(position) - 1)
+    return np.array(chosen)
