@@ -9,8 +9,9 @@ Several paths are tried, first the one that looks fastest by a cheap estimate.
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -91,9 +92,8 @@ def continue_plan(
     check_waypoints(points, limits)
     known = scaled_limits(limits.airframe, limits.plan)
     failure = ""
-    ways = [*_ways(joint, trajectory, points, times)]
-    later = [*_ways_later(joint, trajectory, points)]
-    for way in (*_sound(ways, limits, known)[:TRIES], *_sound(later, limits, known)[:TRIES]):
+    first = _ways(joint, trajectory, points, times)
+    for way in chain(_sound(first, limits, known), _sound(_ways_later(joint, trajectory, points), limits, known)):
         task = PlanningTask(
             way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,
             speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,
@@ -103,7 +103,7 @@ def continue_plan(
             check_endurance(found.trajectory.duration, limits)
             return Continuation(_plan(found, task, limits, time.perf_counter() - begun), way.reached)
         failure = found
-    failure = failure or _unsound(ways[0].path, limits)
+    failure = failure or _unsound(next(_ways(joint, trajectory, points, times)).path, limits)
     speed = float(np.linalg.norm(trajectory.at(leave).velocity))
     away = float(np.linalg.norm(points[0] - joint.derivatives[0]))
     raise NoWayError(
@@ -162,10 +162,10 @@ def _way(joint: Joint, points: NDArray, times: NDArray) -> _Way:
     return _Way(path, joint.state, tuple(np.cumsum(times).tolist()))
 
 
-def _sound(ways: list[_Way], limits: Limits, known: ScaledLimits) -> list[_Way]:
-    """Return the ways inside the space that can be planned, first the one that looks fastest."""
-    good = [way for way in ways if not _unsound(way.path, limits)]
-    return sorted(good, key=lambda way: _least_time(way.path, known))
+def _sound(ways: Iterable[_Way], limits: Limits, known: ScaledLimits) -> Iterator[_Way]:
+    """Yield ways inside the space that can be planned, TRIES at most, first the one that looks fastest."""
+    fastest_first = sorted(ways, key=lambda way: _least_time(way.path, known))
+    return islice((way for way in fastest_first if not _unsound(way.path, limits)), TRIES)
 
 
 def _unsound(path: Path, limits: Limits) -> str:
@@ -194,7 +194,9 @@ def _slowing_to(speed: float, way: _Way) -> SpeedCaps:
 
 def _least_time(path: Path, known: ScaledLimits) -> float:
     """Return about how long a path takes at least, s, by what its derivatives allow place by place."""
-    return known.time * float(np.exp(-node_features(path, _NODES, known, None)[:, REFERENCE]).sum())
+    with np.errstate(all="ignore"):  # paths that stand still somewhere are refused once it is their turn
+        least = known.time * float(np.exp(-node_features(path, _NODES, known, None)[:, REFERENCE]).sum())
+    return least if math.isfinite(least) else math.inf
 
 
 def with_room(limits: PlanLimits, airframe: Airframe, room: float = ROOM) -> PlanLimits:

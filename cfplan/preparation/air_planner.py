@@ -31,7 +31,7 @@ from cfplan.safety.limits import Limits
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 LEARNED_FROM = 8  # plans, the longest of which says how long the next may take
-SLACK = 0.05  # s more than that, for the way to the pilot
+SLACK = 0.02  # s more than that, for the way to the pilot, which looks every 10 ms
 TRIES = 2  # of a request whose proposal comes late
 _ANSWER_WITHIN = 1.0  # s in which a pilot answers
 _CLOSE_WITHIN = 1.0  # s

@@ -8,6 +8,7 @@ Most setpoints are far from all walls, which a coarse look tells with a margin. 
 every motor lag.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,21 +57,35 @@ def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MAR
 
 
 def assess_link_loss_of_stops(
-    encoded: EncodedFlight, limits: Limits, plan: LinkLossMoments, margin: float = MARGIN
+    encoded: EncodedFlight,
+    limits: Limits,
+    plan: LinkLossMoments,
+    margin: float = MARGIN,
+    stops: NDArray | None = None,
 ) -> Assessment:
     """Simulate that the link is lost within stops from the setpoints of a flight, whose own link loss is `plan`.
 
-    A setpoint is at fault for a stop that was sampled from it; one from which none was is not. What was only looked at
+    `stops`, (N, M, 29) uint8, are those from every setpoint; where they are not given, they are made as needed. A
+    setpoint is at fault for a stop that was sampled from it; one from which none was is not. What was only looked at
     coarsely counts as ending as far out as it may.
     """
     count, length = len(encoded.payloads), round(DURATION * RATE) + 1
     sampled = _Sampled(np.full(count, -np.inf), np.full(count, _LEAST_REACH), np.zeros(count, dtype=int))
     about, done = np.ones((count, length), dtype=bool), np.zeros((count, length), dtype=bool)
+
+    def made(begin: NDArray) -> NDArray:
+        if stops is not None:
+            return stops[begin]
+        return encode_stops(encoded.motion, RATE, rows=begin, gains=encoded.gains, space=encoded.space)
+
     for every, each, near in GRIDS:
         asked = about & _every(count, every)[:, None] & _every(length, each) & ~done
         if not asked.any():
             break
-        about, done = _about(_sample(sampled, asked, encoded, limits, plan, margin) > -near, every, each), done | asked
+        about, done = (
+            _about(_sample(sampled, asked, encoded, limits, plan, margin, made) > -near, every, each),
+            done | asked,
+        )
     moments = replace(plan, wall=sampled.wall)
 
     def describe(at: int) -> str:
@@ -97,16 +112,22 @@ class _Sampled:
 
 
 def _sample(
-    sampled: _Sampled, asked: NDArray, encoded: EncodedFlight, limits: Limits, plan: LinkLossMoments, margin: float
+    sampled: _Sampled,
+    asked: NDArray,
+    encoded: EncodedFlight,
+    limits: Limits,
+    plan: LinkLossMoments,
+    margin: float,
+    made: Callable[[NDArray], NDArray],
 ) -> NDArray:
     """Lose the link in the stops from the setpoints and after the rows that are `asked`, (N, M).
 
-    Returns, (N, M), how far beyond the walls they end, as seen coarsely; what sends more than harmless rates is at inf,
-    what was not looked at at -inf.
+    `made` returns the stops from some setpoints. Returns, (N, M), how far beyond the walls they end, as seen coarsely;
+    what sends more than harmless rates is at inf, what was not looked at at -inf.
     """
     begin = np.flatnonzero(asked.any(axis=1))
     forks, starts = asked[begin], plan.snapshots[:, begin]
-    stops = encode_stops(encoded.motion, RATE, rows=begin, gains=encoded.gains, space=encoded.space)
+    stops = made(begin)
     seen = link_loss_within_stops(stops, starts, limits, forks, coarsely=True)
     beyond, reach, wall = seen.beyond + ALLOWANCE, _reach(seen), seen.wall
     in_doubt = ~(beyond < -margin)

@@ -39,8 +39,9 @@ LATER = (0, 15, 35)  # setpoints by which the vehicle may fly on before it turns
 LEAST_SPEED = 0.2  # m/s, to which requests may lower the speed
 PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
 HOVER = 0.05  # s, of the motion that a hover counts as
-STOPS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.8, 1.0, DURATION)
-"""s within which a request to stop is tried to be met: from 2 m/s the first would brake at 7.5 m/s², a tilt of 37°."""
+STOPS = (0.46, 0.48, 0.5, 0.52, 0.54, 0.55, 0.56, 0.58, 0.6, 0.65, 0.7, 0.8, 1.0, DURATION)
+"""s within which a request to stop is tried to be met. From 2 m/s straight on 0.54 s brake at 6.9 m/s², a tilt of 35°;
+where the vehicle turns or slows down already it is more or less."""
 
 
 class EndsBadlyError(InfeasibleError):
@@ -221,10 +222,11 @@ def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned:
     """
     splice = max(splice, held.exact_from)
     left = held.ends - splice / RATE
-    for duration in STOPS:
-        if duration < left:
+    if sooner := [duration for duration in STOPS if duration < left]:
+        encoded = _encoded_from(held, splice, limits)
+        for duration in sooner:
             with suppress(InfeasibleError, NotCertifiedError):
-                return stop_within(held, splice, duration, limits)
+                return _stop_along(encoded, held, splice, duration, limits)
     raise InfeasibleError(
         f"{max(left, 0.0):.1f} s before its end, the vehicle cannot stop sooner",
         where="stop",
@@ -238,7 +240,16 @@ def stop_within(held: HeldFlight, splice: int, duration: float, limits: Limits) 
     Raises NotCertifiedError where the stop exceeds what stops may reach, InfeasibleError where link loss or a gap
     within it would end badly.
     """
-    encoded = encode_trajectory(held.flown.since(splice / RATE), gains=gains_under(limits), space=limits.space)
+    return _stop_along(_encoded_from(held, splice, limits), held, splice, duration, limits)
+
+
+def _encoded_from(held: HeldFlight, splice: int, limits: Limits) -> EncodedFlight:
+    """Return the setpoints of what is held, from one on."""
+    return encode_trajectory(held.flown.since(splice / RATE), gains=gains_under(limits), space=limits.space)
+
+
+def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration: float, limits: Limits) -> Replanned:
+    """Return what stop_within() does; `encoded` are the setpoints of what is held from the splice on."""
     motion, gains, space = encoded.motion, encoded.gains, encoded.space
     first, second = np.array([0]), np.array([1])
     stop = encode_stops(motion, RATE, duration, second, gains, space)
@@ -315,7 +326,7 @@ def certified(
         if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
             raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
         if not limits.link_loss.only_warn:
-            within = assess_link_loss_of_stops(encoded, limits, lost, margin=0.0)
+            within = assess_link_loss_of_stops(encoded, limits, lost, margin=0.0, stops=stops.result())
             if not within.passed:
                 what = f"{within.what} from {within.time[within.worst]:.2f} s on {within.describe(within.worst)}"
                 raise EndsBadlyError(what, where="link loss", hint=OUTSIDE_HINT)
@@ -331,7 +342,8 @@ def certified(
         dry_run(encoded, flown, limits.airframe, limits.flight, snapshot=believed).require_passed()
 
     with ThreadPoolExecutor() as pool:  # compiled loops and most of numpy run side by side
-        snapshots, stops = pool.submit(lose_link), pool.submit(stop_everywhere)
+        stops = pool.submit(stop_everywhere)
+        snapshots = pool.submit(lose_link)
         gaps, rehearsed = pool.submit(meet_gaps), pool.submit(rehearse)
         gaps.result()
         rehearsed.result()

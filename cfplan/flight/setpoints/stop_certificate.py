@@ -86,13 +86,25 @@ def encode_certified_stops(
 
     Raises NotCertifiedError as certify_stops() does.
     """
-    begin, length = np.arange(len(motion.position)), round(DURATION * rate) + 1
-    stops, measured = np.empty((len(begin), length, PAYLOAD_SIZE), dtype=np.uint8), []
+    count, length = len(motion.position), round(DURATION * rate) + 1
+    begin = np.arange(_resting_from(motion) + 1)  # those behind are the same
+    stops, measured = np.empty((count, length, PAYLOAD_SIZE), dtype=np.uint8), []
     for some in chunks(len(begin)):
         made = stop_motion(motion, begin[some], rate, DURATION)
         stops[some] = encode_motion(*made, gains, space=space).reshape(-1, length, PAYLOAD_SIZE)
         measured.append(_measured(stops[some], made, begin, some.start, limits, rate, gains, space))
+    stops[len(begin) :] = stops[begin[-1]]
+    measured.append(np.repeat(measured[-1][:, -1:], count - len(begin), axis=1))
     return stops, _certificate(np.concatenate(measured, axis=1), limits)
+
+
+def _resting_from(motion: FullStateSetpoints) -> int:
+    """Return the first row from which on nothing of a motion changes."""
+    changes = np.zeros(len(motion.position), dtype=bool)
+    for name in FullStateSetpoints.__slots__:
+        values = getattr(motion, name)
+        changes[1:] |= (values[1:] != values[:-1]).any(axis=1)
+    return int(np.flatnonzero(changes).max(initial=0))
 
 
 def _measured(
