@@ -306,6 +306,25 @@ def steering(**given: Any) -> None:
     _measure(run, "flying", given)
 
 
+@study.command(epilog="Example: cfplan study horizon --known 3 --known 5 -o results/horizon.json")
+@_count(100, "Random paths.")
+@click.option("--waypoints", type=click.IntRange(3), default=20, show_default=True, help="Of each path.")
+@click.option(
+    "--known", type=click.IntRange(1), multiple=True,
+    help="Waypoints ahead that are known; may be given several times.  [default: 3]",
+)  # fmt: skip
+@_seed(0)
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@_output
+@options.as_json
+def horizon(**given: Any) -> None:
+    """Plan along paths of which only the next waypoints are known, against knowing them all: time lost."""
+    _use_one_thread()
+    from cfplan.studies.horizon import horizon as run
+
+    _measure(partial(run, _safety_file(Path())), "planning", given)
+
+
 @study.command(epilog="Example: cfplan study link-loss flights/line.yaml flights/helix.yaml -o results/link-loss.json")
 @_paths
 @click.option(
