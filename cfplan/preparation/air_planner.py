@@ -247,6 +247,8 @@ class _Worker:
                 made = plan_request(self._held, request, first, self._limits)
             except CfplanError as error:
                 return PathAnswer(request.number, PathVerdict.REFUSED, str(error))
+            except Exception as error:  # a fault here must not leave the rest of the flight without a planner
+                return PathAnswer(request.number, PathVerdict.REFUSED, f"fault in the planner: {error!r}")
             finally:
                 took.append(REAL_CLOCK.now() - begun)
             if isinstance(made, HeldFlight):

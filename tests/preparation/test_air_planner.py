@@ -9,12 +9,12 @@ import pytest
 from waiting import until
 
 from cfplan.flight.clock import REAL_CLOCK
-from cfplan.flight.pilot.proposals import ReceivedProposals
+from cfplan.flight.pilot.proposals import _ANSWER, _BEGUN, ReceivedProposals
 from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, Refusal, propose, splice
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.preparation.air_planner import AirPlanner, PathAnswer, PathVerdict, Wish
+from cfplan.preparation.air_planner import AirPlanner, PathAnswer, PathRequest, PathVerdict, Wish, _Worker
 from cfplan.preparation.replan import hold
 
 WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
@@ -143,3 +143,15 @@ def test_what_is_no_proposal_is_none(held):
     np.testing.assert_array_equal(read.stops, good.stops)
     for broken in (b"", b"proposal", message[:-1], message + b"x", b"text " * 1000, bytes(len(message))):
         assert Proposal.of_bytes(broken) is None
+
+
+def test_a_fault_in_planning_is_an_answer_and_what_is_held_stays(held, limits):
+    """The process would else be gone for the rest of the flight."""
+    (_main, requests), (pilot, proposals) = multiprocessing.Pipe(), multiprocessing.Pipe()
+    worker = _Worker(held, limits, requests, proposals)
+    pilot.send_bytes(_ANSWER.pack(_BEGUN, 0, 0, REAL_CLOCK.now()))
+    worker._read(1.0)
+    answer = worker._answer(PathRequest(1, Wish.REPLACE, ("no", "numbers")))
+    assert answer.verdict is PathVerdict.REFUSED
+    assert "fault in the planner: ValueError" in answer.reason
+    assert worker._held is held
