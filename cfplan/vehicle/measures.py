@@ -11,6 +11,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
 from cfplan.vehicle.flatness import ROUNDING, Flat
 from cfplan.vehicle.rotations import Scalar, Vector
 
@@ -80,3 +81,32 @@ def measures_of(
             )
         )
     )
+
+
+@njit(error_model="numpy", fastmath=ROUNDING)
+def measures_at_instants(velocity: NDArray, acceleration: NDArray, body_rate: NDArray, force: NDArray) -> NDArray:
+    """Return (MEASURES, N) of what instants tell, (N, 3) each; NaN where one is not known.
+
+    `force`, m/s², is the thrust over mass, as a vector.
+    """
+    out, nan = np.empty((MEASURES, len(force))), np.nan
+    for n in range(len(force)):
+        x, y, z = force[n, 0], force[n, 1], force[n, 2]
+        thrust = np.sqrt(x * x + y * y + z * z)
+        values = measures(
+            Flat(
+                (velocity[n, 0], velocity[n, 1], velocity[n, 2]),
+                (acceleration[n, 0], acceleration[n, 1], acceleration[n, 2]),
+                (nan, nan, nan),
+                (nan, nan, nan),
+                thrust,
+                (x / thrust, y / thrust, z / thrust),
+                (body_rate[n, 0], body_rate[n, 1], body_rate[n, 2]),
+                (nan, nan, nan),
+                (nan, nan, nan),
+                (nan, nan, nan, nan),
+            )
+        )
+        for row in range(MEASURES):
+            out[row, n] = values[row]
+    return out

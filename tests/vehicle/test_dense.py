@@ -11,7 +11,7 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.flatness import flat_state
-from cfplan.vehicle.measures import MEASURES
+from cfplan.vehicle.measures import MEASURES, measures_at_instants, measures_of
 from cfplan.vehicle.trigonometry import cosine, sine
 
 WAYPOINTS = [[0, 0, 1], [1.5, 1, 1.4], [1, -1.5, 0.6], [-1, 0.5, 1.2]]
@@ -67,3 +67,11 @@ def test_sine_and_cosine_are_those_of_the_library(angle):
 def test_what_is_no_number_has_neither():
     assert math.isnan(sine(math.nan))
     assert math.isnan(cosine(math.nan))
+
+
+def test_what_instants_tell_is_what_full_states_measure():
+    random = np.random.default_rng(8)
+    velocity, acceleration, body_rate, force = random.normal(size=(4, 50, 3)) + np.array([0.0, 0.0, 5.0])
+    thrust = np.linalg.norm(force, axis=1)
+    expected = measures_of(velocity, acceleration, body_rate, force / thrust[:, None], thrust)
+    np.testing.assert_allclose(measures_at_instants(velocity, acceleration, body_rate, force), expected, rtol=1e-12)

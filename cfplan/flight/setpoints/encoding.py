@@ -35,7 +35,7 @@ from cfplan.safety.quantities import INSTANT
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.joint import JoinedTrajectory
-from cfplan.vehicle.measures import measures_of
+from cfplan.vehicle.measures import measures_at_instants
 from cfplan.vehicle.rotations import heading_of, matrices_of, norms, write_quaternion, write_rotation
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -261,13 +261,8 @@ def _check_limits(
     quantum = np.sqrt(3) * HALF_QUANTUM + _ROUNDING
     force = flown.acceleration + _GRAVITY
     thrust = norms(force)
-    measured = measures_of(
-        velocity=flown.velocity,
-        acceleration=acceleration,
-        body_rate=flown.body_rate,
-        thrust_axis=force / thrust[:, None],
-        specific_thrust=thrust,
-    )
+    known = (flown.velocity, acceleration, flown.body_rate, force)
+    measured = measures_at_instants(*(np.array(each, dtype=float, order="C") for each in known))
     lean = quantum / thrust  # an error turns the thrust vector so far
     for quantity in INSTANT:
         value, limit = quantity.worst(measured), quantity.allowed(limits)
