@@ -4,9 +4,10 @@ A streamed setpoint's acceleration makes up for drag. That of a polynomial is th
 would trail behind by drag over stiffness, 7 cm at 2 m/s. But where the controller is known, so is the reference that
 makes it fly the plan: with e ahead of the plan, and F = m a + kp e + kd e' + ki ∫e what the controller asks for,
 
-    m e'' + kd e' + kp e + ki ∫e = (drag) v
+    m e'' + kd e' + kp e + ki ∫e = (drag) v + L m a'
 
-e is zero before the flight, and fades out behind it, as the controller's integral takes ten seconds to forget it.
+where L, along z alone, is for the lag with which motors give a thrust that changes. e is zero before the flight, and
+fades out behind it, as the controller's integral takes ten seconds to forget it.
 """
 
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from cfplan.vehicle.trajectory import Trajectory
 
 TAIL = 1.0  # s behind the plan in which the reference comes back to its end
 HALF_TICK = 0.005  # s by which the commander's goals are late in the mean, as each is held for 10 ms
+LIFT_LAG = 0.5  # times the motors' time constant: L. In the simulator more slows flights and gains nothing
 _STEP = 1e-3  # s
 
 
@@ -79,12 +81,13 @@ class PolynomialReference:
         return np.array([[*first.position, first.yaw], [*last.position, last.yaw]])
 
     def _find_lead(self) -> NDArray:
-        """Return e and four derivatives by the transfer functions from drag to e, (N, 5, 3)."""
+        """Return e and four derivatives by the transfer functions from what pulls to e, (N, 5, 3)."""
         airframe = self.trajectory.airframe
         plan = self.plan_at(np.arange(int(np.ceil(self.duration / _STEP)) + 2) * _STEP + HALF_TICK)[:, :, :3]
         out = np.zeros_like(plan)
         drag = np.array([airframe.drag[0], airframe.drag[0], airframe.drag[1]])
-        pull, pull_dt = drag * plan[:, 1], drag * plan[:, 2]
+        lag = np.array([0.0, 0.0, LIFT_LAG * airframe.motor_time_constant * airframe.mass])
+        pull, pull_dt = drag * plan[:, 1] + lag * plan[:, 3], drag * plan[:, 2] + lag * plan[:, 4]
         for axis in range(3):
             mass, kd, kp, ki = _stiffness(airframe, axis)
             for order in range(3):
