@@ -137,7 +137,11 @@ def ablation(
         for number, (name, view) in enumerate(VIEWS.items()):
             training_set = read_training_set(dataset, view=view)
             if training_set.spec.seed == UNSEEN_SEED:
-                raise InputError(f"its seed is {UNSEEN_SEED}, that of the unseen paths", where=str(dataset))
+                raise InputError(
+                    f"its seed is {UNSEEN_SEED}, that of the unseen paths",
+                    where=str(dataset),
+                    hint="make one with another --seed by `cfplan dataset make`",
+                )
             some = training_set.part(np.arange(min(rows, len(training_set.rows))))
             train_on(some, FilePath(folder, f"view-{number}"), Options(epochs=epochs), on_epoch=another)
             models[name] = load_model(FilePath(folder, f"view-{number}")), view
