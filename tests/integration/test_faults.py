@@ -187,8 +187,8 @@ def test_a_vehicle_that_is_left_alone_in_any_phase_comes_down_beneath_and_disarm
 @pytest.mark.slow
 @pytest.mark.xfail(
     strict=True,
-    reason="since blind landings end 0.3 m beneath the floor, 9 of 48 stop their motors up to 0.32 m above it; a gentler "
-    "descent keeps them on but drifts outside in seed 1955 of the random faults",
+    reason="since blind landings end 0.3 m beneath the floor, 9 of 48 stop their motors up to 0.32 m above it; "
+    "a gentler descent keeps them on but drifts outside in seed 1955 of the random faults",
 )
 def test_without_poses_for_good_the_vehicle_comes_down_inside_and_touches_the_floor_softly(missions):
     names, speeds = sorted(missions), []
