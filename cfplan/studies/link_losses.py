@@ -32,7 +32,13 @@ COLUMNS = (
     Column("distance", "comes down", "m", ".1f", meaning="horizontally from the last setpoint, from the worst moment"),
     Column("beyond", "beyond the walls", "m", ".1f", meaning="negative inside"),
     Column("alone_distance", "without watchdog: comes down", "m", ".1f"),
-    Column("alone_beyond", "without watchdog: beyond the walls", "m", ".1f"),
+    Column(
+        "alone_beyond",
+        "without watchdog: beyond the walls",
+        "m",
+        ".1f",
+        meaning="of the same plan, which was made for a vehicle with one; `firmware.watchdog: false` plans for one without",
+    ),  # fmt: skip
 )
 
 
