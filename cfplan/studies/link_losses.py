@@ -37,8 +37,8 @@ COLUMNS = (
         "without watchdog: beyond the walls",
         "m",
         ".1f",
-        meaning="of the same plan, which was made for a vehicle with one; `firmware.watchdog: false` plans for one without",
-    ),  # fmt: skip
+        meaning="of the same plan, which is for a vehicle with one; `firmware.watchdog: false` plans for one without",
+    ),
 )
 
 
