@@ -167,9 +167,18 @@ def _waypoint_derivatives(points: NDArray, times: NDArray, start: NDArray | None
         solution[0] = start
         force[1] -= beside[0].T @ start
     if last > first:
-        solution[first:last] = _solve_block_tridiagonal(
-            diagonal[first:last], beside[first : last - 1], force[first:last]
-        )
+        try:
+            solution[first:last] = _solve_block_tridiagonal(
+                diagonal[first:last], beside[first : last - 1], force[first:last]
+            )
+        except np.linalg.LinAlgError:
+            far = int(np.argmax(times))
+            raise InputError(
+                f"from the point before it is {np.linalg.norm(points[far + 1] - points[far]):g} m, others are "
+                f"{np.linalg.norm(np.diff(points, axis=0), axis=1).min():g} m apart: no smooth path joins these",
+                where=f"waypoint {far + 2}",
+                hint="correct the coordinate that slipped, or add points between",
+            ) from None
     return solution
 
 

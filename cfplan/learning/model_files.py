@@ -29,6 +29,7 @@ WEIGHTS, CARD = "weights.safetensors", "card.json"
 FORMAT = 2
 LARGEST = 10_000  # layers, hidden numbers of each, and intervals of a window
 HEAVIEST = 1e6  # weight; trained ones are a few
+WIDEST = 100.0  # either end of a range; most are logarithms
 FURTHEST = 4.0  # beyond a range, in its own widths, that counts: what is further away is as bad
 _RETRAIN = "train it again with `cfplan train`"
 _RESTORE = "restore both files from where the model came, or train it again with `cfplan train`"
@@ -223,6 +224,6 @@ def _card(text: Mapping[str, Any]) -> Card:
     if tuple(card.ranges) != NUMBERS:
         raise ValueError(f"ranges are not of {', '.join(NUMBERS)}")
     for name, (low, high) in card.ranges.items():
-        if not -math.inf < low <= high < math.inf:
+        if not -WIDEST <= low <= high <= WIDEST:
             raise ValueError(f"the range of {name} is {low} to {high}")
     return card

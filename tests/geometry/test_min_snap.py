@@ -181,3 +181,12 @@ def test_any_waypoints_give_a_path_through_them_or_an_error(points):
         return
     reached = path(path.breaks) if len(points) > 2 else path([0.0, path.end])
     np.testing.assert_allclose(reached, points, atol=1e-6)
+
+
+def test_a_coordinate_that_slipped_by_kilometres_is_named():
+    """Found by fuzzing: beside a segment of 65 km the others leave no digits to solve with."""
+    angle = np.linspace(0.0, 2 * np.pi, 25)
+    circle = 1.4 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    circle[22, 0] = 65535.0
+    with pytest.raises(InputError, match=r"waypoint 2[34].*no smooth path joins these"):
+        smooth_through(circle)

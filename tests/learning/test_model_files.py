@@ -117,6 +117,7 @@ def test_anything_that_is_no_card_is_one_line(saved, content):
         {"ranges": {"acceleration": [0, 1]}},
         {"ranges": dict.fromkeys(NUMBERS, (2, 1))},
         {"ranges": dict.fromkeys(NUMBERS, (0, math.nan))},
+        {"ranges": dict.fromkeys(NUMBERS, (-8192, 1))},
         {"ranges": dict.fromkeys(NUMBERS, ("low", "high"))},
     ],
 )
