@@ -232,7 +232,8 @@ PLAN_LIMITS = {"peak_speed": "speed", "peak_acceleration": "acceleration", "peak
 
 def shares(summary: FlightSummary, limits: PlanLimits) -> dict[str, float]:
     """Return each peak's share of the plan's limit; NaN where the record holds no peak or no limit."""
-    return {peak: getattr(summary, peak) / getattr(limits, limit) for peak, limit in PLAN_LIMITS.items()}
+    allowed = {peak: getattr(limits, limit) for peak, limit in PLAN_LIMITS.items()}
+    return {peak: getattr(summary, peak) / most if most > 0.0 else math.nan for peak, most in allowed.items()}
 
 
 def summary_rows(summary: FlightSummary, limits: PlanLimits) -> list[tuple[str, str]]:

@@ -15,7 +15,7 @@ from cfplan.recording.path_distance import BLOCK, distance_to_path
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import Record
 from cfplan.recording.rerun.states import supervisor_states
-from cfplan.recording.summary import SETTLED, deviation, dropouts, pose_gaps, settling, summarise, summary_text
+from cfplan.recording.summary import SETTLED, deviation, dropouts, pose_gaps, settling, shares, summarise, summary_text
 from cfplan.recording.writer import RecordWriter
 
 BEGIN, TRAVEL, HELD = 100.0, 4.0, 2.0  # s
@@ -239,3 +239,11 @@ def test_the_supervisor_is_named_by_its_gravest_bit():
     bits = np.array([0, 0b1, 0b11, 0b11011, 0b1011011, 0b10000000, 0b100])
     wanted = ["not ready", "can be armed", "armed", "flying", "locked", "crashed", "not ready"]
     assert supervisor_states(bits).tolist() == wanted
+
+
+def test_a_limit_of_zero_in_a_damaged_header_has_no_share(flight):
+    """Found by fuzzing."""
+    limits = dataclasses.replace(flight.header.plan_limits, speed=0.0)
+    found = shares(summarise(flight.record), limits)
+    assert math.isnan(found["peak_speed"])
+    assert found["peak_body_rate"] > 0.0
