@@ -8,6 +8,8 @@ Where `answers` are given, the answer before is the true one (teacher forcing), 
 """
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from enum import StrEnum
 from itertools import pairwise
 from types import MappingProxyType
@@ -43,7 +45,7 @@ HEADS = 4
 MOST_LOG = 10.0  # of h: farther out are no answers but accidents
 
 
-class SequenceNetwork(nn.Module):
+class SequenceNetwork(nn.Module, ABC):
     """What the networks have in common: the normalisation of what they see and say."""
 
     def __init__(self, inputs: int) -> None:
@@ -70,9 +72,9 @@ class SequenceNetwork(nn.Module):
         """Return answers as the network has them, in which errors are measured."""
         return (_with_logarithm(answers) - self.middle) / self.spread
 
+    @abstractmethod
     def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
         """Map what is scaled to what is scaled."""
-        raise NotImplementedError
 
 
 class LstmEncoderDecoder(SequenceNetwork):
@@ -178,7 +180,7 @@ class StepMlp(SequenceNetwork):
         return before[:, REACH:]
 
 
-_NETWORKS = {
+_NETWORKS: dict[Kind, Callable[[int, Size], SequenceNetwork]] = {
     Kind.LSTM: LstmEncoderDecoder, Kind.TRANSFORMER: TransformerEncoderDecoder, Kind.ENCODER: EncoderTransformer,
     Kind.MLP: StepMlp,
 }  # fmt: skip

@@ -36,7 +36,7 @@ from cfplan.studies.paper.networks import (
     trained_networks,
 )
 from cfplan.studies.paper.printed import ROBUSTNESS, TEST
-from cfplan.studies.paper.trials import FLOWN, NODES, PAPER_LAG, paper_task
+from cfplan.studies.paper.trials import FLOWN, NODES, PAPER_LAG, finite_mean, paper_task
 from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
@@ -230,21 +230,16 @@ def _row(own: Sequence[RobustnessTrial]) -> dict[str, Any]:
         "model": own[0].model,
         "epsilon": own[0].epsilon,
         "trials": len(own),
-        "deviation": _mean(LOST if trial.failed else trial.deviation for trial in own),
-        "deviation_flown": _mean(trial.deviation for trial in own if not trial.failed),
+        "deviation": finite_mean(LOST if trial.failed else trial.deviation for trial in own),
+        "deviation_flown": finite_mean(trial.deviation for trial in own if not trial.failed),
         "failed": sum(trial.failed for trial in own),
-        "slower": _mean(trial.travel_time / trial.own_time - 1.0 for trial in own),
-        "slower_clean": _mean(trial.travel_time / trial.clean_time - 1.0 for trial in own),
-        "h_variation": _mean(trial.h_variation for trial in own),
-        "yaw_variation": _mean(trial.yaw_variation for trial in own),
+        "slower": finite_mean(trial.travel_time / trial.own_time - 1.0 for trial in own),
+        "slower_clean": finite_mean(trial.travel_time / trial.clean_time - 1.0 for trial in own),
+        "h_variation": finite_mean(trial.h_variation for trial in own),
+        "yaw_variation": finite_mean(trial.yaw_variation for trial in own),
         **{f"reached_{k + 1}": float(share) for k, share in enumerate(reached.mean(axis=0))},
         "paper_deviation": printed.deviation if printed else None,
         "paper_slower": printed.slower if printed else None,
         "paper_variation": printed.variation if printed else None,
         "paper_in_brt": printed.in_brt if printed else None,
     }
-
-
-def _mean(values: Iterable[float]) -> float:
-    finite = [value for value in values if np.isfinite(value)]
-    return float(np.mean(finite)) if finite else float("nan")

@@ -167,15 +167,17 @@ def planner_row(
         "planner": trials[0].planner,
         "part": trials[0].part,
         "paths": len(trials),
-        "deviation": _mean(LOST if trial.failed else trial.deviation for trial in trials),
-        "deviation_flown": _mean(trial.deviation for trial in flown),
-        "violation": _mean(trial.violation for trial in trials),
-        "asked_violation": _mean(trial.asked_violation for trial in trials),
-        "above": _mean(max(trial.top_speed / PAPER.limits.speed - 1.0, 0.0) for trial in trials if not trial.reason),
-        "slower": _mean(trial.travel_time / against[trial.row] - 1.0 for trial in trials),
-        "slower_flown": _mean(trial.travel_time / against[trial.row] - 1.0 for trial in flown),
+        "deviation": finite_mean(LOST if trial.failed else trial.deviation for trial in trials),
+        "deviation_flown": finite_mean(trial.deviation for trial in flown),
+        "violation": finite_mean(trial.violation for trial in trials),
+        "asked_violation": finite_mean(trial.asked_violation for trial in trials),
+        "above": finite_mean(
+            max(trial.top_speed / PAPER.limits.speed - 1.0, 0.0) for trial in trials if not trial.reason
+        ),
+        "slower": finite_mean(trial.travel_time / against[trial.row] - 1.0 for trial in trials),
+        "slower_flown": finite_mean(trial.travel_time / against[trial.row] - 1.0 for trial in flown),
         "failed": sum(trial.failed for trial in trials),
-        "seconds": _mean(trial.seconds for trial in trials),
+        "seconds": finite_mean(trial.seconds for trial in trials),
         "paper_deviation": printed.deviation if printed else None,
         "paper_violation": printed.violation if printed else None,
         "paper_slower": printed.slower if printed else None,
@@ -184,6 +186,7 @@ def planner_row(
     }
 
 
-def _mean(values: Iterable[float]) -> float:
+def finite_mean(values: Iterable[float]) -> float:
+    """Return the mean of what is finite; NaN where nothing is."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else float("nan")
