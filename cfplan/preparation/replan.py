@@ -28,8 +28,8 @@ from cfplan.planning.plan_result import Plan
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import dry_run
-from cfplan.simulation.glitches import glitch_at_sampled_setpoints
-from cfplan.simulation.link_loss import as_believed, link_loss_near_walls
+from cfplan.simulation.glitches import glitch_where_nearly_lost
+from cfplan.simulation.link_loss import as_believed, link_loss_at_walls
 from cfplan.vehicle.hover import hover_at
 from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.rotations import yaw_of
@@ -263,10 +263,10 @@ def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration:
     after = [padded[min(row, len(rows)) :][: whole.shape[1]] for row in range(len(payloads) - 1)]
     stops = np.concatenate([whole, np.stack(after)])
     starts = held.snapshots[:, min(splice - held.begin, held.snapshots.shape[1] - 1)]
-    lost = link_loss_near_walls(payloads, limits, 0.0, starts=starts)
+    lost = link_loss_at_walls(payloads, limits, starts=starts)
     if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
         raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
-    glitches = glitch_at_sampled_setpoints(payloads, limits, start=as_believed(starts, limits))
+    glitches = glitch_where_nearly_lost(payloads, limits, start=as_believed(starts, limits))
     if glitches.lost.any():
         raise EndsBadlyError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
     end, rests_from = decode(rest), splice + len(rows)
@@ -322,7 +322,7 @@ def certified(
         return stops
 
     def lose_link() -> NDArray:
-        lost = link_loss_near_walls(encoded.payloads, limits, 0.0, starts=starts)
+        lost = link_loss_at_walls(encoded.payloads, limits, starts=starts)
         if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
             raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
         if not limits.link_loss.only_warn:
@@ -333,7 +333,7 @@ def certified(
         return lost.snapshots
 
     def meet_gaps() -> None:
-        glitches = glitch_at_sampled_setpoints(encoded.payloads, limits, start=believed)
+        glitches = glitch_where_nearly_lost(encoded.payloads, limits, start=believed)
         if glitches.lost.any():
             raise EndsBadlyError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
 

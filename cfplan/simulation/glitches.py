@@ -88,15 +88,30 @@ def glitch_at_sampled_setpoints(
 ) -> GlitchMoments:
     """Let a gap begin at every tenth setpoint of a flight, and at each where one of these nearly loses the vehicle.
 
+    So at those about the worst one. Arguments as for glitch_at_every_setpoint.
+    """
+    return _sampled(payloads, limits, rate, start, _NEAR_WORST)
+
+
+def glitch_where_nearly_lost(
+    payloads: NDArray, limits: Limits, rate: float = RATE, *, start: NDArray | None = None
+) -> GlitchMoments:
+    """Return as glitch_at_sampled_setpoints() does which gaps lose the vehicle; where none does, not quite the worst.
+
     Arguments as for glitch_at_every_setpoint.
     """
+    return _sampled(payloads, limits, rate, start, -math.inf)
+
+
+def _sampled(payloads: NDArray, limits: Limits, rate: float, start: NDArray | None, near_worst: float) -> GlitchMoments:
+    """Return what gaps do that begin where sampled, where one nearly loses the vehicle, and that near to the worst."""
     whole = _as_sampled(len(payloads), limits)
     first = np.where(_every(len(payloads), SAMPLED_EVERY), whole.max(), 0)
     found = _simulate(payloads, limits, first, rate, start=start)
     moments = _moments(found, limits, rate)
     share = np.fmax(moments.deviation / limits.flight.deviation.cut, moments.tilt / TURNED_OVER).max(axis=0)
     share[moments.lost.any(axis=0)] = np.inf
-    kinds = np.where((first == 0) & ~(share < min(NEARLY, share.max() - _NEAR_WORST)), whole, 0)
+    kinds = np.where((first == 0) & ~(share < min(NEARLY, share.max() - near_worst)), whole, 0)
     if kinds.any():
         more = _simulate(payloads, limits, kinds, rate, start=start)
         for kind in range(len(KINDS)):

@@ -68,6 +68,7 @@ _SETTLED_RATE = 0.2  # rad/s, below which it hardly turns
 _COAST_STEP = 0.01  # s, of the place alone
 _NEAR = 0.1  # m from a wall, within which it also matters that the accelerometer may say too much
 _COARSE_EVERY = 2  # setpoints between those that are looked at coarsely
+_FORESEEN_EVERY = 16  # likewise, for an estimate
 ALLOWANCE = 0.1  # m, by which what is looked at coarsely may end farther out; 0.07 m at most in 36 flights, to 3 m/s
 _SLOW_EVERY, _SLOW_ALLOWANCE = (
     8,
@@ -128,7 +129,8 @@ def link_loss_at_every_setpoint(
     The flight begins in hover, or from the snapshots `starts`, (L, 31), of another at the same setpoint.
     """
     state = decode(payloads)
-    return _lose_link(state, limits, rate, _begins(state, limits, starts), np.ones(len(payloads), dtype=np.bool_))
+    snapshots = _snapshots(state, limits, rate, _begins(state, limits, starts))
+    return _lose_link(state, limits, rate, snapshots, np.ones(len(payloads), dtype=np.bool_))
 
 
 def link_loss_near_walls(
@@ -142,14 +144,39 @@ def link_loss_near_walls(
     """
     state = decode(payloads)
     begins = _begins(state, limits, starts)
-    seen = _look_coarsely(state, limits, rate, begins)
+    seen, snapshots = _look_coarsely(state, limits, rate, begins), _snapshots(state, limits, rate, begins)
     forks = ~(seen.beyond + ALLOWANCE < -within)
     forks[seen.beyond.argmax()] = True
-    found = _lose_link(state, limits, rate, begins, forks, seen)
+    found = _lose_link(state, limits, rate, snapshots, forks, seen)
     others = ~forks & (found.beyond > found.beyond[forks].max())
     if others.any():  # which may be worse
-        found = _lose_link(state, limits, rate, begins, forks | others, seen)
+        found = _lose_link(state, limits, rate, snapshots, forks | others, seen)
     return found
+
+
+def link_loss_at_walls(
+    payloads: NDArray, limits: Limits, rate: float = RATE, starts: NDArray | None = None
+) -> LinkLossMoments:
+    """Lose the link after each setpoint that may leave the vehicle beyond a wall.
+
+    As link_loss_near_walls does, but of a flight that ends inside from everywhere it does not find the worst moment.
+    """
+    state = decode(payloads)
+    begins = _begins(state, limits, starts)
+    seen = _look_coarsely(state, limits, rate, begins)
+    forks = ~(seen.beyond + ALLOWANCE < 0.0)
+    return _lose_link(state, limits, rate, _snapshots(state, limits, rate, begins), forks, seen)
+
+
+def foreseen_link_loss(
+    payloads: NDArray, limits: Limits, rate: float = RATE, starts: NDArray | None = None
+) -> LinkLossMoments:
+    """Return about how each setpoint ends, were it the last one: an estimate, by one motor lag and coarse steps.
+
+    It takes a tenth of what link_loss_at_walls() takes.
+    """
+    state = decode(payloads)
+    return _look_coarsely(state, limits, rate, _begins(state, limits, starts), _FORESEEN_EVERY)
 
 
 def _begins(state: FullStateSetpoints, limits: Limits, starts: NDArray | None) -> list[NDArray]:
@@ -157,37 +184,62 @@ def _begins(state: FullStateSetpoints, limits: Limits, starts: NDArray | None) -
     return [hovering_snapshot(limits.airframe, state)] * len(_lags(limits)) if starts is None else list(starts)
 
 
+def _snapshots(state: FullStateSetpoints, limits: Limits, rate: float, begins: list[NDArray]) -> NDArray:
+    """Return (L, N, 31) vehicle and controller at each setpoint, for each motor lag, where the link is not lost."""
+    nowhere, wrong = np.zeros(len(state.position), dtype=np.bool_), _wrong(limits)
+
+    def one(body: tuple[NDArray, NDArray], begin: NDArray) -> NDArray:
+        return _swept(state, limits, body, rate, begin, nowhere, wrong)[1]
+
+    with ThreadPoolExecutor() as pool:  # a motor lag each
+        return np.array(list(pool.map(one, _bodies(limits), begins)))
+
+
 def _lose_link(
     state: FullStateSetpoints,
     limits: Limits,
     rate: float,
-    begins: list[NDArray],
+    snapshots: NDArray,
     forks: NDArray,
     seen: LinkLossMoments | None = None,
 ) -> LinkLossMoments:
-    """Lose the link after the setpoints where `forks`, (N,), says so; the others end as seen coarsely, or farther."""
-    wrong, bodies = _wrong(limits), _bodies(limits)
-    time = np.arange(len(state.position)) / rate
+    """Lose the link after the setpoints where `forks`, (N,), says so; the others end as seen coarsely, or farther.
 
-    def swept(forks: NDArray, wrong: NDArray) -> tuple[list[NDArray], list[NDArray]]:
-        def one(body: tuple[NDArray, NDArray], begin: NDArray) -> tuple[NDArray, NDArray]:
-            return _swept(state, limits, body, rate, begin, forks, wrong)
-
-        with ThreadPoolExecutor() as pool:  # a motor lag each
-            flown = list(pool.map(one, bodies, begins))
-        return [boxes for boxes, _ in flown], [snapshots for _, snapshots in flown]
-
-    boxes, snapshots = swept(forks, wrong)
-    if seen is not None:
-        coarse = np.stack([seen.low, seen.high], axis=1)
-        boxes = [np.where(forks[:, None, None], box, coarse) for box in boxes]
+    `snapshots`, (L, N, 31), are at each setpoint, for each motor lag.
+    """
+    time, wrong = np.arange(len(state.position)) / rate, _wrong(limits)
+    coarse = None if seen is None else np.stack([seen.low, seen.high], axis=1)
+    boxes = _boxes(state, limits, rate, snapshots, forks, wrong, coarse)
     found = _judge(time, state.position, boxes, limits, snapshots)
     near = forks & ~(found.beyond < -_NEAR)
     if wrong[_LIFT] and near.any():
-        also, _ = swept(near, wrong * (1.0, 1.0, -1.0, 1.0))
-        sinking = [np.where(near[:, None, None], box, boxes[0]) for box in also]
+        sinking = _boxes(state, limits, rate, snapshots, near, wrong * (1.0, 1.0, -1.0, 1.0), boxes[0])
         found = _judge(time, state.position, boxes + sinking, limits, snapshots)
     return found if seen is None else replace(found, beyond=np.where(forks, found.beyond, found.beyond + ALLOWANCE))
+
+
+def _boxes(
+    state: FullStateSetpoints,
+    limits: Limits,
+    rate: float,
+    snapshots: NDArray,
+    forks: NDArray,
+    wrong: NDArray,
+    others: NDArray | None,
+) -> list[NDArray]:
+    """Return for each motor lag the boxes, (N, 2, 3), swept from where `forks` says so; `others` at the others."""
+    rows = setpoint_rows(state)[forks][:, None]
+    once, arrivals, steps = np.ones((len(rows), 1), dtype=np.bool_), arrival_steps(1, rate), _steps(limits)
+
+    def one(body: tuple[NDArray, NDArray], begins: NDArray) -> NDArray:
+        swept = np.empty((len(rows), 1, 2, 3))
+        _fly_stops(swept, rows, begins[forks], once, _gains(limits), *body, *steps, arrivals, wrong)
+        boxes = np.empty((len(forks), 2, 3)) if others is None else others.copy()
+        boxes[forks] = swept[:, 0]
+        return boxes
+
+    with ThreadPoolExecutor() as pool:  # a motor lag each
+        return list(pool.map(one, _bodies(limits), snapshots))
 
 
 def _look_coarsely(
@@ -204,7 +256,8 @@ def _look_coarsely(
     after = np.where(looked_at, before, np.minimum(before + 1, len(rows) - 1))
     boxes = boxes[rows]
     low, high = np.minimum(boxes[before, 0], boxes[after, 0]), np.maximum(boxes[before, 1], boxes[after, 1])
-    return _judge(np.arange(count) / rate, state.position, [np.stack([low, high], axis=1)], limits, [])
+    box, no_snapshots = np.stack([low, high], axis=1), np.empty((0, count, SNAPSHOT_SIZE))
+    return _judge(np.arange(count) / rate, state.position, [box], limits, no_snapshots)
 
 
 def as_believed(snapshots: NDArray, limits: Limits) -> NDArray:
@@ -237,7 +290,7 @@ def link_loss_within_stops(
         with ThreadPoolExecutor() as pool:  # a motor lag each
             boxes = list(pool.map(one, _bodies(limits), begins))
     times, places = np.nonzero(forks)[1] / rate, rows[..., 0:3][forks]
-    return _judge(times, places, boxes, limits, [np.empty((0, SNAPSHOT_SIZE))] * len(boxes))
+    return _judge(times, places, boxes, limits, np.empty((len(boxes), 0, SNAPSHOT_SIZE)))
 
 
 def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLossMoments:
@@ -262,9 +315,7 @@ def _wrong(limits: Limits) -> NDArray:
     return np.array([push, damping, wrong.vertical_acceleration_error, wrong.velocity_error])
 
 
-def _judge(
-    time: NDArray, place: NDArray, boxes: list[NDArray], limits: Limits, snapshots: list[NDArray]
-) -> LinkLossMoments:
+def _judge(time: NDArray, place: NDArray, boxes: list[NDArray], limits: Limits, snapshots: NDArray) -> LinkLossMoments:
     """Return the worst of the boxes, (N, 2, 3) m, of each motor lag."""
     low, high = np.min([box[:, 0] for box in boxes], axis=0), np.max([box[:, 1] for box in boxes], axis=0)
     space = np.array([limits.space.low, limits.space.high])
@@ -273,9 +324,8 @@ def _judge(
     )
     away = np.maximum(place - low, high - place)[:, :2]
     return LinkLossMoments(
-        time, place, low, high, out.max(axis=1), np.argmax(out, axis=1), np.hypot(away[:, 0], away[:, 1]),
-        np.array(snapshots),
-    )  # fmt: skip
+        time, place, low, high, out.max(axis=1), np.argmax(out, axis=1), np.hypot(away[:, 0], away[:, 1]), snapshots
+    )
 
 
 def _bodies(limits: Limits) -> list[tuple[NDArray, NDArray]]:

@@ -21,6 +21,7 @@ from cfplan.simulation.glitches import (
     WITHOUT_POSES_EVERY,
     glitch_at_every_setpoint,
     glitch_at_sampled_setpoints,
+    glitch_where_nearly_lost,
 )
 
 REPOSITORY = Path(__file__).parents[2]
@@ -111,7 +112,11 @@ def test_sampled_gaps_say_the_same_where_the_vehicle_is_nearly_lost_and_little_l
     assert np.all(sampled.deviation > found.deviation - 0.1 * limits.flight.deviation.cut)
     cut = found.deviation.max() / 0.9  # then some are nearly lost
     strict = replace(limits, flight=replace(limits.flight, deviation=replace(limits.flight.deviation, cut=cut)))
-    sampled = glitch_at_sampled_setpoints(line, strict)
+    for sampled in (glitch_at_sampled_setpoints(line, strict), glitch_where_nearly_lost(line, strict)):
+        _same_where_nearly_lost(sampled, found, cut, line)
+
+
+def _same_where_nearly_lost(sampled, found, cut, line):
     nearly = (np.fmax(found.deviation / cut, found.tilt / TURNED_OVER) > NEARLY + 0.15).any(axis=0)
     assert 0 < np.count_nonzero(nearly) < len(line)
     np.testing.assert_array_equal(sampled.deviation[:, nearly], found.deviation[:, nearly])

@@ -18,7 +18,9 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.link_loss import (
     ALLOWANCE,
+    foreseen_link_loss,
     link_loss_at_every_setpoint,
+    link_loss_at_walls,
     link_loss_near_walls,
     link_loss_of_slow_motion,
     link_loss_within_stops,
@@ -233,6 +235,24 @@ def test_what_may_end_near_a_wall_is_simulated_and_of_the_rest_is_known_how_far_
         assert np.all(found.beyond >= all_of_them.beyond)
         assert np.all(found.beyond <= all_of_them.beyond + 2.5 * ALLOWANCE)
         np.testing.assert_array_equal(found.snapshots, all_of_them.snapshots)
+
+
+@pytest.mark.parametrize("name", ["line", "scan"])
+def test_whether_any_ends_beyond_a_wall_is_known_without_the_worst_moment(name, limits):
+    """In the shipped room none does; in one whose walls are where the vehicle comes to, some do."""
+    payloads = prepare_mission(REPOSITORY / "flights" / f"{name}.yaml", limits).payloads
+    exact = link_loss_at_every_setpoint(payloads, limits)
+    found = link_loss_at_walls(payloads, limits)
+    assert exact.worst.beyond <= found.worst.beyond <= 0.0
+    np.testing.assert_array_equal(found.snapshots, exact.snapshots)
+    narrow = replace(limits.space, high=(*(exact.high[:, :2].max(axis=0) - 0.01), limits.space.high[2]))
+    narrow = replace(limits, space=narrow)
+    exact, found = link_loss_at_every_setpoint(payloads, narrow), link_loss_at_walls(payloads, narrow)
+    assert found.worst == exact.worst
+    assert found.worst.beyond > 0.0
+    beyond = exact.beyond > 0.0
+    np.testing.assert_array_equal(found.beyond[beyond], exact.beyond[beyond])
+    assert np.all(foreseen_link_loss(payloads, narrow).beyond[beyond] > -ALLOWANCE)
 
 
 def test_stops_from_a_flight_are_harmless_too(line, limits):
