@@ -1,0 +1,118 @@
+"""Manoeuvres: the phases in the air as a pilot asks for them, and what all ways to fly them share."""
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+from cfplan.errors import PreflightError
+from cfplan.flight.pilot.abort_monitor import safety_abort
+from cfplan.flight.pilot.flight_loop import AbortRaised, FlightLoop
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.pilot.stream import Stream
+from cfplan.flight.radio.supervisor_bits import ARMED, CAN_FLY, FAULTS, FLYING
+from cfplan.flight.telemetry import Triple
+
+_AT_PLACE_WITHIN = 0.06  # m
+_AT_START_FOR = 0.5  # s
+_READY_WITHIN = 1.0  # s; a vehicle that arms itself is briefly not ready now and then
+# m above the floor: when the setpoint has reached the first, the pose must have reached the second
+_ASKED_TO_RISE, _RISEN = 0.12, 0.015
+
+
+class Manoeuvres(Protocol):
+    """The phases of a flight in the air. Each may raise AbortRaised and LinkLost."""
+
+    def take_off(self) -> None:
+        """Climb to a hover. Raises PreflightError where the vehicle stays on the floor."""
+
+    def go_to_start(self) -> None:
+        """Fly to where the plan begins."""
+
+    def fly_plan(self) -> None:
+        """Fly the plan to its end, and hover."""
+
+    def land(self) -> None:
+        """Land after the plan, and stop the motors."""
+
+    def brake(self) -> None:
+        """Leave the plan: brake to a hover, hold it, and land."""
+
+    def stop_and_land(self) -> None:
+        """Leave the plan: brake, and land at once."""
+
+
+def require_ready(loop: FlightLoop) -> None:
+    """Wait until the vehicle's supervisor says that it may fly: it ignores setpoints until then.
+
+    Raises PreflightError if it does not say so.
+    """
+    if loop.until(lambda: loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, _READY_WITHIN):
+        return
+    faults = " and ".join(fault for bit, fault in FAULTS.items() if loop.bits(bit))
+    armed = "is armed and not ready to fly" if loop.bits(ARMED) else "is no longer armed"
+    raise PreflightError(
+        f"the vehicle may not take off: it {faults or armed}",
+        where="vehicle",
+        hint="restart it on a level floor; its console says more",
+    )
+
+
+def climb(loop: FlightLoop, way: Stream, floor: float, height: float, stop: Callable[[], object]) -> None:
+    """Wait until the vehicle has climbed along `way` from the `floor` to a `height`, m; `stop` stops its motors.
+
+    Raises PreflightError where it stays on the floor, and AbortRaised where it hardly rises.
+    """
+
+    def stays() -> bool:
+        return _pose_stays(loop, way, floor)
+
+    if loop.until(lambda: loop.now() > way.end or stays(), math.inf) and stays():
+        _stay_down(loop, stop)
+    loop.until(lambda: abs(loop.pose().position[2] - height) < _AT_PLACE_WITHIN, 2.0)
+    if loop.pose().position[2] - floor < (height - floor) / 2:
+        raise AbortRaised(safety_abort(Rung.LAND, "the vehicle does not rise"))
+
+
+def _pose_stays(loop: FlightLoop, way: Stream, floor: float) -> bool:
+    """Return whether the tracked body stays on the floor while the vehicle must rise.
+
+    On the ground the vehicle cannot be told from another body that stands still. With that body's pose the
+    vehicle's controller would climb at full thrust.
+    """
+    pose = loop.pose()
+    asked = way.position(pose.time - loop.mission.lead)[2]
+    return asked - floor > _ASKED_TO_RISE and pose.position[2] - floor < _RISEN
+
+
+def _stay_down(loop: FlightLoop, stop: Callable[[], object]) -> None:
+    """Stop the motors, at most a quarter of a metre above the floor, and raise PreflightError."""
+    turning = bool(loop.bits(FLYING))
+    stop()
+    loop.touch_down()
+    if not turning:
+        raise PreflightError(
+            "the vehicle does not start its motors",
+            where="vehicle",
+            hint="restart it; its console may say why its supervisor ignores setpoints",
+        )
+    raise PreflightError(
+        "the tracked body stays on the floor while the vehicle takes off",
+        where="motion capture",
+        hint="is it another body than the vehicle, are two of them swapped? Else look at battery and propellers",
+    )
+
+
+def settle_at(loop: FlightLoop, start: Triple) -> None:
+    """Wait until the vehicle rests at the start, m. Raises AbortRaised where it does not come there."""
+    near_since = math.inf
+
+    def settled() -> bool:
+        nonlocal near_since
+        now = loop.now()
+        near = math.dist(loop.pose().position, start) < _AT_PLACE_WITHIN
+        near_since = min(near_since, now) if near else math.inf
+        return now - near_since > _AT_START_FOR
+
+    if not loop.until(settled, 5.0):
+        away = math.dist(loop.pose().position, start)
+        raise AbortRaised(safety_abort(Rung.LAND, f"still {away:.2f} m from the start"))

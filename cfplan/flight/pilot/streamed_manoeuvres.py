@@ -1,0 +1,140 @@
+"""Manoeuvres by setpoints: from lift-off to the floor the vehicle flies by these alone.
+
+It has time-outs for setpoints, and none for what its on-board commander flies.
+"""
+
+import math
+
+import numpy as np
+
+from cfplan.flight.pilot.flight_loop import FlightLoop
+from cfplan.flight.pilot.landing import Landing, stop_motors
+from cfplan.flight.pilot.manoeuvres import climb, require_ready, settle_at
+from cfplan.flight.pilot.mission import manoeuvre_time
+from cfplan.flight.pilot.stream import Stream
+from cfplan.flight.setpoints.encoding import encode_motion
+from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
+from cfplan.flight.setpoints.rate_trade import ahead, gains_under
+from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.flight.telemetry import Phase, Triple
+from cfplan.vehicle.rotations import yaw_of
+
+BRAKE_HOLD = 1.0  # s of hover after a stop
+_FOLLOWS_WITHIN = 0.15  # m from its setpoint; a vehicle farther off stops from the setpoint nearest to it
+
+
+class StreamedManoeuvres:
+    """Flies a mission's phases by setpoints."""
+
+    def __init__(self, loop: FlightLoop, floor: float):
+        self._loop, self._floor = loop, floor  # m, height of the tracked body before take-off
+        self._mission, self._limits, self._history = loop.mission, loop.limits, loop.history
+        self._landing = Landing(loop, floor)
+
+    def take_off(self) -> None:
+        """Climb by setpoints. Raises PreflightError where the vehicle stays on the floor."""
+        loop = self._loop
+        self._history.enter(Phase.TAKE_OFF)
+        height, (x, y, _) = self._mission.take_off_height, loop.pose().position
+        yaw = yaw_of(loop.pose().quaternion)
+        duration = manoeuvre_time(height - self._floor, self._limits.ground.take_off_speed)
+        way = self._way((x, y, self._floor), yaw, (x, y, height), yaw, duration)
+        if way.stop_from is not None:
+            way.stop_from(0)  # the first call is slow: make it on the ground
+        require_ready(loop)
+        loop.lift_off()
+        climb(loop, loop.begin(way), self._floor, height, lambda: stop_motors(loop))
+
+    def _way(self, begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float) -> Stream:
+        """Return setpoints from hover to hover, with a way to stop from each."""
+        rate = self._mission.rate
+        motion = hover_to_hover(begin, yaw, end, end_yaw, duration, rate)
+        gains, space = gains_under(self._limits), self._limits.space
+        payloads = encode_motion(motion, ahead(motion.acceleration, rate), gains, space=space)
+        return Stream(
+            payloads,
+            rate,
+            stop_from=lambda row: encode_stops(motion, rate, rows=np.array([row]), gains=gains, space=space)[0],
+        )
+
+    def go_to_start(self) -> None:
+        """Fly to the plan's first setpoint and wait until the vehicle is there."""
+        loop = self._loop
+        self._history.enter(Phase.GO_TO_START)
+        start, yaw = self._mission.start
+        above, _, yaw_above = loop.asked()
+        duration = manoeuvre_time(math.dist(loop.pose().position, start), self._limits.ground.go_to_speed)
+        way = loop.begin(self._way(above, yaw_above, start, yaw, duration))
+        loop.until(lambda: loop.now() > way.end, math.inf)
+        settle_at(loop, start)
+
+    def fly_plan(self) -> None:
+        """Stream the plan, then hover for the mission's hold time; a new plan that comes meanwhile is flown too."""
+        loop = self._loop
+        skipped = loop.skipped
+        loop.begin_plan()
+        while True:
+            self._history.enter(Phase.STREAM)
+            loop.until(lambda: loop.now() > loop.plan.end, math.inf)
+            self._history.skipped = loop.skipped - skipped
+            self._history.enter(Phase.HOLD)
+            if not loop.until(lambda: loop.finishing or loop.now() < loop.plan.end, self._mission.hold_time):
+                break
+            if loop.finishing and loop.now() >= loop.plan.end:
+                break
+
+    def land(self) -> None:
+        """Land by setpoints, and stop the motors."""
+        self._landing.land()
+
+    def brake(self) -> None:
+        """Brake to a hover along the plan, hold it, and land."""
+        loop = self._loop
+        self._stop()
+        if not (self._landing.begun or loop.left_alone):
+            self._history.enter(Phase.HOLD)
+            loop.until(lambda: loop.left_alone, BRAKE_HOLD)
+        self._landing.land()
+
+    def stop_and_land(self) -> None:
+        """Brake, and land at once."""
+        self._stop()
+        self._landing.land()
+
+    def _stop(self) -> None:
+        """Brake along the path to a hover, or finish a stop that has begun; sink besides where poses are gone.
+
+        A vehicle that was left alone is no longer on its path.
+        """
+        loop, left = self._loop, self._loop.stream
+        if left is None or self._landing.begun or loop.left_alone:
+            return
+        if left.stop_from is not None:
+            stop = left.stop_from(self._present_index(left))
+            started = loop.begin(Stream(stop, self._mission.rate))
+            if left is loop.plan:
+                self._history.stopped_at = started.start
+        end = loop.stream.end if loop.stream is not None else 0.0
+        loop.until(lambda: loop.now() > end or loop.blind or loop.left_alone, math.inf)
+        if loop.now() < end and not loop.left_alone:
+            self._landing.sink_while_stopping()
+            loop.until(lambda: loop.now() > end or loop.left_alone, math.inf)
+
+    def _present_index(self, stream: Stream) -> int:
+        """Return the setpoint to stop from: the present one, or the nearest before it if the vehicle fell behind."""
+        loop = self._loop
+        due = stream.index(loop.now())
+        pose = loop.pose()
+        if loop.now() - pose.time > self._limits.pose.age_warning:
+            return due
+        wanted = loop.wanted(pose.time)
+        if wanted is None or math.dist(pose.position, wanted) < _FOLLOWS_WITHIN:
+            return due
+        nearest, least = due, math.inf
+        for index in range(due, stream.first - 1, -1):
+            distance = math.dist(pose.position, stream.state(index)[0])
+            if distance < least:
+                nearest, least = index, distance
+            elif distance > least + _FOLLOWS_WITHIN:  # what comes nearer again is another turn of the path
+                break
+        return nearest
