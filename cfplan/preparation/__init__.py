@@ -2,6 +2,7 @@
 
 __all__ = [
     "air_planner",
+    "certified_flight",
     "compiled_calls",
     "export_flight",
     "from_programs",

@@ -25,14 +25,28 @@ from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, R
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
 from cfplan.planning.plan_result import Plan
-from cfplan.preparation.replan import PACE, HeldFlight, Replanned, accepted, at_pace, halt, pace, replan
+from cfplan.preparation.replan import (
+    PACE,
+    HeldFlight,
+    Replanned,
+    accepted,
+    at_pace,
+    given_up,
+    go_on,
+    halt,
+    pace,
+    replan,
+)
 from cfplan.safety.limits import Limits
 
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 LEARNED_FROM = 8  # plans, the longest of which says how long the next may take
+LEAST_PART, PART = 0.8, 4.0  # s of a plan committed at once, at least; and for each s that planning looks ahead
 SLACK = 0.02  # s more than that, for the way to the pilot, which looks every 10 ms
 TRIES = 2  # of a request whose proposal comes late
+FARTHEST = 3000  # setpoints ahead of which no more of a plan is committed, until the vehicle comes nearer
+_LOOK_AGAIN = 1.0  # s, until the planner sees whether it has
 _ANSWER_WITHIN = 1.0  # s in which a pilot answers
 _CLOSE_WITHIN = 1.0  # s
 
@@ -53,6 +67,7 @@ class PathVerdict(StrEnum):
     ACCEPTED = "accepted"
     REFUSED = "refused"  # no plan, or the pilot did not verify it
     LATE = "late"  # planned, but not in time
+    CUT_SHORT = "cut short"  # accepted, but what follows did not pass later: the vehicle rests before its end
     SUPERSEDED = "superseded"  # another request came before it was planned
 
 
@@ -80,8 +95,31 @@ class PathAnswer:
     plan: Plan | None = None  # behind it; a stop has none
 
 
-def plan_request(held: HeldFlight, request: PathRequest, first: int, limits: Limits) -> Replanned | HeldFlight:
-    """Return the proposal from setpoint `first` on that does what is asked for.
+def part_within(ahead: float) -> int:
+    """Return how many setpoints of a plan to commit at once, where planning looks `ahead`, s.
+
+    The next part is to be committed before the vehicle stops behind this one, a request in between or not.
+    """
+    return round(max(LEAST_PART, PART * ahead) * RATE)
+
+
+def wants_more(held: HeldFlight, first: int) -> bool:
+    """Return whether the next part of a plan is to be planned, where one may plan from setpoint `first` on."""
+    return held.unfinished and (held.stops_from is None or held.stops_from < first + FARTHEST)
+
+
+def presses(held: HeldFlight, first: int, ahead: float) -> bool:
+    """Return whether the next part of a plan must be planned before anything else, to be in time at setpoint `first`.
+
+    Planning looks `ahead`, s.
+    """
+    return held.stops_from is not None and held.stops_from < first + round(1.5 * ahead * RATE)
+
+
+def plan_request(
+    held: HeldFlight, request: PathRequest, first: int, limits: Limits, part: int | None = None
+) -> Replanned | HeldFlight:
+    """Return the proposal from setpoint `first` on that does what is asked for, of so many setpoints as `part` says.
 
     Where nothing need be proposed, what is held from now on. Raises a CfplanError where no plan does it.
     """
@@ -92,8 +130,14 @@ def plan_request(held: HeldFlight, request: PathRequest, first: int, limits: Lim
         case Wish.SLOWER | Wish.FASTER:
             now = min(held.speed, limits.plan.speed)
             speed = now * PACE if request.wish is Wish.SLOWER else now / PACE
-            return pace(held, first, speed, limits, yaw_angle=yaw) or at_pace(held, speed)
-    return replan(held, first, request.waypoints, limits, keep=request.wish is Wish.EXTEND, yaw_angle=yaw)
+            return pace(held, first, speed, limits, yaw_angle=yaw, part=part) or at_pace(held, speed)
+    keep = request.wish is Wish.EXTEND
+    return replan(held, first, request.waypoints, limits, keep=keep, yaw_angle=yaw, part=part)
+
+
+def plan_next_part(held: HeldFlight, first: int, limits: Limits, part: int) -> Replanned | HeldFlight:
+    """Return the proposal, from setpoint `first` on, of the next part of the plan that is held. Raises as go_on()."""
+    return go_on(held, first, limits, part, yaw_angle=float(held.flown.at(held.ends).yaw))
 
 
 def answer_accepted(request: PathRequest, made: Replanned) -> PathAnswer:
@@ -103,6 +147,16 @@ def answer_accepted(request: PathRequest, made: Replanned) -> PathAnswer:
         request.number, PathVerdict.ACCEPTED, joint=made.joint, ends=flown.duration, splice=proposal.splice,
         checksum=proposal.checksum, plan=made.plan,
     )  # fmt: skip
+
+
+def answer_held(request: PathRequest, held: HeldFlight) -> PathAnswer:
+    """Return the answer to a request for which nothing need be proposed."""
+    return PathAnswer(request.number, PathVerdict.ACCEPTED, ends=held.ends)
+
+
+def answer_cut_short(number: int, held: HeldFlight, reason: str) -> PathAnswer:
+    """Return what is told of a request that was accepted, where the rest of its plan does not pass."""
+    return PathAnswer(number, PathVerdict.CUT_SHORT, reason, ends=held.ends)
 
 
 def answer_refused(request: PathRequest, answer: Refusal) -> PathAnswer:
@@ -179,7 +233,9 @@ class _Worker:
         self._begun: float | None = None  # s, when setpoint 0 was due
         self._took: deque[float] = deque([FIRST_TIME], maxlen=LEARNED_FROM)
         self._stops_took: deque[float] = deque([FIRST_STOP], maxlen=LEARNED_FROM)
+        self._part_took: deque[float] = deque([FIRST_STOP], maxlen=LEARNED_FROM)
         self._waiting: tuple[PathRequest, float] | None = None
+        self._accepted = 0  # number of the request whose plan is flown
 
     @property
     def _middle(self) -> list[tuple[float, ...]]:
@@ -199,20 +255,34 @@ class _Worker:
             with contextlib.suppress(CfplanError):
                 places = [held.flown.at(held.ends / 2).position, *map(np.array, self._middle)]
                 away = max(places, key=lambda place: float(np.linalg.norm(place - held.ahead[-1])))
-                made = replan(held, max(round(held.ends / 4 * RATE), 1), [away, held.ahead[-1]], self._limits)
+                first, part = max(round(held.ends / 4 * RATE), 1), part_within(0.0)
+                made = replan(held, first, [away, held.ahead[-1]], self._limits, part=part)
                 self._took[0] = REAL_CLOCK.now() - begun
-                halt(made.held, made.proposal.splice + round(RATE), self._limits)
+                go_on(made.held, made.proposal.splice + part // 2, self._limits, part)
+                halt(made.held, made.proposal.splice + part // 2, self._limits)
 
     def serve(self) -> None:
         """Plan until the main process or the pilot has ended."""
         while True:
-            watched = [self._requests, self._pilot]
-            wait(watched)
+            if self._waiting is None and not self._wants_more():
+                wait([self._requests, self._pilot], _LOOK_AGAIN if self._held.unfinished else None)
             self._read(0.0)
-            if self._waiting is not None:
+            if self._wants_more() and (self._waiting is None or presses(self._held, *self._next(self._took))):
+                if answer := self._go_on():
+                    self._requests.send(answer)
+            elif self._waiting is not None:
                 (request, since), self._waiting = self._waiting, None
                 answer = self._answer(request)
                 self._requests.send(replace(answer, seconds=REAL_CLOCK.now() - since))
+
+    def _wants_more(self) -> bool:
+        return self._held.unfinished and wants_more(self._held, self._next(self._part_took)[0])
+
+    def _next(self, took: deque[float]) -> tuple[int, float]:
+        """Return the setpoint from which on one may plan now, by how long that took before, and how far ahead it is."""
+        assert self._begun is not None
+        ahead = max(took) + SLACK
+        return math.ceil((REAL_CLOCK.now() - self._begun + ahead) * RATE) + LEAST_AHEAD, ahead
 
     def _read(self, patience: float) -> PilotAnswer | None:
         """Take what has come; return the pilot's answer to a proposal if there is one, waiting for it if asked to."""
@@ -238,13 +308,11 @@ class _Worker:
         if self._begun is None:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
         reason = ""
+        took = self._stops_took if request.wish is Wish.STOP else self._took
         for _ in range(TRIES):
-            begun = REAL_CLOCK.now()
-            took = self._stops_took if request.wish is Wish.STOP else self._took
-            ahead = max(took) + SLACK
-            first = math.ceil((begun - self._begun + ahead) * RATE) + LEAST_AHEAD
+            begun, (first, ahead) = REAL_CLOCK.now(), self._next(took)
             try:
-                made = plan_request(self._held, request, first, self._limits)
+                made = plan_request(self._held, request, first, self._limits, part_within(ahead))
             except CfplanError as error:
                 return PathAnswer(request.number, PathVerdict.REFUSED, str(error))
             except Exception as error:  # a fault here must not leave the rest of the flight without a planner
@@ -253,16 +321,37 @@ class _Worker:
                 took.append(REAL_CLOCK.now() - begun)
             if isinstance(made, HeldFlight):
                 self._held = made
-                return PathAnswer(request.number, PathVerdict.ACCEPTED)
+                return answer_held(request, made)
             answer = self._propose(made)
             if answer is None:
                 return PathAnswer(request.number, PathVerdict.REFUSED, "the pilot does not answer")
             if answer.commitment is not None:
+                self._accepted = request.number
                 return answer_accepted(request, made)
             reason = answer.reason
             if not reason.startswith(Fault.LATE):
                 return PathAnswer(request.number, PathVerdict.REFUSED, reason)
         return PathAnswer(request.number, PathVerdict.LATE, reason)
+
+    def _go_on(self) -> PathAnswer | None:
+        """Propose the next part of the plan that is flown; return what to tell where there will be none."""
+        begun, (first, ahead) = REAL_CLOCK.now(), self._next(self._part_took)
+        try:
+            made = plan_next_part(self._held, first, self._limits, part_within(ahead))
+        except Exception as error:  # as in _answer
+            reason = str(error) if isinstance(error, CfplanError) else f"fault in the planner: {error!r}"
+        else:
+            if isinstance(made, HeldFlight):
+                self._held = made
+                return None
+            answer = self._propose(made)
+            if answer is not None and (answer.commitment is not None or answer.reason.startswith(Fault.LATE)):
+                return None
+            reason = answer.reason if answer is not None else "the pilot does not answer"
+        finally:
+            self._part_took.append(REAL_CLOCK.now() - begun)
+        self._held = given_up(self._held, self._limits)
+        return answer_cut_short(self._accepted, self._held, reason)
 
     def _propose(self, made: Replanned) -> PilotAnswer | None:
         """Send a proposal and wait for the pilot's answer; what it accepts is held from then on."""

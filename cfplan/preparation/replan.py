@@ -3,36 +3,42 @@
 A held flight is what the planner knows of what the pilot is bound to fly: the trajectories behind the bytes, and the
 simulated vehicle at each setpoint. So what is checked of a new plan is checked of the whole flight: bytes, stops, link
 loss, gaps and the dry run go on from the splice as if the flight had been planned so from its beginning.
+
+A plan may be committed in parts, so that the motion changes soon: its beginning and the stop behind that, and then, by
+go_on(), one part after another before the vehicle comes to the stop. A planner that fails meanwhile leaves it to that.
 """
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
 from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, propose
-from cfplan.flight.setpoints.encoding import HOLD, RATE, EncodedFlight, check_bytes, encode_trajectory
-from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.encoding import HOLD, LEAD, RATE, EncodedFlight, encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
-from cfplan.flight.setpoints.stop_certificate import certify_stops, encode_certified_stops
-from cfplan.flight.setpoints.stops import DURATION, encode_stops
+from cfplan.flight.setpoints.stop_certificate import certify_stops
+from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, min_snap
 from cfplan.planning.continuation import NoWayError, check_waypoints, continue_plan
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
-from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
+from cfplan.preparation.certified_flight import (
+    STOP,
+    CertifiedFlight,
+    EndsBadlyError,
+    certify_beginning,
+    certify_whole,
+    meet_gaps,
+    require_inside,
+)
 from cfplan.safety.limits import Limits
-from cfplan.simulation.dry_run import dry_run
-from cfplan.simulation.glitches import glitch_where_nearly_lost
-from cfplan.simulation.link_loss import as_believed, link_loss_at_walls
+from cfplan.simulation.link_loss import link_loss_at_walls
 from cfplan.vehicle.hover import hover_at
 from cfplan.vehicle.joint import JoinedTrajectory
-from cfplan.vehicle.rotations import yaw_of
 
 SLOWER = (1.2, 0.7)  # m/s, at which a flight is tried that would end badly at full speed
 LATER = (0, 15, 35)  # setpoints by which the vehicle may fly on before it turns off, where it cannot do so at once
@@ -42,10 +48,6 @@ HOVER = 0.05  # s, of the motion that a hover counts as
 STOPS = (0.46, 0.48, 0.5, 0.52, 0.54, 0.55, 0.56, 0.58, 0.6, 0.65, 0.7, 0.8, 1.0, DURATION)
 """s within which a request to stop is tried to be met. From 2 m/s straight on 0.54 s brake at 6.9 m/s², a tilt of 35°;
 where the vehicle turns or slows down already it is more or less."""
-
-
-class EndsBadlyError(InfeasibleError):
-    """After link loss or a gap the vehicle would end outside the walls, or turn over."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,11 +64,22 @@ class HeldFlight:
     exact_from: int = 0
     """Number of the setpoint from which on the trajectories are those behind the bytes: in a stop before it they are
     those that it brakes along."""
+    stops_from: int | None = None
+    """Number of the first setpoint of the stop behind the part of the plan that is committed; None where all of it is.
+    The trajectories are those of the whole plan."""
+    rest: tuple[Triple, float] | None = None  # m, rad: place and yaw where that stop rests
+    left: NDArray = field(default_factory=lambda: np.empty((0, 3)))
+    """(J, 3) m, waypoints of a plan that was stopped before them, as its next part did not come in time."""
 
     @property
     def ends(self) -> float:
-        """Return when the motion ends, s."""
+        """Return when the motion ends, s, once all of the plan is committed."""
         return self.flown.duration
+
+    @property
+    def unfinished(self) -> bool:
+        """Return whether there is more of the plan than is committed."""
+        return self.stops_from is not None or len(self.left) > 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,9 +100,9 @@ def hold(planned: Plan, waypoints: ArrayLike) -> HeldFlight:
     """
     points = np.asarray(waypoints, dtype=float)
     flown = JoinedTrajectory((planned.trajectory,), (0.0,))
-    encoded, stops, snapshots = certified(flown, planned.limits, None)
+    made = certify_whole(flown, planned.limits, None)
     reached = tuple(np.cumsum(centripetal_times(points)).tolist())
-    return HeldFlight(Commitment(0, encoded.payloads, stops), flown, points[1:], reached, 0, snapshots)
+    return HeldFlight(Commitment(0, made.payloads, made.stops), flown, points[1:], reached, 0, made.snapshots)
 
 
 def hold_hover(position: Triple, yaw: float, limits: Limits) -> HeldFlight:
@@ -106,20 +119,27 @@ def hold_hover(position: Triple, yaw: float, limits: Limits) -> HeldFlight:
             hint="take off to a height inside the space less its margin, and nearer to the middle of the room",
         )
     flown = JoinedTrajectory((hover_at(position, yaw, HOVER, limits.airframe),), (0.0,))
-    encoded, stops, snapshots = certified(flown, limits, None)
+    made = certify_whole(flown, limits, None)
     place = np.array([position], dtype=float)
-    return HeldFlight(Commitment(0, encoded.payloads, stops), flown, place, (HOVER,), 0, snapshots)
+    return HeldFlight(Commitment(0, made.payloads, made.stops), flown, place, (HOVER,), 0, made.snapshots)
 
 
 def replan(
-    held: HeldFlight, splice: int, waypoints: ArrayLike, limits: Limits, *, keep: bool = False, yaw_angle: float = 0.0
+    held: HeldFlight,
+    splice: int,
+    waypoints: ArrayLike,
+    limits: Limits,
+    *,
+    keep: bool = False,
+    yaw_angle: float = 0.0,
+    part: int | None = None,
 ) -> Replanned:
     """Return the proposal to leave what is held at setpoint `splice` and to go through waypoints, (K, 3) m, to rest.
 
     The motion changes SPLICE_AHEAD setpoints after the splice, or a little later where it cannot do so at once; never
     before what is held last has begun. With `keep`, the waypoints follow those that are ahead there; else they replace
     them. Where the vehicle rests by then, the plan begins from rest. Where link loss or a gap would end badly, the
-    vehicle flies slower.
+    vehicle flies slower. So many setpoints are proposed as `part` says, and the stop behind them; without it, all.
 
     Raises:
         InputError: what is given are no waypoints.
@@ -130,17 +150,61 @@ def replan(
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
         raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint="give rows of x, y, z in metres")
     check_waypoints(points, limits)
-    return _replan_within(held, splice, points, limits, keep, yaw_angle)
+    return _replan_within(held, splice, points, limits, keep, yaw_angle, part)
 
 
-def pace(held: HeldFlight, splice: int, speed: float, limits: Limits, *, yaw_angle: float = 0.0) -> Replanned | None:
+def pace(
+    held: HeldFlight, splice: int, speed: float, limits: Limits, *, yaw_angle: float = 0.0, part: int | None = None
+) -> Replanned | None:
     """Return the proposal to fly what is ahead at setpoint `splice` at a speed, m/s, at most; None where it rests.
 
     Then nothing need be proposed: what is asked for later flies so. See at_pace(). Raises as replan() does.
     """
     if (splice + SPLICE_AHEAD) / RATE >= held.ends:
         return None
-    return _replan_within(at_pace(held, speed), splice, np.empty((0, 3)), limits, True, yaw_angle)
+    return _replan_within(at_pace(held, speed), splice, np.empty((0, 3)), limits, True, yaw_angle, part)
+
+
+def go_on(
+    held: HeldFlight, splice: int, limits: Limits, part: int, *, yaw_angle: float = 0.0
+) -> Replanned | HeldFlight:
+    """Return the proposal of the next part of a plan that is committed in parts, for one who plans from `splice` on.
+
+    Where that would end badly, the vehicle flies slower from there on. Where it stops by then, as this comes too late,
+    it goes on from rest; where it rests there as all was flown, that is held and nothing need be proposed. Raises as
+    replan() does; then it rests behind the last part.
+    """
+    held = at_rest_from(held, splice, limits)
+    if not held.unfinished:
+        return held
+    if held.stops_from is not None:
+        splice = held.stops_from - 1  # what is before that is committed already
+        since, starts = held.flown.since(splice / RATE), snapshots_at(held, splice)
+        with suppress(EndsBadlyError, NotCertifiedError):
+            following = certify_beginning(since, part, limits, starts, foresee=False)
+            return _proposed(held, splice, following, None, math.nan)
+    return _replan_within(held, splice, np.empty((0, 3)), limits, True, yaw_angle, part)
+
+
+def given_up(held: HeldFlight, limits: Limits) -> HeldFlight:
+    """Return what is held where there is to be no more of a plan than is committed."""
+    if held.stops_from is None:
+        return replace(held, left=np.empty((0, 3)))
+    assert held.rest is not None
+    return _resting(held, held.rest, held.stops_from + STOP, limits)
+
+
+def at_rest_from(held: HeldFlight, splice: int, limits: Limits) -> HeldFlight:
+    """Return what is held for one who plans from setpoint `splice` on.
+
+    Where all that is committed until then is a part of a plan, the vehicle stops behind that: what is flown of the
+    plan is that stop, and the waypoints behind it are left.
+    """
+    if held.stops_from is None or splice < held.stops_from:
+        return held
+    rests_at = (held.stops_from + 0.5 * STOP) / RATE + LEAD - held.flown.starts[-1]  # on the clock of the plan
+    left, _ = _still_ahead(held, rests_at, np.empty((0, 3)))
+    return replace(given_up(held, limits), left=left)
 
 
 def at_pace(held: HeldFlight, speed: float) -> HeldFlight:
@@ -149,15 +213,17 @@ def at_pace(held: HeldFlight, speed: float) -> HeldFlight:
 
 
 def _replan_within(
-    held: HeldFlight, splice: int, points: NDArray, limits: Limits, keep: bool, yaw_angle: float
+    held: HeldFlight, splice: int, points: NDArray, limits: Limits, keep: bool, yaw_angle: float, part: int | None
 ) -> Replanned:
     """Return what replan() does, at the speed that is asked for, or slower where it must be."""
     fastest = min(held.speed, limits.plan.speed)
     refused: InfeasibleError | None = None
     for speed in (fastest, *(slower for slower in SLOWER if slower < fastest)):
         for later in LATER:
+            if later and held.stops_from is not None and splice + later >= held.stops_from:
+                break
             try:
-                return _replan_at(speed, held, splice + later, points, limits, keep, yaw_angle)
+                return _replan_at(speed, held, splice + later, points, limits, keep, yaw_angle, part)
             except EndsBadlyError as error:
                 refused = error
                 break  # slower
@@ -172,14 +238,22 @@ def _replan_within(
 
 
 def _replan_at(
-    speed: float, held: HeldFlight, splice: int, points: NDArray, limits: Limits, keep: bool, yaw_angle: float
+    speed: float,
+    held: HeldFlight,
+    splice: int,
+    points: NDArray,
+    limits: Limits,
+    keep: bool,
+    yaw_angle: float,
+    part: int | None,
 ) -> Replanned:
     """Return what replan() does, at that speed, m/s, or less."""
+    held = at_rest_from(held, splice, limits)
     splice = _not_before(held, splice)
     joint = (splice + SPLICE_AHEAD) / RATE
     if joint >= held.ends:
         place = held.flown.at(held.ends)
-        points = np.concatenate([place.position[None], points])
+        points = np.concatenate([place.position[None], held.left, points] if keep else [place.position[None], points])
         planned = plan(
             min_snap(points, times=centripetal_times(points)),
             limits.airframe,
@@ -207,28 +281,55 @@ def _replan_at(
         )
         planned, reached = made.plan, made.reached
     flown = held.flown.continued(joint, planned.trajectory)
-    row = min(splice - held.begin, held.snapshots.shape[1] - 1)
-    encoded, stops, snapshots = certified(flown.since(splice / RATE), limits, held.snapshots[:, row])
-    proposal = propose(held.commitment, splice, encoded.payloads, stops)
-    later = HeldFlight(held.commitment, flown, points, reached, splice, snapshots, held.speed)
-    return Replanned(proposal, later, planned, joint)
+    since, starts = flown.since(splice / RATE), snapshots_at(held, splice)
+    passed = certify_whole(since, limits, starts) if part is None else certify_beginning(since, part, limits, starts)
+    return _proposed(replace(held, flown=flown, ahead=points, reached=reached), splice, passed, planned, joint)
 
 
-def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned:
+def _proposed(held: HeldFlight, splice: int, made: CertifiedFlight, planned: Plan | None, joint: float) -> Replanned:
+    """Return the proposal of what was certified; `held` has the trajectories and waypoints behind it."""
+    proposal = propose(held.commitment, splice, made.payloads, made.stops)
+    return Replanned(proposal, held_with(held, splice, made), planned, joint)
+
+
+def held_with(held: HeldFlight, splice: int, made: CertifiedFlight) -> HeldFlight:
+    """Return what is held once what was certified from setpoint `splice` on is committed."""
+    before = held.snapshots[:, : splice - held.begin]
+    return replace(
+        held,
+        begin=splice - before.shape[1],  # behind the end of what was held the vehicle waits
+        snapshots=np.concatenate([before, made.snapshots], axis=1),
+        exact_from=0,
+        stops_from=None if made.following is None else splice + made.following,
+        rest=made.rest,
+        left=np.empty((0, 3)),
+    )
+
+
+def snapshots_at(held: HeldFlight, splice: int) -> NDArray:
+    """Return (L, 31), the simulated vehicle at a setpoint; behind the last it hovers."""
+    return np.asarray(held.snapshots[:, min(splice - held.begin, held.snapshots.shape[1] - 1)])
+
+
+def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned | HeldFlight:
     """Return the proposal to leave what is held at setpoint `splice` and to come to rest as soon as may be on its path.
 
-    That is a stop as there is one from each setpoint, but the shortest that keeps what stops may reach. Raises
-    InfeasibleError where the vehicle rests as soon anyway, or no stop passes: then it rests at the end of what is held.
+    That is a stop as there is one from each setpoint, but the shortest that keeps what stops may reach. Where the
+    vehicle stops as soon behind the part of a plan that is committed, that is held. Raises InfeasibleError where it
+    rests as soon anyway, or no stop passes: then it rests at the end of what is held.
     """
+    held = at_rest_from(held, splice, limits)
     splice = max(splice, held.exact_from)
-    left = held.ends - splice / RATE
-    if sooner := [duration for duration in STOPS if duration < left]:
+    ends = held.ends if held.stops_from is None else (held.stops_from + STOP) / RATE
+    if sooner := [duration for duration in STOPS if duration < ends - splice / RATE]:
         encoded = _encoded_from(held, splice, limits)
         for duration in sooner:
             with suppress(InfeasibleError, NotCertifiedError):
                 return _stop_along(encoded, held, splice, duration, limits)
+    if held.unfinished:
+        return given_up(held, limits)
     raise InfeasibleError(
-        f"{max(left, 0.0):.1f} s before its end, the vehicle cannot stop sooner",
+        f"{max(ends - splice / RATE, 0.0):.1f} s before its end, the vehicle cannot stop sooner",
         where="stop",
         hint="it rests at the end of what is committed",
     )
@@ -262,22 +363,23 @@ def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration:
     padded = np.concatenate([rows, np.repeat(rest, whole.shape[1], axis=0)])
     after = [padded[min(row, len(rows)) :][: whole.shape[1]] for row in range(len(payloads) - 1)]
     stops = np.concatenate([whole, np.stack(after)])
-    starts = held.snapshots[:, min(splice - held.begin, held.snapshots.shape[1] - 1)]
+    starts = snapshots_at(held, splice)
     lost = link_loss_at_walls(payloads, limits, starts=starts)
-    if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
-        raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
-    glitches = glitch_where_nearly_lost(payloads, limits, start=as_believed(starts, limits))
-    if glitches.lost.any():
-        raise EndsBadlyError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
-    end, rests_from = decode(rest), splice + len(rows)
-    x, y, z = end.position[0].tolist()
-    qx, qy, qz, qw = end.quaternion[0].tolist()
-    hover = hover_at((x, y, z), yaw_of((qx, qy, qz, qw)), HOVER, limits.airframe)
-    flown = held.flown.continued(rests_from / RATE, hover)
-    later = HeldFlight(
-        held.commitment, flown, end.position, (HOVER,), splice, lost.snapshots, held.speed, rests_from
-    )  # fmt: skip
+    require_inside(lost, limits)
+    meet_gaps(payloads, limits, starts)
+    resting = _resting(held, rest_behind(motion, 1, RATE, duration), splice + len(rows), limits)
+    later = replace(resting, begin=splice, snapshots=lost.snapshots)
     return Replanned(propose(held.commitment, splice, payloads, stops), later, None, splice / RATE)
+
+
+def _resting(held: HeldFlight, rest: tuple[Triple, float], rests_from: int, limits: Limits) -> HeldFlight:
+    """Return the flight that stops, and from a setpoint on rests at a place, m, with a yaw, rad."""
+    place, yaw = rest
+    flown = held.flown.continued(rests_from / RATE, hover_at(place, yaw, HOVER, limits.airframe))
+    return replace(
+        held, flown=flown, ahead=np.array([place]), reached=(HOVER,), exact_from=rests_from, stops_from=None,
+        rest=None, left=np.empty((0, 3)),
+    )  # fmt: skip
 
 
 def _not_before(held: HeldFlight, splice: int) -> int:
@@ -304,47 +406,3 @@ def _still_ahead(held: HeldFlight, leave: float, more: NDArray) -> tuple[NDArray
     begin = held.ahead[kept[-1]] if kept else here
     new = centripetal_times(np.concatenate([begin[None], more])) if len(more) else np.empty(0)
     return held.ahead[kept].reshape(-1, 3), np.concatenate([times, new])
-
-
-def certified(
-    flown: JoinedTrajectory, limits: Limits, starts: NDArray | None
-) -> tuple[EncodedFlight, NDArray, NDArray]:
-    """Return setpoints, stops and snapshots of a flight that goes on from snapshots (L, 31) or from hover.
-
-    All of it is checked like a plan before take-off. Raises EndsBadlyError or NotCertifiedError where it does not pass.
-    """
-    encoded = encode_trajectory(flown, gains=gains_under(limits), space=limits.space)
-    believed = None if starts is None else as_believed(starts, limits)
-
-    def stop_everywhere() -> NDArray:
-        stops, passed = encode_certified_stops(encoded.motion, limits, RATE, encoded.gains, encoded.space)
-        passed.require(limits)
-        return stops
-
-    def lose_link() -> NDArray:
-        lost = link_loss_at_walls(encoded.payloads, limits, starts=starts)
-        if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
-            raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
-        if not limits.link_loss.only_warn:
-            within = assess_link_loss_of_stops(encoded, limits, lost, margin=0.0, stops=stops.result())
-            if not within.passed:
-                what = f"{within.what} from {within.time[within.worst]:.2f} s on {within.describe(within.worst)}"
-                raise EndsBadlyError(what, where="link loss", hint=OUTSIDE_HINT)
-        return lost.snapshots
-
-    def meet_gaps() -> None:
-        glitches = glitch_where_nearly_lost(encoded.payloads, limits, start=believed)
-        if glitches.lost.any():
-            raise EndsBadlyError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")
-
-    def rehearse() -> None:
-        check_bytes(encoded, flown, limits.plan)
-        dry_run(encoded, flown, limits.airframe, limits.flight, snapshot=believed).require_passed()
-
-    with ThreadPoolExecutor() as pool:  # compiled loops and most of numpy run side by side
-        stops = pool.submit(stop_everywhere)
-        snapshots = pool.submit(lose_link)
-        gaps, rehearsed = pool.submit(meet_gaps), pool.submit(rehearse)
-        gaps.result()
-        rehearsed.result()
-        return encoded, stops.result(), snapshots.result()

@@ -13,7 +13,7 @@ import numpy as np
 
 from cfplan.errors import CfplanError
 from cfplan.flight.clock import Clock
-from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Proposal, Refusal, checksum_of
+from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, Proposal, Refusal, checksum_of
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
 from cfplan.preparation.air_planner import (
@@ -23,10 +23,16 @@ from cfplan.preparation.air_planner import (
     PathVerdict,
     Wish,
     answer_accepted,
+    answer_cut_short,
+    answer_held,
     answer_refused,
+    part_within,
+    plan_next_part,
     plan_request,
+    presses,
+    wants_more,
 )
-from cfplan.preparation.replan import HeldFlight, Replanned, accepted
+from cfplan.preparation.replan import HeldFlight, Replanned, accepted, given_up
 from cfplan.safety.limits import Limits
 
 PLANNING = 0.1  # s that planning takes
@@ -47,7 +53,7 @@ class PlannerFault(Enum):
 class _InHand:
     """A proposal on its way to the pilot, or at it."""
 
-    request: PathRequest
+    request: PathRequest | None  # None where it is the next part of the plan that is flown
     asked: float  # s
     made: Replanned
     proposal: Proposal  # as it is sent
@@ -70,10 +76,12 @@ class SteppedPlanner:
         self.held, self._limits, self._clock, self._on_answer = held, limits, clock, on_answer
         self._planning = planning
         self.fault: PlannerFault | None = None
+        self.on_committed: Callable[[Replanned], None] = lambda _: None  # hears what the pilot is committed to
         self._number = 0
         self._begun = math.nan
         self._waiting: tuple[PathRequest, float] | None = None
         self._in_hand: _InHand | None = None
+        self._accepted = 0  # number of the request whose plan is flown
 
     def request(self, wish: Wish, waypoints: Sequence[Triple] = ()) -> int:
         """Ask for a change; return the number of its answer. The latest request wins."""
@@ -90,9 +98,13 @@ class SteppedPlanner:
 
     def newest(self) -> Proposal | None:
         now = self._clock.now()
-        if self._in_hand is None and self._waiting is not None and self.fault is not PlannerFault.KILLED:
-            (request, asked), self._waiting = self._waiting, None
-            self._plan(request, asked, now)
+        if self._in_hand is None and self.fault is not PlannerFault.KILLED:
+            first, ahead = self._next(now)
+            if wants_more(self.held, first) and (self._waiting is None or presses(self.held, first, ahead)):
+                self._go_on(now, first, part_within(ahead))
+            elif self._waiting is not None:
+                (request, asked), self._waiting = self._waiting, None
+                self._plan(request, asked, now)
         if self._in_hand is None or now < self._in_hand.due:
             return None
         self._in_hand.due = math.inf  # given once
@@ -104,28 +116,56 @@ class SteppedPlanner:
         done, self._in_hand = self._in_hand, None
         if isinstance(answer, Commitment):
             self.held = accepted(done.made, answer)
-            told = answer_accepted(done.request, done.made)
+            self.on_committed(replace(done.made, held=self.held))
+        if done.request is None:
+            if isinstance(answer, Refusal) and answer.fault is not Fault.LATE:
+                self._give_up(str(answer))
+        elif isinstance(answer, Commitment):
+            self._accepted = done.request.number
+            self._tell(answer_accepted(done.request, done.made), done.asked)
         else:
-            told = answer_refused(done.request, answer)
-        self._tell(told, done.asked)
+            self._tell(answer_refused(done.request, answer), done.asked)
+
+    def _next(self, now: float) -> tuple[int, float]:
+        """Return the setpoint from which on one may plan now, and how far ahead that is, s."""
+        ahead = self._planning + SLACK
+        return math.ceil((now - self._begun + ahead) * RATE) + LEAST_AHEAD, ahead
 
     def _plan(self, request: PathRequest, asked: float, now: float) -> None:
-        first = math.ceil((now - self._begun + self._planning + SLACK) * RATE) + LEAST_AHEAD
+        first, ahead = self._next(now)
         try:
-            made = plan_request(self.held, request, first, self._limits)
+            made = plan_request(self.held, request, first, self._limits, part_within(ahead))
         except CfplanError as error:
             self._tell(PathAnswer(request.number, PathVerdict.REFUSED, str(error)), asked)
             return
         if isinstance(made, HeldFlight):
             self.held = made
-            self._tell(PathAnswer(request.number, PathVerdict.ACCEPTED), asked)
+            self._tell(answer_held(request, made), asked)
             return
-        due = now + self._planning
+        self._send(_InHand(request, asked, made, self._spoilt(made.proposal), now + self._planning))
+
+    def _go_on(self, now: float, first: int, part: int) -> None:
+        """Make the proposal of the next part of the plan that is flown."""
+        try:
+            made = plan_next_part(self.held, first, self._limits, part)
+        except CfplanError as error:
+            self._give_up(str(error))
+            return
+        if isinstance(made, HeldFlight):
+            self.held = made
+            return
+        self._send(_InHand(None, now, made, self._spoilt(made.proposal), now + self._planning))
+
+    def _give_up(self, reason: str) -> None:
+        self.held = given_up(self.held, self._limits)
+        self._on_answer(answer_cut_short(self._accepted, self.held, reason))
+
+    def _send(self, proposal: _InHand) -> None:
         if self.fault is PlannerFault.STOPPED:
-            due += STOPPED
+            proposal.due += STOPPED
         elif self.fault is PlannerFault.LATE:
-            due = self._begun + made.proposal.splice / RATE
-        self._in_hand = _InHand(request, asked, made, self._spoilt(made.proposal), due)
+            proposal.due = self._begun + proposal.made.proposal.splice / RATE
+        self._in_hand = proposal
 
     def _spoilt(self, proposal: Proposal) -> Proposal:
         if self.fault is PlannerFault.GARBAGE:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.firmware import gains_for
-from cfplan.flight.setpoints.encoding import EncodedFlight
+from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
 from cfplan.machine_code import njit
 from cfplan.safety.limits import FlightLimits
@@ -121,6 +121,32 @@ def dry_run(
     return fly_and_judge(
         fly, encoded.duration + SETTLING, lambda times: trajectory.at(times).position, trajectory.duration, limits
     )
+
+
+def dry_run_of_setpoints(
+    payloads: NDArray, airframe: Airframe, limits: FlightLimits, *, snapshot: NDArray, rate: float = RATE
+) -> DryRun:
+    """Fly payloads, (N, 29) uint8 at `rate`, Hz, on from a snapshot, (31,); compare with the places in them.
+
+    As dry_run() does, of a motion that is known by its setpoints alone.
+    """
+    decoded, times = decode(payloads), np.arange(len(payloads)) / rate
+    moving = np.flatnonzero(decoded.velocity.any(axis=1)).max(initial=0) + 1
+    fly = partial(
+        fly_setpoints,
+        decoded,
+        times,
+        airframe,
+        snapshot[:MEMORY],
+        gains=gains_for(airframe),
+        floor=NO_FLOOR,
+        memory=snapshot[MEMORY:THRUSTS],
+    )
+
+    def wanted_at(moments: NDArray) -> NDArray:
+        return np.stack([np.interp(moments, times + LEAD, along) for along in decoded.position.T], axis=1)
+
+    return fly_and_judge(fly, times[-1] + SETTLING, wanted_at, moving / rate, limits)
 
 
 def fly_and_judge(

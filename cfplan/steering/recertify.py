@@ -2,11 +2,12 @@
 
 Each plan that was committed is read from its file and certified anew, from the vehicle as it is simulated up to its
 splice: its limits, its bytes, a stop from each setpoint, link loss, gaps and the dry run. Its setpoints and stops must
-be those that the pilot verified, to the byte, and each setpoint streamed the one that was committed.
+be those that the pilot verified, to the byte, and each setpoint streamed the one that was committed. Of a plan that was
+committed in parts, each part is.
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +15,28 @@ from numpy.typing import NDArray
 from cfplan.errors import CfplanError, InputError, NotCertifiedError
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, checksum_of
-from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
+from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import Phase
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
-from cfplan.preparation.replan import STOPS, HeldFlight, certified, hold, hold_hover, stop_within
+from cfplan.preparation.certified_flight import BEHIND, certify_beginning, certify_whole
+from cfplan.preparation.replan import (
+    STOPS,
+    HeldFlight,
+    at_rest_from,
+    held_with,
+    hold,
+    hold_hover,
+    snapshots_at,
+    stop_within,
+)
 from cfplan.recording.commitments import committed_setpoints
 from cfplan.recording.record import PLAN_FILE, PLAN_IN_FLIGHT, Record
 from cfplan.safety.certificate import Certificate
 from cfplan.safety.limits import Limits
+from cfplan.vehicle.joint import JoinedTrajectory
 
 YAW = "yaw"  # rad, in the provenance of a header: that of the hover in which a steered flight begins
 _SAME = 1e-6  # m, m/s, m/s², m/s³, that a motion may jump by at a joint
@@ -75,21 +88,21 @@ def recertify(record: Record) -> Recertified:
                 hint="the record was changed since, or made by another version",
             )
     limits = next(plan.limits for plan in (first, *plans) if plan is not None)
-    jump, setpoints = 0.0, len(held.commitment.payloads)
+    jump, stops, setpoints = 0.0, 0, len(held.commitment.payloads)
     for number, plan in enumerate(plans, 1):
         splice = int(commitments.splice[number])
         if plan is not None:
-            jump, limits = max(jump, _jump(held, splice, plan)), plan.limits
+            jump, limits = max(jump, _jump(at_rest_from(held, splice, limits), splice, plan)), plan.limits
         held = _committed(
             held, splice, plan, limits, commitments.payloads[number], int(commitments.checksum[number]), number
         )
+        stops += held.exact_from > 0
         setpoints += len(commitments.payloads[number]) // PAYLOAD_SIZE
     sequence = committed_setpoints(record) if len(commitments.time) else held.commitment.payloads
     streamed, left_after = _compare(record, sequence)
     certificates = sorted(found, key=lambda certificate: certificate.worst.share)
     worst_of_all = certificates[-1] if certificates else None
     joints = sum(plan is not None for plan in plans)
-    stops = len(plans) - joints
     return Recertified(len(found), stops, worst_of_all, joints, jump, setpoints, streamed, left_after)
 
 
@@ -137,23 +150,38 @@ def _jump(held: HeldFlight, splice: int, plan: Plan) -> float:
 def _committed(
     held: HeldFlight, splice: int, plan: Plan | None, limits: Limits, payloads: bytes, checksum: int, number: int
 ) -> HeldFlight:
-    """Certify a plan again and return what was held with it. Raises NotCertifiedError where that is something else."""
+    """Certify a plan again, or another part of it, and return what was held with that.
+
+    Raises NotCertifiedError where it is something else.
+    """
     where = f"plan {number}, from setpoint {splice} on"
     told = np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
-    if plan is None:
+    held, flown = at_rest_from(held, splice, limits), held.flown
+    if plan is not None:
+        flown = held.flown.continued((splice + SPLICE_AHEAD) / RATE, plan.trajectory)
+    elif held.stops_from is None or not _goes_on(flown, splice, told, limits):
         return _stopped(held, splice, told, checksum, where, limits)
-    flown = held.flown.continued((splice + SPLICE_AHEAD) / RATE, plan.trajectory)
-    row = min(splice - held.begin, held.snapshots.shape[1] - 1)
+    since, starts = flown.since(splice / RATE), snapshots_at(held, splice)
     try:
-        encoded, stops, snapshots = certified(flown.since(splice / RATE), limits, held.snapshots[:, row])
+        if len(told) == len(encode_trajectory(since, gains=gains_under(limits), space=limits.space).payloads):
+            made = certify_whole(since, limits, starts)
+        else:
+            made = certify_beginning(since, len(told) - BEHIND, limits, starts, foresee=False)
     except CfplanError as error:
         raise NotCertifiedError(f"{error.where}: {error.what}", where=where, hint=error.hint) from error
-    if told.shape != encoded.payloads.shape or (told != encoded.payloads).any():
+    if told.shape != made.payloads.shape or (told != made.payloads).any():
         raise NotCertifiedError("the setpoints are not those of the plan", where=where, hint="was the record changed?")
-    if checksum_of(splice, encoded.payloads, stops) != checksum:
+    if checksum_of(splice, made.payloads, made.stops) != checksum:
         raise NotCertifiedError("the stops are not those that were verified", where=where, hint="was it changed?")
-    commitment = Commitment(splice, encoded.payloads, stops)
-    return HeldFlight(commitment, flown, held.ahead, held.reached, splice, snapshots)
+    with_it = held_with(replace(held, flown=flown), splice, made)
+    return replace(with_it, commitment=Commitment(splice, made.payloads, made.stops))
+
+
+def _goes_on(flown: JoinedTrajectory, splice: int, told: NDArray, limits: Limits) -> bool:
+    """Return whether setpoints are more of the plan that is flown, and no stop."""
+    encoded = encode_trajectory(flown.since(splice / RATE), gains=gains_under(limits), space=limits.space)
+    same = min(max(len(told) - BEHIND, 2), len(encoded.payloads))
+    return np.array_equal(told[:same], encoded.payloads[:same])
 
 
 def _stopped(held: HeldFlight, splice: int, told: NDArray, checksum: int, where: str, limits: Limits) -> HeldFlight:

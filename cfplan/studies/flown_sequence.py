@@ -22,6 +22,7 @@ from cfplan.flight.setpoints.encoding import (
     THRUST_LEAD,
     EncodedFlight,
     check_bytes,
+    check_setpoints,
 )
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import gains_under
@@ -43,7 +44,8 @@ class Committed:
     payloads: NDArray  # (K, 29) uint8
     stops: NDArray  # (K, 2, 29) uint8, the first and the last setpoint of the stop from each
     flown: JoinedTrajectory  # all motion of the flight with it, on a clock that is 0 at setpoint 0
-    stop_until: int = 0  # number of the setpoint at which a stop that was asked for rests; 0 for a plan
+    stop_from: int = 0  # number of the first setpoint of the stop at its end, or that it is; 0 where there is none
+    stop_until: int = 0  # number of the setpoint at which that rests
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +77,8 @@ def judge_sequence(
     in_stop = np.zeros(len(sequence), dtype=bool)
     for each in commitments:
         in_stop[each.splice :] = False
-        in_stop[each.splice : each.stop_until] = True
-    faults = _byte_faults_between_stops(commitments, limits)
+        in_stop[each.stop_from : each.stop_until] = True
+    faults = [fault for each in commitments for fault in _byte_faults(each, limits)]
     speed = np.linalg.norm(flown.velocity, axis=1)
     accelerating = _differentiated(flown.velocity, numbers)
     stopping = _widened(in_stop)[rows]
@@ -144,34 +146,25 @@ def _plan_share(commitments: Sequence[Committed], limits: Limits) -> float:
     return max(certify(each, limits.plan, limits.space).worst.share for each in trajectories.values())
 
 
-def _byte_faults_between_stops(commitments: Sequence[Committed], limits: Limits) -> list[str]:
-    """Return what the check of bytes finds in the flown sequence, from the first plan to a stop, and behind each stop.
-
-    Such a stretch goes on, behind the splice of the stop that ends it, as it was committed before.
-    """
-    found, begin = [], -1
-    for number, each in enumerate(commitments):
-        if each.stop_until:
-            begin = -1
-            continue
-        begin = each.splice if begin < 0 else min(begin, each.splice)
-        following = commitments[number + 1] if number + 1 < len(commitments) else None
-        if following is None or following.stop_until:
-            so_far, _, _ = _laid_together(commitments[: number + 1])
-            found += _byte_faults(so_far[begin:], begin, each.flown, limits)
-    return found
-
-
-def _byte_faults(payloads: NDArray, begin: int, flown: JoinedTrajectory, limits: Limits) -> list[str]:
-    times, since = np.arange(len(payloads)) / RATE, flown.since(begin / RATE)
-    decoded = decode(payloads)
+def _byte_faults(committed: Committed, limits: Limits) -> list[str]:
+    """Return what the check of bytes finds in the setpoints of a plan or a part of it, before the stop behind that."""
+    before_stop = committed.stop_from - committed.splice if committed.stop_from else len(committed.payloads)
+    if before_stop <= 0:
+        return []  # it is a stop
+    payloads = committed.payloads[:before_stop]
+    times, since, decoded = (
+        np.arange(before_stop) / RATE,
+        committed.flown.since(committed.splice / RATE),
+        decode(payloads),
+    )
     encoded = EncodedFlight(
         times, payloads, decoded, decoded, LEAD, RATE_LEAD, THRUST_LEAD, gains_under(limits), limits.space
     )
+    check = check_setpoints if committed.stop_from else check_bytes
     try:
-        check_bytes(encoded, since, limits.plan)
+        check(encoded, since, limits.plan)
     except NotCertifiedError as error:
-        return [f"{error.where} behind {begin}: {error.what}"]
+        return [f"{error.where} behind {committed.splice}: {error.what}"]
     return []
 
 

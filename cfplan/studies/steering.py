@@ -23,6 +23,7 @@ from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry
 from cfplan.preparation.air_planner import PathAnswer, PathVerdict, Wish
+from cfplan.preparation.certified_flight import STOP
 from cfplan.preparation.replan import HeldFlight
 from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.safety.limits import Limits
@@ -137,6 +138,7 @@ class _WatchedSteering(SteppedSteering):
         self.commitments: list[Committed] = []
         self.sent: dict[int, SetpointSent] = {}
         self.answered: Counter[int] = Counter()
+        self.cut_short = 0
         self._flies_plan = False
 
     def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
@@ -150,16 +152,18 @@ class _WatchedSteering(SteppedSteering):
             listeners.telemetry(message)
 
         def hear_answer(answer: PathAnswer) -> None:
-            self.answered[answer.number] += 1
-            if answer.splice >= 0:
-                assert self.planner is not None
-                self._keep(self.planner.held, answer.splice, stop=answer.plan is None)
+            if answer.verdict is PathVerdict.CUT_SHORT:
+                self.cut_short += 1
+            else:
+                self.answered[answer.number] += 1
             listeners.answer(answer)
 
-        self._keep(held, 0, stop=False)
+        self._keep(held, 0)
         super().start(mission, held, Listeners(hear, hear_answer))
+        assert self.planner is not None
+        self.planner.on_committed = lambda made: self._keep(made.held, made.proposal.splice)
 
-    def _keep(self, held: HeldFlight, splice: int, *, stop: bool) -> None:
+    def _keep(self, held: HeldFlight, splice: int) -> None:
         """Keep what is held with a commitment from a splice on, of its stops their ends.
 
         In a hover the pilot takes a proposal that begins elsewhere than it was made for: all of it is flown later then.
@@ -172,8 +176,11 @@ class _WatchedSteering(SteppedSteering):
         rows = slice(splice + later - commitment.first, None)
         ends = np.array(commitment.stops[rows][:, [0, -1]])
         payloads = np.array(commitment.payloads[rows])
-        rests = held.exact_from + later if stop else 0
-        self.commitments.append(Committed(splice + later, payloads, ends, flown, rests))
+        if held.exact_from > 0:  # a stop that was asked for
+            stop = splice + later, held.exact_from + later
+        else:
+            stop = (0, 0) if held.stops_from is None else (held.stops_from + later, held.stops_from + STOP + later)
+        self.commitments.append(Committed(splice + later, payloads, ends, flown, *stop))
 
 
 def fly_steered(seed: int, limits: Limits, *, requests: int = REQUESTS, seconds: float = SECONDS) -> SteeredFlight:
@@ -211,7 +218,7 @@ def fly_steered(seed: int, limits: Limits, *, requests: int = REQUESTS, seconds:
         superseded=answers[PathVerdict.SUPERSEDED],
         invalid=invalid,
         unanswered=sum(flight.answered[number] != 1 for number in asked[:-_IN_HAND]),
-        stops=sum(each.stop_until > 0 for each in flight.commitments),
+        stops=sum(0 < each.stop_from <= each.splice for each in flight.commitments),
         ended=ended,
         end=failure or (outcome.reason if outcome is not None else "no outcome"),
         landed=well and not failure and _is_down(flight),

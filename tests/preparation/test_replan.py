@@ -7,10 +7,22 @@ from cfplan.errors import CfplanError, InfeasibleError, InputError
 from cfplan.flight.setpoints.commitment import Commitment, splice
 from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.continuation import continue_plan
 from cfplan.planning.plan import plan
-from cfplan.preparation.replan import accepted, at_pace, hold, hold_hover, replan
+from cfplan.preparation.replan import (
+    accepted,
+    at_pace,
+    at_rest_from,
+    given_up,
+    go_on,
+    halt,
+    hold,
+    hold_hover,
+    replan,
+    snapshots_at,
+)
 from cfplan.safety.certificate import certify
 from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.glitches import glitch_at_every_setpoint
@@ -161,3 +173,83 @@ def test_a_slow_flight_is_replaced_before_it_has_left_its_hover(limits):
     assert again.plan is not None
     moments = np.linspace(0.0, again.plan.trajectory.duration, 300)
     assert np.linalg.norm(again.plan.trajectory.at(moments).velocity, axis=1).max() == pytest.approx(1.0, abs=0.02)
+
+
+FAR = [[-0.5, 0.8, 1.0], [0.5, 2.0, 1.0], [-0.8, 0.4, 1.2], [0.8, -1.5, 0.9]]
+PART = 80  # setpoints
+
+
+def in_parts(held, limits, first=NOW + 5):
+    """A plan through FAR as it is committed in parts, and what is held with each."""
+    made = replan(held, first, FAR, limits, part=PART)
+    parts, held = [made], after(held, limits, made, first - 5)
+    while held.unfinished:
+        made = go_on(held, first, limits, PART)
+        parts, held = [*parts, made], after(held, limits, made, first - 5)
+    return parts, held
+
+
+def test_a_plan_that_is_committed_in_parts_is_the_whole_plan_in_the_end(held, limits):
+    """To the byte, stops too; and the simulated vehicle at each setpoint is that of the whole."""
+    whole = after(held, limits, replan(held, NOW + 5, FAR, limits))
+    parts, last = in_parts(held, limits)
+    assert len(parts) >= 4
+    for name in ("payloads", "stops"):
+        np.testing.assert_array_equal(getattr(last.commitment, name), getattr(whole.commitment, name))
+    np.testing.assert_array_equal(last.snapshots[:, -len(whole.snapshots[0]) :], whole.snapshots)
+
+
+def test_each_part_ends_at_rest_inside_and_its_beginning_is_the_plan(held, limits):
+    parts, last = in_parts(held, limits)
+    plan_bytes = encode_trajectory(last.flown, gains=gains_under(limits), space=limits.space).payloads
+    for made in parts[:-1]:
+        proposal, stops_from = made.proposal, made.held.stops_from
+        assert stops_from == proposal.splice + PART
+        np.testing.assert_array_equal(proposal.payloads[:PART], plan_bytes[proposal.splice : stops_from])
+        np.testing.assert_array_equal(proposal.stops[PART], proposal.payloads[PART : PART + 121])
+        worst = link_loss_at_every_setpoint(
+            proposal.payloads, limits, starts=snapshots_at(made.held, proposal.splice)
+        ).worst
+        assert worst.beyond <= 0.0
+
+
+def test_a_part_that_comes_too_late_goes_on_from_rest(held, limits):
+    made = replan(held, NOW + 5, FAR, limits, part=PART)
+    first = after(held, limits, made)
+    late = first.stops_from + 30
+    made = go_on(first, late, limits, PART)
+    assert made.proposal.splice == first.stops_from + 120  # where it rests
+    after(first, limits, made, late - 5)
+    np.testing.assert_allclose(made.held.ahead, FAR)
+    np.testing.assert_allclose(made.plan.path(0.0), first.rest[0])
+
+
+def test_more_waypoints_asked_for_while_a_plan_is_committed_in_parts_follow_all_of_it(held, limits):
+    first = after(held, limits, replan(held, NOW + 5, FAR, limits, part=PART))
+    made = replan(first, NOW + 40, [[-0.5, -2.0, 1.0]], limits, keep=True, part=PART)
+    np.testing.assert_allclose(made.held.ahead, [*FAR, [-0.5, -2.0, 1.0]])
+    after(first, limits, made, NOW + 35)
+
+
+def test_a_stop_on_a_plan_in_parts_is_a_stop_and_nothing_follows_it(held, limits):
+    first = after(held, limits, replan(held, NOW + 5, FAR, limits, part=PART))
+    stopped = after(first, limits, halt(first, NOW + 40, limits), NOW + 35)
+    assert not stopped.unfinished
+    assert not given_up(first, limits).unfinished
+
+
+def test_after_a_stop_beside_a_wall_a_plan_begins_with_what_is_committed(limits):
+    """There a hover leans, so its bytes tell its yaw too coarsely; every plan after such a stop was refused once."""
+    wall = np.array(limits.space.high)[0]
+    points = np.array([[wall - 0.5, -2.0, 0.9], [wall - 0.45, 2.2, 1.2]])
+    flown = plan(
+        min_snap(points, times=centripetal_times(points)), limits.airframe, limits, planner="expert", yaw_angle=0.6
+    )
+    held = hold(flown, points)
+    stopped = after(held, limits, halt(held, NOW + 5, limits))
+    rests = stopped.exact_from + 5
+    after(stopped, limits, replan(stopped, rests, [[0.0, 0.5, 1.0]], limits), rests - 5)
+    in_part = after(held, limits, replan(held, NOW + 5, [[wall - 0.45, 2.0, 1.2]], limits, part=20))
+    resting = at_rest_from(in_part, in_part.stops_from + 5, limits)
+    first = resting.exact_from + 5
+    after(resting, limits, replan(resting, first, [[0.0, 0.5, 1.0]], limits), first - 5)

@@ -47,6 +47,12 @@ def copy(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "copy")
 
 
+def with_a_plan(record):
+    """The numbers of the commitments with which another plan begins; the others are more of it, or stops."""
+    checksums = record.commitments.checksum
+    return [n for n, each in enumerate(checksums) if (record.folder / PLAN_IN_FLIGHT.format(each)).is_file()]
+
+
 def test_everything_committed_is_certified_again_and_was_streamed(folder):
     record = read_record(folder)
     checked = recertify(record)
@@ -78,7 +84,7 @@ def test_a_setpoint_that_was_not_committed_is_found(folder):
 @pytest.mark.parametrize(("byte", "words"), [(29 * 100 + 5, "setpoints are not those"), (None, "stops are not those")])
 def test_other_bytes_or_stops_than_were_certified_are_found(copy, byte, words):
     record = read_record(copy)
-    commitments, number = record.commitments, 2
+    commitments, number = record.commitments, with_a_plan(record)[1]
     payloads, checksums = commitments.payloads.copy(), commitments.checksum.copy()
     if byte is None:
         checksums[number] ^= 1
@@ -91,12 +97,29 @@ def test_other_bytes_or_stops_than_were_certified_are_found(copy, byte, words):
         payloads[number] = bytes(changed)
     with pytest.raises(NotCertifiedError, match=words) as refused:
         recertify(replace(record, commitments=replace(commitments, payloads=payloads, checksum=checksums)))
-    assert "plan 2" in refused.value.where
+    assert f"plan {number}," in refused.value.where
+
+
+def test_another_part_of_a_plan_than_was_certified_is_found(copy):
+    record = read_record(copy)
+    commitments = record.commitments
+    part = next(n for n in range(2, len(commitments.splice)) if n not in with_a_plan(record))
+    payloads, checksums = commitments.payloads.copy(), commitments.checksum.copy()
+    checksums[part] ^= 1
+    with pytest.raises(NotCertifiedError, match="stops are not those"):
+        recertify(replace(record, commitments=replace(commitments, checksum=checksums)))
+    changed = bytearray(payloads[part])
+    changed[-29 * 40 + 5] ^= 1  # in the hover behind the stop
+    payloads[part] = bytes(changed)
+    with pytest.raises(NotCertifiedError, match="setpoints are not those"):
+        recertify(replace(record, commitments=replace(commitments, payloads=payloads)))
 
 
 def test_a_plan_that_is_missing_or_another_is_said(copy):
     record = read_record(copy)
-    first, second = (copy / PLAN_IN_FLIGHT.format(checksum) for checksum in record.commitments.checksum[1:3])
+    first, second = (
+        copy / PLAN_IN_FLIGHT.format(record.commitments.checksum[number]) for number in with_a_plan(record)[:2]
+    )
     shutil.copy(first, second)
     with pytest.raises(NotCertifiedError, match="the motion jumps"):
         recertify(record)
@@ -107,7 +130,7 @@ def test_a_plan_that_is_missing_or_another_is_said(copy):
 
 def test_a_plan_that_exceeds_a_limit_is_said(copy):
     record = read_record(copy)
-    file = copy / PLAN_IN_FLIGHT.format(record.commitments.checksum[1])
+    file = copy / PLAN_IN_FLIGHT.format(record.commitments.checksum[with_a_plan(record)[0]])
     made = load_plan(file)
     slower = replace(made.limits, plan=replace(made.limits.plan, speed=made.limits.plan.speed / 2))
     save_plan(replace(made, limits=slower), file)

@@ -55,7 +55,8 @@ def test_the_readmes_example_flies_and_is_recorded(connect, limits):
     record = read_record(vehicle.record)
     assert record.requests.wish.tolist() == ["replace", "extend", "replace"]
     assert record.answers.verdict.tolist() == ["accepted"] * 3
-    assert len(record.commitments.splice) == 4  # the hover too
+    assert len(record.commitments.splice) > 4  # the hover, and each plan in parts
+    assert len(list(vehicle.record.glob("plan-*.parquet"))) == 3
     assert vehicle.summary["max_deviation"] < 0.1
     assert vehicle.summary["peak_speed"] > 1.0
 
@@ -139,11 +140,33 @@ def test_the_latest_request_wins(flown):
 def test_whatever_is_wrong_with_the_planner_the_vehicle_flies_what_is_committed(flown, fault):
     vehicle, flight = flown
     vehicle.fly([[1, 0, 1], [0, 1, 1.2]])
+    vehicle.sleep(1.0)  # until all of it is committed
+    assert not flight.planner.held.unfinished
     flight.planner.fault = fault
     number = vehicle.request(Wish.REPLACE, [[-1, 0, 1]])
     vehicle.sleep(4.0)
     assert np.linalg.norm(np.subtract(vehicle.position, [0, 1, 1.2])) < 0.1
     assert all(answer.verdict is not PathVerdict.ACCEPTED for answer in vehicle.answers() if answer.number == number)
+
+
+@pytest.mark.parametrize("fault", [*PlannerFault])
+def test_a_planner_that_fails_before_all_of_a_plan_is_committed_leaves_it_to_the_stop_behind_what_is(flown, fault):
+    """It rests on the plan; where the planner can plan again, it goes on from there, or says that it will not."""
+    vehicle, flight = flown
+    vehicle.fly([[1.5, 2.5, 1], [-1.5, 2.5, 1.2]])
+    flown_to = flight.planner.held.flown
+    flight.planner.fault = fault
+    vehicle.sleep(1.6)
+    flight.planner.fault = None if fault is not PlannerFault.KILLED else fault
+    vehicle.sleep(5.0)
+    path = flown_to.at(np.arange(0.0, flown_to.duration, 0.01)).position
+    assert np.linalg.norm(path - vehicle.position, axis=1).min() < 0.1
+    told = [answer for answer in vehicle.answers() if answer.verdict is PathVerdict.CUT_SHORT]
+    arrived = np.linalg.norm(np.subtract(vehicle.position, [-1.5, 2.5, 1.2])) < 0.1
+    assert len(told) == (fault in (PlannerFault.GARBAGE, PlannerFault.OTHER_JOINT))
+    assert arrived == (fault in (PlannerFault.STOPPED, PlannerFault.LATE))
+    vehicle.land()
+    assert vehicle.outcome.exit_code is ExitCode.OK
 
 
 def test_a_program_that_fails_leaves_its_vehicle_landed_and_disarmed(limits):

@@ -65,8 +65,13 @@ def test_a_setpoint_that_was_not_committed_is_found(flown, limits, change, words
 
 def test_what_is_wrong_with_a_commitment_is_found(flown, limits):
     _, sent, commitments = flown
-    plans = [number for number, each in enumerate(commitments) if not each.stop_until]
-    at = next(number for number in plans if decode(commitments[number].payloads).velocity[0].any())
+    plans = [number for number, each in enumerate(commitments[:-1]) if not 0 < each.stop_from <= each.splice]
+    at = next(  # the first that moves as it begins, and was flown
+        number
+        for number in plans
+        if decode(commitments[number].payloads).velocity[0].any()
+        and min(later.splice for later in commitments[number + 1 :]) > commitments[number].splice + 20
+    )
     each = commitments[at]
     later = np.concatenate([each.payloads[1:], each.payloads[-1:]])
     none = np.repeat(each.stops[-1:], len(each.stops), axis=0)

@@ -33,12 +33,13 @@ from cfplan.vehicle.rotations import rotations_of
 SPLICE_AHEAD = math.ceil((LEAD + BRAKE_LEAD) * RATE)  # setpoints from a splice to its joint: so far ahead one looks
 LEAST_AHEAD = 2  # setpoints from the clock to a splice, at least, in time for it
 FARTHEST_AHEAD = 6000  # setpoints from the clock to a splice, at most: a minute
-KEPT_BEHIND = 100  # setpoints before a splice that are kept, for a vehicle that fell behind
+KEPT_BEHIND = 100  # setpoints before the one due that are kept, for a vehicle that fell behind
 QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
 LEVEL = 0.01  # rad of tilt, below which a vehicle hovers: twice what bytes round an attitude by
 LARGEST_JERK = 400.0  # m/s³, beyond which velocities do not belong together: ten times what plans reach
 _ROUNDING = 1e-9
 _MAGIC = b"proposal"
+_CHAIN = struct.Struct("<II")  # checksums of a commitment and of the proposal that continues it
 _HEAD = struct.Struct("<8sIIQII")  # magic, what it follows, checksum, splice, setpoints, setpoints of a stop
 
 
@@ -79,14 +80,15 @@ class Commitment:
     payloads: NDArray  # (N, 29) uint8
     stops: NDArray  # (N, M, 29) uint8
     splices: tuple[int, ...] = ()  # numbers of the setpoints from which plans made in the air are flown
-    checksum: int = -1  # of all that, computed where it is not given
+    checksum: int = -1  # of all that came together to it; of the arrays where it is not given
 
     def __post_init__(self) -> None:
         if wrong := _wrong_shape(self.first, self.payloads, self.stops):
             raise NotCertifiedError(wrong, where="commitment", hint="encode the plan and its stops anew")
         for name in ("payloads", "stops"):
             object.__setattr__(self, name, _frozen(getattr(self, name)))
-        object.__setattr__(self, "checksum", checksum_of(self.first, self.payloads, self.stops))
+        if self.checksum < 0:
+            object.__setattr__(self, "checksum", checksum_of(self.first, self.payloads, self.stops))
 
     @property
     def last(self) -> int:
@@ -166,13 +168,14 @@ def splice(commitment: Commitment, proposal: Proposal, now: int, space: Space) -
         or _unfit_stops(asked, proposal.stops, proposal.splice, space)
     ):
         return refusal
-    first = max(proposal.splice - KEPT_BEHIND, commitment.first)
+    first = max(min(proposal.splice, now) - KEPT_BEHIND, commitment.first)
     behind = np.minimum(np.arange(first, proposal.splice), commitment.last) - commitment.first
     return Commitment(
         first,
         np.concatenate([commitment.payloads[behind], proposal.payloads]),
         np.concatenate([commitment.stops[behind], proposal.stops]),
         (*(one for one in commitment.splices if first <= one < proposal.splice), proposal.splice),
+        zlib.crc32(_CHAIN.pack(commitment.checksum, proposal.checksum)),
     )
 
 

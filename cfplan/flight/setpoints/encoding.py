@@ -191,6 +191,18 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajector
             where="the encoding",
             hint="encode the trajectory anew",
         )
+    flown = check_setpoints(encoded, trajectory, limits)
+    _require_hover(decode(payloads[-1:]), flown, trajectory, len(payloads))
+
+
+def check_setpoints(
+    encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajectory, limits: PlanLimits
+) -> FullStateSetpoints:
+    """Certify as check_bytes() does each of the setpoints, which need not go on to the end of the trajectory.
+
+    Returns the motion that the last of them make. Raises NotCertifiedError with the setpoint at fault.
+    """
+    payloads = np.asarray(encoded.payloads)
     for rows in _batches(len(payloads)):
         times = encoded.times[rows] + encoded.lead
         planned = trajectory.at(times)
@@ -207,7 +219,7 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajector
         # What is sent makes up for drag besides, so the planned acceleration is judged, with the packet's error.
         acceleration = planned.acceleration + flown.acceleration - motion.acceleration
         _check_limits(flown, acceleration, limits, partial(_require, first=rows.start))
-    _require_hover(decode(payloads[-1:]), flown, trajectory, len(payloads))
+    return flown
 
 
 def check_motion(

@@ -61,6 +61,18 @@ def chunks(count: int) -> Iterator[slice]:
     return (slice(first, min(first + _CHUNK, count)) for first in range(0, count, _CHUNK))
 
 
+def rest_behind(
+    motion: FullStateSetpoints, row: int, rate: float, duration: float = DURATION
+) -> tuple[tuple[float, float, float], float]:
+    """Return the place, m, and the yaw, rad, at which the stop from a row of a motion rests; it is level there.
+
+    Bytes tell the place alone: a hover near a wall leans, so the attitude in them is not level, and is rounded.
+    """
+    stop, _ = stop_motion(motion, np.array([row]), rate, duration)
+    x, y, z = stop.position[-1].tolist()
+    return (x, y, z), float(yaw_of(stop.quaternion[-1]))
+
+
 def stop_motion(
     motion: FullStateSetpoints,
     begin: NDArray,

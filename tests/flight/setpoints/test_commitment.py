@@ -84,12 +84,12 @@ def resummed(proposal: Proposal) -> Proposal:
 
 def test_a_new_plan_replaces_the_rest_and_nothing_jumps(committed, spliced, limits):
     joined, proposal = spliced
-    new = splice(committed, proposal, 100, limits.space)
+    new = splice(committed, proposal, 110, limits.space)
     assert isinstance(new, Commitment)
     assert new.splices == (120,)
-    begin = 120 - KEPT_BEHIND
+    begin = 110 - KEPT_BEHIND
     assert new.first == begin
-    np.testing.assert_array_equal(new.payloads[:KEPT_BEHIND], committed.payloads[begin:120])
+    np.testing.assert_array_equal(new.payloads[: 120 - begin], committed.payloads[begin:120])
     # What is sent is the encoding of the joined trajectory, and at the splice it is what was committed, to the byte.
     np.testing.assert_array_equal(proposal.payloads[0], committed.payloads[120])
     state = decode(new.payloads)
@@ -113,6 +113,25 @@ def test_splices_follow_one_another(flown, committed, spliced, limits):
     assert second.splices == (120, 150)
     assert second.last == 150 + len(setpoints.payloads) - 1
     assert further.starts[1:] == (1.36, 1.66)
+
+
+def test_what_is_flown_before_a_splice_far_ahead_stays(flown, committed, limits):
+    """Of setpoints so far behind that no vehicle is there any more, but not of those between now and the splice."""
+    _, setpoints = continued(flown, 300, [[-0.4, 2.0, 1.0]], limits)
+    for now in (20, 150, 290):
+        new = splice(committed, propose(committed, 300, setpoints.payloads, stops_of(setpoints)), now, limits.space)
+        assert new.first == max(now - KEPT_BEHIND, 0)
+        ahead = slice(now - new.first, 301 - new.first)
+        np.testing.assert_array_equal(new.payloads[ahead], committed.payloads[now:301])
+        np.testing.assert_array_equal(new.stops[ahead][:-1], committed.stops[now:300])
+
+
+def test_the_same_proposal_makes_the_same_checksum_whenever_it_comes(committed, spliced, limits):
+    """So planner and pilot agree about what is committed, though they look at different moments."""
+    _, proposal = spliced
+    early, late = (splice(committed, proposal, now, limits.space) for now in (5, 118))
+    assert early.first != late.first
+    assert early.checksum == late.checksum != committed.checksum
 
 
 def test_what_is_committed_cannot_be_changed(committed):
