@@ -340,6 +340,18 @@ def link_loss(path_files: tuple[Path, ...], **given: Any) -> None:
     _measure(partial(link_losses, path_files, _safety_file), "simulating", given)
 
 
+@study.command(epilog="Example: cfplan study physics flights/line.yaml flights/helix.yaml -o results/physics.json")
+@_paths
+@_output
+@options.as_json
+def physics(path_files: tuple[Path, ...], **given: Any) -> None:
+    """Fly the bytes of each PATH by RotorPy and by drone-models, and compare with cfplan's own closed loop."""
+    _use_one_thread()
+    from cfplan.studies.physics import physics as run
+
+    _measure(partial(run, path_files, _safety_file), "simulating", given)
+
+
 @study.command(
     name="identification",
     epilog="Example: cfplan study identification flights/identify.yaml flights/figure8.yaml --vehicles 5",

@@ -7,6 +7,7 @@ __all__ = [
     "lab",
     "link_loss",
     "on_board_run",
+    "other_bodies",
     "virtual_crazyflie",
     "virtual_vicon",
 ]

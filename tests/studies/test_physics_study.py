@@ -1,0 +1,110 @@
+"""The study of other simulators' bodies: the same controller and bytes, and bodies that agree to a centimetre."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.errors import InputError
+from cfplan.preparation.plan_flight import plan_flight
+from cfplan.preparation.prepare_flight import encode_flight
+from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.dry_run import NO_FLOOR, dry_run
+from cfplan.simulation.dynamics.body import (
+    FULL_EFFICIENCY,
+    STILL_AIR,
+    TIME_STEP,
+    hovering,
+    pack_body,
+    step_body,
+)
+from cfplan.simulation.other_bodies import fly_on, identified_body, rotorpy_body
+from cfplan.studies import physics
+from cfplan.vehicle.airframes import AIRFRAMES
+
+SAFETY = Path(__file__).parents[2] / "safety.yaml"
+AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
+
+
+@pytest.fixture(scope="module")
+def path_file(tmp_path_factory):
+    """A path so short that RotorPy flies it in a second."""
+    file = tmp_path_factory.mktemp("physics") / "short.yaml"
+    file.write_text("name: short\nwaypoints:\n  - [0, 0, 1]\n  - [0.25, 0.15, 1.1]\n")
+    return file
+
+
+@pytest.fixture(scope="module")
+def result(path_file):
+    return physics.physics([path_file], lambda _: SAFETY)
+
+
+def own_step(state, asked, seconds):
+    state, body = state.copy(), pack_body(AIRFRAME, floor=NO_FLOOR)
+    for _ in range(round(seconds / TIME_STEP)):
+        step_body(state, np.asarray(asked), body, STILL_AIR, FULL_EFFICIENCY)
+    return state
+
+
+def test_with_the_dry_runs_body_it_is_the_dry_runs_flight(path_file):
+    limits = load_limits(SAFETY)
+    planned = plan_flight(path_file, limits)
+    encoded, trajectory = encode_flight(planned), planned.plan.trajectory
+    times, positions = fly_on(own_step, encoded, trajectory, AIRFRAME)
+    loop = dry_run(encoded, trajectory, AIRFRAME, limits.flight).loop
+    np.testing.assert_allclose(times, loop.time[::2], atol=1e-9)
+    np.testing.assert_array_equal(positions, loop.position[::2])
+
+
+def test_rotorpy_and_the_dry_run_are_a_centimetre_apart_at_most(result):
+    flights = [flight for flight in result.table("flights").rows if flight["body"].startswith("RotorPy")]
+    assert [flight["motor_lag"] for flight in flights] == [physics.REALISTIC_LAG, physics.PAPER_LAG]
+    for flight in flights:
+        assert 0.0 < flight["apart"] < 0.01
+        assert flight["apart_rms"] <= flight["apart"]
+        assert abs(flight["deviation"] - flight["own_deviation"]) <= flight["apart"]
+
+
+def test_a_body_that_is_heavier_than_believed_is_told_apart(path_file, monkeypatch):
+    def heavy(airframe, lag):
+        return rotorpy_body(replace(airframe, mass=1.2 * airframe.mass), lag)
+
+    monkeypatch.setattr(physics, "rotorpy_body", heavy)
+    found = physics.physics([path_file], lambda _: SAFETY).table("flights").rows
+    assert all(flight["apart"] > 0.02 for flight in found if flight["body"].startswith("RotorPy"))
+
+
+def test_the_identified_model_moves_as_the_airframe_does():
+    pytest.importorskip("drone_models")
+    step, state = identified_body(AIRFRAME), hovering(AIRFRAME, [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(step(state, np.full(4, AIRFRAME.hover_thrust), 0.1), state, atol=1e-6)
+    rolled = own = state
+    for _ in range(50):
+        asked = AIRFRAME.hover_thrust + np.array([0.0, 0.0, 0.002, 0.002])
+        rolled, own = step(rolled, asked, 0.002), own_step(own, asked, 0.002)
+    assert own[6] > 0.003
+    np.testing.assert_allclose(rolled[6:10], own[6:10], atol=0.1 * own[6])
+    np.testing.assert_allclose(rolled[:6], own[:6], atol=0.1 * np.abs(own[4]))
+
+
+def test_an_airframe_that_drone_models_does_not_know_is_said():
+    with pytest.raises(InputError, match=r"does not know crazyflie-2\.0"):
+        identified_body(AIRFRAMES["crazyflie-2.0"])
+
+
+def test_packages_that_are_not_there_are_named(path_file, monkeypatch):
+    def not_there(*_):
+        raise InputError("RotorPy is not installed")
+
+    monkeypatch.setattr(physics, "rotorpy_body", not_there)
+    monkeypatch.setattr(physics, "identified_body", not_there)
+    with pytest.raises(InputError, match="RotorPy is not installed") as raised:
+        physics.physics([path_file], lambda _: SAFETY)
+    assert "pip install" in raised.value.hint
+
+
+def test_the_result_is_one_row_a_path_and_survives_json(result):
+    (table,) = json.loads(json.dumps(result.to_json(), allow_nan=False))["tables"]
+    assert [row[0] for row in table["rows"]] == ["short"]
