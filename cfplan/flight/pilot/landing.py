@@ -16,7 +16,7 @@ from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.radio.supervisor_bits import FLYING
-from cfplan.flight.setpoints.descent import QUICK, Pace, descent, gentle, sinking
+from cfplan.flight.setpoints.descent import QUICK, Pace, descent, gentle, off_walls, sinking
 from cfplan.flight.telemetry import Level, Phase, Triple
 
 _BENEATH_FLOOR = 0.3  # m below where it took off, and below the space, that setpoints sink to
@@ -54,12 +54,13 @@ class Landing:
             self._loop.history.enter(Phase.LAND)
 
     def sink_while_stopping(self) -> None:
-        """Begin while the vehicle still brakes: let what is left of that stop sink besides."""
+        """Begin while the vehicle still brakes: let what is left of that stop sink besides, off the walls."""
         self.begin()
         loop, stream = self._loop, self._loop.stream
         if stream is not None:
             left = stream.payloads[stream.index(loop.now()) - stream.first :]
-            loop.begin(Stream(sinking(left, self._floor + _CLEAR, QUICK.speed, stream.rate), stream.rate))
+            sinks = sinking(left, self._floor + _CLEAR, QUICK.speed, stream.rate, loop.limits.space)
+            loop.begin(Stream(sinks, stream.rate))
 
     def land(self) -> None:
         """Descend from where the vehicle is asked to be, and stop its motors. Raises AbortRaised if they do not."""
@@ -92,9 +93,10 @@ class Landing:
             self._conclude(self._stands_by_poses())
 
     def _descend_blindly(self) -> None:
-        """Sink quickly until the estimate or the time says that it is enough, or poses are back."""
+        """Sink quickly, off the walls, until the estimate or the time says that it is enough, or poses are back."""
         loop = self._loop
-        self._sink(loop.asked(), QUICK, self._floor - _BLIND_BENEATH)
+        begin = loop.asked()
+        self._sink(begin, QUICK, self._floor - _BLIND_BENEATH, off_walls(begin[0], loop.limits.space))
         self._was_blind = True
         seen_since = math.inf
 
@@ -111,11 +113,18 @@ class Landing:
         if not (seen() or loop.left_alone):
             self._conclude(self._stands_by_estimate())
 
-    def _sink(self, begin: tuple[Triple, Triple, float], pace: Pace, lowest: float) -> None:
-        """Send a descent from a position, m, velocity, m/s, and yaw, rad, to a height, m."""
+    def _sink(
+        self,
+        begin: tuple[Triple, Triple, float],
+        pace: Pace,
+        lowest: float,
+        aside: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Send a descent from a position, m, velocity, m/s, and yaw, rad, to a height, m, that goes `aside`, m."""
         loop, (position, velocity, yaw) = self._loop, begin
-        sinks = descent(position, yaw, -velocity[2], pace, self._floor, lowest, loop.limits, loop.mission.rate)
-        loop.begin(Stream(sinks, loop.mission.rate))
+        rate = loop.mission.rate
+        sinks = descent(position, yaw, -velocity[2], pace, self._floor, lowest, loop.limits, rate, aside)
+        loop.begin(Stream(sinks, rate))
 
     def _sunk(self) -> bool:
         stream = self._loop.stream

@@ -1,8 +1,11 @@
-"""Straight down by setpoints: landings, gentle with poses and quick without, and stops that sink besides.
+"""Down by setpoints: landings, gentle with poses and quick without, and stops that sink besides.
 
 A descent goes on beneath the floor. A vehicle that stands on the floor, wherever that really is, no longer follows its
 setpoints down, and so the pilot knows that it stands. Roll and pitch rates are small, for a vehicle that is left alone:
 it levels out, leans away from a wall nearby, and comes down where it is.
+
+Without poses the vehicle drifts, and as it sinks it goes off the walls nearby. It is to have done so before it touches
+the floor, where a motion sideways would tip it over, so it goes only as far as its time allows.
 """
 
 import math
@@ -11,15 +14,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.setpoints.encoding import encode_motion
+from cfplan.flight.setpoints.encoding import controller_attitude, encode_motion
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
-from cfplan.vehicle.rotations import about_z
+from cfplan.safety.space import Space
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import about_z, quaternions_of
 
 _CRUISE = 1.5  # times the mean speed of landing: what a descent sinks at between its ends
 _QUICK = 3.0  # m/s²: thrust stays above half of gravity, below which a vehicle counts as tumbling
+# m above the floor, and m/s²: below that, a vehicle that has just braked sinks on more gently. Its controller asks for
+# less thrust than the setpoint does; with 3 m/s² it stopped all motors, and without thrust the vehicle turned by 40°.
+_LOW, _GENTLY = 0.6, 1.0
+_OFF_WALLS = 1.0  # m from a wall, nearer than which a vehicle without poses goes off it
+_ASIDE_MAX = 0.4  # m that it goes along x or y for that in one stop or descent
+_ASIDE_ACCELERATION = 1.5  # m/s², of a descent sideways: a tilt of 9°
+_STOP_ASIDE_ACCELERATION = 3.0  # m/s², of a stop's setpoints, which the vehicle does not follow as fast
+_BY_SMOOTHSTEP = 10.0 / math.sqrt(3.0)  # acceleration of a quintic smoothstep, for a way of 1 m in 1 s
+_CALM = 0.1  # m above the floor, below which a descent only sinks
+
+_Sideways = tuple[NDArray, NDArray, NDArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +63,25 @@ QUICK = Pace(2.0, acceleration=_QUICK, touch_speed=0.6, slow_above=0.1)
 
 
 def descent(
-    begin: Triple, yaw: float, speed_now: float, pace: Pace, floor: float, lowest: float, limits: Limits, rate: float
+    begin: Triple,
+    yaw: float,
+    speed_now: float,
+    pace: Pace,
+    floor: float,
+    lowest: float,
+    limits: Limits,
+    rate: float,
+    aside: tuple[float, float] = (0.0, 0.0),
 ) -> NDArray:
-    """Return payloads, (N, 29) uint8 at `rate`, Hz, straight down from `begin`, m, to the height `lowest`, m.
+    """Return payloads, (N, 29) uint8 at `rate`, Hz, down from `begin`, m, to the height `lowest`, m.
 
     It sinks at `speed_now`, m/s, first, then at the pace for a floor at the height `floor`, m. The last row rests.
+    Meanwhile it goes `aside`, x and y in m, or less far where it would reach the floor before.
     """
     heights, speeds = [begin[2]], [max(speed_now, 0.0)]
     while heights[-1] > lowest:
-        faster = min(speeds[-1] + pace.acceleration / rate, pace.at(heights[-1] - floor))
+        quickest = _GENTLY if heights[-1] - floor < _LOW else _QUICK
+        faster = min(speeds[-1] + min(pace.acceleration, quickest) / rate, pace.at(heights[-1] - floor))
         speeds.append(max(faster, speeds[-1] - _QUICK / rate))
         heights.append(max(heights[-1] - speeds[-1] / rate, lowest))
     count = len(heights) + 1
@@ -63,17 +89,54 @@ def descent(
     position[:, 2] = [*heights, heights[-1]]
     velocity[:-1, 2] = -np.array(speeds)
     change[:-2, 2] = -np.diff(speeds) * rate
+    above = sum(height - floor > _CALM for height in heights)
+    sideways = _sideways(aside, above, count, rate, _ASIDE_ACCELERATION)
+    position[:, :2] += sideways[0]
+    velocity[:, :2], change[:, :2] = sideways[1:]
     still = np.zeros((count, 3))
-    level = np.tile(about_z(yaw), (count, 1))
-    motion = FullStateSetpoints(position, velocity, change, level, still)
+    attitude = np.tile(about_z(yaw), (count, 1))
+    if sideways[2].any():
+        attitude = quaternions_of(controller_attitude(change + np.array([0.0, 0.0, GRAVITY]), attitude))
+    motion = FullStateSetpoints(position, velocity, change, attitude, still)
     return encode_motion(motion, still, gains_under(limits), space=limits.space)
 
 
-def sinking(payloads: NDArray, lowest: float, speed: float, rate: float) -> NDArray:
+def off_walls(position: Triple, space: Space) -> tuple[float, float]:
+    """Return the way, x and y in m, that leads a vehicle at a position, m, off the walls nearby."""
+    x, y = (
+        min(max(_clear(place, low, high) - place, -_ASIDE_MAX), _ASIDE_MAX)
+        for place, low, high in zip(position[:2], space.low[:2], space.high[:2], strict=True)
+    )
+    return x, y
+
+
+def _clear(place: float, low: float, high: float) -> float:
+    """Return the nearest place that is far enough from two opposite walls, or the middle between them."""
+    off = min(_OFF_WALLS, 0.5 * (high - low))
+    return min(max(place, low + off), high - off)
+
+
+def _sideways(aside: tuple[float, float], within: int, count: int, rate: float, acceleration: float) -> _Sideways:
+    """Return place, m, speed, m/s, and acceleration, m/s², (N, 2) each, of a way that is over `within` so many rows.
+
+    It is as much of the way `aside`, m, as can be gone with that `acceleration`, m/s², at most.
+    """
+    duration, length = max(within, 1) / rate, math.hypot(*aside)
+    reach = acceleration * duration**2 / _BY_SMOOTHSTEP if within else 0.0
+    way = np.array(aside) * (min(1.0, reach / length) if length > 0.0 else 0.0)
+    share = np.minimum(np.arange(count)[:, None] / max(within, 1), 1.0)
+    return (
+        share**3 * (10.0 - 15.0 * share + 6.0 * share**2) * way,
+        30.0 * share**2 * (1.0 - share) ** 2 / duration * way,
+        60.0 * share * (1.0 - share) * (1.0 - 2.0 * share) / duration**2 * way,
+    )
+
+
+def sinking(payloads: NDArray, lowest: float, speed: float, rate: float, space: Space) -> NDArray:
     """Return the motion of `payloads`, (N, 29) uint8 at `rate`, Hz, sinking besides, at `speed`, m/s, at most.
 
-    It sinks to the height `lowest`, m, at most, and not at all where the motion is that low anyway. Only position and
-    velocity change, so it is feedback that makes the vehicle sink.
+    It sinks to the height `lowest`, m, at most, and not at all where the motion is that low anyway; and it goes off the
+    walls near which it would end. Only position and velocity change, so it is feedback that moves the vehicle.
     """
     motion = decode(payloads)
     room = max(float(motion.position[:, 2].min()) - lowest, 0.0)
@@ -82,4 +145,8 @@ def sinking(payloads: NDArray, lowest: float, speed: float, rate: float) -> NDAr
         allowed = min(speed, math.sqrt(2.0 * _QUICK * (room - depth[row - 1, 2])))
         fall[row, 2] = min(fall[row - 1, 2] + _QUICK / rate, allowed)
         depth[row, 2] = min(depth[row - 1, 2] + fall[row, 2] / rate, room)
+    x, y, z = motion.position[-1].tolist()
+    aside, rows = off_walls((x, y, z), space), len(payloads)
+    place, along, _ = _sideways(aside, rows - 1, rows, rate, _STOP_ASIDE_ACCELERATION)
+    depth[:, :2], fall[:, :2] = -place, -along
     return encode(replace(motion, position=motion.position - depth, velocity=motion.velocity - fall))
