@@ -110,7 +110,7 @@ def plan_learned(task: PlanningTask, *, model: Model | None = None, view: View =
 def propose(task: PlanningTask, model: Model, view: View = scaled_limits) -> tuple[NDArray, YawSpline]:
     """Return the (N+3,) coefficients of h that a model proposes, not finite where it fails, and yaw."""
     path, nodes, start, end = task.path, task.nodes, task.start, task.end
-    asked = min(nodes, max(model.window, math.ceil(path.length / SPACING), len(path.breaks) - 1))
+    asked = _asked(path, nodes, model.window)
     tracks = [
         None if task.yaw is YawMode.FREE else YawSpline.along(path, count, task.yaw, task.yaw_angle, start, end)
         for count in dict.fromkeys((asked, nodes))
@@ -125,6 +125,18 @@ def propose(task: PlanningTask, model: Model, view: View = scaled_limits) -> tup
     if asked < nodes and np.isfinite(coefficients).all():
         coefficients = _laid_over(coefficients, nodes, path, start, end)
     return coefficients, yaw
+
+
+def window_overlaps(path: Path, nodes: int, window: int) -> NDArray:
+    """Return from where to where two windows of a network answer for a path over `nodes` intervals, (J, 2) s."""
+    asked = _asked(path, nodes, window)
+    starts = window_starts(asked, window)
+    return np.stack([starts[1:], starts[:-1] + window], axis=1) * (path.end / asked)
+
+
+def _asked(path: Path, nodes: int, window: int) -> int:
+    """Return the intervals over which a network is asked about a path that is planned over `nodes`."""
+    return min(nodes, max(window, math.ceil(path.length / SPACING), len(path.breaks) - 1))
 
 
 def _laid_over(

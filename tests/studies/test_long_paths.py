@@ -7,7 +7,7 @@ import pytest
 
 from cfplan.errors import CfplanError, InputError
 from cfplan.studies import long_paths as study
-from cfplan.studies.long_paths import COLUMNS, long_paths
+from cfplan.studies.long_paths import BESIDE, COLUMNS, long_paths
 from cfplan.studies.result import Table
 
 LENGTHS = (20.0, 60.0)
@@ -15,7 +15,9 @@ LENGTHS = (20.0, 60.0)
 
 @pytest.fixture(scope="module")
 def short():
-    return long_paths(lengths=LENGTHS, paths=1, repeats=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "TOPPQUAD_NODES", 250)
+        return long_paths(lengths=LENGTHS, paths=1, repeats=2)
 
 
 def plans(result):
@@ -37,6 +39,27 @@ def test_flights_are_certified_and_near_the_experts(short):
         assert all(part > 0 for part in plan.seconds)
 
 
+def test_flights_are_followed_however_long_they_are(short):
+    for plan in plans(short):
+        assert 0.0 < plan.deviation < 0.04
+
+
+def test_the_network_is_as_near_the_expert_at_its_joints_as_elsewhere(short):
+    for plan in plans(short):
+        assert plan.joints > 0
+        assert 0.0 < plan.error_at_joints < 1.5 * plan.error_elsewhere
+
+
+def test_toppquad_stands_beside_as_far_as_it_goes(short):
+    first, second = plans(short)
+    assert first.toppquad_asked
+    assert first.toppquad_seconds > 0.0
+    assert first.flight / first.toppquad_flight == pytest.approx(1.0, abs=0.1)
+    assert not second.toppquad_asked
+    assert math.isnan(second.toppquad_flight)
+    assert [row["toppquad_asked"] for row in short.table("beside").rows] == [1, None]
+
+
 def test_memory_is_measured_where_linux_tells_it(short):
     for plan in plans(short):
         assert plan.peak >= plan.kept
@@ -44,7 +67,8 @@ def test_memory_is_measured_where_linux_tells_it(short):
 
 
 def test_the_result_is_one_table_compared_with_its_first_row_and_survives_json(short):
-    (table,) = short.tables
+    table, beside = short.tables
+    assert beside.cells()[0] == [column.title for column in BESIDE if column.title]
     assert table.cells()[0] == [column.title for column in COLUMNS if column.title]
     assert shown(short, "against the first")[0] == "1.0×"
     document = json.loads(json.dumps(short.to_json(), allow_nan=False))
