@@ -3,6 +3,7 @@
 __all__ = [
     "banded",
     "continued",
+    "guides",
     "min_snap",
     "path",
     "path_families",

@@ -3,7 +3,8 @@
 A path laid from where the vehicle is, with the velocity that it has, may swing far out before its first waypoint, or
 turn too sharply for its speed. That depends on the nominal time that its first segment takes, and on the unit of s in
 which its start is given: that of the path left, which keeps the curve where waypoints stay, or time, which is gentle
-where the path left is about to stop. Where the vehicle must turn back, it may first go on a little as it would have.
+where the path left is about to stop. Where all of these swing outside the space, guides keep the path near the
+straight lines between waypoints. Where the vehicle must turn back, it may first go on a little as it would have.
 Several paths are tried, first the one that looks fastest by a cheap estimate.
 """
 
@@ -19,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import CfplanError, InfeasibleError
 from cfplan.geometry.continued import continued_min_snap
-from cfplan.geometry.min_snap import centripetal_times
+from cfplan.geometry.guides import with_guides
+from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.features import REFERENCE, ScaledLimits, node_features, scaled_limits
@@ -42,10 +44,13 @@ from cfplan.vehicle.trajectory import Trajectory
 FIRST_TIMES, FIRST_TIMES_TIMED = (0.7, 1.0, 1.4, 2.0, 3.0), (1.0, 1.4, 2.0)
 VIA = (0.25, 0.5, 0.8)  # s later on the path left, a place through which the vehicle may go before it turns off
 FIRST_TIMES_VIA = (1.0, 1.8, 3.0)  # of the segment behind that place
+GUIDES = (0.15, 0.3, 0.08, 0.5)  # m from waypoints, at which guides lie, in the order in which they are tried
+GUIDES_IN_MOTION, FIRST_TIMES_GUIDED = (0.3, 0.1), (1.0, 1.6)  # likewise, and of the first segment
 NEAR_VIA = 0.1  # m from the joint or a waypoint, nearer than which there is no such place
 RATE = 1.0  # units of s a second, where it is time: about the speed in m/s
 TRIES = 6  # paths that are planned, and as many that go on a little first
 SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², and s before that, with which the vehicle slows down to a lower speed
+STOPPING = 0.6  # s of the way left, on which a vehicle that stops comes to rest
 OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
 ROOM = 0.005  # share of each limit that plans leave to whoever continues them
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
@@ -93,7 +98,8 @@ def continue_plan(
     known = scaled_limits(limits.airframe, limits.plan)
     failure = ""
     first = _ways(joint, trajectory, points, times)
-    for way in chain(_sound(first, limits, known), _sound(_ways_later(joint, trajectory, points), limits, known)):
+    ways = (first, _ways_guided(joint, trajectory, points), _ways_later(joint, trajectory, points))
+    for way in chain.from_iterable(_sound(each, limits, known) for each in ways):
         task = PlanningTask(
             way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,
             speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,
@@ -109,8 +115,29 @@ def continue_plan(
     raise NoWayError(
         f"from {speed:.2f} m/s no way leads through waypoint 1, {away:.2f} m away: {failure}",
         where="waypoint 1",
-        hint="give a waypoint farther on and more ahead, or stop first",
+        hint="give a waypoint farther on than ({:.2f}, {:.2f}, {:.2f}) m, where it could rest, or stop first".format(
+            *trajectory.at(min(leave + STOPPING, trajectory.duration)).position
+        ),
     )
+
+
+def path_from_rest(points: ArrayLike, limits: Limits) -> tuple[Path, tuple[float, ...]]:
+    """Return a path through points, (K, 3) m, at rest at both ends, and the s of each but the first.
+
+    It has guides where it would swing outside the space without. Raises InputError where they are no waypoints.
+    """
+    given = np.asarray(points, dtype=float)
+    times = centripetal_times(given)
+    plain = min_snap(given, times=times), tuple(np.cumsum(times).tolist())
+    if not _unsound(plain[0], limits):
+        return plain
+    for away in GUIDES:
+        guided, rows = with_guides(given, away)
+        times = centripetal_times(guided)
+        path = min_snap(guided, times=times)
+        if not _unsound(path, limits):
+            return path, tuple(np.cumsum(times)[rows[1:] - 1].tolist())
+    return plain
 
 
 def check_waypoints(points: NDArray, limits: Limits) -> None:
@@ -155,6 +182,17 @@ def _ways_later(joint: Joint, trajectory: Trajectory, points: NDArray) -> Iterat
                 ahead = np.concatenate([[s - joint.s, factor * onwards[0]], onwards[1:]])
                 way = _way(joint, np.concatenate([via[None], points]), ahead)
                 yield way._replace(reached=way.reached[1:])
+
+
+def _ways_guided(joint: Joint, trajectory: Trajectory, points: NDArray) -> Iterator[_Way]:
+    """Yield paths that keep near the straight lines between the waypoints."""
+    for away in GUIDES_IN_MOTION:
+        guided, rows = with_guides(np.concatenate([joint.derivatives[:1], points]), away, first_too=False)
+        onwards = centripetal_times(guided)
+        for begin in (joint, joint.timed(trajectory, RATE)):
+            for factor in FIRST_TIMES_GUIDED:
+                way = _way(begin, guided[1:], np.concatenate([[factor * onwards[0]], onwards[1:]]))
+                yield way._replace(reached=tuple(way.reached[row - 1] for row in rows[1:]))
 
 
 def _way(joint: Joint, points: NDArray, times: NDArray) -> _Way:

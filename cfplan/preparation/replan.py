@@ -22,8 +22,8 @@ from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
-from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, min_snap
-from cfplan.planning.continuation import NoWayError, check_waypoints, continue_plan
+from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times
+from cfplan.planning.continuation import NoWayError, check_waypoints, continue_plan, path_from_rest
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.certified_flight import (
@@ -254,15 +254,15 @@ def _replan_at(
     if joint >= held.ends:
         place = held.flown.at(held.ends)
         points = np.concatenate([place.position[None], held.left, points] if keep else [place.position[None], points])
+        path, reached = path_from_rest(points, limits)
         planned = plan(
-            min_snap(points, times=centripetal_times(points)),
+            path,
             limits.airframe,
             limits,
             planner="expert",
             yaw_angle=float(place.yaw),
             speed_factor=min(speed / limits.plan.speed, 1.0),
         )
-        reached = tuple(np.cumsum(centripetal_times(points)).tolist())
         points = points[1:]
     else:
         leave = joint - held.flown.starts[-1]

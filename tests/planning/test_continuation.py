@@ -8,7 +8,7 @@ import pytest
 from cfplan.errors import InfeasibleError, InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
-from cfplan.planning.continuation import continue_plan
+from cfplan.planning.continuation import continue_plan, path_from_rest
 from cfplan.planning.plan import plan
 from cfplan.safety.certificate import certify
 from cfplan.vehicle.joint import JoinedTrajectory
@@ -104,8 +104,45 @@ def test_where_no_way_leads_through_a_waypoint_speed_and_distance_are_said(flown
     room = replace(limits, space=replace(limits.space, low=tuple(low), high=tuple(high)))
     away = np.zeros(3)
     away[axis] = -0.05 * towards
-    with pytest.raises(InfeasibleError, match=r"from \d\.\d\d m/s no way leads through waypoint 1, 0\.05 m away"):
+    with pytest.raises(
+        InfeasibleError, match=r"from \d\.\d\d m/s no way leads through waypoint 1, 0\.05 m away"
+    ) as refused:
         continue_plan(flown.trajectory, leave, [state.position + away], room)
+    x, y, z = flown.trajectory.at(leave + 0.6).position
+    assert f"farther on than ({x:.2f}, {y:.2f}, {z:.2f}) m" in refused.value.hint
+
+
+def test_waypoints_anywhere_in_the_space_are_flown_from_rest(limits):
+    """Nearly all, where of paths of least snap alone a third swing outside."""
+    random = np.random.default_rng(3)
+    low, high = np.array(limits.space.low) + limits.space.margin, np.array(limits.space.high) - limits.space.margin
+    inside = guided = 0
+    for _ in range(40):
+        points = random.uniform(low, high, (4, 3))
+        path, reached = path_from_rest(points, limits)
+        np.testing.assert_allclose(path(np.array(reached)), points[1:], atol=1e-9)
+        inside += bool((limits.space.beyond(path(np.linspace(0.0, path.end, 400))) <= 0.0).all())
+        if len(path.breaks) > len(points):
+            guided += 1
+            last = path
+    assert inside >= 39
+    assert 10 < guided < 30
+    assert plan(last, limits.airframe, limits, planner="expert").certificate.passed
+
+
+def test_most_waypoints_anywhere_in_the_space_are_flown_in_motion(flown, limits):
+    random, made, tried = np.random.default_rng(5), 0, 24
+    low, high = np.array(limits.space.low) + limits.space.margin, np.array(limits.space.high) - limits.space.margin
+    for _ in range(tried):
+        points = random.uniform(low, high, (3, 3))
+        try:
+            leave = float(random.uniform(0.1, 0.8)) * flown.trajectory.duration
+            new = continue_plan(flown.trajectory, leave, points, limits)
+        except InfeasibleError:
+            continue
+        made += 1
+        np.testing.assert_allclose(new.plan.path(np.array(new.reached)), points, atol=1e-9)
+    assert made >= 0.85 * tried
 
 
 @pytest.mark.parametrize("waypoints", [[], [[1, 2]], [[np.nan, 0, 1]], [[0.5, 0, 1], [0.5, 0, 1]]])
