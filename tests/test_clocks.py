@@ -24,6 +24,21 @@ READ_REAL_TIME = {
     "recording/mavlink/bridge.py": "dates a log by the wall clock",
 }
 IN_REAL_TIME = sorted(TESTS.rglob("test_*_in_real_time.py"))
+# The tests that go by the computer's clock, and what only they can show.
+REAL_TIME_TESTS = {
+    "test_a_flight_goes_by_the_clock_and_ends_landed": "the pilot's process meets its deadlines",
+    "test_ctrl_c_at_full_speed_lands_and_twice_cuts_the_motors": "a signal to one process ends the flight of another",
+    "test_whichever_process_is_killed_the_vehicle_comes_down": "the system's own end of a process",
+    "test_a_fault_in_real_time_comes_to_its_rung_and_the_vehicle_to_the_ground": "drivers and sockets, a stopped pilot",
+    "test_without_its_planner_a_flight_ends_on_what_is_committed": "a planner's process that dies or hangs",
+    "test_a_vehicle_is_steered_by": "programs and pipes that request waypoints in flight",
+    "test_a_flight_ends_disarmed_and_recorded_whatever_is_done_from_outside": "terminals, and a ground station",
+    "test_poses_are_where_and_when_the_body_was": "how late poses of the driver's process are",
+    "test_a_link_fails_or_closes_soon": "how long a person waits",
+    "test_cflib_flies_the_virtual_crazyflie": "cflib's threads go by the computer's clock",
+    "test_an_example_of_cflib_flies_and_lands": "programs that others wrote",
+    "test_a_sleeper_notes_its_deadlines_and_how_long_a_process_waits_for_its_processor": "the system's scheduling",
+}
 
 
 def imports_time(file: Path) -> bool:
@@ -54,3 +69,14 @@ def test_only_slow_tests_read_the_computers_clock():
 @pytest.mark.parametrize("file", IN_REAL_TIME, ids=lambda file: file.stem)
 def test_tests_in_real_time_are_slow(file):
     assert re.search(r"^pytestmark = .*\bpytest\.mark\.slow\b", file.read_text(), re.MULTILINE)
+
+
+def test_a_dozen_tests_go_by_the_computers_clock():
+    found = [
+        node.name
+        for file in IN_REAL_TIME
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+    ]
+    assert sorted(found) == sorted(REAL_TIME_TESTS)
+    assert len(REAL_TIME_TESTS) == 12

@@ -1,18 +1,25 @@
-"""Whole flights from a terminal that is stopped, not read, closed or interrupted: each ends disarmed, with a record."""
+"""Whole flights that are ended, or not, from outside: each ends disarmed, with a record.
+
+Their terminal is stopped, not read, closed or interrupted, or a ground station lands the vehicle.
+"""
 
 import json
 import os
 import pty
 import select
+import socket
 import sys
 import time
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import common
 from waiting import PATIENCE
 
 from cfplan.errors import ExitCode
+from cfplan.recording.importers.formats import read_log
+from cfplan.recording.mavlink.bridge import messages_in
 from cfplan.recording.reader import read_record
 
 REPOSITORY = Path(__file__).parents[2]
@@ -24,9 +31,13 @@ pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
 
 class Terminal:
-    """A terminal with a program in it."""
+    """A terminal with a flight in it, and a ground station beside it."""
 
     def __init__(self, *words: str):
+        self.station = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.station.bind(("127.0.0.1", 0))
+        self.station.settimeout(PATIENCE)
+        words = (*words, "--mavlink", f"udp:127.0.0.1:{self.station.getsockname()[1]}")
         self.program, self._screen = pty.fork()
         if self.program == 0:
             os.chdir(REPOSITORY)
@@ -69,6 +80,19 @@ def interrupt_twice(terminal: Terminal) -> None:
     terminal.read_to_the_end()
 
 
+def land_by_ground_station(terminal: Terminal) -> None:
+    """Send MAVLink's command to land until it is answered; what was sent to the station so far came to nobody."""
+    mav, answers, end = common.MAVLink(None, srcSystem=255, srcComponent=190), [], time.monotonic() + PATIENCE
+    while not answers:
+        assert time.monotonic() < end
+        data, vehicle = terminal.station.recvfrom(2048)
+        answers = [one.result for _, one in messages_in(data) if one.get_type() == "COMMAND_ACK"]
+        land = mav.command_long_encode(1, 1, common.MAV_CMD_NAV_LAND, 0, 0, 0, 0, 0, 0, 0, 0)
+        terminal.station.sendto(land.pack(mav), vehicle)
+    assert answers == [common.MAV_RESULT_ACCEPTED]
+    terminal.read_to_the_end()
+
+
 @pytest.mark.parametrize(
     ("phase", "act", "code"),
     [
@@ -76,15 +100,17 @@ def interrupt_twice(terminal: Terminal) -> None:
         ("take off", read_nothing, ExitCode.OK),
         ("stream", Terminal.close, ExitCode.ENDED_BY_OPERATOR),
         ("arm", interrupt_twice, ExitCode.ENDED_BY_OPERATOR),
+        ("stream", land_by_ground_station, ExitCode.ENDED_BY_OPERATOR),
     ],
 )
-def test_a_flight_ends_disarmed_and_recorded_whatever_its_terminal_does(
+def test_a_flight_ends_disarmed_and_recorded_whatever_is_done_from_outside(
     tmp_path, patient_safety_file, phase, act, code
 ):
     terminal = Terminal(*FLY, "--safety", str(patient_safety_file), "--records", str(tmp_path))
     terminal.read_until(f" s  {phase}\r\n")
     act(terminal)
     assert os.waitstatus_to_exitcode(os.waitpid(terminal.program, 0)[1]) == code
+    terminal.station.close()
     (folder,) = tmp_path.iterdir()
     record = read_record(folder)
     assert list(record.phases.phase[-2:]) == ["disarm", "closed"]
@@ -93,3 +119,8 @@ def test_a_flight_ends_disarmed_and_recorded_whatever_its_terminal_does(
     assert not record.status.motor[-1].any()
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["outcome"]["exit_code"] == code
+    log = read_log(folder / "telemetry.tlog")
+    subjects = {"vehicle 1", "vehicle 1 odometry"} | ({"vehicle 1 setpoint"} if phase == "stream" else set())
+    assert subjects <= {subject.name for subject in log.subjects}
+    assert not log.truncated
+    assert log.notes == ()

@@ -73,7 +73,8 @@ ROWS = {
     "connection reset for 0.5 s": (disturb(ViconFault(FaultKind.CLOSE, 0.0, 0.5)), "vicon", (Rung.LAND,)),
     "poses stop for 0.3 s": (disturb(ViconFault(FaultKind.OCCLUDE, 0.0, 0.3)), "vicon", (Rung.BRAKE,)),
     "radio loses 30 %": (disturb(RadioFault(RadioFaultKind.LOSS, 0.0, 20.0, 0.3)), "vicon", (Rung.NONE,)),
-    "radio dead for 1 s": (disturb(RadioFault(RadioFaultKind.DEAD, 0.0, 1.0)), "vicon", (Rung.LAND,)),
+    # The vehicle's watchdog locks it 1 s after the last keep-alive packet, which may be 0.1 s before the radio dies.
+    "radio dead for 0.8 s": (disturb(RadioFault(RadioFaultKind.DEAD, 0.0, 0.8)), "vicon", (Rung.LAND,)),
     "pilot stopped for 0.6 s": (stall(0.6), "vicon", (Rung.BRAKE, Rung.LAND)),
 }
 

@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from cfplan.recording.reader import read_record
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
@@ -22,25 +25,32 @@ print(vehicle.outcome.reason)
 """
 
 
-@pytest.fixture
-def folder(tmp_path):
-    (tmp_path / "safety.yaml").write_text(SAFETY.read_text())
-    return tmp_path
+def says_that_it_landed(said: str) -> None:
+    assert said.strip() == "landed"
 
 
-def test_waypoints_of_standard_input_are_flown(folder):
-    done = subprocess.run(
-        [sys.executable, "-m", "cfplan", "fly", "--waypoints", "-", "--json"],
-        cwd=folder, input="1 0 1\n0 1 1.2\nhello\n", capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    document = json.loads(done.stdout)
+def answers_each_line(said: str) -> None:
+    document = json.loads(said)
     assert sorted(answer.split()[1] for answer in document["answers"]) == ["accepted:", "accepted:", "refused:"]
     assert document["max_deviation"] < 0.2
 
 
-def test_a_program_steers(folder):
+@pytest.mark.parametrize(
+    ("command", "given", "tells"),
+    [
+        (("-c", PROGRAM), "", says_that_it_landed),
+        (("-m", "cfplan", "fly", "--waypoints", "-", "--json"), "1 0 1\n0 1 1.2\nhello\n", answers_each_line),
+    ],
+    ids=["a program", "lines of standard input"],
+)
+def test_a_vehicle_is_steered_by(command, given, tells, tmp_path):
+    (tmp_path / "safety.yaml").write_text(SAFETY.read_text())
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM], cwd=folder, capture_output=True, text=True, timeout=300, check=False
+        [sys.executable, *command], cwd=tmp_path, input=given, capture_output=True, text=True, timeout=300, check=False
     )
-    assert done.stdout.strip() == "landed", done.stderr
+    assert done.returncode == 0, done.stderr
+    tells(done.stdout)
+    (folder,) = (tmp_path / "records").iterdir()
+    record = read_record(folder)
+    assert not record.status.motor[-1].any()
+    np.testing.assert_allclose(record.estimates.position[-1], (0.0, 1.0, 0.0), atol=0.15)

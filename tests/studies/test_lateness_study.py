@@ -1,5 +1,7 @@
 """Lateness: of a sleeper and of the stream, with and without going first; who gives that up has given it up."""
 
+import json
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -7,7 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from cfplan.errors import InputError
+from cfplan.errors import ExitCode, InputError
+from cfplan.flight.pilot.deadlines import Lateness
+from cfplan.flight.pilot.outcome import Deviation, FlightOutcome, Rung
+from cfplan.flight.telemetry import SetpointSent
 from cfplan.studies import lateness
 from cfplan.studies.lateness import FIRST, ORDINARY, WakeUps, lateness_table
 from cfplan.studies.real_time import RealTimeFlight
@@ -26,6 +31,53 @@ sys.exit(subprocess.run([sys.executable, "-c",
 
 def refused(reason):
     return lambda: RealTimeFlight(None, reason)
+
+
+class KnownSleeper:
+    """A sleeper that is 3 ms late at each deadline of 100 Hz, and has no process to watch."""
+
+    def __init__(self, rate, *, first):
+        self.rate, self.first = rate, first
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+    def watch(self, process):
+        pass
+
+    def late(self, begin=0.0, end=0.1):
+        return [3e-3] * math.floor((end - begin) * self.rate + 1.5)  # both ends count
+
+    def queued(self, begin, end):
+        return []
+
+
+def streamed(late, skipped):
+    """A flight that streamed for a fifth of a second, each setpoint late by as much."""
+    due = [100.0 + index / 100 for index in range(20)]
+    sent = [SetpointSent(when + late, when, index, *[STILL] * 3, LEVEL, STILL) for index, when in enumerate(due)]
+    outcome = FlightOutcome(
+        ExitCode.OK, "landed", Rung.NONE, (), (), due[0], 0.2, Lateness(late, late, late, 20, skipped),
+        Deviation(0.0, 0.0, 0.0, 0), 0.0, STILL,
+    )  # fmt: skip
+    return lambda: RealTimeFlight(outcome, "landed", sent=sent)
+
+
+def test_a_sleeper_stands_before_each_stream_and_beside_it_over_the_same_seconds(study, measured, monkeypatch):
+    monkeypatch.setattr(lateness, "Sleeper", KnownSleeper)
+    result = study(streamed(1e-3, 3), streamed(2e-3, 0))
+    rows = measured(result)
+    assert [(row.what, row.priority, row.count, row.skipped) for row in rows] == [
+        ("asleep, nothing else", FIRST, 11, 0), ("stream", FIRST, 20, 3), ("asleep meanwhile", FIRST, 20, 0),
+        ("asleep, nothing else", ORDINARY, 11, 0), ("stream", ORDINARY, 20, 0), ("asleep meanwhile", ORDINARY, 20, 0),
+    ]  # fmt: skip
+    assert [row.p50 for row in rows] == pytest.approx([3e-3, 1e-3, 3e-3, 3e-3, 2e-3, 3e-3])
+    titles, cells = result.table("lateness").cells()
+    assert all(len(row) == len(titles) for row in cells)
+    json.dumps(result.to_json(), allow_nan=False)
 
 
 def test_percentiles_are_those_of_the_setpoints():

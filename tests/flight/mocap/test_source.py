@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from hanging_server import hanging_server
 from stepped_vicon import SteppedFeed
 from waiting import PATIENCE, a_moment, until
 
@@ -273,8 +274,8 @@ def test_a_system_that_sends_nothing_is_an_error():
     assert caught.value.where == vicon.uri
 
 
-def test_a_vendors_client_that_hangs_is_ended(trap):
-    with trap(then_close=True) as uri, pytest.raises(LinkError, match="no answer"):
+def test_a_vendors_client_that_hangs_is_ended():
+    with hanging_server(then_close=True) as uri, pytest.raises(LinkError, match="no answer"):
         pose_source(uri, LIMITS, open_within=PATIENCE).open()
 
 

@@ -1,7 +1,5 @@
-"""Unmodified cflib flies the virtual Crazyflie in real time, and loses it."""
+"""Unmodified cflib flies the virtual Crazyflie in real time."""
 
-import os
-import signal
 import threading
 import time
 from dataclasses import replace
@@ -9,11 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.mem import MemoryElement
-from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 from cflib.crtp.crtpstack import CRTPPort
-from cflib.positioning.motion_commander import MotionCommander
 from waiting import until
 
 from cfplan.flight.on_board.certified_pieces import certified_compressed, certified_pieces
@@ -64,16 +59,22 @@ def prepare(cf, feed, set_and_read_back):
     time.sleep(0.7)
 
 
-def test_a_whole_flight_take_off_go_to_stream_hand_back_land(lab, link, set_and_read_back):
-    codes = []
-    link.add_port_callback(CRTPPort.SETPOINT_HL, lambda packet: codes.append(packet.data[3]))
-    feed = PoseFeed(link)
-    prepare(link, feed, set_and_read_back)
-    commander, planner = link.commander, link.high_level_commander
-
-    started = time.monotonic()
-    planner.takeoff(0.8, 1.5, yaw=None)
+def takes_off(cf):
+    cf.high_level_commander.takeoff(0.8, 1.5, yaw=None)
     time.sleep(2.0)
+
+
+def lands(cf, feed):
+    cf.high_level_commander.land(0.0, 1.5, yaw=None)
+    assert until(lambda: not cf.supervisor.is_flying)
+    feed.stop.set()
+    feed.join()
+
+
+def streams(lab, cf, feed):
+    """Take off, go to, stream, hand back, land."""
+    commander, planner, started = cf.commander, cf.high_level_commander, time.monotonic()
+    takes_off(cf)
     planner.go_to(0.0, 0.0, 1.0, 0.0, 1.5)
     time.sleep(2.0)
     begun = time.monotonic()
@@ -88,19 +89,14 @@ def test_a_whole_flight_take_off_go_to_stream_hand_back_land(lab, link, set_and_
     planner.go_to(x, y, z, 0.0, 1.0)
     commander.send_notify_setpoint_stop()
     time.sleep(1.2)
-    planner.land(0.0, 1.5, yaw=None)
-    assert until(lambda: not link.supervisor.is_flying)
+    lands(cf, feed)
 
     truth = lab.truth()
-    feed.stop.set()
-    feed.join()
-    assert codes == [0, 0, 0, 0]
     begun_at = np.searchsorted(truth.time, started)
     assert truth.position[-1, 2] == 0.0
     assert truth.position[begun_at:, 2].max() == pytest.approx(1.0, abs=0.1)
     assert np.abs(truth.position[begun_at:, 0]).max() < 0.8
     assert truth.off_in_air[-1] == truth.off_in_air[begun_at]
-    assert not truth.locked
     assert np.allclose(np.diff(truth.time[begun_at:]), 0.01, atol=1e-6)
 
 
@@ -114,78 +110,52 @@ class Packed:
         return bytearray(self.content)
 
 
-@pytest.mark.parametrize("make", [certified_pieces, certified_compressed])
-def test_cflib_uploads_a_plan_and_the_vehicle_flies_it_by_itself(lab, link, set_and_read_back, make):
+def uploads(make):
+    """Upload a plan, and let the vehicle fly it by itself."""
     limits = load_limits(Path(__file__).parents[3] / "safety.yaml")
     gentle = replace(limits.plan, angular_acceleration=0.57 * limits.plan.angular_acceleration)
     path = path_through([[-0.8, -0.8, 0.7], [0.2, 0.4, 1.1], [1.0, -0.6, 0.9]]).path
     made = make(plan(path, limits.airframe, replace(limits, plan=gentle)).trajectory, limits)
+
+    def fly(lab, cf, feed):
+        (memory,) = cf.mem.get_mems(MemoryElement.TYPE_TRAJ)
+        memory.trajectory = [Packed(made.memory)]
+        assert memory.write_data_sync()
+        planner = cf.high_level_commander
+        planner.define_trajectory(1, 0, len(made.pieces.durations), int(made.compressed))
+        takes_off(cf)
+        x, y, z, yaw = (float(value) for value in made.pieces.coefficients[0, :, 0])
+        planner.go_to(x, y, z, yaw, 3.0)
+        time.sleep(4.5)
+        begun = time.monotonic()
+        planner.start_trajectory(1)
+        time.sleep(made.duration + 0.5)
+        lands(cf, feed)
+
+        truth = lab.truth()
+        offsets = []
+        for late in np.arange(0.0, 0.2, 0.01):  # until the command took effect
+            here = (truth.time >= begun + late) & (truth.time < begun + late + made.duration)
+            wanted = made.reference.plan_at(truth.time[here] - begun - late)[:, 0, :3]
+            offsets.append(np.linalg.norm(truth.position[here] - wanted, axis=1).max())
+        assert min(offsets) < 0.05
+
+    return fly
+
+
+@pytest.mark.parametrize(
+    ("make_flight", "commands"),
+    [
+        pytest.param(lambda: streams, 4, id="by setpoints"),
+        pytest.param(lambda: uploads(certified_pieces), 5, id="by polynomials"),
+        pytest.param(lambda: uploads(certified_compressed), 5, id="by compressed polynomials"),
+    ],
+)
+def test_cflib_flies_the_virtual_crazyflie(lab, link, set_and_read_back, make_flight, commands):
+    flight, codes = make_flight(), []
+    link.add_port_callback(CRTPPort.SETPOINT_HL, lambda packet: codes.append(packet.data[3]))
     feed = PoseFeed(link)
     prepare(link, feed, set_and_read_back)
-    (memory,) = link.mem.get_mems(MemoryElement.TYPE_TRAJ)
-    memory.trajectory = [Packed(made.memory)]
-    assert memory.write_data_sync()
-    planner, codes = link.high_level_commander, []
-    link.add_port_callback(CRTPPort.SETPOINT_HL, lambda packet: codes.append(packet.data[3]))
-    planner.define_trajectory(1, 0, len(made.pieces.durations), int(made.compressed))
-    planner.takeoff(0.8, 1.5, yaw=None)
-    time.sleep(2.0)
-    x, y, z, yaw = (float(value) for value in made.pieces.coefficients[0, :, 0])
-    planner.go_to(x, y, z, yaw, 3.0)
-    time.sleep(4.5)
-    begun = time.monotonic()
-    planner.start_trajectory(1)
-    time.sleep(made.duration + 0.5)
-    planner.land(0.0, 1.5, yaw=None)
-    assert until(lambda: not link.supervisor.is_flying)
-    feed.stop.set()
-    feed.join()
-    assert codes == [0, 0, 0, 0, 0]
-
-    truth = lab.truth()
-    offsets = []
-    for late in np.arange(0.0, 0.2, 0.01):  # until the command took effect
-        here = (truth.time >= begun + late) & (truth.time < begun + late + made.duration)
-        wanted = made.reference.plan_at(truth.time[here] - begun - late)[:, 0, :3]
-        offsets.append(np.linalg.norm(truth.position[here] - wanted, axis=1).max())
-    assert min(offsets) < 0.05
-    assert not truth.locked
-
-
-def test_motion_commander_flies_with_the_default_controller(lab, link, set_and_read_back):
-    """The firmware's PID and its velocity setpoints, as cflib's own examples use them."""
-    set_and_read_back("stabilizer.controller", 1)
-    feed = PoseFeed(link)
-    set_and_read_back("stabilizer.estimator", 2)
-    feed.start()
-    for axis, value in zip("XYZ", feed.start_position, strict=True):
-        link.param.set_value(f"kalman.initial{axis}", value)
-    link.param.set_value("kalman.resetEstimation", 1)
-    time.sleep(0.7)
-    with MotionCommander(link, default_height=0.5) as motion:
-        motion.forward(0.4)
-        motion.left(0.3)
-        time.sleep(0.3)
-        place = feed.latest.position
-    feed.stop.set()
-    feed.join()
-    x, y, _ = feed.start_position
-    assert place == pytest.approx((x + 0.4, y + 0.3, 0.5), abs=0.2)
-    assert until(lambda: lab.truth().position[-1, 2] == 0.0)
-
-
-def test_the_link_closes_at_once(lab):
-    for _ in range(2):
-        with SyncCrazyflie(lab.uri, cf=Crazyflie()) as sync:
-            sync.wait_for_params()
-            begun = time.monotonic()
-        assert time.monotonic() - begun < 0.5
-
-
-def test_a_lab_that_hangs_is_a_lost_connection(doomed, doomed_link):
-    _, lost = doomed_link
-    os.kill(doomed.process_id, signal.SIGSTOP)
-    try:
-        assert lost.wait(5)
-    finally:
-        os.kill(doomed.process_id, signal.SIGCONT)
+    flight(lab, link, feed)
+    assert codes == [0] * commands
+    assert not lab.truth().locked

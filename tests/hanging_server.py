@@ -1,17 +1,15 @@
-"""Servers that cheat their clients."""
+"""A server that cheats the vendor's client."""
 
 import socket
 import threading
 from contextlib import contextmanager
 
-import pytest
-
 from cfplan.flight.mocap.datastream import Block, kinds, packet
 
 
 @contextmanager
-def _trap(then_close):
-    """A server that welcomes clients and never sends a frame; it may stop listening after the first."""
+def hanging_server(then_close):
+    """A server that welcomes clients and never sends a frame, by its URI; it may stop listening after the first."""
     listener = socket.create_server(("127.0.0.1", 0))
     clients = []
 
@@ -34,9 +32,3 @@ def _trap(then_close):
         listener.close()
         for client in clients:
             client.close()
-
-
-@pytest.fixture
-def trap():
-    """Makes such a server for the vendor's client, and gives its URI."""
-    return _trap
