@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from sources import tree
 
 REPOSITORY = Path(__file__).parent.parent
 PACKAGE = REPOSITORY / "cfplan"
@@ -22,7 +23,7 @@ def plain(text: str) -> str:
 @cache
 def announced(file: Path) -> tuple[str, str]:
     """The name of a module with its docstring's first line, and the whole docstring."""
-    docstring = ast.get_docstring(ast.parse(file.read_text())) or ""
+    docstring = ast.get_docstring(tree(file)) or ""
     return plain(f"{file.stem} {docstring.partition(chr(10))[0]}"), plain(docstring)
 
 

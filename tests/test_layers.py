@@ -1,10 +1,11 @@
 """Packages import those above them in the design's list, rooms of a package likewise, and each by its face alone."""
 
 import ast
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
+from sources import FILES, PACKAGE, nodes, tree
 
 LAYERS = [
     "files", "geometry", "vehicle", "safety", "planners", "learning", "planning", "flight", "simulation",
@@ -18,13 +19,13 @@ ROOMS = {
     "simulation": ["timed_fault", "dynamics", "virtual_crazyflie", "virtual_vicon", "lab", MODULES],
     "recording": ["plausible", "importers", MODULES, "rerun", "report", "mavlink"],
 }
-PACKAGE = Path(__file__).parent.parent / "cfplan"
-FILES = sorted(PACKAGE.rglob("*.py"))
 
 
-def imports(file: Path) -> Iterator[tuple[str, ...]]:
+@cache
+def imports(file: Path) -> list[tuple[str, ...]]:
     """What a file imports of cfplan, anywhere in it: the parts of each module's name, without the first."""
-    for node in ast.walk(ast.parse(file.read_text())):
+    found = []
+    for node in nodes(file):
         names: list[str] = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -38,7 +39,8 @@ def imports(file: Path) -> Iterator[tuple[str, ...]]:
                     PACKAGE.joinpath(*parts).is_dir() or PACKAGE.joinpath(*parts).with_suffix(".py").exists()
                 ):
                     parts.pop()
-                yield tuple(parts)
+                found.append(tuple(parts))
+    return found
 
 
 def room_of(parts: tuple[str, ...]) -> tuple[str, ...]:
@@ -46,9 +48,10 @@ def room_of(parts: tuple[str, ...]) -> tuple[str, ...]:
     return parts if PACKAGE.joinpath(*parts).is_dir() else parts[:-1]
 
 
+@cache
 def face(room: tuple[str, ...]) -> set[str]:
     """What a room's __init__.py says that others may import."""
-    for node in ast.parse(PACKAGE.joinpath(*room, "__init__.py").read_text()).body:
+    for node in tree(PACKAGE.joinpath(*room, "__init__.py")).body:
         if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
             return set(ast.literal_eval(node.value))
     return set()
@@ -128,7 +131,7 @@ def test_no_module_imports_itself_by_way_of_others():
 def test_a_public_class_name_occurs_once():
     places: dict[str, list[str]] = {}
     for file in FILES:
-        for node in ast.walk(ast.parse(file.read_text())):
+        for node in nodes(file):
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 places.setdefault(node.name, []).append(f"{file.relative_to(PACKAGE)}:{node.lineno}")
     assert {name: found for name, found in places.items() if len(found) > 1} == {}

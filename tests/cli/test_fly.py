@@ -20,23 +20,18 @@ COMMAND = (sys.executable, "-c", "from cfplan.cli import main; main()")
 pytestmark = pytest.mark.integration
 
 
-def run(*words: object) -> subprocess.CompletedProcess:
-    """In a process of its own, without a terminal."""
-    return subprocess.run(
-        [*COMMAND, *map(str, words)], cwd=REPOSITORY, capture_output=True, text=True, stdin=subprocess.DEVNULL,
-        timeout=240, check=False,
-    )  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory, patient_safety_file):
     """One flight of flights/line.yaml, watched by a ground station that never speaks, as JSON."""
     records = tmp_path_factory.mktemp("records")
-    words = ["flights/line.yaml", "--safety", patient_safety_file, "--records", records]
+    words = ["fly", "flights/line.yaml", "--safety", str(patient_safety_file), "--records", str(records), "--json"]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
         station.bind(("127.0.0.1", 0))
         place = f"udp:127.0.0.1:{station.getsockname()[1]}"
-        ended = run("fly", *words, "--mavlink", place, "--json")
+        ended = subprocess.run(
+            [*COMMAND, *words, "--mavlink", place], cwd=REPOSITORY, capture_output=True, text=True,
+            stdin=subprocess.DEVNULL, timeout=240, check=False,
+        )  # fmt: skip
     assert ended.returncode == 0, ended.stderr
     return json.loads(ended.stdout)
 
@@ -59,11 +54,11 @@ def test_the_record_holds_the_plan_and_the_flight(flight):
     assert summary["travel_time_flown"] != summary["travel_time_planned"]
 
 
-def test_the_flight_has_the_same_figures_wherever_they_stand(flight):
+def test_the_flight_has_the_same_figures_wherever_they_stand(flight, cfplan):
     """In what `fly` prints, in summary.json and in the report; each figure once."""
     folder = Path(flight["record"])
     summary = json.loads((folder / "summary.json").read_text())
-    (reported,) = json.loads(run("report", folder, "--json").stdout)["flights"]
+    (reported,) = cfplan("report", folder, "--json").json["flights"]
     figures = {key: value for key, value in summary.items() if isinstance(value, float)}
     assert {"travel_time_flown", "settling", "max_deviation"} <= set(figures)
     for key, value in figures.items():
@@ -78,30 +73,29 @@ def test_the_log_of_the_ground_station_is_whole(flight):
     assert log.notes == ()
 
 
-def test_the_record_replays_and_verifies(flight, tmp_path):
+def test_the_record_replays_and_verifies(flight, tmp_path, cfplan):
     file = tmp_path / "flight.rrd"
-    ended = run("replay", flight["record"], "--save", file)
-    assert ended.returncode == 0, ended.stderr
+    ended = cfplan("replay", flight["record"], "--save", file)
+    assert ended.code == 0, ended.err
     verified = subprocess.run(
         [Path(sys.executable).parent / "rerun", "rrd", "verify", file], capture_output=True, timeout=60, check=False
     )
     assert verified.returncode == 0
 
 
-def test_the_recorded_plan_can_be_checked_and_rehearsed_again(flight):
+def test_the_recorded_plan_can_be_checked_and_rehearsed_again(flight, cfplan):
     plan = Path(flight["record"]) / "plan.parquet"
-    assert run("check", plan).returncode == 0
-    rehearsed = run("sim", plan, "--json")
-    assert rehearsed.returncode == 0
-    document = json.loads(rehearsed.stdout)
-    assert document["dry_run"]["passed"]
-    assert document["link_loss"]["beyond"] < 0.0
+    assert cfplan("check", plan).code == 0
+    rehearsed = cfplan("sim", plan, "--json")
+    assert rehearsed.code == 0
+    assert rehearsed.json["dry_run"]["passed"]
+    assert rehearsed.json["link_loss"]["beyond"] < 0.0
 
 
-def test_a_truncated_record_says_so_and_replays_what_is_there(flight, tmp_path):
+def test_a_truncated_record_says_so_and_replays_what_is_there(flight, tmp_path, cfplan):
     whole = (Path(flight["record"]) / "flight.mcap").read_bytes()
     (tmp_path / "flight.mcap").write_bytes(whole[: len(whole) // 2])
-    ended = run("replay", tmp_path, "--save", tmp_path / "part.rrd")
-    assert ended.returncode == 0
-    assert "truncated" in ended.stdout
+    ended = cfplan("replay", tmp_path, "--save", tmp_path / "part.rrd")
+    assert ended.code == 0
+    assert "truncated" in ended.out
     assert (tmp_path / "part.rrd").stat().st_size > 0

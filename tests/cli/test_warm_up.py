@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from waiting import until
 
+from cfplan import machine_code
 from cfplan.cli import warm_up
 from cfplan.preparation.compiled_calls import Stage
 
@@ -62,6 +63,7 @@ def test_what_a_first_plan_needed_is_compiled_behind_it(tmp_path):
 
 GOING_ON = """
 import os
+from cfplan import machine_code
 from cfplan.cli import warm_up
 print(warm_up._may_go_on(os.getppid()), warm_up._may_go_on(-1), os.nice(0) == warm_up.LEAST_PRIORITY, flush=True)
 warm_up._step_back_once_alone()
@@ -83,18 +85,47 @@ def test_of_those_whose_command_has_ended_one_goes_on(tmp_path):
     assert begin().communicate("\n", timeout=60)[0] == "True True False\nTrue\n"
 
 
+WORK = "from cfplan.cli.warm_up import *; work(Stage.PLAN, Path('safety.yaml'), 'last')"
+# Into a folder of its own goes what is compiled ahead, and nothing that it needs besides.
+KEPT_ALONE = """
+import shutil, sys
+from cfplan import machine_code
+from cfplan.preparation.compiled_calls import Stage, find_calls
+from pathlib import Path
+for call in find_calls(Path("safety.yaml"), Stage.PLAN):
+    while not machine_code.is_compiled(call):
+        machine_code.compile_call(call)
+    shutil.copy(machine_code.cache_folder() / machine_code._file_of(call), sys.argv[1])
+"""
+
+
 @pytest.mark.integration
+def test_what_is_compiled_ahead_is_all_that_a_plan_needs(tmp_path):
+    run(KEPT_ALONE, machine_code.cache_folder(), str(tmp_path))
+    code = [file.read_bytes() for file in tmp_path.iterdir()]
+    assert len(code) > 20
+    # An array assigned to a slice makes numba compile this, for seconds: write a loop.
+    assert not [each for each in code if b"raise_with_shape_context" in each]
+
+    compiled, done = run(WORK, tmp_path)
+    assert compiled == []
+    assert done.stdout.split() == [str(len(code))] * 2
+    assert_a_plan_compiles_nothing(tmp_path)
+
+
+@pytest.mark.slow  # it compiles all that a plan needs, for a minute
 def test_after_compiling_ahead_a_plan_compiles_nothing(tmp_path):
-    work = "from cfplan.cli.warm_up import *; work(Stage.PLAN, Path('safety.yaml'), 'last')"
-    compiled, done = run(work, tmp_path)
+    compiled, done = run(WORK, tmp_path)
     counts = [tuple(map(int, line.split())) for line in done.stdout.splitlines()]
     assert counts == sorted(counts)
     assert counts[-1][0] == counts[-1][1] > 20
     assert "_search" in compiled
-    # An array assigned to a slice makes numba compile this, for seconds: write a loop.
     assert not [name for name in compiled if "raise_with_shape_context" in name]
+    assert_a_plan_compiles_nothing(tmp_path)
 
-    compiled, done = run(PLAN, tmp_path)
+
+def assert_a_plan_compiles_nothing(cache):
+    compiled, done = run(PLAN, cache)
     assert compiled == []
     assert "compiling" not in done.stderr  # there is nothing to wait for
     assert "Certificate: passed" in done.stdout
