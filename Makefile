@@ -22,12 +22,13 @@ fly: install
 	$(BIN)/cfplan fly flights/figure8.yaml
 
 test: $(VENV)/installed-tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
 
 slow: $(VENV)/installed-tests
 	$(BIN)/python -m pytest -m slow
 
 fuzz: $(VENV)/installed-tests
+	$(BIN)/python -m pytest -m "hypothesis and not slow" --hypothesis-profile=random
 	$(BIN)/python -m tests.fuzzing --inputs 100000
 
 # An archive of the sources, and the wheel made from that archive, in dist/.

@@ -1,9 +1,10 @@
-"""What tests of several packages share: profiles and limits."""
+"""What tests of several packages share: profiles, limits, and how examples are drawn."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from scipy.interpolate import BSpline
 
 from cfplan.safety.limits import Limits
@@ -11,6 +12,12 @@ from cfplan.safety.limits_file import load_limits
 from cfplan.vehicle.profile import SpeedProfile
 
 REPOSITORY = Path(__file__).parents[1]
+
+# A verdict depends neither on how busy the computer is nor on the day: no deadlines, and the same examples on each run.
+# `make fuzz` draws others: pytest -m hypothesis --hypothesis-profile=random
+settings.register_profile("random", deadline=None)
+settings.register_profile("repeatable", deadline=None, derandomize=True)
+settings.load_profile("repeatable")
 
 
 def spline_profile(end, h_coefficients, yaw_coefficients=None) -> SpeedProfile:
