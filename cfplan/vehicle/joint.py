@@ -59,6 +59,9 @@ def joint_at(trajectory: Trajectory, time: float) -> Joint:
     return Joint(float(time), s, derivatives, state)
 
 
+LOOK_BACK = 0.05  # s; setpoints are made of rates that were planned up to 0.03 s before (RATE_LEAD)
+
+
 @dataclass(frozen=True, slots=True)
 class JoinedTrajectory:
     """Trajectories on one clock, each flown from its start until that of the next; the last one to its end."""
@@ -117,8 +120,8 @@ class JoinedTrajectory:
         return np.argsort(np.concatenate(flown), kind="stable"), answers
 
     def since(self, time: float) -> "JoinedTrajectory":
-        """Return the same flight on a clock that is 0 at `time`, s, without what is flown before."""
-        first = max(int(np.searchsorted(self.starts, time, side="right")) - 1, 0)
+        """Return the same flight on a clock that is 0 at `time`, s, without what is flown more than LOOK_BACK before."""
+        first = max(int(np.searchsorted(self.starts, time - LOOK_BACK, side="right")) - 1, 0)
         return JoinedTrajectory(self.trajectories[first:], tuple(start - time for start in self.starts[first:]))
 
     def continued(self, time: float, trajectory: Trajectory) -> "JoinedTrajectory":

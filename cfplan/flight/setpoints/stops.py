@@ -17,6 +17,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.encoding import (
+    LEADING_SHARE,
     RATE_LEAD,
     THRUST_LEAD,
     command_quaternion,
@@ -85,7 +86,7 @@ def stop_motion(
     """Return the stops from rows `begin`, (K,), of a motion, one after another, K · M rows, as motion to fly.
 
     With it comes the acceleration of each row BRAKE_LEAD later, (K · M, 3). Body rates and the length of the thrust
-    vector are ahead by the leads, s, as in the setpoints of a plan.
+    vector have the leads, s, of the setpoints of a plan.
     """
     steps = round(duration * rate)
     share = np.arange(steps + 1) / steps
@@ -142,7 +143,8 @@ def _stop_rows_interpreted(
     turn = at(yaw[:, None])[..., 0].reshape(-1)
     attitude = quaternions_of(controller_attitude(made.reshape(-1, 3) + _GRAVITY, about_z(turn)))
     attitude = attitude.reshape(*place.shape, 4)
-    body_rate = _ahead(_turn_rates(attitude, rate), leads[0])
+    turning = _turn_rates(attitude, rate)
+    body_rate = LEADING_SHARE * _ahead(turning, leads[0]) + (1.0 - LEADING_SHARE) * _ahead(turning, -leads[0])
     body_rate[:, -1] = 0.0  # the vehicle may be left with the last setpoint
     force = made + _GRAVITY
     thrust = norms(force)[..., None]
@@ -192,11 +194,9 @@ def _stop_rows(
             periods = 1.0 if m == 0 or m == length - 1 else 2.0
             _write_turn(turning[m], attitudes[k, max(m - 1, 0)], attitudes[k, min(m + 1, length - 1)], rate / periods)
         for m in range(length):
-            place = min(m + leads[0], length - 1.0)
-            row = int(place)
-            after, between = min(row + 1, length - 1), place - row
             for i in range(3):
-                rates[k, m, i] = turning[row, i] + between * (turning[after, i] - turning[row, i])
+                later, before = _between(turning, m + leads[0], i), _between(turning, m - leads[0], i)
+                rates[k, m, i] = LEADING_SHARE * later + (1.0 - LEADING_SHARE) * before
             place = min(m + leads[1], length - 1.0)
             row = int(place)
             after, between = min(row + 1, length - 1), place - row
@@ -205,6 +205,15 @@ def _stop_rows(
             sent[k, m, 2] = scale * (made[k, m, 2] + GRAVITY) - GRAVITY
         rates[k, length - 1] = 0.0  # the vehicle may be left with the last setpoint
     return places, speeds, sent, attitudes, rates, made
+
+
+@register_jitable
+def _between(values: NDArray, place: float, column: int) -> float:
+    """Return what is between two rows of (M, K) values; the first and the last hold."""
+    place = min(max(place, 0.0), len(values) - 1.0)
+    row = int(place)
+    after = min(row + 1, len(values) - 1)
+    return values[row, column] + (place - row) * (values[after, column] - values[row, column])
 
 
 @register_jitable
@@ -238,8 +247,8 @@ def _write_turn(out: NDArray, before: NDArray, after: NDArray, rate: float) -> N
 
 
 def _ahead(values: NDArray, by: float) -> NDArray:
-    """Return (..., M, K): the rows `by` rows later on; the last holds."""
-    place = np.minimum(np.arange(values.shape[-2]) + by, values.shape[-2] - 1.0)
+    """Return (..., M, K): the rows `by` rows later on, or before; the first and the last hold."""
+    place = np.clip(np.arange(values.shape[-2]) + by, 0.0, values.shape[-2] - 1.0)
     row = place.astype(int)
     after = np.minimum(row + 1, values.shape[-2] - 1)
     return values[..., row, :] + (place - row)[:, None] * (values[..., after, :] - values[..., row, :])
