@@ -6,17 +6,18 @@ import signal
 
 import numpy as np
 import pytest
-from waiting import until
+from waiting import a_moment, until
 
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.proposals import _ANSWER, _BEGUN, ReceivedProposals
-from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, Refusal, propose, splice
+from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Fault, Proposal, Refusal, propose, splice
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
 from cfplan.preparation.air_planner import AirPlanner, PathAnswer, PathRequest, PathVerdict, Wish, _Worker
 from cfplan.preparation.replan import hold
 
+NOT_FLOWN = "the plan is not flown yet"
 WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
 
 
@@ -75,7 +76,7 @@ def answer_to(number: int, planner: AirPlanner, pilot: PilotSide) -> PathAnswer:
 def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(both, limits):
     planner, pilot = both
     early = answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)]), planner, pilot)
-    assert (early.verdict, early.reason) == (PathVerdict.REFUSED, "the plan is not flown yet")
+    assert (early.verdict, early.reason) == (PathVerdict.REFUSED, NOT_FLOWN)
     pilot.begin()
     told: list[PathAnswer] = []
 
@@ -99,6 +100,24 @@ def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(b
     assert answer.joint == pytest.approx((pilot.commitment.splices[-1] + SPLICE_AHEAD) / RATE)
     again = answer_to(planner.request(Wish.EXTEND, [(0.5, -0.5, 1.0)]), planner, pilot)
     assert again.verdict is PathVerdict.ACCEPTED, again
+
+
+def test_a_request_that_comes_while_a_proposal_is_with_the_pilot_is_answered(both):
+    planner, pilot = both
+    pilot.begin()
+    assert until(lambda: answer_to(planner.request(Wish.EXTEND), planner, pilot).reason != NOT_FLOWN)
+    planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)])
+    proposals: list[Proposal] = []
+
+    def proposed() -> bool:
+        proposals.extend(filter(None, [pilot.proposals.newest()]))
+        return bool(proposals)
+
+    assert until(proposed)
+    another = planner.request(Wish.REPLACE, [(0.0, 7.0, 1.0)])
+    a_moment()  # the planner's process reads it, and waits for the pilot
+    pilot.proposals.answer(proposals[0], Refusal(Fault.MOTION, ""))
+    assert "waypoint 1" in answer_to(another, planner, pilot).reason
 
 
 def test_the_latest_request_wins(both):

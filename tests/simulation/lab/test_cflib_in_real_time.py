@@ -153,6 +153,7 @@ def uploads(make):
 )
 def test_cflib_flies_the_virtual_crazyflie(lab, link, set_and_read_back, make_flight, commands):
     flight, codes = make_flight(), []
+    assert until(lambda: link.supervisor.can_fly)  # some seconds after the flight before
     link.add_port_callback(CRTPPort.SETPOINT_HL, lambda packet: codes.append(packet.data[3]))
     feed = PoseFeed(link)
     prepare(link, feed, set_and_read_back)
