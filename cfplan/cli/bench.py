@@ -328,6 +328,21 @@ def horizon(**given: Any) -> None:
     _measure(partial(run, _safety_file(Path())), "planning", given)
 
 
+@study.command(epilog="Example: cfplan study latency -o results/latency.json")
+@click.option("--requests", type=click.IntRange(1), default=100, show_default=True, help="One at a time.")
+@click.option("--seconds", type=click.FloatRange(1.0), default=60.0, show_default=True, help="Of all other requests.")
+@click.option("--rate", type=click.FloatRange(0.1, 1000.0), default=50.0, show_default=True, help="Of those, a second.")
+@_seed(0, "Of the waypoints.")
+@_output
+@options.as_json
+def latency(**given: Any) -> None:
+    """Steer the virtual vehicle in real time: how soon requests change the motion, and how many a second may."""
+    _use_one_thread()
+    from cfplan.studies.latency import latency as run
+
+    _measure(partial(run, _safety_file(Path())), "flying", given)
+
+
 @study.command(epilog="Example: cfplan study link-loss flights/line.yaml flights/helix.yaml -o results/link-loss.json")
 @_paths
 @click.option(

@@ -347,11 +347,11 @@ class _Worker:
             answer = self._propose(made)
             if answer is not None and (answer.commitment is not None or answer.reason.startswith(Fault.LATE)):
                 return None
-            reason = answer.reason if answer is not None else "the pilot does not answer"
+            reason = answer.reason if answer is not None else ""  # then it lands, or is gone
         finally:
             self._part_took.append(REAL_CLOCK.now() - begun)
         self._held = given_up(self._held, self._limits)
-        return answer_cut_short(self._accepted, self._held, reason)
+        return answer_cut_short(self._accepted, self._held, reason) if reason else None
 
     def _propose(self, made: Replanned) -> PilotAnswer | None:
         """Send a proposal and wait for the pilot's answer; what it accepts is held from then on."""
@@ -362,9 +362,10 @@ class _Worker:
             if answer is None or answer.proposal != made.proposal.checksum:
                 continue
             if answer.commitment is not None:
-                committed = splice(
-                    self._held.commitment, made.proposal, made.proposal.splice - LEAST_AHEAD, self._limits.space
-                )
+                assert self._begun is not None
+                due = math.floor((REAL_CLOCK.now() - self._begun) * RATE)  # the pilot looked a little earlier
+                now = min(due, made.proposal.splice - LEAST_AHEAD)
+                committed = splice(self._held.commitment, made.proposal, now, self._limits.space)
                 assert isinstance(committed, Commitment)
                 assert committed.checksum == answer.commitment
                 self._held = accepted(made, committed)

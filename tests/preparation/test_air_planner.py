@@ -12,6 +12,7 @@ from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.proposals import _ANSWER, _BEGUN, ReceivedProposals
 from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Fault, Proposal, Refusal, propose, splice
 from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
 from cfplan.preparation.air_planner import AirPlanner, PathAnswer, PathRequest, PathVerdict, Wish, _Worker
@@ -175,3 +176,22 @@ def test_a_fault_in_planning_is_an_answer_and_what_is_held_stays(held, limits):
     assert answer.verdict is PathVerdict.REFUSED
     assert "fault in the planner: ValueError" in answer.reason
     assert worker._held is held
+
+
+def test_what_is_committed_far_ahead_of_the_vehicle_is_replaced_from_near(both):
+    """A plan is committed in parts, the last of them long before it is flown; then another one replaces it."""
+    planner, pilot = both
+    pilot.begin()
+    far = [(-0.5, 0.8, 1.0), (0.5, 2.0, 1.0), (-0.8, 0.4, 1.2), (0.8, -1.5, 0.9), (-0.8, 1.5, 1.0), (0.0, -2.0, 1.0)]
+    verdicts = [answer_to(planner.request(Wish.REPLACE, far), planner, pilot).verdict for _ in range(3)]
+    assert PathVerdict.ACCEPTED in verdicts
+
+    def all_of_it() -> bool:
+        pilot.tick()
+        end = decode(pilot.commitment.payloads[-1:]).position[0]
+        return bool(np.abs(end - far[-1]).max() < 2e-3)
+
+    assert until(all_of_it)
+    answers = [answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)]), planner, pilot) for _ in range(2)]
+    assert planner.alive
+    assert any(answer.verdict is PathVerdict.ACCEPTED for answer in answers), answers

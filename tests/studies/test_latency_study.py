@@ -1,0 +1,45 @@
+"""The study of latency: which setpoint is the first that another plan changes, and what the tables say of it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cfplan.errors import InputError
+from cfplan.studies.latency import Replan, first_change, latency_table
+from cfplan.studies.result import StudyResult
+
+
+def rows(*values):
+    return np.repeat(np.array(values, dtype=np.uint8)[:, None], 29, axis=1)
+
+
+@pytest.mark.parametrize(
+    ("splice", "payloads", "number"),
+    [
+        (2, rows(2, 3, 4), None),  # the same as before
+        (2, rows(2, 3, 9, 9), 4),
+        (2, rows(2, 8, 4), 3),
+        (3, rows(3, 4, 4, 4), None),  # behind the end the last one holds
+        (3, rows(3, 4, 4, 7), 6),
+        (9, rows(4, 5), 10),
+    ],
+)
+def test_the_first_changed_setpoint_is_the_first_with_other_bytes(splice, payloads, number):
+    assert first_change(rows(0, 1, 2, 3, 4), splice, payloads) == number
+
+
+def test_its_table_has_a_row_for_each_delay_and_survives_json():
+    replans = [Replan(0.0, 0.05 + 0.001 * k, 0.2 + 0.001 * k, 0.04) for k in range(101)]
+    result = StudyResult("latency", {}, (latency_table(replans),))
+    document = json.loads(json.dumps(result.to_json(), allow_nan=False))
+    assert [row[0] for row in document["tables"][0]["rows"]] == [
+        "first changed setpoint", "change of the motion", "answer",
+    ]  # fmt: skip
+    first = result.table("latency").rows[0]
+    assert (first["count"], first["median"], first["p99"]) == (101, pytest.approx(0.1), pytest.approx(0.149))
+
+
+def test_where_nothing_was_accepted_that_is_said():
+    with pytest.raises(InputError, match="no request was accepted"):
+        latency_table([])
