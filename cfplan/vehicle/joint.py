@@ -120,7 +120,7 @@ class JoinedTrajectory:
         return np.argsort(np.concatenate(flown), kind="stable"), answers
 
     def since(self, time: float) -> "JoinedTrajectory":
-        """Return the same flight on a clock that is 0 at `time`, s, without what is flown more than LOOK_BACK before."""
+        """Return the same flight on a clock that is 0 at `time`, s, without what is flown LOOK_BACK before."""
         first = max(int(np.searchsorted(self.starts, time - LOOK_BACK, side="right")) - 1, 0)
         return JoinedTrajectory(self.trajectories[first:], tuple(start - time for start in self.starts[first:]))
 
