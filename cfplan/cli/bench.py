@@ -490,6 +490,23 @@ def robustness(**given: Any) -> None:
     _measure(run, "training and planning", given)
 
 
+@study.command(epilog="Example: cfplan study baselines -o results/baselines.json")
+@_count(50, "Random.")
+@_seed(60_000)
+@_data
+@_networks
+@_epochs
+@_quick
+@_output
+@options.as_json
+def baselines(**given: Any) -> None:
+    """Make the paper's Table 3: TOPPQuad, networks and the planner that ships beside planners of other kinds."""
+    _use_one_thread()
+    from cfplan.studies.paper.baselines import baselines as run
+
+    _measure(run, "training and planning", given)
+
+
 @study.command(name="yaw-consistency", epilog="Example: cfplan study yaw-consistency -o results/yaw-consistency.json")
 @click.option("--pairs", type=click.IntRange(1), default=100, show_default=True, help="Of random paths.")
 @_seed(50_000)
@@ -507,7 +524,7 @@ def yaw_consistency(**given: Any) -> None:
 @click.argument("folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path("results"))
 @_quick
 def paper(folder: Path, quick: bool) -> None:
-    """Make all tables of the paper: architectures, inputs, robustness, yaw consistency; a result each in DIR.
+    """Make all tables of the paper: architectures, inputs, robustness, yaw, baselines; a result each in DIR.
 
     What was made by the same commit is kept, so that a run that was stopped goes on.
     """

@@ -26,7 +26,9 @@ COLUMNS = (
     Column("repeats"),
     Column("solved", "solved", of="repeats"),
     Column("first_seconds", meaning="of the first call at this size, with all that is built for it"),
-    *quantile_columns("plan_seconds", "plan", "ms", ".1f", shown=("median",), meaning="the planner's call"),
+    *quantile_columns(
+        "plan_seconds", "plan", "ms", ".1f", shown=("median",), meaning="the planner's call, processor time"
+    ),
     Column("per_node", "per interval", "µs", ".1f", meaning="median"),
     Column("against_first", "against the first", "×", ".2f", meaning="time per interval"),
     Column("per_node_iteration", "per interval and iteration", "µs", ".2f", meaning="median"),
@@ -67,9 +69,9 @@ def scaling(
     chosen, found = find_limit_set(limits), find_planner(planner)
 
     def solve(path: Path, nodes: int) -> Solve:
-        begun = time.perf_counter()
+        begun = time.process_time()
         solution = found(PlanningTask(path, chosen.airframe, chosen.limits, nodes, yaw))
-        seconds = time.perf_counter() - begun
+        seconds = time.process_time() - begun
         return Solve(seconds, int(solution.stats.get("iterations", 0)), solution.profile is not None)
 
     def measure() -> Iterator[dict[str, Any]]:

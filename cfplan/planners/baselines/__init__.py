@@ -1,3 +1,3 @@
-"""Baselines: the paper's TOPPQuad, convex TOPP with its lower bound, and scaled min-snap."""
+"""Baselines: the paper's TOPPQuad, convex TOPP with its lower bound, scaled min-snap, corridors."""
 
-__all__ = ["convex", "toppquad", "toppquad_nlp"]
+__all__ = ["convex", "corridors", "min_snap", "toppquad", "toppquad_nlp"]

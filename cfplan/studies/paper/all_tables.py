@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from cfplan.errors import InputError
 from cfplan.studies.paper.architectures import architectures
+from cfplan.studies.paper.baselines import baselines
 from cfplan.studies.paper.inputs import inputs_study
 from cfplan.studies.paper.networks import Progress
 from cfplan.studies.paper.robustness import robustness
@@ -21,11 +22,12 @@ from cfplan.version import UNKNOWN
 
 TABLES: MappingProxyType[str, Callable[..., StudyResult]] = MappingProxyType({
     "architectures": architectures, "inputs": inputs_study, "robustness": robustness,
-    "yaw-consistency": yaw_consistency,
+    "yaw-consistency": yaw_consistency, "baselines": baselines,
 })  # fmt: skip
 QUICK: MappingProxyType[str, dict[str, Any]] = MappingProxyType({
     "architectures": {"paths": 2, "quick": True}, "inputs": {"paths": 2, "quick": True},
     "robustness": {"paths": 1, "draws": 1, "quick": True}, "yaw-consistency": {"pairs": 2},
+    "baselines": {"paths": 1, "quick": True},
 })  # fmt: skip
 
 

@@ -72,3 +72,28 @@ ROBUSTNESS = MappingProxyType({
     ("LSTM-0.1", 0.01): PrintedRobustness(0.126, 0.0004, 0.002, 0.930),
     ("LSTM-0.1", 0.1): PrintedRobustness(0.127, 0.0029, 0.013, 0.929),
 })  # fmt: skip
+
+
+class PrintedBaseline(NamedTuple):
+    """A planner's numbers in Table 3."""
+
+    deviation: float  # m
+    thrust_least: float  # N
+    thrust_most: float  # N
+    violation: float  # N
+    travel_time: float  # s
+    length: float  # m
+    speed: float  # m/s, average
+    failures: float  # share
+    seconds: float  # "compute time"
+
+
+# Table 3, the comparison with baselines, by its columns. What the paper calls AllocNet and MFBOTrajectory are these
+# packages themselves.
+BASELINES = MappingProxyType({
+    "TOPPQuad": PrintedBaseline(0.039, 0.05, 0.14, 0.000, 5.687, 19.772, 3.477, 0.0, 10.083),
+    "LSTM": PrintedBaseline(0.124, 0.03, 0.16, 0.002, 5.653, 19.772, 3.498, 0.0, 0.069),
+    "LSTM-0.1": PrintedBaseline(0.170, 0.03, 0.17, 0.002, 5.691, 19.772, 3.474, 0.0, 0.101),
+    "AllocNet's kind": PrintedBaseline(0.037, 0.06, 0.10, 0.000, 4.066, 11.453, 2.817, 0.28, 0.277),
+    "MFBOTrajectory's kind": PrintedBaseline(0.010, 0.07, 0.08, 0.000, 9.431, 16.778, 1.779, 0.0, 13609.913),
+})  # fmt: skip

@@ -1,0 +1,272 @@
+"""The paper's Table 3: planners of other kinds on the same waypoints, each flown by the geometric controller.
+
+TOPPQuad, the paper's networks, the planner that ships and convex TOPP time the min-snap path, and scaled min-snap flies
+it at one factor on its timing. A learned time allocation flies a path of its own through the corridor about it, as
+AllocNet does.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from cfplan.errors import CfplanError, InputError
+from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.path import Path
+from cfplan.geometry.random_paths import random_waypoints
+from cfplan.learning.learned import plan_learned
+from cfplan.learning.paper.sequences import MAX_LENGTH
+from cfplan.learning.paper.time_allocation import TimeNetwork, allotted_times, train_times
+from cfplan.learning.paper.training import SequenceOptions
+from cfplan.planners.baselines.convex import plan_convex
+from cfplan.planners.baselines.corridors import ACCELERATION, SPEED, corridor_about, min_jerk, timed_path
+from cfplan.planners.baselines.min_snap import plan_min_snap
+from cfplan.planners.baselines.toppquad import plan_toppquad
+from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.task import Planner
+from cfplan.planning.repair import refine
+from cfplan.safety.limit_sets import PAPER
+from cfplan.simulation.geometric_flight import LOST, fly_geometric, thrust_violation
+from cfplan.studies.paper.networks import DATA, NETWORKS, NODES, WAYPOINTS, Progress, paper_data, trained_networks
+from cfplan.studies.paper.printed import BASELINES
+from cfplan.studies.paper.trials import (
+    EXPERT,
+    FLOWN,
+    PAPER_LAG,
+    SAMPLE,
+    TOPPQUAD,
+    finite_mean,
+    network_plan,
+    paper_task,
+)
+from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
+from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.trajectory import Trajectory
+
+BOX = np.array([10.0, 10.0, 5.0])  # m, where waypoints are drawn
+NOISES = (0.0, 0.1)  # m, of the LSTMs of the table
+CORRIDORS, QUICK_CORRIDORS = 2000, 6  # that the time allocation learns from
+SHIPPED, ALLOCATION, CONVEX, MIN_SNAP = "the shipped planner", "AllocNet's kind", "convex TOPP", "scaled min-snap"
+Ask = Callable[[Path], Trajectory]  # raises CfplanError where there is none
+
+
+@dataclass(frozen=True, slots=True)
+class BaselineTrial:
+    """One path, planned and flown. NaN where there was nothing to measure."""
+
+    planner: str
+    seed: int
+    reason: str = ""  # why there is no flight
+    seconds: float = np.nan  # of the processor, to plan
+    travel_time: float = np.nan  # s
+    length: float = np.nan  # m, of the path that is flown
+    deviation: float = np.nan  # m, LOST where it failed
+    thrust_least: float = np.nan  # N, planned, of a motor
+    thrust_most: float = np.nan  # N
+    violation: float = np.nan  # N, planned beyond a motor's range, mean over time
+    top_speed: float = np.nan  # m/s, planned
+
+    @property
+    def failed(self) -> bool:
+        """Return whether there was no flight, or one that crashed or was LOST."""
+        return not self.deviation < LOST
+
+
+def baselines(
+    *,
+    paths: int = 50,
+    first_seed: int = 60_000,
+    data: FilePath = DATA,
+    networks: FilePath = NETWORKS,
+    epochs: int | None = None,
+    quick: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> StudyResult:
+    """Plan and fly `paths` random paths by each planner; networks are trained if need be.
+
+    Raises:
+        InputError: no path, or no such dataset.
+    """
+    if paths < 1:
+        raise InputError("paths must be at least 1", where="paths", hint="give --paths 50, as in the paper")
+    wanted = [SequenceOptions(epsilon=epsilon) for epsilon in NOISES]
+    corridors = QUICK_CORRIDORS if quick else CORRIDORS
+    with paper_data(data, networks, 1, epochs=epochs, quick=quick) as material:
+        more = corridors + paths
+        trained = trained_networks(material, wanted, progress, more)
+        done = sum(each.options.epochs for each in trained)
+        begun = time.process_time()
+        allocation = _time_network(corridors, first_seed, lambda count: progress(done + count, done + more))
+        training = time.process_time() - begun
+        asked = _planners([(each.name, network_plan(each)) for each in trained], allocation)
+        retraining = {each.name: each.training_seconds for each in trained} | {ALLOCATION: training}
+
+        def show(count: int) -> None:
+            progress(done + corridors + count, done + more)
+
+        trials, interrupted = collect(_trials(asked, range(first_seed, first_seed + paths), show))
+    settings = {
+        "paths": paths, "first_seed": first_seed, "corridors": corridors, "motor_lag": PAPER_LAG, "quick": quick,
+    }  # fmt: skip
+    table = baselines_table(trials, list(asked), retraining)
+    return StudyResult("baselines", settings, (table,), (detail_table("trials", trials),), interrupted)
+
+
+def random_path(seed: int) -> Path:
+    """Return the min-snap path of that seed; one that leaves the box by far is drawn anew, as for training."""
+    attempt = 0
+    while True:
+        drawn = np.random.SeedSequence(seed, spawn_key=(attempt,))
+        path = min_snap(random_waypoints(drawn, np.array([-BOX / 2, BOX / 2]), (WAYPOINTS, WAYPOINTS)))
+        with suppress(InputError):
+            path.check()
+            if path.length <= MAX_LENGTH:
+                return path
+        attempt += 1
+
+
+def _time_network(count: int, first_seed: int, on_label: Callable[[int], None]) -> TimeNetwork:
+    """Train a time allocation on paths that are none of the study's."""
+    corridors = [corridor_about(random_path(10 * first_seed + k)) for k in range(count)]
+    return train_times(corridors, on_label=on_label)
+
+
+def _planners(
+    networks: Sequence[tuple[str, Callable[[Path], SpeedProfile]]], allocation: TimeNetwork
+) -> dict[str, Ask]:
+    found: dict[str, Ask] = {TOPPQUAD: _by(plan_toppquad), EXPERT: _by(plan_expert)}
+    for name, plan in networks:
+        found[name] = lambda path, plan=plan: Trajectory(path, plan(path), PAPER.airframe)  # type: ignore[misc]
+    return found | {
+        SHIPPED: _shipped,
+        ALLOCATION: lambda path: _allotted(path, allocation),
+        CONVEX: _by(plan_convex),
+        MIN_SNAP: _by(plan_min_snap),
+    }
+
+
+def _by(planner: Planner) -> Ask:
+    def ask(path: Path) -> Trajectory:
+        solution = planner(paper_task(path))
+        if solution.profile is None:
+            raise CfplanError(solution.reason or str(solution.status), hint="plan by another planner")
+        return Trajectory(path, solution.profile, PAPER.airframe)
+
+    return ask
+
+
+def _shipped(path: Path) -> Trajectory:
+    task = paper_task(path)
+    solution = plan_learned(task)
+    if solution.profile is None:
+        raise CfplanError(solution.reason or str(solution.status), hint="plan by the expert")
+    return refine(task, solution.profile).trajectory
+
+
+def _allotted(path: Path, network: TimeNetwork) -> Trajectory:
+    corridor = corridor_about(path)
+    times = allotted_times(network, corridor)
+    timed = timed_path(min_jerk(corridor, times), times)
+    grid = np.linspace(0.0, timed.end, NODES + 1)
+    zeros = np.zeros(NODES + 1)
+    profile = SpeedProfile(grid, np.ones(NODES + 1), zeros, zeros, zeros[1:], zeros, zeros, zeros[1:])
+    return Trajectory(timed, profile, PAPER.airframe)
+
+
+def _trials(asked: Mapping[str, Ask], seeds: range, show: Callable[[int], None]) -> Iterator[BaselineTrial]:
+    warm = random_path(seeds.start)
+    for ask in asked.values():
+        with suppress(CfplanError):
+            ask(warm)  # loads and compiles
+    for done, seed in enumerate(seeds):
+        path = random_path(seed)
+        for name, ask in asked.items():
+            yield _flown(ask, path, BaselineTrial(name, seed))
+        show(done + 1)
+
+
+def _flown(ask: Ask, path: Path, trial: BaselineTrial) -> BaselineTrial:
+    begun = time.process_time()
+    try:
+        trajectory = ask(path)
+    except CfplanError as error:
+        return replace(trial, reason=str(error))
+    seconds = time.process_time() - begun
+    state = trajectory.at(np.arange(0.0, trajectory.duration, SAMPLE))
+    return replace(
+        trial,
+        seconds=seconds,
+        travel_time=trajectory.duration,
+        length=trajectory.path.length,
+        deviation=fly_geometric(trajectory, FLOWN).deviation,
+        thrust_least=float(state.motor_thrust.min()),
+        thrust_most=float(state.motor_thrust.max()),
+        violation=thrust_violation(state.motor_thrust, PAPER.airframe),
+        top_speed=float(np.linalg.norm(state.velocity, axis=1).max()),
+    )
+
+
+def baselines_table(trials: Sequence[BaselineTrial], names: Sequence[str], retraining: Mapping[str, float]) -> Table:
+    """Return the paper's Table 3 with the paper's numbers beside."""
+    columns = (
+        Column("planner", "planner"),
+        Column("paths"),
+        Column("deviation", "largest deviation", "m", ".3f", meaning="mean over flights that did not fail"),
+        Column("paper_deviation", "paper", "m", ".3f"),
+        Column("thrust_least", "least thrust", "N", ".2f", meaning="planned, of a motor; mean over paths"),
+        Column("thrust_most", "greatest", "N", ".2f"),
+        Column("paper_thrusts", "paper", meaning="least and greatest, N"),
+        Column("violation", "thrust violation", "N", ".4f", meaning="planned beyond a motor's range, mean over time"),
+        Column("paper_violation", "paper", "N", ".3f"),
+        Column("travel_time", "time", "s", ".2f", meaning="mean, as are length and speed"),
+        Column("paper_time", "paper", "s", ".2f"),
+        Column("length", "length", "m", ".1f"),
+        Column("paper_length", "paper", "m", ".1f"),
+        Column("speed", "mean speed", "m/s", ".2f"),
+        Column("paper_speed", "paper", "m/s", ".2f"),
+        Column("failed", "failures", of="paths", meaning=f"no plan, a crash, or {LOST:g} m from its place"),
+        Column("paper_failed", "paper", "%", ".0f"),
+        Column("seconds", "compute", "ms", ".1f", meaning="mean of the processor's time, one thread"),
+        Column("paper_seconds", "paper", "ms", ".0f"),
+        Column("retraining", "training", "s", ".0f", meaning="of the processor, once for a vehicle and its limits"),
+    )  # fmt: skip
+    rows = [
+        _row([trial for trial in trials if trial.planner == name]) | {"retraining": retraining.get(name)}
+        for name in names
+        if any(trial.planner == name for trial in trials)
+    ]
+    title = (
+        f"Paths through {WAYPOINTS} random waypoints in {' × '.join(f'{side:g}' for side in BOX)} m, "
+        f"{SPEED:g} m/s, motor lag {PAPER_LAG:g} s; {ALLOCATION}: {ACCELERATION:g} m/s²"
+    )
+    return Table("baselines", title, columns, tuple(rows))
+
+
+def _row(own: Sequence[BaselineTrial]) -> dict[str, Any]:
+    printed = BASELINES.get(own[0].planner)
+    flown = [trial for trial in own if not trial.failed]
+    return {
+        "planner": own[0].planner,
+        "paths": len(own),
+        "deviation": finite_mean(trial.deviation for trial in flown),
+        "thrust_least": finite_mean(trial.thrust_least for trial in own),
+        "thrust_most": finite_mean(trial.thrust_most for trial in own),
+        "violation": finite_mean(trial.violation for trial in own),
+        "travel_time": finite_mean(trial.travel_time for trial in own),
+        "length": finite_mean(trial.length for trial in own),
+        "speed": finite_mean(trial.length / trial.travel_time for trial in own),
+        "failed": sum(trial.failed for trial in own),
+        "seconds": finite_mean(trial.seconds for trial in own),
+        "paper_deviation": printed.deviation if printed else None,
+        "paper_thrusts": f"{printed.thrust_least:g} / {printed.thrust_most:g}" if printed else None,
+        "paper_violation": printed.violation if printed else None,
+        "paper_time": printed.travel_time if printed else None,
+        "paper_length": printed.length if printed else None,
+        "paper_speed": printed.speed if printed else None,
+        "paper_failed": printed.failures if printed else None,
+        "paper_seconds": printed.seconds if printed else None,
+    }

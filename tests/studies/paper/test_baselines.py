@@ -1,0 +1,45 @@
+"""The paper's Table 3: every planner on the same paths, with what the paper prints beside."""
+
+import pytest
+
+from cfplan.errors import InputError
+from cfplan.studies.paper.baselines import ALLOCATION, CONVEX, MIN_SNAP, SHIPPED, baselines, random_path
+from cfplan.studies.paper.printed import BASELINES
+
+
+@pytest.fixture(scope="module")
+def quick():
+    return baselines(paths=1, quick=True)
+
+
+def test_every_planner_has_its_row_beside_the_papers(quick):
+    rows = {row["planner"]: row for row in quick.table("baselines").rows}
+    assert list(rows) == [
+        "TOPPQuad", "expert", "LSTM", "LSTM-0.1", SHIPPED, ALLOCATION, CONVEX, MIN_SNAP,
+    ]  # fmt: skip
+    assert rows["TOPPQuad"]["paper_time"] == 5.687
+    assert rows[ALLOCATION]["paper_failed"] == 0.28
+    assert {name for name in rows if rows[name]["retraining"] is not None} == {"LSTM", "LSTM-0.1", ALLOCATION}
+
+
+def test_all_but_the_time_allocation_keep_to_the_path(quick):
+    trials = {trial["planner"]: trial for trial in quick.table("trials").rows}
+    length = random_path(60_000).length
+    for name, trial in trials.items():
+        if name != ALLOCATION:
+            assert trial["length"] == pytest.approx(length), name
+    assert trials[SHIPPED]["deviation"] < 0.05
+    assert trials[SHIPPED]["violation"] == 0.0
+    assert trials[MIN_SNAP]["travel_time"] > 1.2 * trials[SHIPPED]["travel_time"]
+    assert trials["expert"]["travel_time"] == pytest.approx(trials[SHIPPED]["travel_time"], rel=0.005)
+
+
+def test_what_the_paper_prints_is_consistent():
+    for name, printed in BASELINES.items():
+        if name != "AllocNet's kind":  # a mean of ratios is not the ratio of means; AllocNet's lengths vary the most
+            assert printed.length / printed.travel_time == pytest.approx(printed.speed, rel=0.01), name
+
+
+def test_no_path_is_refused():
+    with pytest.raises(InputError, match="at least 1"):
+        baselines(paths=0)
