@@ -358,6 +358,18 @@ def link_loss(path_files: tuple[Path, ...], **given: Any) -> None:
     _measure(partial(link_losses, path_files, _safety_file), "simulating", given)
 
 
+@study.command(epilog="Example: cfplan study dry-runs flights/line.yaml flights/helix.yaml -o results/dry-runs.json")
+@_paths
+@_output
+@options.as_json
+def dry_runs(path_files: tuple[Path, ...], **given: Any) -> None:
+    """Fly the bytes of each PATH in the dry run at motor lags of 0.07, 0.105 and 0.13 s: deviation from the plan."""
+    _use_one_thread()
+    from cfplan.studies.dry_runs import dry_runs as run
+
+    _measure(partial(run, path_files, _safety_file), "simulating", given)
+
+
 @study.command(epilog="Example: cfplan study physics flights/line.yaml flights/helix.yaml -o results/physics.json")
 @_paths
 @_output
