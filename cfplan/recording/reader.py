@@ -14,7 +14,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata
+from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, Statistics
 from mcap.stream_reader import get_chunk_data_stream
 
 from cfplan.errors import InputError
@@ -33,6 +33,7 @@ _READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.METADATA: Metadata.read,
     Opcode.CHANNEL: Channel.read,
     Opcode.CHUNK: Chunk.read,
+    Opcode.STATISTICS: Statistics.read,
     Opcode.FOOTER: Footer.read,
 }
 _DAMAGE = (
@@ -58,7 +59,7 @@ def read_record(place: Path) -> Record:
     header: RecordHeader | None = None
     topics: dict[int, str] = {}
     payloads: dict[int, list[bytes]] = defaultdict(list)
-    whole = False
+    whole, written = False, None
     for entry in _entries(data, len(MAGIC), payloads):
         match entry:
             case Header(profile=profile) if profile != PROFILE:
@@ -67,8 +68,10 @@ def read_record(place: Path) -> Record:
                 header = _header(values, file)
             case Channel(id=number, topic=name):
                 topics[number] = name
-            case Footer():
-                whole = data.endswith(MAGIC)
+            case Statistics(message_count=count):
+                written = count
+            case Footer():  # a chunk whose own kind is damaged is passed over, and then messages are missing
+                whole = data.endswith(MAGIC) and written in (None, sum(map(len, payloads.values())))
     if header is None:
         raise InputError(
             "the record ends before its header; nothing of it can be read",

@@ -148,7 +148,7 @@ class Record:
     phases: Phases
     events: Events
     summary: Mapping[str, Any]  # as written at the end of the flight; empty where there is none
-    truncated: bool  # the file ends before its time; the streams hold all that can be read
+    truncated: bool  # the file ends before its time, or is damaged; the streams hold all that can be read
     commitments: Commitments = _NO_COMMITMENTS
     requests: Requests = _NO_REQUESTS
     answers: Answers = _NO_ANSWERS
