@@ -223,7 +223,9 @@ def test_the_child_ends_with_its_parent():
         "os.kill(os.getpid(), 9)\n"
     )
     with serve(ViconSettings(), flown) as vicon:
-        ended = subprocess.run([sys.executable, "-c", program, vicon.uri], capture_output=True, timeout=30, check=False)
+        ended = subprocess.run(
+            [sys.executable, "-c", program, vicon.uri], capture_output=True, timeout=PATIENCE, check=False
+        )
         child = int(ended.stdout)
         assert until(lambda: not Path(f"/proc/{child}").exists())
 
