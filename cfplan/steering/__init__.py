@@ -3,6 +3,7 @@
 __all__ = [
     "connect",
     "flight_in_progress",
+    "real_time_steering",
     "recertify",
     "recorded_steering",
     "starting_vehicle",

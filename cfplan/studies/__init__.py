@@ -1,10 +1,10 @@
 """Measurements: each study returns a `StudyResult` with tables, which is written to results/ and shown in docs/results.
 
 Studies: bench, feasibility, scaling, learned, unseen_limits, ablation, proposals, long_paths, hard_paths; flights,
-dry_runs, lateness, faults, random_faults, link_losses, giving_way, identification, steering, horizon, physics; in
-paper/ the paper's tables. They stand on result, provenance, machine and docs_tables (what a study returns, and where it
-goes), trials (one planner on one path), adversarial_paths, real_time and sleeper (flights in the virtual lab),
-fault_scenarios (the faults), flown_sequence (what a steered flight streamed).
+dry_runs, lateness, latency, faults, random_faults, link_losses, giving_way, identification, steering, horizon,
+physics; in paper/ the paper's tables. They stand on result, provenance, machine and docs_tables (what a study returns,
+and where it goes), trials (one planner on one path), adversarial_paths, real_time and sleeper (flights in the virtual
+lab), fault_scenarios (the faults), flown_sequence (what a steered flight streamed).
 """
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "hard_paths",
     "horizon",
     "identification",
+    "latency",
     "lateness",
     "learned",
     "link_losses",
