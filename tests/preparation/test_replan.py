@@ -12,6 +12,7 @@ from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.continuation import continue_plan
 from cfplan.planning.plan import plan
 from cfplan.preparation.replan import (
+    LOOKS_BACK,
     accepted,
     at_pace,
     at_rest_from,
@@ -218,7 +219,7 @@ def test_a_part_that_comes_too_late_goes_on_from_rest(held, limits):
     first = after(held, limits, made)
     late = first.stops_from + 30
     made = go_on(first, late, limits, PART)
-    assert made.proposal.splice == first.stops_from + 120  # where it rests
+    assert made.proposal.splice == first.stops_from + 120 + LOOKS_BACK  # where it rests
     after(first, limits, made, late - 5)
     np.testing.assert_allclose(made.held.ahead, FAR)
     np.testing.assert_allclose(made.plan.path(0.0), first.rest[0])
