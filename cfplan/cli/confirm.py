@@ -12,12 +12,12 @@ from cfplan.errors import ExitCode, InputError
 from cfplan.steering.starting_vehicle import SIMULATED
 
 if TYPE_CHECKING:
-    from cfplan.preparation.prepare_flight import PreparedFlight
+    from cfplan.cli.recorded_flight import Prepared
 
 FIRST_SPEED = 0.3  # factor on the speed at which a path should be flown first
 
 
-def confirmed(prepared: "PreparedFlight", uri: str, records: Path, *, yes: bool, speed_factor: float | None) -> bool:
+def confirmed(prepared: "Prepared", uri: str, records: Path, *, yes: bool, speed_factor: float | None) -> bool:
     """Return whether to fly: always with a virtual vehicle or --yes, otherwise what the person answers.
 
     Raises InputError where standard input is not a terminal.
@@ -35,7 +35,7 @@ def confirmed(prepared: "PreparedFlight", uri: str, records: Path, *, yes: bool,
     return click.confirm("Fly?", err=True)
 
 
-def describe(prepared: "PreparedFlight", uri: str) -> str:
+def describe(prepared: "Prepared", uri: str) -> str:
     """Say how long, how fast and where it will fly, how to end it, and where link loss would end it."""
     import numpy as np
 
@@ -49,11 +49,14 @@ def describe(prepared: "PreparedFlight", uri: str) -> str:
     )
     remedy = "a lower --speed" if mission.limits.firmware.watchdog else "a lower --speed, or firmware.watchdog,"
     advice = f" With {remedy} it would not come so far." if lost.beyond > 0 else ""
+    alone = "it stops its motors by itself"
+    if mission.on_board is not None:
+        alone = "it flies on for a second, blind; then its watchdog stops its motors"
     return (
         f"{uri} will take off to {mission.take_off_height:g} m, go to the start of {prepared.planned.name!r}, fly it "
         f"in {mission.motion_ends:.1f} s at up to {speed:.1f} m/s, and land where it ends.\n"
         f"Keep everybody out of {walls}. Space lands it, Esc cuts the motors.\n"
-        f"If the pilot's process or the radio dies, it stops its motors by itself: {lost}.{advice}"
+        f"If the pilot's process or the radio dies, {alone}: {lost}.{advice}"
     )
 
 

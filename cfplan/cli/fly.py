@@ -12,9 +12,9 @@ from cfplan.errors import ExitCode, InputError
 from cfplan.preparation.compiled_calls import Stage
 
 if TYPE_CHECKING:
-    from cfplan.cli.recorded_flight import RecordedFlight
-    from cfplan.preparation.prepare_flight import PreparedFlight
+    from collections.abc import Callable
 
+    from cfplan.cli.recorded_flight import Prepared, RecordedFlight
 
 BUSY = 0.02  # s by which a setpoint is sent late only where the computer does other things
 
@@ -26,6 +26,7 @@ Examples:
   cfplan fly flights/figure8.yaml
   cfplan fly flights/figure8.yaml --speed 0.3
   cfplan fly flights/figure8.yaml --live --mavlink udp:127.0.0.1:14550
+  cfplan fly flights/figure8.yaml --on-board
   printf '1 0 1\\n0 1 1.2\\n' | cfplan fly --waypoints -
 
 Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts.""",
@@ -38,6 +39,11 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
     metavar="-|HOST:PORT",
     help="Instead of a path: fly waypoints that come while it flies, x y z a line, from standard input (-) or from "
     "clients of a port of this machine, as 127.0.0.1:7777.",
+)
+@click.option(
+    "--on-board",
+    is_flag=True,
+    help="Upload the flight as polynomials for the vehicle's own commander to fly: nothing but poses is streamed.",
 )
 @click.option("--uri", default="sim://0", show_default=True, help="The vehicle; sim:// is the virtual Crazyflie.")
 @click.option(
@@ -63,6 +69,7 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
 def fly(
     path_or_plan: Path | None,
     lines: str | None,
+    on_board: bool,
     safety_file: Path | None,
     uri: str,
     mocap_uri: str | None,
@@ -82,7 +89,7 @@ def fly(
     check_uris(uri, mocap_uri)
     check_watchers(watched)
     if path_or_plan is None or lines is not None:
-        return _steer(path_or_plan, lines, safety_file, uri, mocap_uri, records, watched, yes, as_json)
+        return _steer(path_or_plan, lines, on_board, safety_file, uri, mocap_uri, records, watched, yes, as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.FLIGHT)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # starts while the flight is prepared
@@ -90,9 +97,8 @@ def fly(
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
             from cfplan.cli.warm_up import compiling_paused
-            from cfplan.preparation.prepare_flight import prepare_flight
-        chosen = options.flight_options(planning, safety_file, path_or_plan)
-        prepared = prepare_flight(path_or_plan, limits, chosen, steps)
+        prepare = _preparation(on_board)
+        prepared = prepare(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             click.echo("not flown", err=True)
             return int(ExitCode.ENDED_BY_OPERATOR)
@@ -102,9 +108,24 @@ def fly(
     return int(flown.outcome.exit_code)
 
 
-def _steer(path_or_plan: Path | None, lines: str | None, *flight: Any) -> int:
+def _preparation(on_board: bool) -> "Callable[..., Prepared]":
+    """Return what prepares a flight by setpoints, or on board."""
+    if on_board:
+        from cfplan.preparation.on_board_flight import prepare_on_board_flight
+
+        return prepare_on_board_flight
+    from cfplan.preparation.prepare_flight import prepare_flight
+
+    return prepare_flight
+
+
+def _steer(path_or_plan: Path | None, lines: str | None, on_board: bool, *flight: Any) -> int:
     from cfplan.cli.fly_waypoints import fly_waypoints
 
+    if on_board and lines is not None:
+        raise InputError(
+            "waypoints that come in the air are streamed", where="--on-board", hint="name a path, or leave it out"
+        )
     if lines is None or path_or_plan is not None:
         raise InputError(
             "neither a path nor waypoints" if lines is None else "both a path and waypoints",
@@ -114,11 +135,12 @@ def _steer(path_or_plan: Path | None, lines: str | None, *flight: Any) -> int:
     return fly_waypoints(lines, *flight)
 
 
-def _print_result(prepared: "PreparedFlight", flown: "RecordedFlight", as_json: bool) -> None:
+def _print_result(prepared: "Prepared", flown: "RecordedFlight", as_json: bool) -> None:
     outcome, summary, folder = flown.outcome, flown.summary, str(flown.record.folder)
     if as_json:
         document = {"record": folder, "plan": prepared.planned.to_dict(), **summary}
-        print_json(document | {"dry_run_max_deviation": prepared.dry_run.deviation})
+        program = prepared.mission.on_board
+        print_json(document | {"dry_run_max_deviation": prepared.dry_run.deviation, "on_board": program is not None})
     else:
         if outcome.checks and outcome.exit_code == ExitCode.PREFLIGHT:
             columns = ["check", "value", "must be", "verdict", "hint"]
@@ -146,13 +168,14 @@ def why_late(exit_code: ExitCode, summary: dict[str, Any]) -> str:
     )
 
 
-def _rows(prepared: "PreparedFlight", flown: "RecordedFlight") -> list[tuple[str, str]]:
+def _rows(prepared: "Prepared", flown: "RecordedFlight") -> list[tuple[str, str]]:
     """Return the verdicts of preflight and dry run, and what `cfplan report` says of the record too."""
     from cfplan.recording.summary import summarise, summary_rows
 
-    outcome = flown.outcome
+    outcome, program = flown.outcome, prepared.mission.on_board
     return [
         ("ended", outcome.reason),
+        *([("flown on board", f"{program.pieces} pieces, {len(program.memory)} bytes")] if program else []),
         ("preflight", f"{sum(check.passed for check in outcome.checks)} of {len(outcome.checks)} checks passed"),
         ("deviation, dry run", f"{100 * prepared.dry_run.deviation:.1f} cm max"),
         *summary_rows(summarise(flown.record), flown.record.header.plan_limits),

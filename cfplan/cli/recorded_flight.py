@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import Telemetry
 from cfplan.identification.advice import suggests_identification
 from cfplan.planning.plan_file import save_plan
+from cfplan.preparation.on_board_flight import PreparedOnBoard
 from cfplan.preparation.prepare_flight import PreparedFlight
 from cfplan.recording.header import header_of_plan
 from cfplan.recording.reader import read_record
@@ -23,6 +25,8 @@ from cfplan.recording.record import Record
 from cfplan.recording.summary import summarise
 from cfplan.recording.writer import RecordWriter, new_record_folder, wall_time_at_zero, write_summary
 from cfplan.steering.starting_vehicle import StartingVehicle
+
+Prepared = PreparedFlight | PreparedOnBoard
 
 
 class RecordedFlight(NamedTuple):
@@ -34,7 +38,7 @@ class RecordedFlight(NamedTuple):
 
 
 def fly_and_record(
-    prepared: PreparedFlight, source: Path, records: Path, vehicle: StartingVehicle, watched: Watched, steps: Steps
+    prepared: Prepared, source: Path, records: Path, vehicle: StartingVehicle, watched: Watched, steps: Steps
 ) -> RecordedFlight:
     """Fly, and return the outcome, the record and its summary. Without a flight no folder is left.
 
@@ -64,7 +68,7 @@ def fly_and_record(
 
 def _fly_into(
     folder: Path,
-    prepared: PreparedFlight,
+    prepared: Prepared,
     source: Path,
     vehicle: StartingVehicle,
     pose_source: PoseSource,
@@ -76,6 +80,8 @@ def _fly_into(
     name, uri = prepared.planned.name, vehicle.uri
     save_plan(prepared.plan, folder / "plan.parquet", {"name": name, "path file": str(source)})
     header = header_of_plan(prepared.plan, name=name, uri=uri, source=source, wall_time_at_zero=wall_time_at_zero())
+    if prepared.mission.on_board is not None:
+        header = replace(header, provenance={**header.provenance, "flown": "on board"})
     with (
         RecordWriter(folder, header) as writer,
         watchers(header, folder, watched) as watching,

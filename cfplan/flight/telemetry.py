@@ -13,6 +13,7 @@ class Phase(StrEnum):
     CONNECT = "connect"
     RELEASE = "release"
     CONFIGURE = "configure"
+    UPLOAD = "upload"
     FEED = "feed"
     CONVERGE = "converge"
     PREFLIGHT = "preflight"
@@ -28,9 +29,9 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SetpointSent:
-    """A full-state setpoint as the vehicle decodes it."""
+    """A full-state setpoint as the vehicle decodes it; of a flight on board, one that would fly the same."""
 
-    time: float  # s, when it was handed to the link
+    time: float  # s, when it was handed to the link, or was due on board
     due: float  # s, its deadline; time - due is the lateness
     index: int  # row of the encoded flight
     position: Triple

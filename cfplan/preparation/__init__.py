@@ -6,6 +6,7 @@ __all__ = [
     "compiled_calls",
     "export_flight",
     "from_programs",
+    "on_board_flight",
     "plan_flight",
     "prepare_flight",
     "replan",

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError, NotCertifiedError
 from cfplan.files.text import read_table
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory, certified_compressed, certified_pieces
-from cfplan.flight.on_board.memory_format import MOST_PIECES
+from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
 from cfplan.flight.on_board.pieces import Pieces
 from cfplan.geometry.polynomial_csv import polynomial_rows, read_polynomial_rows
 from cfplan.machine_code import compile_from_here
@@ -90,24 +90,30 @@ def plan_for_polynomials(
 
 
 def fit_polynomials(
-    planned: PlannedFlight, form: Form, *, leads: bool = True, most: int = MOST_PIECES, on_step: OnStep = ignore_steps
+    planned: PlannedFlight,
+    form: Form,
+    *,
+    leads: bool = True,
+    most: int = MOST_PIECES,
+    room: int = MEMORY_SIZE,
+    on_step: OnStep = ignore_steps,
 ) -> ExportedFlight:
     """Fit certified polynomials to a plan, and fly them in the simulator.
 
-    The form MEMORY is compressed where `most` pieces are too few. Raises NotCertifiedError where no polynomials keep
-    the limits near the plan, or the dry run fails.
+    The form MEMORY is compressed, in at most `room` bytes, where `most` pieces are too few. Raises NotCertifiedError
+    where no polynomials keep the limits near the plan, or the dry run fails.
     """
     trajectory, limits = planned.plan.trajectory, planned.limits
     with step(on_step, "polynomials") as results:
         if form is Form.COMPRESSED:
-            made = certified_compressed(trajectory, limits, leads=leads)
+            made = certified_compressed(trajectory, limits, leads=leads, room=room)
         else:
             try:
                 made = certified_pieces(trajectory, limits, leads=leads, most=most)
             except NotCertifiedError:
                 if form is not Form.MEMORY:
                     raise
-                made = certified_compressed(trajectory, limits, leads=leads)
+                made = certified_compressed(trajectory, limits, leads=leads, room=room)
         kind = f"compressed, {len(made.memory)} bytes" if made.compressed else f"{len(made.memory)} bytes"
         longer = made.duration / planned.duration - 1.0
         results.append(f"{len(made.pieces.durations)} pieces, {kind}, {made.duration:.2f} s ({100 * longer:+.1f} %)")

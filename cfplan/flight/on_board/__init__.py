@@ -1,3 +1,14 @@
 """Trajectories that fly on board: polynomial pieces as the firmware reads them, their bytes, fit and certificate."""
 
-__all__ = ["certified_pieces", "fitting", "memory_format", "piece_certificate", "pieces", "reference"]
+__all__ = [
+    "certified_pieces",
+    "commands",
+    "fall",
+    "fitting",
+    "go_to",
+    "memory_format",
+    "piece_certificate",
+    "pieces",
+    "program",
+    "reference",
+]

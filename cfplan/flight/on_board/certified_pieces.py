@@ -99,19 +99,26 @@ def certified_pieces(
     return _best(makers, PolynomialReference(trajectory, leads=leads), limits, f"{most} pieces")
 
 
-def certified_compressed(trajectory: Trajectory, limits: Limits, *, leads: bool = True) -> OnBoardTrajectory:
-    """Return compressed pieces that fly a trajectory within the limits. Raises NotCertifiedError as above."""
+def certified_compressed(
+    trajectory: Trajectory, limits: Limits, *, leads: bool = True, room: int = MEMORY_SIZE
+) -> OnBoardTrajectory:
+    """Return compressed pieces that fly a trajectory within the limits, in `room` bytes at most.
+
+    Raises NotCertifiedError as above.
+    """
 
     def maker(count: int) -> _Maker:
         def make(reference: PolynomialReference) -> _Made:
             memory = compressed_bytes(fit_control_points(reference, count))
+            if len(memory) > room:
+                raise NotCertifiedError(f"{len(memory)} bytes", where="trajectory memory", hint="use longer pieces")
             return _Made(memory, True, read_compressed(memory))
 
         return make
 
     reference = PolynomialReference(trajectory, leads=leads)
     counts = sorted({max(1, int(np.ceil(reference.duration / length))) for length in _LENGTHS})
-    return _best(map(maker, counts), reference, limits, f"{MEMORY_SIZE} bytes")
+    return _best(map(maker, counts), reference, limits, f"{room} bytes")
 
 
 def _best(makers: Iterable[_Maker], reference: PolynomialReference, limits: Limits, room: str) -> OnBoardTrajectory:

@@ -28,7 +28,8 @@ _POINTS_OF_TYPE = (0, 1, 3, POINTS)
 _SCALES = np.array([1000.0, 1000.0, 1000.0, np.float32(1800.0) / np.float32(np.pi)], dtype=np.float32)
 _HEADER = struct.Struct("<BH")
 _START = struct.Struct("<4h")
-_END = _HEADER.pack(0, 0)
+START_SIZE = _START.size  # bytes
+END = _HEADER.pack(0, 0)  # behind the last compressed piece
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +97,7 @@ def compressed_bytes(curve: ControlPoints) -> bytes:
     for duration, points, moving in zip(curve.durations.tolist(), curve.points, moves, strict=True):
         parts.append(_HEADER.pack(sum(3 << (2 * axis) for axis in range(AXES) if moving[axis]), duration))
         parts.append(points[moving].astype("<i2").tobytes())
-    return b"".join([*parts, _END])
+    return b"".join([*parts, END])
 
 
 def read_compressed(memory: bytes, offset: int = 0) -> Pieces:

@@ -107,6 +107,16 @@ def derivatives_of(pieces: Pieces, piece: int, times: NDArray, orders: int = 5) 
     return np.stack(values, axis=1)
 
 
+def states_at(pieces: Pieces, times: NDArray) -> NDArray:
+    """Return position and yaw with four derivatives, (N, 5, 4) in float64, at times, (N,) s from the start."""
+    piece, left, _ = _located(pieces, np.asarray(times, dtype=np.float32))
+    out = np.zeros((len(times), 5, AXES))
+    for k in np.unique(piece):
+        here = piece == k
+        out[here] = derivatives_of(pieces, int(k), left[here].astype(float))
+    return out
+
+
 def _located(pieces: Pieces, times: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Return the piece of each time, how long it has been flown, s, and whether all pieces have ended, (N,) each."""
     piece, left = np.full(len(times), len(pieces.durations) - 1), times.copy()

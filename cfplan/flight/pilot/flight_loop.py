@@ -88,7 +88,7 @@ class FlightLoop:
         self._stop_expected = math.inf  # s, from when on motors that do not turn were meant to stop
         self._tolerated = Rung.NONE  # an abort of this rung or a lesser one changes nothing
         self.commitment = Commitment(0, mission.payloads, mission.stops)
-        self.plan = stream_of(self.commitment, mission.rate)
+        self.plan = stream_of(self.commitment, mission.rate, on_board=mission.on_board is not None)
         self.stream: Stream | None = None  # what each tick sends
         self.left_alone = False
         """The vehicle had no setpoint for so long that it left its stream by itself; until `hold_where_it_is`."""
@@ -148,8 +148,13 @@ class FlightLoop:
     # The stream.
 
     def begin(self, stream: Stream) -> Stream:
-        """Send this stream from the next deadline on; return it with its start."""
-        self.stream = stream.starting_at(self._deadlines.upcoming)
+        """Send this stream from the next deadline on; return it with its start.
+
+        One that is flown on board begins when the command that was just sent has arrived, and the commander next looks
+        for one, which is half a period later in the mean.
+        """
+        arrived = self.now() + 0.5 * self.link.round_trip + 0.5 / stream.rate
+        self.stream = stream.starting_at(arrived if stream.on_board else self._deadlines.upcoming)
         self._begun.append(self.stream)
         return self.stream
 
@@ -228,7 +233,8 @@ class FlightLoop:
 
     def _note_left_alone(self, now: float) -> None:
         link = self.link
-        if self.airborne and self.stream is not None and link.estimate is not None and link.status is not None:
+        sent = self.stream is not None and not self.stream.on_board
+        if self.airborne and sent and link.estimate is not None and link.status is not None:
             silent = now - max(link.estimate.time, link.status.time)
             self.left_alone |= max(silent, now - self._sent_at) > _LEFT_ALONE_AFTER
 
@@ -242,11 +248,12 @@ class FlightLoop:
         self._note_left_alone(now)
         if stream is not None:
             index = stream.index(now)
-            self.link.send(stream.packet(index))
-            self._sent_at = now
+            if not stream.on_board:
+                self.link.send(stream.packet(index))
+                self._sent_at = now
             if self.history.first_setpoint:
-                self.history.report(stream.sent(index, now, due))
-            if stream is self.plan and now < stream.end:
+                self.history.report(stream.sent(index, due if stream.on_board else now, due))
+            if stream is self.plan and now < stream.end and not stream.on_board:
                 self.history.late.append(now - due)
         watched = self.airborne or self.watched  # to the end of the link: it locks 1 s later
         if watched and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
@@ -321,7 +328,7 @@ class FlightLoop:
             estimate=link.estimate,
             status=link.status,
             otherwise=self._moves_otherwise(now),
-            late=late if self.stream is not None else 0.0,
+            late=late if self.stream is not None and not self.stream.on_board else 0.0,
         )
         watched = self.airborne and not self._stopped(link)
         abort = self._monitor.gravest(observation) if watched else self._monitor.ordered(observation)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.flight.on_board.program import OnBoardProgram
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
@@ -25,6 +26,8 @@ class Mission:
     lead: float = 0.0  # s by which each setpoint is ahead of the trajectory at its time
     hold_time: float = 1.0  # s that the vehicle hovers after the last setpoint before it is handed back
     rate: float = RATE  # Hz
+    on_board: OnBoardProgram | None = None
+    """Where the vehicle's own commander is to fly: then setpoints and stops are what it flies, and are not sent."""
 
     @property
     def start(self) -> tuple[Triple, float]:

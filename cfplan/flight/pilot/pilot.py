@@ -1,7 +1,7 @@
 """The pilot: the phases of one flight in the air, and the abort ladder that ends it early.
 
 Each rung of the abort ladder can only be left for a graver one. How the vehicle is made to fly is for its manoeuvres
-to know.
+to know: by setpoints, or by its on-board commander.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,7 @@ from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop, LinkLost, OrderSource
 from cfplan.flight.pilot.manoeuvres import Manoeuvres
 from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.on_board_manoeuvres import OnBoardManoeuvres
 from cfplan.flight.pilot.outcome import FlightOutcome, Rung
 from cfplan.flight.pilot.prearm import prepare
 from cfplan.flight.pilot.proposals import NO_PROPOSALS, ProposalSource
@@ -64,7 +65,7 @@ class Pilot:
         loop = self._loop
         try:
             floor = prepare(loop, self._connect, self._enter_real_time)
-            flown = self._manoeuvres = StreamedManoeuvres(loop, floor)
+            flown = self._manoeuvres = _manoeuvres(loop, floor)
             flown.take_off()
             flown.go_to_start()
             flown.fly_plan()
@@ -152,3 +153,8 @@ class Pilot:
             self._loop.link.restart()
         except LinkError as error:
             self._history.say(Level.WARNING, str(error))
+
+
+def _manoeuvres(loop: FlightLoop, floor: float) -> Manoeuvres:
+    program = loop.mission.on_board
+    return StreamedManoeuvres(loop, floor) if program is None else OnBoardManoeuvres(loop, floor, program)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from cfplan.errors import InputError, PreflightError
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.flight_loop import TRIES, FlightLoop
+from cfplan.flight.pilot.on_board_manoeuvres import upload_program
 from cfplan.flight.pilot.outcome import Check
 from cfplan.flight.pilot.preflight import PreflightSnapshot, check_traffic, run_checks, standing_check
 from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES, Action, Traffic
@@ -38,6 +39,8 @@ def prepare(
     loop.history.enter(Phase.CONFIGURE)
     loop.restart_deadlines()
     read = _configure(loop)
+    if loop.mission.on_board is not None:
+        upload_program(loop, loop.mission.on_board)
     loop.link.start_logs()
     loop.until(lambda: loop.link.estimate is not None and loop.link.status is not None, 3.0)
     if loop.link.estimate is None or loop.link.status is None:

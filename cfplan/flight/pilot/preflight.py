@@ -6,11 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cfplan.flight.firmware import NEWEST_KNOWN, Timeouts, timeouts_of, version_of, version_text
 from cfplan.flight.mocap.poses import Pose
+from cfplan.flight.on_board.fall import falls_from
+from cfplan.flight.on_board.go_to import go_to_states
 from cfplan.flight.pilot.deadlines import Lateness
-from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.mission import Mission, manoeuvre_time
 from cfplan.flight.pilot.outcome import Check
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, ParameterRule, Traffic
 from cfplan.flight.radio.supervisor_bits import FAULTS, FLYING
@@ -51,7 +54,8 @@ class PreflightSnapshot:
 
 def run_checks(snapshot: PreflightSnapshot) -> tuple[Check, ...]:
     """Every check, in the order of the table; parameters have a line a group, and one for each that is wrong."""
-    return (*(check(snapshot) for check in CHECKS), *check_parameters(snapshot))
+    more = ON_BOARD_CHECKS if snapshot.mission.on_board is not None else ()
+    return (*(check(snapshot) for check in (*CHECKS, *more)), *check_parameters(snapshot))
 
 
 def check_protocol(snapshot: PreflightSnapshot) -> Check:
@@ -278,3 +282,47 @@ CHECKS: tuple[Callable[[PreflightSnapshot], Check], ...] = (
     check_plan_inside,
     check_waking,
 )
+
+
+def check_memory(snapshot: PreflightSnapshot) -> Check:
+    """What the memory holds was read back, and compared, when it was written."""
+    program = snapshot.mission.on_board
+    assert program is not None
+    kind = "compressed pieces" if program.compressed else "pieces"
+    return Check("trajectory memory", f"{program.pieces} {kind}, {len(program.memory)} bytes", "as uploaded", True)
+
+
+def check_watchdog(snapshot: PreflightSnapshot) -> Check:
+    """The on-board commander has no time-out: without the watchdog a vehicle without a link flies on, blind."""
+    on, seconds = snapshot.mission.limits.firmware.watchdog, Timeouts().keep_alive
+    return Check(
+        "link loss on board", f"motors stop {seconds:g} s later" if on else "it flies on, blind",
+        "motors stop", on, "set firmware.watchdog to true in safety.yaml",
+    )  # fmt: skip
+
+
+def check_fall(snapshot: PreflightSnapshot) -> Check:
+    """The trajectory was looked at before; take-off from here and the way to the start are now."""
+    mission, limits = snapshot.mission, snapshot.mission.limits
+    assert mission.on_board is not None
+    (x, y, z), height = snapshot.poses[-1].position, mission.take_off_height
+    ways = [_hover_to_hover((x, y, z), (x, y, height), limits.ground.take_off_speed)]
+    ways.append(_hover_to_hover((x, y, height), mission.on_board.begin[:3], limits.ground.go_to_speed))
+    falls = falls_from(np.concatenate(ways), limits, mission.on_board.deviation)
+    beyond = float(falls.beyond[falls.worst])
+    where = falls.name_of_wall(falls.worst, limits)
+    found = f"trajectory {mission.on_board.falls}; before it {abs(beyond):.2f} m {'beyond' if beyond > 0 else 'from'} "
+    return Check(
+        "fall after link loss", found + where, "inside the walls", beyond <= 0.0 or limits.link_loss.only_warn,
+        "move the vehicle towards the middle of the room, or lower `ground.go_to_speed`",
+    )  # fmt: skip
+
+
+def _hover_to_hover(begin: Triple, end: Triple, speed: float) -> NDArray:
+    """Return states, (N, 5, 4), of the commander's way between two places, m, at a mean speed, m/s."""
+    hover = np.zeros((1, 3, 4))
+    hover[0, 0, :3] = begin
+    return go_to_states(hover, np.array([[*end, 0.0]]), manoeuvre_time(math.dist(begin, end), speed), 100)[0]
+
+
+ON_BOARD_CHECKS: tuple[Callable[[PreflightSnapshot], Check], ...] = (check_memory, check_watchdog, check_fall)

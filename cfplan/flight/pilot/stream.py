@@ -20,7 +20,7 @@ class Stream:
     `payloads` (N, 29) uint8, the last of them at rest; `rate` in Hz; `start` in s on the clock of time.monotonic();
     `stop_from` returns (M, 29) uint8, a way to stop from one of the setpoints, and is None for a stop and a descent.
     Setpoints have numbers, from `first` to `last`; number 0 is due at the start. Everything slow is done when the
-    stream is made.
+    stream is made. Where the vehicle flies the motion `on_board`, nothing is sent: the setpoints say where it is to be.
     """
 
     def __init__(
@@ -30,8 +30,11 @@ class Stream:
         start: float = 0.0,
         stop_from: Callable[[int], NDArray] | None = None,
         first: int = 0,
+        *,
+        on_board: bool = False,
     ):
         self.payloads, self.start, self.rate, self.stop_from = payloads, start, rate, stop_from
+        self.on_board = on_board
         self.first, self.last = first, first + len(payloads) - 1
         state = decode(payloads)
         fields = (state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate)
@@ -77,7 +80,7 @@ class Stream:
         return SetpointSent(time, due, index, *self.state(index))
 
 
-def stream_of(commitment: Commitment, rate: float, start: float = 0.0) -> Stream:
+def stream_of(commitment: Commitment, rate: float, start: float = 0.0, *, on_board: bool = False) -> Stream:
     """Return the stream of a commitment, of which setpoint 0 was or would have been due at `start`, s."""
     first, stops = commitment.first, commitment.stops
-    return Stream(commitment.payloads, rate, start, lambda number: stops[number - first], first)
+    return Stream(commitment.payloads, rate, start, lambda number: stops[number - first], first, on_board=on_board)

@@ -16,6 +16,7 @@ from cfplan.errors import LinkError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.radio.perishable import EXTERNAL_POSE, LOCALIZATION_PORT
 from cfplan.flight.radio.restart import restart_vehicle
+from cfplan.flight.radio.trajectory_upload import upload
 from cfplan.flight.setpoints.packets import CRTP_PORT, decompress_quaternion
 from cfplan.flight.telemetry import Estimate, Telemetry, Triple, VehicleStatus
 from cfplan.vehicle.airframe import GRAVITY
@@ -91,6 +92,10 @@ class Link:
     def release_priority(self) -> None:
         """Give the vehicle back to its on-board commander."""
         self._send(GENERIC_PORT, 1, struct.pack("<BI", 0, 0))
+
+    def command(self, command: bytes) -> None:
+        """Send a command of `on_board.commands`; its answer is one of `replies`."""
+        self._send(HIGH_LEVEL_PORT, 0, command)
 
     def stop_setpoint(self) -> None:
         """Switch the motors off until another setpoint comes."""
@@ -177,6 +182,10 @@ class Link:
         finally:
             self._crazyflie.param.remove_update_callback(group, short, note)
         return values[-1]
+
+    def upload_trajectory(self, content: bytes) -> bytes:
+        """Write the beginning of the trajectory memory, and return what it holds there. Raises as upload()."""
+        return upload(self._crazyflie, content, self.uri, self._clock)
 
     def start_logs(self) -> None:
         """Start the logs of `estimate`, `status`, `position_variance` and `has_setpoint`; report the first two."""

@@ -8,5 +8,6 @@ TUMBLED = 1 << 5
 LOCKED = 1 << 6
 CRASHED = 1 << 7
 HIGH_LEVEL_ACTIVE = 1 << 8
+TRAJECTORY_FINISHED = 1 << 9
 
 FAULTS = {TUMBLED: "tumbled", LOCKED: "locked", CRASHED: "crashed"}

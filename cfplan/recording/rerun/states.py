@@ -11,6 +11,7 @@ PHASE_COLOURS = {
     Phase.CONNECT: _GROUND,
     Phase.RELEASE: _GROUND,
     Phase.CONFIGURE: _GROUND,
+    Phase.UPLOAD: _GROUND,
     Phase.FEED: _GROUND,
     Phase.CONVERGE: _GROUND,
     Phase.PREFLIGHT: _GROUND,

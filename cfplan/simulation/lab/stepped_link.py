@@ -24,6 +24,8 @@ _PATIENCE = 3.0  # s for an answer
 _ROUND_TRIP_MS = 2.0
 _POWER_OFF = 1.0  # s, as long as cflib leaves it off
 _READ, _WRITE, _DATA = 1, 2, 2
+_INFO, _MEMORY_READ, _MEMORY_WRITE = range(3)
+_MEMORY_PART, _TRAJECTORY_MEMORY = 24, 0x12  # bytes in a packet; the type of memory, as cflib has it
 _CREATE_BLOCK, _APPEND_BLOCK, _RESET_LOG, _START_BLOCK, _STOP_BLOCK = 6, 7, 5, 8, 4
 _CREATED = 27  # bytes of variables that fit into the first packet
 _LOG_TYPES = {"uint8_t": (1, "B"), "int16_t": (5, "h"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "float": (7, "f")}
@@ -78,6 +80,20 @@ class SteppedLink(Link):
         head = struct.pack("<H", number)
         answer = self._ask(Port.PARAMETERS, _READ, head, head, patience)
         return float(struct.unpack_from(self._lab.vehicle.parameters.toc.variables[number].format, answer, 3)[0])
+
+    def upload_trajectory(self, content: bytes, patience: float = 30.0) -> bytes:
+        (count,) = self._ask(Port.MEMORY, _INFO, b"\x01", b"\x01", _PATIENCE)[1:2]
+        details = (self._ask(Port.MEMORY, _INFO, bytes((2, k)), bytes((2, k)), _PATIENCE) for k in range(count))
+        number = next(found[1] for found in details if found[2] == _TRAJECTORY_MEMORY)
+        held = b""
+        for address in range(0, len(content), _MEMORY_PART):
+            part = content[address : address + _MEMORY_PART]
+            head = struct.pack("<BI", number, address)
+            if self._ask(Port.MEMORY, _MEMORY_WRITE, head + part, head, patience)[5]:
+                raise LinkError("the vehicle refuses it: writing its trajectory memory", where=URI, hint="restart it")
+            answer = self._ask(Port.MEMORY, _MEMORY_READ, head + bytes((len(part),)), head, patience)
+            held += answer[6:]
+        return held
 
     def _log(self, name: str, variables: tuple[list[tuple[str, str]], int], note: Callable[..., None]) -> Any:
         entries, period = variables

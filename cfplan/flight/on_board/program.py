@@ -1,0 +1,94 @@
+"""The on-board program: a trajectory for the vehicle's memory that ends in a landing, and what its pilot knows of it.
+
+Behind the plan's pieces two more sink to the floor: quickly at first, then at a pace with which the vehicle may touch
+it, and on beneath it, so that a vehicle that stands no longer has the thrust to rise. Without its pilot it then stands,
+rather than hover until its battery is empty.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory
+from cfplan.flight.on_board.memory_format import (
+    END,
+    POINTS,
+    START_SIZE,
+    STEPS,
+    ControlPoints,
+    compressed_bytes,
+    raw_bytes,
+    read_compressed,
+    read_raw,
+)
+from cfplan.flight.on_board.pieces import Pieces
+
+LANDING_PIECES = 2
+LANDING_SIZE = LANDING_PIECES * (3 + 2 * POINTS)  # bytes, compressed: of the height alone
+_SLOW_FROM = 0.15  # m above the floor, from which it sinks at a pace with which it may touch it
+_PERIOD = 70  # ms: durations are multiples, in which 0.1 m/s, with which it may touch the floor, is whole millimetres
+_BENEATH_FLOOR = 0.3  # m, where no thrust is left; see setpoints/descent.py
+_SHORTEST = 1.4  # s of the quick part
+
+
+@dataclass(frozen=True, slots=True)
+class OnBoardProgram:
+    """What is uploaded, and how the pilot watches it."""
+
+    memory: bytes  # from byte 0 of the trajectory memory on
+    compressed: bool
+    pieces: int
+    begin: tuple[float, float, float, float]  # m, m, m, rad, where the first piece begins
+    descent: NDArray  # (N, 29) uint8, the landing at its end as setpoints would fly it
+    falls: str  # how near to which wall the vehicle falls at the worst moment to lose its pilot
+    deviation: float  # m, from the plan, in the dry run
+
+
+def with_landing(made: OnBoardTrajectory, floor: float, mean_speed: float) -> tuple[bytes, Pieces]:
+    """Return the memory, and the pieces in it, of a trajectory that sinks at its end to a floor at `floor`, m.
+
+    The quick part of its landing has the mean speed given, m/s. Raises NotCertifiedError where it does not fit.
+    """
+    last = made.pieces.coefficients[-1]
+    end = _end_of(last, made.pieces.durations[-1])
+    sinking = _sinking(end, floor, mean_speed)
+    if made.compressed:
+        memory = _joined(made.memory, sinking)
+        return memory, read_compressed(memory)
+    added = read_compressed(compressed_bytes(sinking))
+    table = added.coefficients.copy()
+    table[:, [0, 1, 3], 0] = end[[0, 1, 3]]  # which need not be rounded here
+    table[:, 2, 0] += np.float32(end[2]) - added.coefficients[0, 2, 0]
+    pieces = Pieces(
+        np.concatenate([made.pieces.durations, added.durations]), np.concatenate([made.pieces.coefficients, table])
+    )
+    memory = raw_bytes(pieces)
+    return memory, read_raw(memory, len(pieces.durations))
+
+
+def _end_of(table: NDArray, duration: float) -> NDArray:
+    """Return where a piece, (4, 8), ends: (4,) m and rad."""
+    return np.asarray(table.astype(float) @ float(duration) ** np.arange(table.shape[1]))
+
+
+def _sinking(end: NDArray, floor: float, mean_speed: float) -> ControlPoints:
+    """Return the two pieces of the landing, in whole steps of compressed memory, from a rest at `end`, (4,), to one."""
+    start = np.round(end / STEPS).astype(int)
+    lowest = round(1000 * (floor - _BENEATH_FLOOR))
+    way = max(int(start[2]) - round(1000 * (floor + _SLOW_FROM)), 0)
+    quick = _PERIOD * math.ceil(max(_SHORTEST, way / 1000 / mean_speed) * 1000 / _PERIOD)
+    step = quick // _PERIOD  # mm from one control point to the next, at the pace to touch the floor
+    middle = int(start[2]) - max(way, 3 * step)
+    slow = _PERIOD * max(round((middle - lowest) / 7), 1)
+    points = np.tile(start[:, None], (2, 1, 7))
+    points[0, 2, 3:] = middle + step * np.arange(3, -1, -1)
+    points[1, 2, :3] = middle - slow // _PERIOD * np.arange(1, 4)
+    points[1, 2, 3:] = lowest
+    return ControlPoints(start, np.array([quick, slow]), points)
+
+
+def _joined(memory: bytes, sinking: ControlPoints) -> bytes:
+    """Return compressed memory with more pieces behind its own, which begin where those end."""
+    return memory[: -len(END)] + compressed_bytes(sinking)[START_SIZE:]

@@ -1,0 +1,273 @@
+"""Manoeuvres on board: the vehicle's own commander flies, and the pilot asks, watches, and ends the flight.
+
+The commander flies take-off, the way to the start, the uploaded trajectory with the landing at its end, and where the
+abort ladder asks for it, a stop from any state and a landing. Nothing is streamed but poses and keep-alive packets. The
+vehicle has no time-out for what its commander flies; its watchdog alone, which stops its motors a second after the last
+keep-alive packet, and runs before they turn.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from cfplan.errors import PreflightError
+from cfplan.flight.on_board import commands
+from cfplan.flight.on_board.go_to import STOP_DURATION, go_to_states, motion_of, stop_targets
+from cfplan.flight.on_board.program import OnBoardProgram
+from cfplan.flight.pilot.abort_monitor import safety_abort
+from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
+from cfplan.flight.pilot.manoeuvres import climb, require_ready, settle_at
+from cfplan.flight.pilot.mission import manoeuvre_time
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.pilot.stream import Stream
+from cfplan.flight.pilot.streamed_manoeuvres import BRAKE_HOLD
+from cfplan.flight.radio.supervisor_bits import FLYING, TRAJECTORY_FINISHED
+from cfplan.flight.setpoints.encoding import encode_motion
+from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
+from cfplan.flight.setpoints.rate_trade import gains_under
+from cfplan.flight.telemetry import Level, Phase
+from cfplan.vehicle.rotations import yaw_of
+
+_ANSWERS_WITHIN = 0.3  # s
+_KEPT_ALIVE_FOR = 0.4  # s before the motors turn: some packets, one of which starts the watchdog
+_QUICK_DESCENT = 1.5  # m/s², at most about, of a landing without poses, where the estimate goes wrong with time
+_SHORTEST_LANDING = 1.2  # s
+_TOUCH, _TOUCH_BLINDLY = 0.05, 0.5  # m beneath the floor that landings aim at; without poses the height is unsure
+_STANDS_FOR, _STANDS_WITHIN = 0.3, 0.015  # s, m: the range of the heights of a standing body's poses
+_NEAR_FLOOR, _NOT_FOLLOWING = 0.15, 0.05  # m above the floor, and above its setpoint
+_SETTLE = 0.5  # s at the end of a descent
+_MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
+
+
+def upload_program(loop: FlightLoop, program: OnBoardProgram) -> None:
+    """Write the trajectory memory, read it back, and define what it holds. Raises LinkError or PreflightError."""
+    loop.history.enter(Phase.UPLOAD)
+    held = loop.link.upload_trajectory(program.memory)
+    loop.restart_deadlines()
+    if held != program.memory:
+        wrong = sum(a != b for a, b in zip(held, program.memory, strict=False)) + abs(len(held) - len(program.memory))
+        raise PreflightError(
+            f"the trajectory memory holds {wrong} other bytes than were uploaded", where="vehicle",
+            hint="does another client write to it? Restart the vehicle and try again",
+        )  # fmt: skip
+    answer = _ask(loop, commands.define(program.pieces, compressed=program.compressed))
+    if answer != commands.DONE:
+        raise PreflightError(
+            f"the vehicle does not define the trajectory: {_what(answer)}", where="vehicle",
+            hint="update its firmware, and restart it",
+        )  # fmt: skip
+    loop.history.say(Level.INFO, f"{program.pieces} pieces in {len(program.memory)} bytes uploaded and read back")
+
+
+def _ask(
+    loop: FlightLoop,
+    command: bytes,
+    sent: Callable[[], object] = lambda: None,
+    taken: Callable[[], bool] = lambda: False,
+) -> int | None:
+    """Send a command until it is answered, and return the answer; None where none comes.
+
+    `sent` is called at each sending. A command that was `taken`, as the vehicle's log shows, is not sent again.
+    """
+    number = command[0]
+    for attempt in range(TRIES):
+        loop.link.replies.pop(number, None)
+        loop.link.command(command)
+        sent()
+        loop.until(lambda: number in loop.link.replies, _ANSWERS_WITHIN)
+        answer = loop.link.replies.get(number)
+        if taken() or (attempt and answer == commands.BUSY):  # the first one came, and its answer did not
+            return commands.DONE
+        if answer is not None:
+            return answer
+    return None
+
+
+def _what(answer: int | None) -> str:
+    """Return an answer in words."""
+    return "it does not answer" if answer is None else commands.ANSWERS.get(answer, f"it answers {answer}")
+
+
+class OnBoardManoeuvres:
+    """Lets the vehicle's commander fly a mission's phases."""
+
+    def __init__(self, loop: FlightLoop, floor: float, program: OnBoardProgram):
+        self._loop, self._floor, self._program = loop, floor, program  # m, height of the tracked body before take-off
+        self._mission, self._limits, self._history = loop.mission, loop.limits, loop.history
+        self._stopping = False  # a stop was asked for
+        self._landing = False  # the last descent has begun
+
+    def take_off(self) -> None:
+        """Climb to a hover, once the watchdog runs. Raises PreflightError where the vehicle stays on the floor."""
+        loop = self._loop
+        self._history.enter(Phase.TAKE_OFF)
+        height, (x, y, _) = self._mission.take_off_height, loop.pose().position
+        yaw = yaw_of(loop.pose().quaternion)
+        duration = manoeuvre_time(height - self._floor, self._limits.ground.take_off_speed)
+        way = self._way((x, y, self._floor, yaw), (x, y, height, yaw), duration)
+        if way.stop_from is not None:
+            way.stop_from(0)  # the first call is slow: make it on the ground
+        require_ready(loop)
+        loop.lift_off()
+        loop.pause(_KEPT_ALIVE_FOR)
+        answer = _ask(loop, commands.take_off(height, duration), lambda: loop.begin(way))
+        if answer != commands.DONE:
+            self._stop_motors()
+            loop.touch_down()
+            raise PreflightError(
+                f"the vehicle does not take off: {_what(answer)}", where="vehicle",
+                hint="restart it on a level floor; its console says more",
+            )  # fmt: skip
+        assert loop.stream is not None
+        climb(loop, loop.stream, self._floor, height, self._stop_motors)
+
+    def go_to_start(self) -> None:
+        """Fly to where the trajectory begins and wait until the vehicle is there."""
+        loop = self._loop
+        self._history.enter(Phase.GO_TO_START)
+        (x, y, z), _, yaw = loop.asked()
+        start = self._program.begin
+        duration = manoeuvre_time(math.dist(loop.pose().position, start[:3]), self._limits.ground.go_to_speed)
+        way = self._way((x, y, z, yaw), start, duration)
+        self._require(_ask(loop, commands.go_to(*start, duration), lambda: loop.begin(way)), "go to the start")
+        assert loop.stream is not None
+        end = loop.stream.end
+        loop.until(lambda: loop.now() > end, math.inf)
+        settle_at(loop, start[:3])
+
+    def fly_plan(self) -> None:
+        """Start the trajectory, and watch it until its landing begins."""
+        loop = self._loop
+        self._history.enter(Phase.STREAM)
+        begun = loop.now()
+
+        def flies() -> bool:
+            status = loop.link.status
+            return status is not None and status.time > begun and not loop.bits(TRAJECTORY_FINISHED)
+
+        self._require(_ask(loop, commands.start(), loop.begin_plan, flies), "start the trajectory")
+        self._history.say(Level.INFO, "the vehicle flies the trajectory on board")
+        loop.until(lambda: loop.now() > loop.plan.start + loop.motion_ends, math.inf)
+        self._history.enter(Phase.HOLD)
+        loop.until(lambda: loop.now() > loop.plan.end, math.inf)
+
+    def land(self) -> None:
+        """Watch the landing with which the trajectory ends, and stop the motors once the vehicle stands."""
+        loop = self._loop
+        self._begin_landing()
+        down = loop.begin(Stream(self._program.descent, self._mission.rate, on_board=True))
+        loop.until(lambda: self._stands() or loop.now() > down.end + _SETTLE, math.inf)
+        self._end_landing()
+
+    def brake(self) -> None:
+        """Brake to a hover, hold it, and land."""
+        self._stop()
+        if not self._landing:
+            self._history.enter(Phase.HOLD)
+            self._loop.until(lambda: self._loop.blind, BRAKE_HOLD)
+        self._descend()
+
+    def stop_and_land(self) -> None:
+        """Brake, and land at once."""
+        self._stop()
+        self._descend()
+
+    def _require(self, answer: int | None, what: str) -> None:
+        """Raise AbortRaised unless the vehicle does as it is asked."""
+        if answer != commands.DONE:
+            raise AbortRaised(safety_abort(Rung.LAND, f"the vehicle does not {what}: {_what(answer)}"))
+
+    def _way(self, begin: tuple[float, ...], end: tuple[float, ...], duration: float) -> Stream:
+        """Return what the commander flies from hover to hover, m and rad, as setpoints, with a stop from each."""
+        hover = np.zeros((1, 3, 4))
+        hover[0, 0] = begin
+        turn = math.remainder(end[3] - begin[3], math.tau)
+        states = go_to_states(hover, np.array([[*end[:3], begin[3] + turn]]), duration, self._rows(duration))[0]
+        return Stream(
+            self._encoded(states), self._mission.rate, stop_from=lambda row: self._stop_rows(states[row]), on_board=True
+        )
+
+    def _stop_rows(self, state: np.ndarray) -> np.ndarray:
+        """Return the stop from a state of the commander, (5, 4), as setpoints."""
+        begin = state[None, :3]
+        return self._encoded(go_to_states(begin, stop_targets(begin), STOP_DURATION, self._rows(STOP_DURATION))[0])
+
+    def _rows(self, duration: float) -> int:
+        return round(duration * self._mission.rate) + 1
+
+    def _encoded(self, states: np.ndarray) -> np.ndarray:
+        motion = motion_of(states, self._limits.airframe)
+        return encode_motion(motion, motion.acceleration, gains_under(self._limits), space=self._limits.space)
+
+    def _stop(self) -> None:
+        """Let the commander brake to a hover where it was certified to, or finish a stop that has begun."""
+        loop, left = self._loop, self._loop.stream
+        if left is None or self._landing:
+            return
+        if not self._stopping and left.stop_from is not None:
+            self._stopping = True
+            rows = left.stop_from(left.index(loop.now()))
+            last = decode(rows[-1:].reshape(-1, PAYLOAD_SIZE))
+            (x, y, z), yaw = last.position[0].tolist(), float(yaw_of(tuple(last.quaternion[0].tolist())))
+            stop = Stream(rows, self._mission.rate, on_board=True)
+            if left is loop.plan:
+                self._history.stopped_at = loop.now()
+            answer = _ask(loop, commands.go_to(x, y, z, yaw, STOP_DURATION), lambda: loop.begin(stop))
+            if answer != commands.DONE:
+                self._history.say(Level.WARNING, f"the vehicle does not stop: {_what(answer)}")
+        end = loop.stream.end if loop.stream is not None else 0.0
+        loop.until(lambda: loop.now() > end, math.inf)
+
+    def _begin_landing(self) -> None:
+        if not self._landing:
+            self._landing = True
+            self._history.enter(Phase.LAND)
+
+    def _descend(self) -> None:
+        """Let the commander land from where it is asked to be; quickly without poses."""
+        loop = self._loop
+        if loop.stream is None:  # it was not asked to take off yet
+            self._end_landing()
+            return
+        (x, y, z), _, yaw = loop.asked()
+        self._begin_landing()
+        lowest = self._floor - (_TOUCH_BLINDLY if loop.blind else _TOUCH)
+        way = max(z - lowest, 0.0)
+        quick = math.sqrt(7.513 * way / _QUICK_DESCENT)  # the peak of a septic's acceleration is 7.513 way / duration²
+        duration = max(quick if loop.blind else way / self._limits.ground.land_speed, _SHORTEST_LANDING)
+        down = self._way((x, y, z, yaw), (x, y, min(lowest, z), yaw), duration)
+        down.stop_from = None
+        self._require_landing(_ask(loop, commands.land(lowest, duration), lambda: loop.begin(down)))
+        end = loop.stream.end + _SETTLE
+        loop.until(lambda: loop.now() > end, math.inf)
+        self._end_landing()
+
+    def _require_landing(self, answer: int | None) -> None:
+        if answer not in (commands.DONE, commands.BUSY):  # it lands already
+            raise AbortRaised(safety_abort(Rung.CUT, f"the vehicle does not land: {_what(answer)}"))
+
+    def _stands(self) -> bool:
+        """Return whether the tracked body stays near the floor although the trajectory has sunk on."""
+        loop, pose = self._loop, self._loop.pose()
+        wanted, heights = loop.wanted(pose.time), loop.heights(_STANDS_FOR)
+        if wanted is None or not heights or max(heights) - min(heights) > _STANDS_WITHIN:
+            return False
+        return pose.position[2] - self._floor < _NEAR_FLOOR and pose.position[2] - wanted[2] > _NOT_FOLLOWING
+
+    def _end_landing(self) -> None:
+        """Stop the motors. Raises AbortRaised if they do not stop."""
+        if not self._stop_motors():
+            raise AbortRaised(safety_abort(Rung.CUT, "the vehicle does not land"))
+        self._loop.touch_down()
+
+    def _stop_motors(self) -> bool:
+        """Stop the motors, and return whether the vehicle says so; its null setpoints count from then on."""
+        loop = self._loop
+        loop.end_stream()
+        loop.expect_stop()
+        for _ in range(TRIES):
+            _ask(loop, commands.stop())
+            if loop.until(lambda: not loop.bits(FLYING), _MOTORS_STOP_WITHIN):
+                return True
+        return False
