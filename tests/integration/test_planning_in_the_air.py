@@ -304,6 +304,7 @@ def test_random_requests_keep_every_limit_over_the_flown_sequence(held, mission,
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # of a busy computer, too
 @pytest.mark.parametrize("seed", range(10, 20))
 def test_a_minute_of_random_requests_is_one_certified_motion(held, mission, limits, seed):
     flight, planner, count = fly_random(held, mission, limits, seed, 60.0)
