@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cflib.crazyflie.mem import MemoryElement
+from cflib.crazyflie.mem import MemoryElement, Poly4D
 from cflib.crtp.crtpstack import CRTPPort
 from waiting import until
 
 from cfplan.flight.on_board.certified_pieces import certified_compressed, certified_pieces
 from cfplan.geometry.path_file import path_through
+from cfplan.geometry.polynomial_csv import polynomial_rows
 from cfplan.planning.plan import plan
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.room import RoomPoseSource
@@ -110,7 +111,18 @@ class Packed:
         return bytearray(self.content)
 
 
-def uploads(make):
+def packed(made):
+    return [Packed(made.memory)]
+
+
+def from_csv(made):
+    """Pieces of cflib's own, from a CSV as Crazyswarm reads it, and as cflib's autonomous_sequence_high_level has."""
+    text = polynomial_rows(made.pieces.durations, made.pieces.coefficients)
+    rows = np.loadtxt(text.splitlines(), delimiter=",", skiprows=1, usecols=range(33), ndmin=2)
+    return [Poly4D(row[0], *(Poly4D.Poly(row[k : k + 8]) for k in range(1, 33, 8))) for row in rows]
+
+
+def uploads(make, elements=packed):
     """Upload a plan, and let the vehicle fly it by itself."""
     limits = load_limits(Path(__file__).parents[3] / "safety.yaml")
     gentle = replace(limits.plan, angular_acceleration=0.57 * limits.plan.angular_acceleration)
@@ -119,7 +131,7 @@ def uploads(make):
 
     def fly(lab, cf, feed):
         (memory,) = cf.mem.get_mems(MemoryElement.TYPE_TRAJ)
-        memory.trajectory = [Packed(made.memory)]
+        memory.trajectory = elements(made)
         assert memory.write_data_sync()
         planner = cf.high_level_commander
         planner.define_trajectory(1, 0, len(made.pieces.durations), int(made.compressed))
@@ -149,6 +161,7 @@ def uploads(make):
         pytest.param(lambda: streams, 4, id="by setpoints"),
         pytest.param(lambda: uploads(certified_pieces), 5, id="by polynomials"),
         pytest.param(lambda: uploads(certified_compressed), 5, id="by compressed polynomials"),
+        pytest.param(lambda: uploads(certified_pieces, from_csv), 5, id="by a CSV of Crazyswarm's"),
     ],
 )
 def test_cflib_flies_the_virtual_crazyflie(lab, link, set_and_read_back, make_flight, commands):
