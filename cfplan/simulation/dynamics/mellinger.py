@@ -79,8 +79,13 @@ def step_controller(
     pull_z = _pull(memory, gains, setpoint, state, 2, period)
 
     turn = axes_of(state[6], state[7], state[8], state[9])
+    by_position = mode[MODE_X] == ABSOLUTE
+    manual = mode[MODE_ROLL] == ABSOLUTE and mode[MODE_PITCH] == ABSOLUTE and mode[MODE_Z] == DISABLE
     yaw = 1.0, 0.0  # cosine and sine
-    if mode[MODE_YAW] == VELOCITY_MODE:
+    if not (by_position or manual):
+        # Level out: the firmware keeps height and the direction that it points in.
+        yaw = _direction(turn[0][0], turn[0][1])
+    elif mode[MODE_YAW] == VELOCITY_MODE:
         ahead = np.arctan2(turn[0][1], turn[0][0]) + setpoint[15] * period
         yaw = np.cos(ahead), np.sin(ahead)
     elif mode[MODE_YAW] == ABSOLUTE:
@@ -89,8 +94,6 @@ def step_controller(
         x, y = heading_of((setpoint[9], setpoint[10], setpoint[11], setpoint[12]))
         yaw = _direction(x, y)
 
-    by_position = mode[MODE_X] == ABSOLUTE
-    manual = mode[MODE_ROLL] == ABSOLUTE and mode[MODE_PITCH] == ABSOLUTE and mode[MODE_Z] == DISABLE
     thrust = 0.0
     if manual and not by_position:
         desired = _attitude(setpoint[16], -setpoint[17], yaw)
@@ -100,9 +103,6 @@ def step_controller(
             force_x = gains[_MASS] * setpoint[6] + pull_x
             force_y = gains[_MASS] * setpoint[7] + pull_y
             force_z += gains[_MASS] * setpoint[8]
-        else:
-            # Level out: the firmware keeps height and the direction that it points in.
-            yaw = _direction(turn[0][0], turn[0][1])
         thrust = _dot((force_x, force_y, force_z), turn[2])
         desired = _thrust_frame(force_x, force_y, force_z, yaw)
 
