@@ -20,7 +20,7 @@ from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposa
 from cfplan.flight.setpoints.encoding import HOLD, LEAD, RATE, RATE_LEAD, EncodedFlight, encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import certify_stops
-from cfplan.flight.setpoints.stops import DURATION, Shape, encode_stops, firm, gentle, rest_behind
+from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times
 from cfplan.planning.continuation import NoWayError, check_waypoints, continue_plan, path_from_rest
@@ -46,12 +46,10 @@ LEAST_SPEED = 0.2  # m/s, to which requests may lower the speed
 PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
 LOOKS_BACK = math.ceil(RATE_LEAD * RATE)  # setpoints before one, of whose motion it is made too
 HOVER = 0.05  # s, of the motion that a hover counts as
-STOPS: tuple[tuple[float, Shape], ...] = (
-    *((round(0.38 + 0.02 * k, 2), firm) for k in range(15)), (0.7, gentle), (0.8, gentle), (1.0, gentle),
-    (DURATION, gentle),
-)  # fmt: skip
-"""s within which a request to stop is tried to be met, and how. From 2 m/s straight on 0.42 s brake at 6.8 m/s², a tilt
-of 35°; where the vehicle turns it is more, and where it slows down already less."""
+STOPS = (0.46, 0.48, 0.5, 0.52, 0.54, 0.55, 0.56, 0.58, 0.6, 0.65, 0.7, 0.8, 1.0, DURATION)
+"""s within which a request to stop is tried to be met. From 2 m/s straight on 0.54 s brake at 6.9 m/s², a tilt of 35°;
+where the vehicle turns or slows down already it is more or less. One that holds its deceleration is planned to rest
+0.1 m sooner, but motors that lag let the vehicle overshoot that by as much."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -325,11 +323,11 @@ def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned | HeldFligh
     held = at_rest_from(held, splice, limits)
     splice = max(splice, held.exact_from)
     ends = held.ends if held.stops_from is None else (held.stops_from + STOP) / RATE
-    if sooner := [stop for stop in STOPS if stop[0] < ends - splice / RATE]:
+    if sooner := [duration for duration in STOPS if duration < ends - splice / RATE]:
         encoded = _encoded_from(held, splice, limits)
-        for duration, shape in sooner:
+        for duration in sooner:
             with suppress(InfeasibleError, NotCertifiedError):
-                return _stop_along(encoded, held, splice, duration, shape, limits)
+                return _stop_along(encoded, held, splice, duration, limits)
     if held.unfinished:
         return given_up(held, limits)
     raise InfeasibleError(
@@ -339,13 +337,13 @@ def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned | HeldFligh
     )
 
 
-def stop_within(held: HeldFlight, splice: int, duration: float, shape: Shape, limits: Limits) -> Replanned:
+def stop_within(held: HeldFlight, splice: int, duration: float, limits: Limits) -> Replanned:
     """Return the proposal to stop along the path from the setpoint behind `splice` on, within `duration`, s.
 
     Raises NotCertifiedError where the stop exceeds what stops may reach, InfeasibleError where link loss or a gap
     within it would end badly.
     """
-    return _stop_along(_encoded_from(held, splice, limits), held, splice, duration, shape, limits)
+    return _stop_along(_encoded_from(held, splice, limits), held, splice, duration, limits)
 
 
 def _encoded_from(held: HeldFlight, splice: int, limits: Limits) -> EncodedFlight:
@@ -353,14 +351,12 @@ def _encoded_from(held: HeldFlight, splice: int, limits: Limits) -> EncodedFligh
     return encode_trajectory(held.flown.since(splice / RATE), gains=gains_under(limits), space=limits.space)
 
 
-def _stop_along(
-    encoded: EncodedFlight, held: HeldFlight, splice: int, duration: float, shape: Shape, limits: Limits
-) -> Replanned:
+def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration: float, limits: Limits) -> Replanned:
     """Return what stop_within() does; `encoded` are the setpoints of what is held from the splice on."""
     motion, gains, space = encoded.motion, encoded.gains, encoded.space
     first, second = np.array([0]), np.array([1])
-    stop = encode_stops(motion, RATE, duration, second, gains, space, shape)
-    certify_stops(stop, motion, limits, RATE, second, gains, space, shape).require(limits)
+    stop = encode_stops(motion, RATE, duration, second, gains, space)
+    certify_stops(stop, motion, limits, RATE, second, gains, space).require(limits)
     rows, rest = stop[0], stop[0, -1:]
     hovering = np.repeat(rest, round(HOLD * RATE), axis=0)
     payloads = np.concatenate([encoded.payloads[:1], rows, hovering])
@@ -373,7 +369,7 @@ def _stop_along(
     lost = link_loss_at_walls(payloads, limits, starts=starts)
     require_inside(lost, limits)
     meet_gaps(payloads, limits, starts)
-    resting = _resting(held, rest_behind(motion, 1, RATE, duration, shape), splice + len(rows), limits)
+    resting = _resting(held, rest_behind(motion, 1, RATE, duration), splice + len(rows), limits)
     later = replace(resting, begin=splice, snapshots=lost.snapshots)
     return Replanned(propose(held.commitment, splice, payloads, stops), later, None, splice / RATE)
 

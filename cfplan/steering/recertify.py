@@ -186,9 +186,9 @@ def _goes_on(flown: JoinedTrajectory, splice: int, told: NDArray, limits: Limits
 
 def _stopped(held: HeldFlight, splice: int, told: NDArray, checksum: int, where: str, limits: Limits) -> HeldFlight:
     """Return what was held with a stop that was asked for, certified again. Raises InputError where there is none."""
-    for duration, shape in STOPS:
+    for duration in STOPS:
         with suppress(CfplanError):
-            made = stop_within(held, splice, duration, shape, limits)
+            made = stop_within(held, splice, duration, limits)
             if made.proposal.checksum == checksum and np.array_equal(made.proposal.payloads, told):
                 return made.held
     raise InputError(

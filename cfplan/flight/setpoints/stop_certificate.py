@@ -15,7 +15,7 @@ from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.encoding import check_motion, encode_motion
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains
-from cfplan.flight.setpoints.stops import DURATION, Shape, chunks, gentle, stop_motion
+from cfplan.flight.setpoints.stops import DURATION, chunks, stop_motion
 from cfplan.safety.limits import Limits
 from cfplan.safety.quantities import AT_MOST, PACKET_ROUNDING, QUANTITIES
 from cfplan.safety.space import Space
@@ -61,7 +61,6 @@ def certify_stops(
     rows: NDArray | None = None,
     gains: AttitudeGains = FIRMWARE_GAINS,
     space: Space | None = None,
-    shape: Shape = gentle,
 ) -> StopCertificate:
     """Return the worst values of stops (N, M, 29) uint8 at `rate`, Hz, from each row of a motion, or from `rows`.
 
@@ -71,7 +70,7 @@ def certify_stops(
     duration = (stops.shape[1] - 1) / rate
     measured = []
     for some in chunks(len(stops)):
-        made = stop_motion(motion, begin[some], rate, duration, shape)
+        made = stop_motion(motion, begin[some], rate, duration)
         measured.append(_measured(stops[some], made, begin, some.start, limits, rate, gains, space))
     return _certificate(np.concatenate(measured, axis=1), limits)
 

@@ -7,11 +7,10 @@ on the path itself, where it was certified to be, and ends level at rest. With r
 
 r falls as a quintic smoothstep, so the braking deceleration is at most 1.875 v₀ / duration, and begins from nothing. A
 stop that begins at once, or is shorter, turns the vehicle so fast that link loss within it ends outside the walls.
-Where a stop is asked for it is firm(), if that passes: the deceleration holds its maximum, 1.43 v₀ / duration.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from numba.extending import register_jitable
@@ -33,35 +32,8 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import about_z, norms, quaternions_of, write_quaternion, yaw_of
 
 DURATION = 1.2  # s, from full speed to rest: 3.1 m/s² from 2 m/s on top of the turn's own
-_RAMP = 0.3  # share of a firm stop in which braking rises, and in which it falls
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
 _CHUNK = 200  # stops at a time, so that all fields of them stay in a processor's cache
-
-
-Shape = Callable[[NDArray], tuple[NDArray, NDArray, NDArray]]
-"""Of a stop: returns for shares of its duration, (M,), the time elapsed, its rate, and the change of that."""
-
-
-def gentle(share: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Slow down as a quintic smoothstep."""
-    elapsed = share - 2.5 * share**4 + 3.0 * share**5 - share**6  # the integral of the rate
-    rate = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-    return elapsed, rate, -30.0 * share**2 * (1.0 - share) ** 2
-
-
-def firm(share: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Slow down evenly, but at the beginning and the end, where braking rises and falls as a cubic smoothstep."""
-    ramp, most = _RAMP, 1.0 / (1.0 - _RAMP)
-    behind = 1.0 - share
-    first, last = share < ramp, behind < ramp
-    u = np.where(first, share, np.where(last, behind, ramp)) / ramp
-    braking, part = u**2 * (3.0 - 2.0 * u), ramp * (u**3 - 0.5 * u**4)
-    lost = np.where(first, part, np.where(last, 1.0 - ramp - part, share - 0.5 * ramp))
-    held = 0.15 * ramp**2 + 0.5 * ramp * (share - ramp) + 0.5 * (share - ramp) ** 2
-    twice = ramp**2 * (0.25 * u**4 - 0.1 * u**5)
-    at_end = 0.5 * (1.0 - ramp) - behind * (1.0 - ramp) + twice
-    away = np.where(first, twice, np.where(last, at_end, held))
-    return share - most * away, 1.0 - most * lost, -most * braking
 
 
 def encode_stops(
@@ -71,7 +43,6 @@ def encode_stops(
     rows: NDArray | None = None,
     gains: AttitudeGains = FIRMWARE_GAINS,
     space: Space | None = None,
-    shape: Shape = gentle,
 ) -> NDArray:
     """Return (N, M, 29) uint8: stop i begins with the place of the motion's row i and ends in hover; M at `rate`, Hz.
 
@@ -81,7 +52,7 @@ def encode_stops(
     begin = np.arange(len(motion.position)) if rows is None else rows
     out = np.empty((len(begin), round(duration * rate) + 1, PAYLOAD_SIZE), dtype=np.uint8)
     for some in chunks(len(begin)):
-        stops, coming = stop_motion(motion, begin[some], rate, duration, shape)
+        stops, coming = stop_motion(motion, begin[some], rate, duration)
         out[some] = encode_motion(stops, coming, gains, space=space).reshape(-1, *out.shape[1:])
     return out
 
@@ -92,13 +63,13 @@ def chunks(count: int) -> Iterator[slice]:
 
 
 def rest_behind(
-    motion: FullStateSetpoints, row: int, rate: float, duration: float = DURATION, shape: Shape = gentle
+    motion: FullStateSetpoints, row: int, rate: float, duration: float = DURATION
 ) -> tuple[tuple[float, float, float], float]:
     """Return the place, m, and the yaw, rad, at which the stop from a row of a motion rests; it is level there.
 
     Bytes tell the place alone: a hover near a wall leans, so the attitude in them is not level, and is rounded.
     """
-    stop, _ = stop_motion(motion, np.array([row]), rate, duration, shape)
+    stop, _ = stop_motion(motion, np.array([row]), rate, duration)
     x, y, z = stop.position[-1].tolist()
     return (x, y, z), float(yaw_of(stop.quaternion[-1]))
 
@@ -108,7 +79,6 @@ def stop_motion(
     begin: NDArray,
     rate: float,
     duration: float = DURATION,
-    shape: Shape = gentle,
     *,
     rate_lead: float = RATE_LEAD,
     thrust_lead: float = THRUST_LEAD,
@@ -119,8 +89,11 @@ def stop_motion(
     vector have the leads, s, of the setpoints of a plan.
     """
     steps = round(duration * rate)
-    elapsed, clock_rate, slowing = shape(np.arange(steps + 1) / steps)
-    elapsed, slowing = elapsed * (duration * rate), slowing / duration  # in setpoints, 1/s
+    share = np.arange(steps + 1) / steps
+    clock_rate = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    slowing = -30.0 * share**2 * (1.0 - share) ** 2 / duration
+    elapsed = share - 2.5 * share**4 + 3.0 * share**5 - share**6  # the integral of clock_rate
+    elapsed *= duration * rate  # in setpoints
     yaw = np.unwrap(yaw_of(command_quaternion(motion.quaternion).T))
     position, velocity, sent, attitude, body_rate, acceleration = _stop_rows(
         np.array(motion.position, dtype=float),

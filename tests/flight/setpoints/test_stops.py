@@ -7,7 +7,7 @@ from cfplan.flight.setpoints import stops
 from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import UNTIL_WATCHDOG
-from cfplan.flight.setpoints.stops import encode_stops, firm, gentle, stop_motion
+from cfplan.flight.setpoints.stops import encode_stops, stop_motion
 from cfplan.vehicle.airframe import GRAVITY
 
 
@@ -113,15 +113,3 @@ def test_stops_by_loops_are_those_by_arrays(circle, monkeypatch, count):
     for name in FullStateSetpoints.__slots__:
         np.testing.assert_allclose(getattr(by_loops, name), getattr(by_arrays, name), rtol=0, atol=1e-11)
     np.testing.assert_allclose(coming, coming_by_arrays, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize(("shape", "hardest"), [(gentle, 1.875), (firm, 1.0 / 0.7)])
-def test_a_shape_of_stops_begins_at_full_rate_and_ends_at_rest_half_way_on(shape, hardest):
-    """Its rate is the derivative of the time elapsed, and its slowing that of the rate."""
-    share = np.linspace(0.0, 1.0, 4001)
-    elapsed, rate, slowing = shape(share)
-    np.testing.assert_allclose([elapsed[0], rate[0], slowing[0]], [0.0, 1.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose([elapsed[-1], rate[-1], slowing[-1]], [0.5, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(np.gradient(elapsed, share)[1:-1], rate[1:-1], atol=1e-6)
-    np.testing.assert_allclose(np.gradient(rate, share)[1:-1], slowing[1:-1], atol=2e-6)
-    assert -slowing.min() == pytest.approx(hardest)
