@@ -504,6 +504,9 @@ def robustness(**given: Any) -> None:
 
 @study.command(epilog="Example: cfplan study baselines -o results/baselines.json")
 @_count(50, "Random.")
+@click.option(
+    "--corridors", type=click.IntRange(2), default=2000, show_default=True, help="That the time allocation learns from."
+)
 @_seed(60_000)
 @_data
 @_networks

@@ -79,6 +79,7 @@ class BaselineTrial:
 def baselines(
     *,
     paths: int = 50,
+    corridors: int = CORRIDORS,
     first_seed: int = 60_000,
     data: FilePath = DATA,
     networks: FilePath = NETWORKS,
@@ -88,13 +89,15 @@ def baselines(
 ) -> StudyResult:
     """Plan and fly `paths` random paths by each planner; networks are trained if need be.
 
+    The time allocation learns from `corridors` corridors about other paths.
+
     Raises:
-        InputError: no path, or no such dataset.
+        InputError: no path or corridor, or no such dataset.
     """
     if paths < 1:
         raise InputError("paths must be at least 1", where="paths", hint="give --paths 50, as in the paper")
     wanted = [SequenceOptions(epsilon=epsilon) for epsilon in NOISES]
-    corridors = QUICK_CORRIDORS if quick else CORRIDORS
+    corridors = QUICK_CORRIDORS if quick else corridors
     with paper_data(data, networks, 1, epochs=epochs, quick=quick) as material:
         more = corridors + paths
         trained = trained_networks(material, wanted, progress, more)
