@@ -1,6 +1,6 @@
 """Whole flights that are ended, or not, from outside: each ends disarmed, with a record.
 
-Their terminal is stopped, not read, closed or interrupted, or a ground station lands the vehicle.
+Their terminal is read, stopped, not read, closed or interrupted, or a ground station lands the vehicle.
 """
 
 import json
@@ -94,19 +94,20 @@ def land_by_ground_station(terminal: Terminal) -> None:
 
 
 @pytest.mark.parametrize(
-    ("phase", "act", "code"),
+    ("words", "phase", "act", "code"),
     [
-        ("stream", stop_output, ExitCode.OK),
-        ("take off", read_nothing, ExitCode.OK),
-        ("stream", Terminal.close, ExitCode.ENDED_BY_OPERATOR),
-        ("arm", interrupt_twice, ExitCode.ENDED_BY_OPERATOR),
-        ("stream", land_by_ground_station, ExitCode.ENDED_BY_OPERATOR),
+        (["--on-board"], "upload", Terminal.read_to_the_end, ExitCode.OK),
+        ([], "stream", stop_output, ExitCode.OK),
+        ([], "take off", read_nothing, ExitCode.OK),
+        ([], "stream", Terminal.close, ExitCode.ENDED_BY_OPERATOR),
+        ([], "arm", interrupt_twice, ExitCode.ENDED_BY_OPERATOR),
+        ([], "stream", land_by_ground_station, ExitCode.ENDED_BY_OPERATOR),
     ],
 )
 def test_a_flight_ends_disarmed_and_recorded_whatever_is_done_from_outside(
-    tmp_path, patient_safety_file, phase, act, code
+    tmp_path, patient_safety_file, words, phase, act, code
 ):
-    terminal = Terminal(*FLY, "--safety", str(patient_safety_file), "--records", str(tmp_path))
+    terminal = Terminal(*FLY, *words, "--safety", str(patient_safety_file), "--records", str(tmp_path))
     terminal.read_until(f" s  {phase}\r\n")
     act(terminal)
     assert os.waitstatus_to_exitcode(os.waitpid(terminal.program, 0)[1]) == code
@@ -119,6 +120,9 @@ def test_a_flight_ends_disarmed_and_recorded_whatever_is_done_from_outside(
     assert not record.status.motor[-1].any()
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["outcome"]["exit_code"] == code
+    assert (record.header.provenance.get("flown") == "on board") == ("--on-board" in words)
+    if code == ExitCode.OK:
+        assert summary["max_deviation"] <= 0.08
     log = read_log(folder / "telemetry.tlog")
     subjects = {"vehicle 1", "vehicle 1 odometry"} | ({"vehicle 1 setpoint"} if phase == "stream" else set())
     assert subjects <= {subject.name for subject in log.subjects}

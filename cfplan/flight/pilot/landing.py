@@ -6,7 +6,8 @@ pilot or radio dies levels out after 0.5 s and stops its motors after a second, 
 The setpoints sink on beneath the floor. A vehicle that no longer follows them stands, be it on a box or lower than
 where it took off, and its motors are stopped. Without poses only its own estimate is left, whose height goes wrong with
 the square of time; so it comes down as fast as it may touch the floor. Its estimate still feels the floor. When neither
-that nor a pose has come in time, the motors stop wherever the vehicle is: it falls, but does not fly away.
+that nor a pose has come in time, the motors stop wherever the vehicle is: it falls, but does not fly away. Where poses
+stop once its setpoint is on the floor, the motors stop at once: by an estimate gone wrong it would fly off from there.
 """
 
 import math
@@ -67,7 +68,9 @@ class Landing:
         self.begin()
         while not self._stands:
             self._find()
-            if self._loop.blind:
+            if self._blind_on_floor():
+                self._conclude(True)
+            elif self._loop.blind:
                 self._descend_blindly()
             else:
                 self._descend()
@@ -88,8 +91,12 @@ class Landing:
         pace = gentle(loop.limits.ground.land_speed)
         self._sink(loop.seen() if self._was_blind else loop.asked(), pace, lowest)
         self._was_blind = False
-        loop.until(lambda: self._stands_by_poses() or self._sunk() or loop.blind or loop.left_alone, math.inf)
-        if not (loop.blind or loop.left_alone):
+
+        def over() -> bool:
+            return self._sunk() or self._blind_on_floor() or loop.blind or loop.left_alone
+
+        loop.until(lambda: self._stands_by_poses() or over(), math.inf)
+        if not (self._blind_on_floor() or loop.blind or loop.left_alone):
             self._conclude(self._stands_by_poses())
 
     def _descend_blindly(self) -> None:
@@ -129,6 +136,13 @@ class Landing:
     def _sunk(self) -> bool:
         stream = self._loop.stream
         return stream is None or self._loop.now() > stream.end + _SETTLE
+
+    def _blind_on_floor(self) -> bool:
+        """Return whether no good poses come of a vehicle whose setpoint, led by those before, is on the floor."""
+        loop = self._loop
+        if loop.stream is None or self._was_blind or loop.left_alone:
+            return False
+        return loop.blind_for > loop.limits.pose.age_brake and loop.asked()[0][2] < self._floor
 
     def _conclude(self, shown: bool) -> None:
         self._stands = True
