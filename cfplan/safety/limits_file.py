@@ -1,7 +1,7 @@
 """safety.yaml, read strictly: every mistake is named with its line and column."""
 
 import math
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -145,6 +145,49 @@ class _SafetyFile(_Section):
     firmware: _Firmware
     ground: _Ground
     lateness: Annotated[float, Field(gt=0.0, le=0.1)]
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A key of safety.yaml, as the reader knows it."""
+
+    name: str  # with its section, as plan.speed
+    default: Any  # None where the file must have it
+    range: str  # what it may be, in words
+
+
+def all_keys() -> tuple[Key, ...]:
+    """Return every key that safety.yaml may have, in the order of the file; a ladder with its three rungs is one."""
+    schema = _SafetyFile.model_json_schema()
+    definitions, defaults, found = schema["$defs"], _defaults(), []
+    for name, kind in schema["properties"].items():
+        section = definitions.get(kind.get("$ref", "").split("/")[-1])
+        if section is None:
+            found.append(Key(name, defaults.get(name), _range(kind)))
+            continue
+        for key, value in section["properties"].items():
+            rungs = definitions.get(value.get("$ref", "").split("/")[-1], {}).get("properties")
+            words = f"each {_range(rungs['brake'])}" if rungs else _range(value)
+            found.append(Key(f"{name}.{key}", defaults.get(name, {}).get(key), words))
+    return tuple(found)
+
+
+def _range(kind: dict[str, Any]) -> str:
+    """Return what a JSON Schema allows, in words: "above 0, at most 2"."""
+    if "enum" in kind:
+        return " or ".join(kind["enum"])
+    if kind["type"] == "boolean":
+        return "true or false"
+    if kind["type"] == "string":
+        return "text"
+    if kind["type"] == "array":
+        least, most = kind["minItems"], kind["maxItems"]
+        each = _range(kind["items"] if "items" in kind else kind["prefixItems"][0])
+        return f"{least} to {most}, each {each}" if least < most else f"{most} numbers, each {each}"
+    if "minimum" in kind:
+        return f"from {kind['minimum']:g} to {kind['maximum']:g}"
+    side = f"at most {kind['maximum']:g}" if "maximum" in kind else f"below {kind['exclusiveMaximum']:g}"
+    return f"above {kind['exclusiveMinimum']:g}, {side}"
 
 
 Kind = TypeVar("Kind")
