@@ -6,7 +6,7 @@ import sys
 
 import click
 
-from cfplan.cli.bench import bench, study
+from cfplan.cli.bench import bench
 from cfplan.cli.check import check
 from cfplan.cli.dataset import dataset
 from cfplan.cli.doctor import doctor
@@ -21,6 +21,7 @@ from cfplan.cli.replay import replay
 from cfplan.cli.report import report
 from cfplan.cli.robustness import robustness
 from cfplan.cli.sim import sim
+from cfplan.cli.study import study
 from cfplan.cli.train import train
 from cfplan.cli.virtual import virtual
 from cfplan.errors import CfplanError

@@ -1,0 +1,117 @@
+"""What makes a command of a study: its options, one thread, progress, and its result as tables and as JSON."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from cfplan.cli import options
+from cfplan.cli.output import print_json, print_table
+from cfplan.errors import InputError
+
+if TYPE_CHECKING:
+    from cfplan.studies.result import StudyResult
+
+Study = Callable[..., "StudyResult"]
+Option = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+PATH = click.argument("path_file", metavar="PATH", type=click.Path(path_type=Path))
+PATHS = click.argument("path_files", metavar="PATH...", type=click.Path(path_type=Path), nargs=-1, required=True)
+YAW = click.option("--yaw", type=click.Choice(["fixed", "tangent", "free"]), default="free", show_default=True)
+BOXES = click.option("--box", "boxes", multiple=True, help="4.5x8x2 or 10x10x10; may be given twice.  [default: both]")
+SETS = click.option("--limits", "limit_sets", multiple=True, help="hardware or simulation.  [default: both]")
+NODES = click.option("--nodes", type=int, default=100, show_default=True, help="Grid intervals.")
+PLANNER = click.option("--planner", default="expert", show_default=True)
+JOBS = click.option("--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+MINUTES = click.option(
+    "--minutes", type=click.FloatRange(0, min_open=True), help="Begin no flight after them.  [default: all]"
+)
+EARLIER = click.option(
+    "--add", "earlier_files", type=click.Path(path_type=Path), multiple=True,
+    help="A result of other seeds, which the tables then count as well; may be given several times.",
+)  # fmt: skip
+_OUTPUT = click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the result here, as JSON.")
+
+
+def count(default: int, text: str) -> Option:
+    """Return --paths."""
+    return click.option("--paths", type=int, default=default, show_default=True, help=text)
+
+
+def seed(default: int, text: str = "Of the first path.") -> Option:
+    """Return --seed."""
+    return click.option("--seed", "first_seed", type=int, default=default, show_default=True, help=text)
+
+
+def measured(
+    what: str, example: str, *extra: Option, one_thread: bool = True, short_help: str | None = None
+) -> Callable[[Callable[[], Study]], click.Command]:
+    """Make a command of a function that imports and returns a study, to be called with the `extra` options as given.
+
+    It has the function's name and text, ends in an `example`, and says `what` it does beside its progress.
+    """
+
+    def command(find: Callable[[], Study]) -> click.Command:
+        @wraps(find)
+        def run(output: Path | None, as_json: bool, **given: Any) -> None:
+            if one_thread:  # before the study imports numpy
+                use_one_thread()
+            _measure(find(), what, given, output, as_json)
+
+        callback: Callable[..., Any] = run
+        for option in reversed((*extra, _OUTPUT, options.as_json)):
+            callback = option(callback)
+        name = find.__name__.replace("_", "-")
+        return click.command(name, epilog=f"Example: {example}", short_help=short_help)(callback)
+
+    return command
+
+
+def safety_file_of(path_file: Path) -> Path:
+    """Return the safety.yaml nearest to this folder or the path file. Raises InputError where there is none."""
+    return options.find_safety_file(None, path_file)
+
+
+def use_one_thread() -> None:
+    """Keep numpy, torch and the solvers to one thread."""
+    from cfplan.studies.machine import one_thread
+
+    one_thread()
+
+
+def _measure(run: Study, what: str, given: dict[str, Any], output: Path | None, as_json: bool) -> None:
+    """Run a study with the options that were given, show its progress, then write and print its result."""
+    from cfplan.studies.provenance import provenance
+
+    if output is not None and not output.parent.is_dir():  # before an hour is spent measuring
+        raise InputError("no such folder", where=str(output.parent), hint="make it first")
+    provenance()  # of the beginning
+    chosen = {
+        name: value for name, value in given.items() if value not in ((), None)
+    }  # the rest is the study's own default
+    if "yaw" in chosen:
+        from cfplan.geometry.yaw import YawMode
+
+        chosen["yaw"] = YawMode(chosen["yaw"])
+    with _progress(what, as_json) as progress:
+        result = run(**chosen, progress=progress)
+    if output is not None:
+        result.write(output)
+    if as_json:
+        print_json(result.to_json())
+        return
+    for table in result.tables:
+        print_table(table.title, *table.cells())
+
+
+@contextmanager
+def _progress(what: str, as_json: bool) -> Iterator[Callable[[int, int], None]]:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True, quiet=as_json)) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
