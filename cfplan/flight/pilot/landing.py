@@ -31,7 +31,7 @@ _BLIND_BENEATH = 2.0  # m below the floor that setpoints sink to without poses, 
 _BLIND_FOR = 3.0  # s without poses after which the motors stop, as the estimate may be metres off
 _CLEAR = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
 _SEEN_FOR = 0.1  # s of good poses after which they are believed again
-_MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
+MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
 _LOOK_AGAIN = 0.05  # s
 _LATEST_ESTIMATE = 0.1  # s
 _BENEATH = 0.3  # m below the floor: an estimate that has the vehicle there is worth nothing
@@ -95,9 +95,9 @@ class Landing:
         def over() -> bool:
             return self._sunk() or self._blind_on_floor() or loop.blind or loop.left_alone
 
-        loop.until(lambda: self._stands_by_poses() or over(), math.inf)
+        loop.until(lambda: stands_by_poses(self._loop, self._floor, _NOT_HELD) or over(), math.inf)
         if not (self._blind_on_floor() or loop.blind or loop.left_alone):
-            self._conclude(self._stands_by_poses())
+            self._conclude(stands_by_poses(self._loop, self._floor, _NOT_HELD))
 
     def _descend_blindly(self) -> None:
         """Sink quickly, off the walls, until the estimate or the time says that it is enough, or poses are back."""
@@ -149,16 +149,6 @@ class Landing:
         if not shown:
             self._loop.history.say(Level.WARNING, "nothing shows that the vehicle stands; its motors are stopped")
 
-    def _stands_by_poses(self) -> bool:
-        """Return whether the tracked body stays where it is although its setpoint has sunk on."""
-        loop, pose = self._loop, self._loop.pose()
-        wanted, heights = loop.wanted(pose.time), loop.heights(_STANDS_FOR)
-        if wanted is None or not heights or max(heights) - min(heights) > _STANDS_WITHIN:
-            return False
-        height = pose.position[2]
-        near = height - self._floor < _NEAR_FLOOR
-        return height - wanted[2] > (_NOT_FOLLOWING if near else _NOT_HELD)
-
     def _beneath_by_estimate(self) -> bool:
         """Return whether the vehicle believes itself far beneath the floor, and would climb from there.
 
@@ -183,6 +173,20 @@ class Landing:
         return wanted is not None and estimate.position[2] - wanted[2] > _NOT_HELD
 
 
+def stands_by_poses(loop: FlightLoop, floor: float, not_held: float = math.inf) -> bool:
+    """Return whether the tracked body stays where it is although its setpoint has sunk on.
+
+    Near the `floor`, m, a little above its setpoint is enough; elsewhere it is to be `not_held`, m, above it.
+    """
+    pose = loop.pose()
+    wanted, heights = loop.wanted(pose.time), loop.heights(_STANDS_FOR)
+    if wanted is None or not heights or max(heights) - min(heights) > _STANDS_WITHIN:
+        return False
+    height = pose.position[2]
+    near = height - floor < _NEAR_FLOOR
+    return height - wanted[2] > (_NOT_FOLLOWING if near else not_held)
+
+
 def stop_motors(loop: FlightLoop) -> bool:
     """Stop the motors by stop setpoints, the last setpoints to be sent; return whether the vehicle says so.
 
@@ -197,6 +201,6 @@ def stop_motors(loop: FlightLoop) -> bool:
         for _ in range(TRIES):
             loop.link.release_priority()
             loop.pause(0.02)
-        if loop.until(lambda: not loop.bits(FLYING), _MOTORS_STOP_WITHIN):
+        if loop.until(lambda: not loop.bits(FLYING), MOTORS_STOP_WITHIN):
             return True
     return False

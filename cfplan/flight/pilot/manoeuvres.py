@@ -7,11 +7,14 @@ from typing import Protocol
 from cfplan.errors import PreflightError
 from cfplan.flight.pilot.abort_monitor import safety_abort
 from cfplan.flight.pilot.flight_loop import AbortRaised, FlightLoop
+from cfplan.flight.pilot.mission import manoeuvre_time
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.radio.supervisor_bits import ARMED, CAN_FLY, FAULTS, FLYING
-from cfplan.flight.telemetry import Triple
+from cfplan.flight.telemetry import Phase, Triple
+from cfplan.vehicle.rotations import yaw_of
 
+Place = tuple[float, float, float, float]  # m, m, m, and yaw, rad
 _AT_PLACE_WITHIN = 0.06  # m
 _AT_START_FOR = 0.5  # s
 _READY_WITHIN = 1.0  # s; a vehicle that arms itself is briefly not ready now and then
@@ -41,7 +44,7 @@ class Manoeuvres(Protocol):
         """Leave the plan: brake, and land at once."""
 
 
-def require_ready(loop: FlightLoop) -> None:
+def _require_ready(loop: FlightLoop) -> None:
     """Wait until the vehicle's supervisor says that it may fly: it ignores setpoints until then.
 
     Raises PreflightError if it does not say so.
@@ -55,6 +58,25 @@ def require_ready(loop: FlightLoop) -> None:
         where="vehicle",
         hint="restart it on a level floor; its console says more",
     )
+
+
+def begin_take_off(
+    loop: FlightLoop, floor: float, way_between: Callable[[Place, Place, float], Stream]
+) -> tuple[Stream, float]:
+    """Let the vehicle fly from now on; return the way straight up from the `floor`, m, to a hover, and its time, s.
+
+    `way_between` two places makes setpoints. Raises PreflightError where the vehicle may not fly.
+    """
+    loop.history.enter(Phase.TAKE_OFF)
+    height, (x, y, _) = loop.mission.take_off_height, loop.pose().position
+    yaw = yaw_of(loop.pose().quaternion)
+    duration = manoeuvre_time(height - floor, loop.limits.ground.take_off_speed)
+    way = way_between((x, y, floor, yaw), (x, y, height, yaw), duration)
+    if way.stop_from is not None:
+        way.stop_from(0)  # the first call is slow: make it on the ground
+    _require_ready(loop)
+    loop.lift_off()
+    return way, duration
 
 
 def climb(loop: FlightLoop, way: Stream, floor: float, height: float, stop: Callable[[], object]) -> None:

@@ -17,7 +17,8 @@ from cfplan.flight.on_board.go_to import STOP_DURATION, go_to_states, motion_of,
 from cfplan.flight.on_board.program import OnBoardProgram
 from cfplan.flight.pilot.abort_monitor import safety_abort
 from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
-from cfplan.flight.pilot.manoeuvres import climb, require_ready, settle_at
+from cfplan.flight.pilot.landing import MOTORS_STOP_WITHIN, stands_by_poses
+from cfplan.flight.pilot.manoeuvres import begin_take_off, climb, settle_at
 from cfplan.flight.pilot.mission import manoeuvre_time
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
@@ -34,10 +35,7 @@ _KEPT_ALIVE_FOR = 0.4  # s before the motors turn: some packets, one of which st
 _QUICK_DESCENT = 1.5  # m/s², at most about, of a landing without poses, where the estimate goes wrong with time
 _SHORTEST_LANDING = 1.2  # s
 _TOUCH, _TOUCH_BLINDLY = 0.05, 0.5  # m beneath the floor that landings aim at; without poses the height is unsure
-_STANDS_FOR, _STANDS_WITHIN = 0.3, 0.015  # s, m: the range of the heights of a standing body's poses
-_NEAR_FLOOR, _NOT_FOLLOWING = 0.15, 0.05  # m above the floor, and above its setpoint
 _SETTLE = 0.5  # s at the end of a descent
-_MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
 
 
 def upload_program(loop: FlightLoop, program: OnBoardProgram) -> None:
@@ -100,16 +98,8 @@ class OnBoardManoeuvres:
 
     def take_off(self) -> None:
         """Climb to a hover, once the watchdog runs. Raises PreflightError where the vehicle stays on the floor."""
-        loop = self._loop
-        self._history.enter(Phase.TAKE_OFF)
-        height, (x, y, _) = self._mission.take_off_height, loop.pose().position
-        yaw = yaw_of(loop.pose().quaternion)
-        duration = manoeuvre_time(height - self._floor, self._limits.ground.take_off_speed)
-        way = self._way((x, y, self._floor, yaw), (x, y, height, yaw), duration)
-        if way.stop_from is not None:
-            way.stop_from(0)  # the first call is slow: make it on the ground
-        require_ready(loop)
-        loop.lift_off()
+        loop, height = self._loop, self._mission.take_off_height
+        way, duration = begin_take_off(loop, self._floor, self._way)
         loop.pause(_KEPT_ALIVE_FOR)
         answer = _ask(loop, commands.take_off(height, duration), lambda: loop.begin(way))
         if answer != commands.DONE:
@@ -157,7 +147,7 @@ class OnBoardManoeuvres:
         loop = self._loop
         self._begin_landing()
         down = loop.begin(Stream(self._program.descent, self._mission.rate, on_board=True))
-        loop.until(lambda: self._stands() or loop.now() > down.end + _SETTLE, math.inf)
+        loop.until(lambda: stands_by_poses(loop, self._floor) or loop.now() > down.end + _SETTLE, math.inf)
         self._end_landing()
 
     def brake(self) -> None:
@@ -247,14 +237,6 @@ class OnBoardManoeuvres:
         if answer not in (commands.DONE, commands.BUSY):  # it lands already
             raise AbortRaised(safety_abort(Rung.CUT, f"the vehicle does not land: {_what(answer)}"))
 
-    def _stands(self) -> bool:
-        """Return whether the tracked body stays near the floor although the trajectory has sunk on."""
-        loop, pose = self._loop, self._loop.pose()
-        wanted, heights = loop.wanted(pose.time), loop.heights(_STANDS_FOR)
-        if wanted is None or not heights or max(heights) - min(heights) > _STANDS_WITHIN:
-            return False
-        return pose.position[2] - self._floor < _NEAR_FLOOR and pose.position[2] - wanted[2] > _NOT_FOLLOWING
-
     def _end_landing(self) -> None:
         """Stop the motors. Raises AbortRaised if they do not stop."""
         if not self._stop_motors():
@@ -268,6 +250,6 @@ class OnBoardManoeuvres:
         loop.expect_stop()
         for _ in range(TRIES):
             _ask(loop, commands.stop())
-            if loop.until(lambda: not loop.bits(FLYING), _MOTORS_STOP_WITHIN):
+            if loop.until(lambda: not loop.bits(FLYING), MOTORS_STOP_WITHIN):
                 return True
         return False

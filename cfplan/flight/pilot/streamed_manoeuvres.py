@@ -9,15 +9,14 @@ import numpy as np
 
 from cfplan.flight.pilot.flight_loop import FlightLoop
 from cfplan.flight.pilot.landing import Landing, stop_motors
-from cfplan.flight.pilot.manoeuvres import climb, require_ready, settle_at
+from cfplan.flight.pilot.manoeuvres import Place, begin_take_off, climb, settle_at
 from cfplan.flight.pilot.mission import manoeuvre_time
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.rate_trade import ahead, gains_under
 from cfplan.flight.setpoints.stops import encode_stops
-from cfplan.flight.telemetry import Phase, Triple
-from cfplan.vehicle.rotations import yaw_of
+from cfplan.flight.telemetry import Phase
 
 BRAKE_HOLD = 1.0  # s of hover after a stop
 _FOLLOWS_WITHIN = 0.15  # m from its setpoint; a vehicle farther off stops from the setpoint nearest to it
@@ -34,21 +33,13 @@ class StreamedManoeuvres:
     def take_off(self) -> None:
         """Climb by setpoints. Raises PreflightError where the vehicle stays on the floor."""
         loop = self._loop
-        self._history.enter(Phase.TAKE_OFF)
-        height, (x, y, _) = self._mission.take_off_height, loop.pose().position
-        yaw = yaw_of(loop.pose().quaternion)
-        duration = manoeuvre_time(height - self._floor, self._limits.ground.take_off_speed)
-        way = self._way((x, y, self._floor), yaw, (x, y, height), yaw, duration)
-        if way.stop_from is not None:
-            way.stop_from(0)  # the first call is slow: make it on the ground
-        require_ready(loop)
-        loop.lift_off()
-        climb(loop, loop.begin(way), self._floor, height, lambda: stop_motors(loop))
+        way, _ = begin_take_off(loop, self._floor, self._way)
+        climb(loop, loop.begin(way), self._floor, self._mission.take_off_height, lambda: stop_motors(loop))
 
-    def _way(self, begin: Triple, yaw: float, end: Triple, end_yaw: float, duration: float) -> Stream:
+    def _way(self, begin: Place, end: Place, duration: float) -> Stream:
         """Return setpoints from hover to hover, with a way to stop from each."""
         rate = self._mission.rate
-        motion = hover_to_hover(begin, yaw, end, end_yaw, duration, rate)
+        motion = hover_to_hover(begin[:3], begin[3], end[:3], end[3], duration, rate)
         gains, space = gains_under(self._limits), self._limits.space
         payloads = encode_motion(motion, ahead(motion.acceleration, rate), gains, space=space)
         return Stream(
@@ -62,9 +53,9 @@ class StreamedManoeuvres:
         loop = self._loop
         self._history.enter(Phase.GO_TO_START)
         start, yaw = self._mission.start
-        above, _, yaw_above = loop.asked()
+        (x, y, z), _, yaw_above = loop.asked()
         duration = manoeuvre_time(math.dist(loop.pose().position, start), self._limits.ground.go_to_speed)
-        way = loop.begin(self._way(above, yaw_above, start, yaw, duration))
+        way = loop.begin(self._way((x, y, z, yaw_above), (*start, yaw), duration))
         loop.until(lambda: loop.now() > way.end, math.inf)
         settle_at(loop, start)
 
