@@ -37,13 +37,6 @@ def with_rest_ends(durations: NDArray, table: NDArray) -> Path:
     return rest_path(durations, table)
 
 
-def with_rest_end(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
-    """Return pieces (M, D, 3) brought to rest at the end alone; s is not scaled, and the first half stays as it is."""
-    half = durations.sum() / 2
-    durations, table = reversed_pieces(durations, table)
-    return reversed_pieces(*_with_rest_start(durations, table, half))
-
-
 def rest_path(durations: NDArray, table: NDArray) -> Path:
     """Return a Path of pieces that rest at both ends, with the rounding errors there set to zero."""
     if len(durations) == 1:  # two pieces, so that each end is the origin of one

@@ -24,7 +24,6 @@ _B0, _B2, _B4, _B6 = np.array(
     [4.89352518554385e-03, 2.26843463243900e-03, 1.18534705686654e-04, 1.19825839466702e-06], dtype=np.float32
 )
 _HALF = np.float32(0.5)
-_ZERO = np.float32(0.0)
 
 
 class Network(Protocol):

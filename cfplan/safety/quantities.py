@@ -134,7 +134,6 @@ QUANTITIES = (
         hover=lambda _: GRAVITY, in_stop=lambda limits: limits.plan.specific_thrust_min - PACKET_ROUNDING,
     ),
 )  # fmt: skip
-BY_NAME = {quantity.name: quantity for quantity in QUANTITIES}
 INSTANT = tuple(quantity for quantity in QUANTITIES if not quantity.jumps)  # what a boundary state or setpoint tells
 ON_LADDER = tuple(quantity for quantity in QUANTITIES if quantity.ladder)  # what the pilot watches
 

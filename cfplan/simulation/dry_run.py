@@ -165,22 +165,6 @@ def fly_and_judge(
     return replace(run, real_time_factor=loop.time[-1] / (time.perf_counter() - begun))
 
 
-def stress(
-    encoded: EncodedFlight, trajectory: Trajectory, airframe: Airframe, limits: FlightLimits
-) -> dict[str, DryRun]:
-    """Fly the same bytes on vehicles, and over a link, that differ a little from what the plan assumes."""
-    slow = replace(airframe, motor_time_constant=1.25 * airframe.motor_time_constant)
-    heavy, light = replace(airframe, mass=1.05 * airframe.mass), replace(airframe, mass=0.95 * airframe.mass)
-    noisy = EstimateErrors(latency=0.010, position_noise=0.002, velocity_noise=0.03)
-    return {
-        "5 % heavier": dry_run(encoded, trajectory, heavy, limits, believed=airframe),
-        "5 % lighter": dry_run(encoded, trajectory, light, limits, believed=airframe),
-        "motors lag by a quarter more": dry_run(encoded, trajectory, slow, limits),
-        "setpoints 20 ms late": dry_run(encoded, trajectory, airframe, limits, delay=0.020),
-        "estimate 10 ms late and noisy": dry_run(encoded, trajectory, airframe, limits, estimate=noisy),
-    }
-
-
 def _judge(loop: ClosedLoop, wanted_at: Callable[[NDArray], NDArray], duration: float, limits: FlightLimits) -> DryRun:
     times, positions = loop.time[::_STRIDE], loop.position[::_STRIDE]
     wanted = wanted_at(times)

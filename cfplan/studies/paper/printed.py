@@ -19,7 +19,6 @@ class PrintedRow(NamedTuple):
 
 
 TRAIN, TEST = "train", "test"
-TRAVEL_TIME = 5.929  # s, of TOPPQuad in Table 1 and in the table of inputs
 ABOVE_IN_TEXT = 0.023  # m, of the LSTM over TOPPQuad by the text; by Table 1 it is 0.021 (train) and 0.090 (test)
 
 # Table 1, "Ablation study on model architectures", by its columns.
