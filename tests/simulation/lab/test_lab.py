@@ -133,6 +133,7 @@ def test_a_link_without_a_lab_brings_its_own(monkeypatch):
         own = sync.cf.link._own_lab
         assert own.alive
         assert sync.cf.log.toc is not None
+        sync.wait_for_params()  # else cflib's thread that asks for them ends in an exception
     assert not own.alive
     assert "CFPLAN_SIM_3" not in os.environ
 
