@@ -16,10 +16,11 @@ from cfplan.files.shipped import example, shipped_folder
 REPOSITORY = Path(__file__).parents[1]
 
 
-def test_a_wheel_takes_every_model_and_example_along():
+def test_a_wheel_takes_every_model_example_and_layout_along():
     packed = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]["data-files"]
     found = {file for patterns in packed.values() for pattern in patterns for file in REPOSITORY.glob(pattern)}
     wanted = {REPOSITORY / "safety.yaml", *(REPOSITORY / "flights").iterdir()}
+    wanted |= set((REPOSITORY / "layouts").iterdir())
     wanted |= {file for file in (REPOSITORY / "models").glob("*/*") if file.suffix in (".safetensors", ".json")}
     assert wanted == found
 
