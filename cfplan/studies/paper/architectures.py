@@ -45,6 +45,7 @@ from cfplan.studies.paper.trials import (
     planner_columns,
     planner_row,
     planners,
+    profile_of,
 )
 from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
 from cfplan.vehicle.trajectory import Trajectory
@@ -208,14 +209,8 @@ def _shipped(path: Path, part: str, row: int) -> ShippedFlight:
     known: dict[str, Any] = {"part": part, "row": row}
     try:
         task = PlanningTask(path, airframe, limits, SHIPPED_NODES, YawMode.FIXED)
-        expert, learned = plan_expert(task), plan_learned(task)
-        for solution in (expert, learned):
-            if solution.profile is None:
-                return ShippedFlight(**known, reason=solution.reason or str(solution.status))
-        assert expert.profile is not None
-        assert learned.profile is not None
-        known["expert_time"] = repair(task, expert.profile).trajectory.duration
-        trajectory = refine(task, learned.profile).trajectory
+        known["expert_time"] = repair(task, profile_of(plan_expert, task)).trajectory.duration
+        trajectory = refine(task, profile_of(plan_learned, task)).trajectory
         known |= {"travel_time": trajectory.duration, "violation": _planned_violation(trajectory)}
         encoded = encode_trajectory(trajectory)
         check_bytes(encoded, trajectory, limits)

@@ -18,7 +18,6 @@ from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
-from cfplan.learning.learned import plan_learned
 from cfplan.learning.paper.sequences import MAX_LENGTH
 from cfplan.learning.paper.time_allocation import TimeNetwork, allotted_times, train_times
 from cfplan.learning.paper.training import SequenceOptions
@@ -27,8 +26,6 @@ from cfplan.planners.baselines.corridors import ACCELERATION, SPEED, corridor_ab
 from cfplan.planners.baselines.min_snap import plan_min_snap
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
-from cfplan.planners.task import Planner
-from cfplan.planning.repair import refine
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import LOST, fly_geometric, thrust_violation
 from cfplan.studies.paper.networks import DATA, NETWORKS, NODES, WAYPOINTS, Progress, paper_data, trained_networks
@@ -39,9 +36,13 @@ from cfplan.studies.paper.trials import (
     PAPER_LAG,
     SAMPLE,
     TOPPQUAD,
+    Ask,
+    Plan,
     finite_mean,
     network_plan,
-    paper_task,
+    profile_by,
+    shipped_profile,
+    trajectory_by,
 )
 from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
 from cfplan.vehicle.profile import SpeedProfile
@@ -51,7 +52,6 @@ BOX = np.array([10.0, 10.0, 5.0])  # m, where waypoints are drawn
 NOISES = (0.0, 0.1)  # m, of the LSTMs of the table
 CORRIDORS, QUICK_CORRIDORS = 2000, 6  # that the time allocation learns from
 SHIPPED, ALLOCATION, CONVEX, MIN_SNAP = "the shipped planner", "AllocNet's kind", "convex TOPP", "scaled min-snap"
-Ask = Callable[[Path], Trajectory]  # raises CfplanError where there is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ def baselines(
         begun = time.process_time()
         allocation = _time_network(corridors, first_seed, lambda count: progress(done + count, done + more))
         training = time.process_time() - begun
-        asked = _planners([(each.name, network_plan(each)) for each in trained], allocation)
+        asked = _planners({each.name: network_plan(each) for each in trained}, allocation)
         retraining = {each.name: each.training_seconds for each in trained} | {ALLOCATION: training}
 
         def show(count: int) -> None:
@@ -138,36 +138,15 @@ def _time_network(count: int, first_seed: int, on_label: Callable[[int], None]) 
     return train_times(corridors, on_label=on_label)
 
 
-def _planners(
-    networks: Sequence[tuple[str, Callable[[Path], SpeedProfile]]], allocation: TimeNetwork
-) -> dict[str, Ask]:
-    found: dict[str, Ask] = {TOPPQUAD: _by(plan_toppquad), EXPERT: _by(plan_expert)}
-    for name, plan in networks:
-        found[name] = lambda path, plan=plan: Trajectory(path, plan(path), PAPER.airframe)  # type: ignore[misc]
-    return found | {
-        SHIPPED: _shipped,
+def _planners(networks: Mapping[str, Plan], allocation: TimeNetwork) -> dict[str, Ask]:
+    on_the_path = {
+        TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert), **networks, SHIPPED: shipped_profile,
+    }  # fmt: skip
+    return {name: trajectory_by(plan) for name, plan in on_the_path.items()} | {
         ALLOCATION: lambda path: _allotted(path, allocation),
-        CONVEX: _by(plan_convex),
-        MIN_SNAP: _by(plan_min_snap),
+        CONVEX: trajectory_by(profile_by(plan_convex)),
+        MIN_SNAP: trajectory_by(profile_by(plan_min_snap)),
     }
-
-
-def _by(planner: Planner) -> Ask:
-    def ask(path: Path) -> Trajectory:
-        solution = planner(paper_task(path))
-        if solution.profile is None:
-            raise CfplanError(solution.reason or str(solution.status), hint="plan by another planner")
-        return Trajectory(path, solution.profile, PAPER.airframe)
-
-    return ask
-
-
-def _shipped(path: Path) -> Trajectory:
-    task = paper_task(path)
-    solution = plan_learned(task)
-    if solution.profile is None:
-        raise CfplanError(solution.reason or str(solution.status), hint="plan by the expert")
-    return refine(task, solution.profile).trajectory
 
 
 def _allotted(path: Path, network: TimeNetwork) -> Trajectory:

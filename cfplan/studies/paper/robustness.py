@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import perturbed
-from cfplan.learning.learned import plan_learned
 from cfplan.learning.paper.recovery import recover_profile
 from cfplan.learning.paper.sequences import Sequences, path_inputs
 from cfplan.learning.paper.training import SequenceOptions, answer
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import Planner
-from cfplan.planning.repair import repair
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import LOST, fly_geometric, nearest_states
 from cfplan.studies.paper.architectures import settings_of, training_table
@@ -36,7 +34,15 @@ from cfplan.studies.paper.networks import (
     trained_networks,
 )
 from cfplan.studies.paper.printed import ROBUSTNESS, TEST
-from cfplan.studies.paper.trials import FLOWN, NODES, PAPER_LAG, finite_mean, paper_task
+from cfplan.studies.paper.trials import (
+    FLOWN,
+    NODES,
+    PAPER_LAG,
+    finite_mean,
+    profile_by,
+    shipped_profile,
+    trajectory_by,
+)
 from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
@@ -169,17 +175,15 @@ def _network(trained: TrainedNetwork) -> Callable[[Path], Answered]:
 
 
 def _shipped(path: Path) -> Answered:
-    task = paper_task(path)
-    solution = plan_learned(task)
-    if solution.profile is None:
-        raise CfplanError(solution.reason or str(solution.status), hint="plan by the expert")
-    profile = repair(task, solution.profile).trajectory.profile
+    profile = shipped_profile(path)
     return Answered(profile, profile.h, profile.yaw)
 
 
 def _time(planner: Planner, path: Path) -> float:
-    profile = planner(paper_task(path)).profile
-    return float("nan") if profile is None else Trajectory(path, profile, PAPER.airframe).duration
+    try:
+        return trajectory_by(profile_by(planner))(path).duration
+    except CfplanError:
+        return float("nan")
 
 
 def robustness_table(trials: Sequence[RobustnessTrial], names: Iterable[str], reference: str) -> Table:

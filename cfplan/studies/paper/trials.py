@@ -22,7 +22,7 @@ from cfplan.learning.paper.training import answer
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import Planner, PlanningTask
-from cfplan.planning.repair import repair
+from cfplan.planning.repair import refine, repair
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import LOST, fly_geometric, thrust_violation
 from cfplan.studies.paper.networks import NODES, TrainedNetwork
@@ -36,6 +36,7 @@ FLOWN = replace(PAPER.airframe, motor_time_constant=PAPER_LAG)
 TOPPQUAD, EXPERT, SHIPPED = "TOPPQuad", "expert", "the shipped network"
 SAMPLE = 0.002  # s between the moments at which planned thrust and speed are looked at
 Plan = Callable[[Path], SpeedProfile]  # raises CfplanError where there is none
+Ask = Callable[[Path], Trajectory]  # likewise
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +63,9 @@ class PaperTrial:
 
 def planners(networks: Iterable[TrainedNetwork]) -> dict[str, Plan]:
     """Return TOPPQuad and the expert, the networks, and the network that ships, by name."""
-    found = {TOPPQUAD: _by(plan_toppquad), EXPERT: _by(plan_expert)}
+    found = {TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert)}
     found |= {each.name: network_plan(each) for each in networks}
-    return found | {SHIPPED: _by(plan_learned)}
+    return found | {SHIPPED: profile_by(plan_learned)}
 
 
 def paper_task(path: Path) -> PlanningTask:
@@ -72,14 +73,31 @@ def paper_task(path: Path) -> PlanningTask:
     return PlanningTask(path, PAPER.airframe, PAPER.limits, NODES, YawMode.FREE)
 
 
-def _by(planner: Planner) -> Plan:
-    def plan(path: Path) -> SpeedProfile:
-        solution = planner(paper_task(path))
-        if solution.profile is None:
-            raise CfplanError(solution.reason or str(solution.status), hint="plan by another planner")
-        return solution.profile
+def profile_of(planner: Planner, task: PlanningTask) -> SpeedProfile:
+    """Return the planner's profile as it answers it. Raises CfplanError, with its reason, where there is none."""
+    solution = planner(task)
+    if solution.profile is None:
+        raise CfplanError(solution.reason or str(solution.status), hint="plan by another planner")
+    return solution.profile
 
-    return plan
+
+def profile_by(planner: Planner) -> Plan:
+    """Return the planner, asked as the paper asks: see `paper_task`."""
+    return lambda path: profile_of(planner, paper_task(path))
+
+
+def shipped_profile(path: Path) -> SpeedProfile:
+    """Return what the planner that ships flies: the network's profile, refined to the optimum and certified.
+
+    That is how the policy of planning finishes it, whether it passes or not; `repair` would leave alone what passes.
+    """
+    task = paper_task(path)
+    return refine(task, profile_of(plan_learned, task)).trajectory.profile
+
+
+def trajectory_by(plan: Plan) -> Ask:
+    """Return the planner with the flatness map behind it: from a path to a trajectory of the paper's vehicle."""
+    return lambda path: Trajectory(path, plan(path), PAPER.airframe)
 
 
 def network_plan(trained: TrainedNetwork) -> Plan:

@@ -22,7 +22,7 @@ from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import Planner
 from cfplan.safety.limit_sets import BOXES, PAPER
 from cfplan.studies.paper.networks import WAYPOINTS
-from cfplan.studies.paper.trials import paper_task
+from cfplan.studies.paper.trials import profile_by
 from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import duration_of
@@ -83,12 +83,9 @@ def _pair(name: str, seed: int, planner: Planner, path: Path, moved: Path) -> Pa
     for each in (path, moved):
         try:
             each.check()
-            solution = planner(paper_task(each))
+            profiles.append(profile_by(planner)(each))
         except CfplanError as error:
             return Pair(name, seed, str(error))
-        if solution.profile is None:
-            return Pair(name, seed, solution.reason or str(solution.status))
-        profiles.append(solution.profile)
     first, second = profiles
     times = [duration_of(each) for each in profiles]
     return Pair(

@@ -3,8 +3,14 @@
 import pytest
 
 from cfplan.errors import InputError
+from cfplan.planners.expert.expert import plan_expert
+from cfplan.planning.planners import PLANNERS, Finish
+from cfplan.safety.certificate import certify
 from cfplan.studies.paper.baselines import ALLOCATION, CONVEX, MIN_SNAP, SHIPPED, baselines, random_path
 from cfplan.studies.paper.printed import BASELINES
+from cfplan.studies.paper.trials import paper_task, profile_of, shipped_profile
+from cfplan.vehicle.timing import duration_of
+from cfplan.vehicle.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +38,14 @@ def test_all_but_the_time_allocation_keep_to_the_path(quick):
     assert trials[SHIPPED]["violation"] == 0.0
     assert trials[MIN_SNAP]["travel_time"] > 1.2 * trials[SHIPPED]["travel_time"]
     assert trials["expert"]["travel_time"] == pytest.approx(trials[SHIPPED]["travel_time"], rel=0.005)
+
+
+def test_what_ships_is_certified_at_the_optimum_as_the_policy_of_planning_has_it():
+    path = random_path(60_000)
+    task, profile = paper_task(path), shipped_profile(path)
+    assert PLANNERS["learned"].finished is Finish.REFINED
+    assert certify(Trajectory(path, profile, task.airframe), task.limits).passed
+    assert duration_of(profile) == pytest.approx(duration_of(profile_of(plan_expert, task)), rel=0.002)
 
 
 def test_what_the_paper_prints_is_consistent():
