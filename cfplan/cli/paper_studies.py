@@ -56,7 +56,7 @@ def inputs() -> Study:
     click.option(
         "--draws", type=click.IntRange(1), default=10, show_default=True, help="Perturbations of each, each ε."
     ),
-    click.option("--model", "models", multiple=True, help="LSTM, LSTM-0.001, LSTM-0.01 or LSTM-0.1.  [default: all]"),
+    click.option("--model", "models", multiple=True, help="LSTM, LSTM-0.001, …, LSTM-0.1-solved.  [default: all]"),
     click.option(
         "--reference", type=click.Choice(["toppquad", "expert"]), default="toppquad", show_default=True,
         help="Whose travel times are compared with, on the path and on the perturbed one.",

@@ -136,7 +136,7 @@ def _row(spec: DatasetSpec, row: int) -> tuple[dict[str, Any], float]:
         content |= {"breaks": path.breaks, "coefficients": path.coefficients.ravel()}
         content |= {"length": path.length, "end": path.end}
         kept = copy > 0 and spec.relabel is Relabel.KEEP
-        solution = _clean_solution(spec, number) if kept else _solve(spec, number, path)
+        solution = _clean_solution(spec, number) if kept else solve(spec, number, path)
         content |= _label(path, solution, chosen)
         seconds = float(solution.stats.get("solve_seconds", np.nan))
     except CfplanError as error:
@@ -145,7 +145,8 @@ def _row(spec: DatasetSpec, row: int) -> tuple[dict[str, Any], float]:
     return {name: content.get(name) for name in SCHEMA.names}, seconds
 
 
-def _solve(spec: DatasetSpec, number: int, path: Path) -> Solution:
+def solve(spec: DatasetSpec, number: int, path: Path) -> Solution:
+    """Solve a path under the limits, for the vehicle and with the yaw of the dataset's path of that number."""
     chosen, mode, angle = row_limits(spec, number)
     task = PlanningTask(path, chosen.airframe, chosen.limits, nodes=spec.nodes, yaw=mode, yaw_angle=angle)
     if spec.planner is Labeller.TOPPQUAD:
@@ -158,7 +159,7 @@ def _solve(spec: DatasetSpec, number: int, path: Path) -> Solution:
 @lru_cache(maxsize=1)
 def _clean_solution(spec: DatasetSpec, number: int) -> Solution:
     """Return the clean path's label, cached for its copies, which are the next rows."""
-    return _solve(spec, number, clean_path(spec, number))
+    return solve(spec, number, clean_path(spec, number))
 
 
 def _label(path: Path, solution: Solution, chosen: LimitSet) -> dict[str, Any]:

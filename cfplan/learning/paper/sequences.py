@@ -4,7 +4,7 @@ Nothing is scaled by limits or made relative to a place, as the features of cfpl
 networks know one vehicle, one set of limits and one box.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path as FilePath
 
@@ -15,7 +15,8 @@ from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import perturbed
 from cfplan.learning.dataset import read_dataset
-from cfplan.learning.dataset_spec import DatasetSpec
+from cfplan.learning.dataset_spec import DatasetSpec, Relabel
+from cfplan.learning.labels import solve
 from cfplan.planners.solution import Status
 
 MAX_LENGTH = 60.0  # m: the few longer paths are excursions of min-snap, far out of the box
@@ -70,12 +71,28 @@ class Sequences:
         """Return the rows from number `first` on, without those longer than MAX_LENGTH."""
         return self.part((self.rows >= first) & (self.length <= MAX_LENGTH))
 
-    def perturbed_inputs(self, epsilon: float, seed: np.random.SeedSequence) -> NDArray:
-        """Return (R, N, 9): what networks see of every path when it is perturbed by at most epsilon, m."""
-        noisy = (
+    def perturbed_by(
+        self, epsilon: float, seed: np.random.SeedSequence, relabel: Relabel = Relabel.KEEP
+    ) -> "Sequences":
+        """Return every path perturbed by at most epsilon, m, with the clean path's label or with its own solution.
+
+        A perturbed path that has no solution keeps the clean path's label. Lengths and times are the clean path's.
+        """
+        noisy = tuple(
             perturbed(path, epsilon, own) for path, own in zip(self.paths, seed.spawn(len(self.paths)), strict=True)
         )
-        return np.stack([path_inputs(path, self.inputs.shape[1]) for path in noisy])
+        inputs = np.stack([path_inputs(path, self.inputs.shape[1]) for path in noisy])
+        answers = self.answers if relabel is Relabel.KEEP else self._solved(noisy)
+        return replace(self, paths=noisy, inputs=inputs, answers=answers)
+
+    def _solved(self, paths: tuple[Path, ...]) -> NDArray:
+        """Return (R, N, 2): the answers of other paths, solved as these were."""
+        answers = self.answers.copy()
+        for k, path in enumerate(paths):
+            profile = solve(self.spec, int(self.rows[k]) // (1 + self.spec.copies), path).profile
+            if profile is not None:
+                answers[k] = np.stack([profile.h, np.cos(profile.yaw)], axis=1)
+        return answers
 
 
 def path_inputs(path: Path, nodes: int) -> NDArray:

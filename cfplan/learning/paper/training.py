@@ -2,7 +2,8 @@
 
 Transformer and MLP learn by teacher forcing, which is what the paper's explanation of their failures rests on; the
 LSTM, of which the paper says that it answers from its own answers, learns so in the second half of its epochs. Noise
-injection as in the paper: half of what is seen in an epoch is perturbed, and keeps the clean path's label.
+injection as in the paper: half of what is seen in an epoch is perturbed, and keeps the clean path's label. Or, not in
+the paper, it is solved again.
 """
 
 import json
@@ -10,6 +11,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from torch import Tensor
 
 from cfplan.errors import InputError
 from cfplan.learning.checkpoints import CHECKPOINT, Epoch, resume, save_checkpoint
+from cfplan.learning.dataset_spec import Relabel
 from cfplan.learning.paper.networks import Kind, SequenceNetwork, build_network
 from cfplan.learning.paper.recovery import nodal_time
 from cfplan.learning.paper.sequences import Inputs, Sequences, select_inputs
@@ -41,6 +44,7 @@ class SequenceOptions:
     kind: Kind = Kind.LSTM
     inputs: Inputs = Inputs.ALL
     epsilon: float = 0.0  # m, noise injection
+    relabel: Relabel = Relabel.KEEP  # of the paths that it perturbs
     epochs: int = 14
     batch: int = 50
     rate: float = 3e-3  # the highest learning rate; a third of it for Transformers
@@ -50,6 +54,7 @@ class SequenceOptions:
     def name(self) -> str:
         """Return the name, which no two networks of a study share."""
         noise = f"-{self.epsilon:g}" if self.epsilon else ""
+        noise += "-solved" if self.relabel is Relabel.SOLVE else ""
         return f"{self.kind}{noise}" + ("" if self.inputs is Inputs.ALL else f"-{self.inputs.replace('/', '-')}")
 
 
@@ -74,10 +79,11 @@ def train_network(
     optimiser = torch.optim.Adam(network.parameters(), lr=options.rate)
     identity = _identity(sequences, options)
     log = resume(folder, identity, network, optimiser, torch.device("cpu"))
+    perturb = _perturbations(known, options)
     while len(log) < options.epochs:
         begun = time.process_time()
         number = len(log)
-        loss, rate = _run_epoch(network, optimiser, known, options, number)
+        loss, rate = _run_epoch(network, optimiser, known, perturb, options, number)
         if not np.isfinite(loss):
             raise InputError(f"the loss is {loss} in epoch {number + 1}", where=str(folder), hint="lower the rate")
         judged = _judge(network, unseen, options)
@@ -125,8 +131,11 @@ def answer(network: SequenceNetwork, inputs: NDArray, chosen: Inputs = Inputs.AL
 
 
 def _identity(sequences: Sequences, options: SequenceOptions) -> dict[str, Any]:
+    decided = asdict(options)
+    if options.relabel is Relabel.KEEP:
+        del decided["relabel"]  # trainings of older versions, which had no other
     return {
-        "options": json.loads(json.dumps(asdict(options))),
+        "options": json.loads(json.dumps(decided)),
         "data": {
             "dataset": json.loads(json.dumps(asdict(sequences.spec))),
             "rows": [int(sequences.rows[0]), int(sequences.rows[-1]), len(sequences.rows)],
@@ -142,16 +151,30 @@ def _split(sequences: Sequences, seed: int) -> tuple[Sequences, Sequences]:
     return sequences.part(np.sort(order[:count])), sequences.part(np.sort(order[count:]))
 
 
+def _perturbations(known: Sequences, options: SequenceOptions) -> Callable[[int], Sequences]:
+    """Return a function from an epoch to the perturbed paths of it, which it remembers until others take turns."""
+
+    @lru_cache(maxsize=1)
+    def drawn(turn: int) -> Sequences:
+        return known.perturbed_by(
+            options.epsilon, np.random.SeedSequence(options.seed, spawn_key=(2, turn)), options.relabel
+        )
+
+    return lambda epoch: drawn(epoch // NOISE_EPOCHS)
+
+
 def _run_epoch(
-    network: SequenceNetwork, optimiser: torch.optim.Optimizer, known: Sequences, options: SequenceOptions, epoch: int
-) -> tuple[float, float]:
+    network: SequenceNetwork, optimiser: torch.optim.Optimizer, known: Sequences,
+    perturb: Callable[[int], Sequences], options: SequenceOptions, epoch: int,
+) -> tuple[float, float]:  # fmt: skip
     """Return the mean loss and the last learning rate."""
     random = np.random.default_rng([options.seed, 1, epoch])
     seen, answers = _tensor(known.inputs, options), torch.from_numpy(known.answers)
     if options.epsilon:
-        seed = np.random.SeedSequence(options.seed, spawn_key=(2, epoch // NOISE_EPOCHS))
-        noisy = _tensor(known.perturbed_inputs(options.epsilon, seed), options)
-        seen = torch.where(torch.from_numpy(random.uniform(size=len(seen)) < 0.5)[:, None, None], noisy, seen)
+        noisy = perturb(epoch)
+        moved = torch.from_numpy(random.uniform(size=len(seen)) < 0.5)[:, None, None]
+        seen = torch.where(moved, _tensor(noisy.inputs, options), seen)
+        answers = torch.where(moved, torch.from_numpy(noisy.answers), answers)
     order = torch.from_numpy(random.permutation(len(seen)))
     batches = torch.split(order, options.batch)
     total, rate = 0.0, 0.0

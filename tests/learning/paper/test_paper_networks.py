@@ -10,11 +10,14 @@ from cfplan.errors import InputError, NotCertifiedError
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.checkpoints import Epoch
 from cfplan.learning.dataset import make_dataset
-from cfplan.learning.dataset_spec import DatasetSpec
+from cfplan.learning.dataset_spec import DatasetSpec, Relabel
 from cfplan.learning.paper.networks import Kind, Size, build_network
 from cfplan.learning.paper.recovery import nodal_time, recover_profile, yaw_of_cosines
 from cfplan.learning.paper.sequences import Inputs, path_inputs, read_sequences, select_inputs
 from cfplan.learning.paper.training import SequenceOptions, answer, load_network, train_network
+from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.task import PlanningTask
+from cfplan.safety.limit_sets import PAPER
 from cfplan.vehicle.timing import duration_of
 
 SMALL = Size(8, 1)
@@ -127,9 +130,24 @@ def test_training_learns_and_goes_on_where_it_stopped(sequences, tmp_path):
 
 
 def test_noise_moves_what_is_seen_by_at_most_epsilon(sequences):
-    noisy = sequences.perturbed_inputs(0.05, np.random.SeedSequence(3))
-    moved = np.linalg.norm((noisy - sequences.inputs)[..., :3], axis=2)
+    noisy = sequences.perturbed_by(0.05, np.random.SeedSequence(3))
+    moved = np.linalg.norm((noisy.inputs - sequences.inputs)[..., :3], axis=2)
     assert 0.005 < moved.max() <= 0.05 + 1e-5
+    assert noisy.answers is sequences.answers
+
+
+def test_paths_that_are_solved_again_have_labels_of_their_own(sequences, tmp_path):
+    noisy = sequences.perturbed_by(0.05, np.random.SeedSequence(3), Relabel.SOLVE)
+    for path, answers in zip(noisy.paths, noisy.answers, strict=True):
+        profile = plan_expert(PlanningTask(path, PAPER.airframe, PAPER.limits, 99, YawMode.FREE)).profile
+        assert answers[:, 0] == pytest.approx(profile.h, rel=1e-5)
+        assert answers[:, 1] == pytest.approx(np.cos(profile.yaw), abs=1e-5)
+    assert np.abs(noisy.answers[..., 0] / sequences.answers[..., 0] - 1.0).max() > 1e-3
+
+    kept, solved = (replace(OPTIONS, epsilon=0.05, relabel=relabel) for relabel in Relabel)
+    assert {kept.name, solved.name} == {"LSTM-0.05", "LSTM-0.05-solved"}
+    ends = [train_network(sequences, tmp_path / each.name, each) for each in (kept, solved)]
+    assert any(not torch.equal(*pair) for pair in zip(*(end.state_dict().values() for end in ends), strict=True))
 
 
 def test_damaged_weights_are_named(sequences, tmp_path):
