@@ -8,6 +8,7 @@ import click
 from cfplan.cli.measured import Study, count, measured, seed, use_one_thread
 from cfplan.cli.output import print_table
 
+_EPOCHS = click.option("--epochs", type=click.IntRange(1), help="Of each training.  [default: 14]")
 _QUICK = click.option("--quick", is_flag=True, help="A few paths and epochs on data of its own: does it run?")
 _NETWORKS = (
     click.option(
@@ -18,7 +19,7 @@ _NETWORKS = (
         "--networks", type=click.Path(path_type=Path), default=Path("datasets/paper-networks"), show_default=True,
         help="Where networks are kept; those not there are trained.",
     ),
-    click.option("--epochs", type=click.IntRange(1), help="Of each training.  [default: 14]"),
+    _EPOCHS,
     _QUICK,
 )  # fmt: skip
 
@@ -87,6 +88,26 @@ def baselines() -> Study:
 
 
 @measured(
+    "labelling, training and flying", "cfplan study hardware -o results/hardware.json",
+    count(8, "In the room, the first a straight line; the long one is flown besides."),
+    click.option(
+        "--learned-from", type=click.IntRange(10), default=9000, show_default=True,
+        help="Paths, for each set of limits.",
+    ),
+    click.option(
+        "--data", type=click.Path(path_type=Path), default=Path("datasets/paper-hardware"), show_default=True,
+        help="Where paths and networks are kept; those not there are made.",
+    ),
+    _EPOCHS, _QUICK,
+)  # fmt: skip
+def hardware() -> Study:
+    """Make the paper's hardware tables on the virtual lab, without real time: TOPPQuad, networks and what ships."""
+    from cfplan.studies.paper.hardware import hardware as run
+
+    return run
+
+
+@measured(
     "planning", "cfplan study yaw-consistency -o results/yaw-consistency.json",
     click.option("--pairs", type=click.IntRange(1), default=100, show_default=True, help="Of random paths."),
     seed(50_000),
@@ -102,7 +123,7 @@ def yaw_consistency() -> Study:
 @click.argument("folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path("results"))
 @_QUICK
 def paper(folder: Path, quick: bool) -> None:
-    """Make all tables of the paper: architectures, inputs, robustness, yaw, baselines; a result each in DIR.
+    """Make all tables of the paper: the studies above and that of long paths, a result each in DIR.
 
     What was made by the same commit is kept, so that a run that was stopped goes on.
     """
@@ -127,4 +148,4 @@ def paper(folder: Path, quick: bool) -> None:
         click.echo(f"{each.file}: {how}")
 
 
-COMMANDS = (architectures, inputs, robustness, baselines, yaw_consistency, paper)
+COMMANDS = (architectures, inputs, robustness, baselines, hardware, yaw_consistency, paper)

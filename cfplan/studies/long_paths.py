@@ -184,7 +184,10 @@ def long_paths(
                     progress(made := made + 1, total)
     except KeyboardInterrupt:
         interrupted = True
-    settings = {"box": box, "limits": limits, "first_seed": first_seed, "paths": paths, "repeats": repeats}
+    settings = {
+        "box": box, "limits": limits, "first_seed": first_seed, "paths": paths, "repeats": repeats,
+        "quick": max(lengths) < LENGTHS[-1],
+    }  # fmt: skip
     detail = detail_table("plans", [plan for plans in done for plan in plans])
     return StudyResult("long", settings, (lengths_table(done, box, limits), beside_table(done)), (detail,), interrupted)
 

@@ -1,9 +1,10 @@
-"""The paper's tables, each by one study, beside what the paper prints: architectures, inputs, robustness, baselines."""
+"""The paper's tables, each by one study, beside what the paper prints; printed.py has its numbers."""
 
 __all__ = [
     "all_tables",
     "architectures",
     "baselines",
+    "hardware",
     "inputs",
     "networks",
     "printed",

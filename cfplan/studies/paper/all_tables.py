@@ -10,8 +10,10 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from cfplan.errors import InputError
+from cfplan.studies.long_paths import long_paths
 from cfplan.studies.paper.architectures import architectures
 from cfplan.studies.paper.baselines import baselines
+from cfplan.studies.paper.hardware import hardware
 from cfplan.studies.paper.inputs import inputs_study
 from cfplan.studies.paper.networks import Progress
 from cfplan.studies.paper.robustness import robustness
@@ -22,12 +24,13 @@ from cfplan.version import UNKNOWN
 
 TABLES: MappingProxyType[str, Callable[..., StudyResult]] = MappingProxyType({
     "architectures": architectures, "inputs": inputs_study, "robustness": robustness,
-    "yaw-consistency": yaw_consistency, "baselines": baselines,
+    "yaw-consistency": yaw_consistency, "baselines": baselines, "hardware": hardware, "long": long_paths,
 })  # fmt: skip
 QUICK: MappingProxyType[str, dict[str, Any]] = MappingProxyType({
     "architectures": {"paths": 2, "quick": True}, "inputs": {"paths": 2, "quick": True},
     "robustness": {"paths": 1, "draws": 1, "quick": True}, "yaw-consistency": {"pairs": 2},
-    "baselines": {"paths": 1, "quick": True},
+    "baselines": {"paths": 1, "quick": True}, "hardware": {"paths": 1, "quick": True},
+    "long": {"paths": 1, "repeats": 1, "lengths": (20.0, 40.0)},
 })  # fmt: skip
 
 

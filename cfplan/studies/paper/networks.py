@@ -68,6 +68,32 @@ def paper_data(
     yield _parts(read_sequences(data), networks, paths, TESTED, epochs)
 
 
+@contextmanager
+def labelled_data(
+    folder: Path, spec: DatasetSpec, progress: Progress, *, epochs: int | None = None, quick: bool = False
+) -> Iterator[PaperData]:
+    """Yield the dataset of `spec` to learn from, labelled first where it is not there; networks are kept beside it.
+
+    `quick`: a few paths, in a folder that goes away. Raises InputError where the folder holds another dataset.
+    """
+    if quick:
+        with tempfile.TemporaryDirectory() as passing:
+            few = replace(spec, count=QUICK_PATHS // 2)
+            with labelled_data(Path(passing), few, progress, epochs=QUICK_EPOCHS) as material:
+                yield material
+        return
+    done = 0
+
+    def show(rows: int) -> None:
+        nonlocal done
+        done += rows
+        progress(done, spec.rows)
+
+    data = folder / "data"
+    make_dataset(data, spec, on_rows=show)
+    yield PaperData({}, read_sequences(data).learned_from(0), folder, epochs)
+
+
 def quick_spec() -> DatasetSpec:
     """Return a dataset of the paper's kind that is made in a second."""
     return DatasetSpec(

@@ -1,0 +1,106 @@
+"""The paper's hardware tables on the virtual lab: what is flown, under which limits, and who crashes."""
+
+import numpy as np
+import pytest
+
+from cfplan.errors import CfplanError, InputError
+from cfplan.safety.limits_file import DEFAULTS, load_limits
+from cfplan.safety.space import check_space
+from cfplan.studies.paper import hardware as study
+from cfplan.studies.paper.hardware import (
+    CERTIFIED,
+    LIMITS,
+    LONG,
+    RAW,
+    SHIPPED,
+    HardwareFlight,
+    hardware,
+    hardware_paths,
+    hardware_tables,
+    long_path,
+    paper_limits,
+)
+from cfplan.studies.paper.trials import TOPPQUAD
+
+USUAL = load_limits(DEFAULTS)
+
+
+@pytest.fixture(scope="module")
+def quick():
+    return hardware(paths=1, quick=True)
+
+
+def test_every_planner_flies_certified_and_all_but_the_one_that_ships_as_planned(quick):
+    rows = quick.table("hardware").rows
+    assert [(row["way"], row["planner"]) for row in rows] == [
+        (RAW, TOPPQUAD), (RAW, "LSTM-0.001"), (CERTIFIED, TOPPQUAD), (CERTIFIED, "LSTM-0.001"), (CERTIFIED, SHIPPED),
+    ]  # fmt: skip
+    assert [row["paper_deviation"] for row in rows] == [0.347, 0.355, 0.347, 0.355, None]
+    assert quick.settings["quick"]
+    assert len(quick.table("training").rows) == 1
+
+
+def test_what_is_certified_lands_near_its_place(quick):
+    flights = [flight for flight in quick.table("flights").rows if flight["way"] == CERTIFIED]
+    assert all(not flight["reason"] for flight in flights)
+    assert max(flight["deviation"] for flight in flights) < 0.06
+    assert max(flight["settled"] for flight in flights) < 1.0
+    times = {flight["planner"]: flight["travel_time"] for flight in flights}
+    assert times["LSTM-0.001"] == pytest.approx(times[SHIPPED], rel=0.01)  # repair leads to the same optimum
+
+
+def test_failures_are_counted_and_left_out_of_the_means():
+    def flight(trial, **changes):
+        return HardwareFlight("text", RAW, "LSTM-0.1", str(trial), trial, **changes)
+
+    flights = [
+        flight(1, deviation=0.2, travel_time=5.0, settled=0.1), flight(2, deviation=1.4, travel_time=7.0, settled=9.0),
+        flight(3, reason="no plan"), flight(4, deviation=0.4, travel_time=6.0, settled=0.3),
+    ]  # fmt: skip
+    table, line, long = hardware_tables(flights)
+    (row,) = table.rows
+    assert (row["flights"], row["failed"]) == (4, 2)
+    assert (row["deviation"], row["deviation_most"]) == (pytest.approx(0.3), 0.4)
+    assert (row["travel_time"], row["settled"]) == (pytest.approx(5.5), pytest.approx(0.2))
+    assert row["paper_time"] == 8.288
+    assert [each["flights"] for each in line.rows] == [1]  # the first path alone
+    assert not long.rows
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_the_pilot_brakes_above_what_is_planned_and_no_sooner_than_usual(name):
+    limits = paper_limits(USUAL, name)
+    assert (limits.plan.acceleration, limits.plan.angular_velocity) == LIMITS[name]
+    for quantity in ("acceleration", "angular_velocity"):
+        ladder, usual = getattr(limits.flight, quantity), getattr(USUAL.flight, quantity)
+        assert ladder.brake > getattr(limits.plan, quantity)
+        assert usual.brake <= ladder.brake < ladder.land < ladder.cut
+
+
+def test_the_paths_stay_in_the_room_and_the_first_is_straight():
+    paths = hardware_paths(USUAL, 8)
+    assert list(paths) == [str(number) for number in range(1, 9)]
+    for path in paths.values():
+        check_space(path, USUAL.space)
+    straight = paths["1"](np.linspace(0.0, paths["1"].end, 50))
+    along = straight[-1] - straight[0]
+    assert np.abs(np.cross(straight - straight[0], along)).max() < 1e-9
+    longest = max(path.length for path in paths.values())
+    assert long_path(USUAL).length > 2.0 * longest
+
+
+def test_a_planner_without_a_plan_fails_every_flight_of_that_path(monkeypatch):
+    def none(*_):
+        raise CfplanError("no plan", hint="none")
+
+    planner = study.FlownPlanner("none", none, none, 3)
+    paths = {LONG: long_path(USUAL), **hardware_paths(USUAL, 1)}
+    flights = list(study._all_flights(USUAL, {"text": [planner]}, paths, None, lambda done, total: None))
+    assert [(flight.path, flight.way, flight.failed) for flight in flights] == 3 * [("1", RAW, True)] + 3 * [
+        ("1", CERTIFIED, True)
+    ]
+
+
+def test_no_path_is_refused():
+    with pytest.raises(InputError, match="at least 1"):
+        hardware(paths=0)
