@@ -34,7 +34,7 @@ from cfplan.learning.features import (
 from cfplan.learning.inference import Network
 from cfplan.learning.model_files import Model, find_model
 from cfplan.learning.smooth import Begin, smoothed
-from cfplan.learning.windows import overlapped, shares, window_starts
+from cfplan.learning.windows import overlapped, windows_over
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.profile import BoundaryState
@@ -70,7 +70,9 @@ class _Windows(NamedTuple):
 
     inputs: NDArray  # (B, W+1, INPUTS)
     starts: NDArray  # (B,)
+    shares: NDArray  # (B, W+1), how much each answer counts
     reference: NDArray  # (N+1,) log rates, in units of time
+    rests: tuple[bool, bool]  # whether the path rests at its start and end, where no state is given
 
 
 def plan_learned(task: PlanningTask, *, model: Model | None = None, view: View = scaled_limits) -> Solution:
@@ -130,7 +132,7 @@ def propose(task: PlanningTask, model: Model, view: View = scaled_limits) -> tup
 def window_overlaps(path: Path, nodes: int, window: int) -> NDArray:
     """Return from where to where two windows of a network answer for a path over `nodes` intervals, (J, 2) s."""
     asked = _asked(path, nodes, window)
-    starts = window_starts(asked, window)
+    starts, _ = windows_over(asked, window)
     return np.stack([starts[1:], starts[:-1] + window], axis=1) * (path.end / asked)
 
 
@@ -172,7 +174,7 @@ def _windows(question: Question, window: int) -> _Windows:
     path, known, nodes, start, end, track, yaw_angle = question
     step = path.end / nodes
     table = node_features(path, nodes, known, track)
-    starts = window_starts(nodes, window)
+    starts, counts = windows_over(nodes, window)
     inputs = np.empty((len(starts), window + 1, INPUTS), np.float32)
     rest_start, rest_end = start is None and rests(path, 0.0), end is None and rests(path, path.end)
     first = (0.0, 0.0, 0.0)
@@ -187,15 +189,14 @@ def _windows(question: Question, window: int) -> _Windows:
             inputs[b], table[place : place + window + 1], begins and rest_start, b == len(starts) - 1 and rest_end,
             begins and start is not None, first, yaw, turning, track is None, known.numbers,
         )  # fmt: skip
-    return _Windows(inputs, starts, table[:, REFERENCE])
+    return _Windows(inputs, starts, counts, table[:, REFERENCE], (rest_start, rest_end))
 
 
 def _proposal(question: Question, asked: _Windows, answers: NDArray) -> ProposedProfile:
     path, known, nodes, start, end, track, yaw_angle = question
-    step, starts = path.end / nodes, asked.starts
-    counts = shares(starts, answers.shape[1] - 1)
+    step, starts, counts = path.end / nodes, asked.starts, asked.shares
     rates = overlapped(starts, counts * answers[..., 0]) + asked.reference
-    rest_start, rest_end = start is None and rests(path, 0.0), end is None and rests(path, path.end)
+    rest_start, rest_end = asked.rests
     begin, settled = Begin.REST if rest_start else Begin.FREE, np.zeros(3)
     if start is not None:
         begin, settled = Begin.KNOWN, np.array(start_logs(start, step)) + math.log(known.time)

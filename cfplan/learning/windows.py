@@ -4,6 +4,8 @@ Near its ends a window does not see what its answers depend on: there they count
 answers pass over from the one to the other.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +32,16 @@ def shares(starts: NDArray, window: int) -> NDArray:
     out[:-1] *= rise[::-1]
     total = overlapped(starts, out)
     return out / total[starts[:, None] + np.arange(window + 1)]
+
+
+@lru_cache(maxsize=16)
+def windows_over(nodes: int, window: int) -> tuple[NDArray, NDArray]:
+    """Return window_starts() of so many intervals, (B,), and the windows' shares(), (B, W+1)."""
+    starts = window_starts(nodes, window)
+    counts = shares(starts, window)
+    for array in (starts, counts):
+        array.setflags(write=False)
+    return starts, counts
 
 
 def overlapped(starts: NDArray, values: NDArray) -> NDArray:

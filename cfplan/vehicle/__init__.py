@@ -8,6 +8,7 @@ __all__ = [
     "hover",
     "joint",
     "measures",
+    "panels",
     "profile",
     "profile_spline",
     "rotations",

@@ -20,9 +20,10 @@ from cfplan.machine_code import njit
 Scalar = Any  # float, NDArray or casadi.SX
 Vector = tuple[Scalar, Scalar, Scalar]
 Quaternion = Any  # four scalars: a tuple, or an array whose first axis is 4
+Matrix = tuple[Vector, Vector, Vector]  # a rotation by its rows
 
 
-@register_jitable
+@register_jitable(forceinline=True)
 def heading_of(quaternion: Quaternion) -> tuple[Scalar, Scalar]:
     """Return the horizontal components x, y of the body's x axis: cosine and sine of yaw, times the cosine of pitch."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
@@ -64,7 +65,7 @@ def hopf_quaternion(axis: Vector, cos: Scalar, sin: Scalar) -> tuple[Scalar, Sca
     return (a * sin - b * cos) / norm, (a * cos + b * sin) / norm, sin * norm / 2, cos * norm / 2
 
 
-@register_jitable
+@register_jitable(forceinline=True)
 def product(first: Quaternion, second: Quaternion) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Return first ⊗ second: the turn `second` in the axes that `first` makes."""
     x, y, z, w = first[0], first[1], first[2], first[3]
@@ -108,30 +109,99 @@ def matrices_of(quaternions: NDArray) -> NDArray:
 @register_jitable
 def write_matrix(out: NDArray, quaternion: NDArray, scale: float) -> None:
     """Write the matrix of a quaternion; `scale` is 2 over its squared length."""
+    _write_rows(out, matrix_rows(quaternion, scale))
+
+
+@register_jitable(forceinline=True)
+def matrix_rows(quaternion: Quaternion, scale: float) -> Matrix:
+    """Return the matrix of a quaternion as scalars; `scale` is 2 over its squared length."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    out[0, 0], out[0, 1], out[0, 2] = 1 - scale * (y * y + z * z), scale * (x * y - z * w), scale * (x * z + y * w)
-    out[1, 0], out[1, 1], out[1, 2] = scale * (x * y + z * w), 1 - scale * (x * x + z * z), scale * (y * z - x * w)
-    out[2, 0], out[2, 1], out[2, 2] = scale * (x * z - y * w), scale * (y * z + x * w), 1 - scale * (x * x + y * y)
+    return (
+        (1 - scale * (y * y + z * z), scale * (x * y - z * w), scale * (x * z + y * w)),
+        (scale * (x * y + z * w), 1 - scale * (x * x + z * z), scale * (y * z - x * w)),
+        (scale * (x * z - y * w), scale * (y * z + x * w), 1 - scale * (x * x + y * y)),
+    )
+
+
+@register_jitable
+def _write_rows(out: NDArray, rows: Matrix) -> None:
+    (out[0, 0], out[0, 1], out[0, 2]), (out[1, 0], out[1, 1], out[1, 2]), (out[2, 0], out[2, 1], out[2, 2]) = rows
 
 
 @register_jitable
 def write_quaternion(out: NDArray, matrix: NDArray) -> None:
-    """Write the quaternion, (4,), of a rotation matrix, by way of its largest component (Shepperd 1978)."""
-    trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
-    i = 0 if matrix[0, 0] >= matrix[1, 1] and matrix[0, 0] >= matrix[2, 2] else 1 if matrix[1, 1] >= matrix[2, 2] else 2
-    j, k = (i + 1) % 3, (i + 2) % 3
-    if trace >= matrix[i, i]:
-        twice = math.sqrt(1.0 + trace)
-        for axis in range(3):
-            before, behind = (axis + 1) % 3, (axis + 2) % 3
-            out[axis] = (matrix[behind, before] - matrix[before, behind]) / (2.0 * twice)
-        out[3] = twice / 2.0
-    else:
-        twice = math.sqrt(1.0 + matrix[i, i] - matrix[j, j] - matrix[k, k])
-        out[i] = twice / 2.0
-        out[j] = (matrix[j, i] + matrix[i, j]) / (2.0 * twice)
-        out[k] = (matrix[k, i] + matrix[i, k]) / (2.0 * twice)
-        out[3] = (matrix[k, j] - matrix[j, k]) / (2.0 * twice)
+    """Write the quaternion, (4,), of a rotation matrix, see quaternion_of()."""
+    rows = (
+        (matrix[0, 0], matrix[0, 1], matrix[0, 2]),
+        (matrix[1, 0], matrix[1, 1], matrix[1, 2]),
+        (matrix[2, 0], matrix[2, 1], matrix[2, 2]),
+    )
+    out[0], out[1], out[2], out[3] = quaternion_of(rows)
+
+
+@register_jitable(forceinline=True)
+def quaternion_of(matrix: Matrix) -> tuple[float, float, float, float]:
+    """Return the quaternion of a rotation matrix, by way of its largest component (Shepperd 1978).
+
+    There are no branches, so that a compiler can take several at once.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = matrix
+    trace = a + e + i
+    largest = 0 if (a >= e) & (a >= i) else 1 if e >= i else 2
+    diagonal = a if largest == 0 else e if largest == 1 else i
+    largest = 3 if trace >= diagonal else largest
+    of_x, of_y, of_z = 1.0 + a - e - i, 1.0 + e - i - a, 1.0 + i - a - e
+    twice = math.sqrt(1.0 + trace if largest == 3 else of_x if largest == 0 else of_y if largest == 1 else of_z)
+    half, double = twice / 2.0, 2.0 * twice
+    x = (h - f if largest == 3 else d + b if largest == 1 else g + c) / double
+    y = (c - g if largest == 3 else d + b if largest == 0 else h + f) / double
+    z = (d - b if largest == 3 else g + c if largest == 0 else h + f) / double
+    w = (h - f if largest == 0 else c - g if largest == 1 else d - b) / double
+    return (
+        half if largest == 0 else x,
+        half if largest == 1 else y,
+        half if largest == 2 else z,
+        half if largest == 3 else w,
+    )
+
+
+@register_jitable(forceinline=True)
+def turn_rows(x: Scalar, y: Scalar, sine: Scalar, versine: Scalar) -> Matrix:
+    """Return the matrix of a turn about (x, y, 0); `sine` is that of its angle over the length of (x, y, 0), and
+    `versine` 1 less the cosine over the square of that."""
+    xy = versine * x * y
+    return (
+        (1 - versine * (y * y), xy, sine * y),
+        (xy, 1 - versine * (x * x), -sine * x),
+        (-sine * y, sine * x, 1 - versine * (x * x + y * y)),
+    )
+
+
+@register_jitable(forceinline=True)
+def matrix_product(first: Matrix, second: Matrix) -> Matrix:
+    """Return the product of two matrices."""
+    return transposed_product(first, transpose(second))
+
+
+@register_jitable(forceinline=True)
+def transposed_product(first: Matrix, second: Matrix) -> Matrix:
+    """Return the product of a matrix and the transpose of another."""
+    a, b, c = first
+    p, q, r = second
+    return (dot(a, p), dot(a, q), dot(a, r)), (dot(b, p), dot(b, q), dot(b, r)), (dot(c, p), dot(c, q), dot(c, r))
+
+
+@register_jitable(forceinline=True)
+def transpose(matrix: Matrix) -> Matrix:
+    """Return the transpose: a rotation's inverse, and its columns."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix
+    return (a, d, g), (b, e, h), (c, f, i)
+
+
+@register_jitable(forceinline=True)
+def dot(first: Vector, second: Vector) -> Scalar:
+    """Return the inner product."""
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 @njit(error_model="numpy")
@@ -148,12 +218,12 @@ def rotations_of(vectors: NDArray) -> NDArray:
     """Return the (N, 3, 3) matrices of rotation vectors, (N, 3) rad (Rodrigues)."""
     out = np.empty((len(vectors), 3, 3))
     for n in range(len(vectors)):
-        write_rotation(out[n], vectors[n, 0], vectors[n, 1], vectors[n, 2])
+        _write_rotation(out[n], vectors[n, 0], vectors[n, 1], vectors[n, 2])
     return out
 
 
 @register_jitable
-def write_rotation(out: NDArray, x: float, y: float, z: float) -> None:
+def _write_rotation(out: NDArray, x: float, y: float, z: float) -> None:
     """Write the matrix, (3, 3), of a rotation vector, rad (Rodrigues)."""
     angle = math.sqrt(x * x + y * y + z * z)
     sine = math.sin(angle) / angle if angle > 1e-12 else 1.0

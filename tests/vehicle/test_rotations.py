@@ -54,3 +54,14 @@ def test_matrices_of_quaternions_of_any_length_lead_back_to_them():
         found = np.empty(4)
         rotations.write_quaternion(found, matrix)
         np.testing.assert_allclose(found * np.sign(found @ quaternion), quaternion, atol=1e-12)
+
+
+def test_a_turn_about_a_level_axis_and_products_of_matrices_are_those_of_scipy():
+    rng = np.random.default_rng(5)
+    for (x, y), first, second in zip(rng.uniform(-1.5, 1.5, (20, 2)), ATTITUDES, ATTITUDES[20:], strict=False):
+        angle = np.hypot(x, y)
+        turn = rotations.turn_rows(x, y, np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2)
+        np.testing.assert_allclose(turn, Rotation.from_rotvec([x, y, 0.0]).as_matrix(), atol=1e-12)
+        a, b = (tuple(map(tuple, each.as_matrix())) for each in (first, second))
+        np.testing.assert_allclose(rotations.matrix_product(a, b), (first * second).as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(rotations.transposed_product(a, b), (first * second.inv()).as_matrix(), atol=1e-12)

@@ -36,8 +36,33 @@ from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.measures import measures_at_instants
-from cfplan.vehicle.rotations import heading_of, matrices_of, norms, write_quaternion, write_rotation
+from cfplan.vehicle.panels import (
+    WIDTH,
+    give_out,
+    lanes_for,
+    pair_in,
+    quaternion_in,
+    take_in,
+    triple_in,
+    write_pair,
+    write_quaternion_in,
+    write_triple,
+)
+from cfplan.vehicle.rotations import (
+    Matrix,
+    Vector,
+    dot,
+    heading_of,
+    matrix_product,
+    matrix_rows,
+    norms,
+    quaternion_of,
+    transpose,
+    transposed_product,
+    turn_rows,
+)
 from cfplan.vehicle.trajectory import Trajectory
+from cfplan.vehicle.trigonometry import sine
 
 RATE = 100.0  # Hz
 HOLD = 0.5  # s of hover after the end, so that what the vehicle keeps when the stream stops is a hover
@@ -63,6 +88,7 @@ ATTITUDE_QUANTUM = np.radians(0.25)  # the largest angle by which compressing tu
 _ROUNDING = 1e-9
 _ROUNDED = HALF_QUANTUM + _ROUNDING
 _OFF = "{} in the packet is not that of the trajectory, off by"
+_NO_TURN = 1e-12  # rad, in place of a smaller turn
 _LEAST_LIFT = math.cos(math.radians(75.0))  # the controller's heading is not defined at a tilt of 90°
 _BATCH = 4096  # setpoints at a time, so that memory does not grow with the states of a long flight
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
@@ -262,10 +288,12 @@ def check_motion(
     _check_values("body_rate", decoded.body_rate - sent_rate, require)
 
     planned = (motion.acceleration, motion.quaternion, motion.body_rate)
-    thrust, turned, off, level, flown, attitude, rate = _made(
+    compared, flown, attitude, rate = _made(
         decoded.acceleration, decoded.quaternion, decoded.body_rate,
         *(np.array(each, dtype=float, order="C") for each in planned), gains.full_rate,
     )  # fmt: skip
+    thrust, level = compared[:, 0], compared[:, 3]
+    turned, off = 2.0 * np.arcsin(np.minimum(compared[:, 1:3].T, 1.0))
     require(thrust <= _ROUNDED, _OFF.format("acceleration"), thrust)
     require(turned <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", turned)
     require(level >= _LEAST_LIFT, "the thrust that is sent leans too far, with a vertical share of", level)
@@ -330,133 +358,170 @@ def _require(good: NDArray, what: str, values: NDArray, first: int = 0) -> None:
         )
 
 
+# Rows of the panels of _made: what comes in, and what goes out.
+_SENT_FORCE, _SENT_ATTITUDE, _SENT_RATE, _FORCE, _ATTITUDE, _RATE = 0, 3, 7, 9, 12, 16
+_THRUST_OFF, _FLOWN, _MADE_ATTITUDE, _MADE_RATE, _ROWS = 18, 22, 25, 29, 31
+
+
 @njit(error_model="numpy")
 def _made(
     acceleration: NDArray, quaternion: NDArray, body_rate: NDArray, planned_acceleration: NDArray,
     planned_quaternion: NDArray, planned_rate: NDArray, full_rate: float,
-) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]:  # fmt: skip
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:  # fmt: skip
     """Hold setpoints as decoded against the motion that they are to make, N of each.
 
-    Returned are: by how much the thrust vectors are off, m/s² in their worst component; by what angles, rad, the
-    quaternions are, and the controller's attitudes turned back by what stands for rates; the vertical share of the
-    thrust; and the motion made: accelerations (N, 3), attitudes (N, 4) and body rates (N, 3).
+    Returned are, (N, 4), by how much the thrust vectors are off, m/s² in their worst component, the sines of half the
+    angles by which the quaternions are, and the controller's attitudes turned back by what stands for rates, and the
+    vertical share of the thrust; and the motion made: accelerations (N, 3), attitudes (N, 4) and body rates (N, 3).
     """
     count = len(acceleration)
-    thrust_off, turned, off, level = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
-    flown, attitude, rate = np.empty((count, 3)), np.empty((count, 4)), body_rate.copy()
-    sent, frames, force = matrices_of(quaternion), matrices_of(planned_quaternion), acceleration + _GRAVITY
-    made = _attitudes(force, quaternion)
-    seen, turn, wanted = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    believed, planned, back = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for n in range(count):
-        frame = frames[n]
-        wx, wy = planned_rate[n, 0], planned_rate[n, 1]
-        write_rotation(seen, -ATTITUDE_AGE * wx, -ATTITUDE_AGE * wy, 0.0)
-        dx, dy = wx - body_rate[n, 0], wy - body_rate[n, 1]
-        size = math.sqrt(dx * dx + dy * dy)
-        share = math.asin(min(size / full_rate, 1.0)) / size if size > 0.0 else 0.0
-        write_rotation(back, share * dx, share * dy, 0.0)
-        _multiply(turn, seen, back)
-        _multiply(wanted, frame, turn)
-        _multiply(believed, frame, seen)
-
-        fx, fy, fz = planned_acceleration[n, 0], planned_acceleration[n, 1], planned_acceleration[n, 2] + GRAVITY
-        along = turn[2, 2]  # cosine between thrust as flown and as sent
-        thrust, worst = math.sqrt(fx * fx + fy * fy + fz * fz) / along, 0.0
-        for i in range(3):
-            error = abs(force[n, i] - thrust * wanted[i, 2])
-            worst = worst if error <= worst else error  # also what is not a number
-        thrust_off[n] = worst
-        size = math.sqrt(force[n, 0] ** 2 + force[n, 1] ** 2 + force[n, 2] ** 2)
-        level[n] = force[n, 2] / size
-        # The rates that the setpoint asks for at the attitude that the controller believes in the motion.
-        for k in range(2):
-            lean = believed[0, k] * force[n, 0] + believed[1, k] * force[n, 1] + believed[2, k] * force[n, 2]
-            rate[n, 1 - k] += (2 * (1 - k) - 1) * full_rate * lean / size
-
-        _multiply_transposed(back, frame, wanted)
-        _point_to_yaw(wanted)
-        turned[n] = _angle(sent[n], wanted)
-        _multiply_transposed(planned, made[n], turn)
-        off[n] = _angle(planned, frame)
-        for i in range(3):
-            flown[n, i] = (back[i, 0] * force[n, 0] + back[i, 1] * force[n, 1] + back[i, 2] * force[n, 2]) * along
-        flown[n, 2] -= GRAVITY
-        _multiply(planned, back, made[n])
-        write_quaternion(attitude[n], planned)
-    return thrust_off, turned, off, level, flown, attitude, rate
+    off, flown, attitude, rate = np.empty((count, 4)), np.empty((count, 3)), np.empty((count, 4)), body_rate.copy()
+    panel = np.empty(_ROWS * WIDTH)
+    for begin in range(0, count, WIDTH):
+        lanes = lanes_for(count - begin)
+        take_in(panel, _SENT_FORCE, acceleration, begin, lanes)
+        take_in(panel, _SENT_ATTITUDE, quaternion, begin, lanes)
+        take_in(panel, _SENT_RATE, body_rate[:, :2], begin, lanes)
+        take_in(panel, _FORCE, planned_acceleration, begin, lanes)
+        take_in(panel, _ATTITUDE, planned_quaternion, begin, lanes)
+        take_in(panel, _RATE, planned_rate[:, :2], begin, lanes)
+        _hold_all_against(panel, lanes, full_rate)
+        give_out(off, begin, panel, _THRUST_OFF)
+        give_out(flown, begin, panel, _FLOWN)
+        give_out(attitude, begin, panel, _MADE_ATTITUDE)
+        give_out(rate[:, :2], begin, panel, _MADE_RATE)
+    return off, flown, attitude, rate
 
 
 @register_jitable
-def _multiply(out: NDArray, first: NDArray, second: NDArray) -> None:
-    """Write the product of two matrices, (3, 3) each."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = first[i, 0] * second[0, j] + first[i, 1] * second[1, j] + first[i, 2] * second[2, j]
+def _hold_all_against(panel: NDArray, lanes: int, full_rate: float) -> None:
+    lanes = min(lanes, WIDTH)  # the compiler must see that no index overflows
+    for n in range(lanes):
+        _hold_against(panel, n, full_rate)
 
 
-@register_jitable
-def _multiply_transposed(out: NDArray, first: NDArray, second: NDArray) -> None:
-    """Write the product of a matrix and the transpose of another, (3, 3) each."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = first[i, 0] * second[j, 0] + first[i, 1] * second[j, 1] + first[i, 2] * second[j, 2]
+@register_jitable(forceinline=True)
+def _hold_against(panel: NDArray, n: int, full_rate: float) -> None:
+    """Write what _made() returns of one setpoint."""
+    frame = _rows_of(quaternion_in(panel, _ATTITUDE, n))
+    (wx, wy), (sent_x, sent_y) = pair_in(panel, _RATE, n), pair_in(panel, _SENT_RATE, n)
+    turned = max(ATTITUDE_AGE * math.sqrt(wx * wx + wy * wy), _NO_TURN)
+    half = sine(0.5 * turned) / turned
+    seen = turn_rows(-ATTITUDE_AGE * wx, -ATTITUDE_AGE * wy, sine(turned) / turned, 2.0 * half * half)
+    dx, dy = wx - sent_x, wy - sent_y
+    size = math.sqrt(dx * dx + dy * dy)
+    along = 1.0 / max(size, full_rate)  # the turn back has the sine |Δ| kw / 2kR, 1 at most
+    size *= along
+    back = turn_rows(dx, dy, along, along * along / (1.0 + math.sqrt(1.0 - min(size * size, 1.0))))
+    turn = matrix_product(seen, back)
+    wanted, believed = matrix_product(frame, turn), transpose(matrix_product(frame, seen))
+
+    px, py, pz = triple_in(panel, _FORCE, n)
+    cosine = turn[2][2]  # between thrust as flown and as sent
+    pz += GRAVITY
+    thrust = math.sqrt(px * px + py * py + pz * pz) / cosine
+    fx, fy, fz = triple_in(panel, _SENT_FORCE, n)
+    force = fx, fy, fz + GRAVITY
+    worst = abs(force[0] - thrust * wanted[0][2])
+    error = abs(force[1] - thrust * wanted[1][2])
+    worst = worst if error <= worst else error  # also what is not a number
+    error = abs(force[2] - thrust * wanted[2][2])
+    worst = worst if error <= worst else error
+    length = math.sqrt(dot(force, force))
+
+    sent = quaternion_in(panel, _SENT_ATTITUDE, n)
+    made = _attitude_rows(force, heading_of(sent))
+    turned = _sine_of_half(_rows_of(sent), _pointed_to_yaw(wanted))
+    off = _sine_of_half(transposed_product(made, turn), frame)
+    forth = transposed_product(frame, wanted)
+    ax, ay, az = dot(forth[0], force) * cosine, dot(forth[1], force) * cosine, dot(forth[2], force) * cosine
+    write_quaternion_in(panel, _THRUST_OFF, n, (worst, turned, off, force[2] / length))
+    write_triple(panel, _FLOWN, n, (ax, ay, az - GRAVITY))
+    write_quaternion_in(panel, _MADE_ATTITUDE, n, quaternion_of(matrix_product(forth, made)))
+    # The rates that the setpoint asks for at the attitude that the controller believes in the motion.
+    x, y = full_rate * dot(believed[0], force) / length, full_rate * dot(believed[1], force) / length
+    write_pair(panel, _MADE_RATE, n, sent_x - y, sent_y + x)
 
 
-@register_jitable
-def _angle(first: NDArray, second: NDArray) -> float:
-    """Return the angle between rotation matrices (3, 3), rad: ‖A - B‖² = 8 sin²(angle / 2)."""
-    total = 0.0
-    for i in range(3):
-        for j in range(3):
-            total += (first[i, j] - second[i, j]) ** 2
-    return 2.0 * math.asin(min(math.sqrt(total / 8.0), 1.0))
+@register_jitable(forceinline=True)
+def _rows_of(quaternion: tuple[float, float, float, float]) -> Matrix:
+    x, y, z, w = quaternion
+    return matrix_rows(quaternion, 2.0 / (x * x + y * y + z * z + w * w))
+
+
+@register_jitable(forceinline=True)
+def _sine_of_half(first: Matrix, second: Matrix) -> float:
+    """Return the sine of half the angle between rotations: ‖A - B‖² = 8 sin²(angle / 2)."""
+    total = _off(first[0], second[0]) + _off(first[1], second[1]) + _off(first[2], second[2])
+    return math.sqrt(total / 8.0)
+
+
+@register_jitable(forceinline=True)
+def _off(first: Vector, second: Vector) -> float:
+    x, y, z = first[0] - second[0], first[1] - second[1], first[2] - second[2]
+    return x * x + y * y + z * z
 
 
 @njit(error_model="numpy")
 def _attitudes(thrusts: NDArray, quaternions: NDArray) -> NDArray:
-    """Return what controller_attitude gives: z along the thrust, y along z × [cos yaw, sin yaw, 0]."""
+    """Return what controller_attitude gives."""
     out = np.empty((len(thrusts), 3, 3))
     for n in range(len(thrusts)):
-        x, y = heading_of(quaternions[n])
-        cos, sin = _direction(x, y)  # of yaw
-        a, b, c = thrusts[n, 0], thrusts[n, 1], thrusts[n, 2]
-        norm = math.sqrt(a * a + b * b + c * c)
-        a, b, c = a / norm, b / norm, c / norm
-        left = (-c * sin, c * cos, a * sin - b * cos)
-        norm = math.sqrt(left[0] ** 2 + left[1] ** 2 + left[2] ** 2)
-        p, q, r = left[0] / norm, left[1] / norm, left[2] / norm
-        out[n, 0, 0], out[n, 1, 0], out[n, 2, 0] = q * c - r * b, r * a - p * c, p * b - q * a
-        out[n, 0, 1], out[n, 1, 1], out[n, 2, 1] = p, q, r
-        out[n, 0, 2], out[n, 1, 2], out[n, 2, 2] = a, b, c
+        rows = _attitude_rows((thrusts[n, 0], thrusts[n, 1], thrusts[n, 2]), heading_of(quaternions[n]))
+        out[n, 0, 0], out[n, 0, 1], out[n, 0, 2] = rows[0]
+        out[n, 1, 0], out[n, 1, 1], out[n, 1, 2] = rows[1]
+        out[n, 2, 0], out[n, 2, 1], out[n, 2, 2] = rows[2]
     return out
+
+
+@register_jitable(forceinline=True)
+def _attitude_rows(thrust: Vector, heading: tuple[float, float]) -> Matrix:
+    """Return the controller's attitude: z along the thrust, y along z × [cos yaw, sin yaw, 0]."""
+    cos, sin = _direction(heading[0], heading[1])  # of yaw
+    a, b, c = thrust
+    norm = math.sqrt(a * a + b * b + c * c)
+    a, b, c = a / norm, b / norm, c / norm
+    left = (-c * sin, c * cos, a * sin - b * cos)
+    norm = math.sqrt(left[0] ** 2 + left[1] ** 2 + left[2] ** 2)
+    p, q, r = left[0] / norm, left[1] / norm, left[2] / norm
+    return (q * c - r * b, p, a), (r * a - p * c, q, b), (p * b - q * a, r, c)
 
 
 @njit(error_model="numpy")
 def _commands(quaternions: NDArray) -> NDArray:
     """Return what command_quaternion gives: z as planned, x above [cos yaw, sin yaw]."""
-    out = np.empty((len(quaternions), 4))
-    planned = matrices_of(quaternions)
-    for n in range(len(quaternions)):
-        _point_to_yaw(planned[n])
-        write_quaternion(out[n], planned[n])
+    out, panel = np.empty((len(quaternions), 4)), np.empty(8 * WIDTH)
+    for begin in range(0, len(quaternions), WIDTH):
+        lanes = lanes_for(len(quaternions) - begin)
+        take_in(panel, 0, quaternions, begin, lanes)
+        _point_all_to_yaw(panel, lanes)
+        give_out(out, begin, panel, 4)
     return out
 
 
 @register_jitable
-def _point_to_yaw(frame: NDArray) -> None:
-    """Turn a planned attitude, (3, 3), about its z, in place, to the one that is sent: x above [cos yaw, sin yaw]."""
-    a, b, c = frame[0, 2], frame[1, 2], frame[2, 2]
-    cos, sin = _direction(frame[1, 1], -frame[0, 1])  # of yaw
+def _point_all_to_yaw(panel: NDArray, lanes: int) -> None:
+    """Write _pointed_to_yaw() of the first four rows to the next four."""
+    lanes = min(lanes, WIDTH)
+    for n in range(lanes):
+        frame = _pointed_to_yaw(_rows_of(quaternion_in(panel, 0, n)))
+        write_quaternion_in(panel, 4, n, quaternion_of(frame))
+
+
+@register_jitable(forceinline=True)
+def _pointed_to_yaw(frame: Matrix) -> Matrix:
+    """Return a planned attitude turned about its z to the one that is sent: x above [cos yaw, sin yaw]."""
+    a, b, c = frame[0][2], frame[1][2], frame[2][2]
+    cos, sin = _direction(frame[1][1], -frame[0][1])  # of yaw
     rise = -(cos * a + sin * b) / c
     norm = math.sqrt(1.0 + rise * rise)
     p, q, r = cos / norm, sin / norm, rise / norm
-    frame[0, 0], frame[1, 0], frame[2, 0] = p, q, r
-    frame[0, 1], frame[1, 1], frame[2, 1] = b * r - c * q, c * p - a * r, a * q - b * p
+    return (p, b * r - c * q, a), (q, c * p - a * r, b), (r, a * q - b * p, c)
 
 
-@njit(error_model="numpy")
+@register_jitable(forceinline=True)
 def _direction(x: float, y: float) -> tuple[float, float]:
     """Return cosine and sine of atan2(y, x)."""
     size = math.sqrt(x * x + y * y)
-    return (1.0, 0.0) if size == 0.0 else (x / size, y / size)
+    cos, sin = x / size, y / size
+    return cos if size > 0.0 else 1.0, sin if size > 0.0 else 0.0

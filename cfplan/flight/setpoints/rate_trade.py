@@ -38,7 +38,19 @@ from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import heading_of, norms, product, write_matrix, write_rotation
+from cfplan.vehicle.panels import (
+    WIDTH,
+    give_out,
+    lanes_for,
+    pair_in,
+    quaternion_in,
+    take_in,
+    triple_in,
+    write_pair,
+    write_quaternion_in,
+    write_triple,
+)
+from cfplan.vehicle.rotations import dot, heading_of, matrix_rows, norms, product, transpose, turn_rows
 from cfplan.vehicle.trigonometry import cosine, sine
 
 BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ahead of the setpoint
@@ -212,6 +224,12 @@ def _walls(space: Space | None) -> NDArray:
     return np.array([space.low[:2], space.high[:2]]) if space else np.array([[-np.inf] * 2, [np.inf] * 2])
 
 
+# Rows of the panels of _traded: what comes in, what is in between, and what goes out.
+_PLACE, _SPEED, _FORCE, _AHEAD, _ATTITUDE, _TURNING = 0, 2, 4, 7, 9, 13
+_BACK, _TRADED, _SIZE, _MOST = 15, 19, 21, 22
+_RATE, _TURNED, _PUSH, _ROWS = 23, 25, 29, 32
+
+
 @njit(error_model="numpy")
 def _traded(
     position: NDArray,
@@ -226,64 +244,122 @@ def _traded(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return what trade_rates gives: body rates (N, 3), attitudes (N, 4) and accelerations (N, 3)."""
     rates, attitudes, accelerations = body_rate.copy(), np.empty_like(quaternion), np.empty_like(acceleration)
-    for n in range(len(velocity)):
-        wx, wy = body_rate[n, 0], body_rate[n, 1]
-        good_x, good_y = _good_rate(
-            position[n], velocity[n], acceleration_ahead[n], quaternion[n], walls, full_rate, level_out
-        )
-        half = -0.5 * ATTITUDE_AGE * math.sqrt(wx * wx + wy * wy)
-        back = _turn(sine(half), cosine(half), wx, wy)
-        dx, dy = wx - good_x, wy - good_y
-        size = math.sqrt(dx * dx + dy * dy)
-        most = min(TRADED_RATE_MAX, _most_by_lean(product(quaternion[n], back), dx, dy, size, full_rate))
-        share = most / size if size > most else 1.0
-        rates[n, 0] = math.floor((wx - share * dx) / _QUANTUM + 0.5) * _QUANTUM
-        rates[n, 1] = math.floor((wy - share * dy) / _QUANTUM + 0.5) * _QUANTUM
-
-        dx, dy = wx - rates[n, 0], wy - rates[n, 1]
-        size = math.sqrt(dx * dx + dy * dy)
-        share = min(size / full_rate, 1.0)  # the sine of the turn
-        half = math.sqrt(0.5 + 0.5 * math.sqrt(1.0 - share * share))  # the cosine of half of it
-        turn = product(back, _turn(0.5 * share / half, half, dx, dy))
-        turned = product(quaternion[n], turn)
-        for k in range(4):
-            attitudes[n, k] = turned[k]
-
-        x, y, z, w = turned
-        fx, fy, fz = acceleration[n, 0], acceleration[n, 1], acceleration[n, 2] + GRAVITY
-        thrust = math.sqrt(fx * fx + fy * fy + fz * fz) / (1.0 - 2.0 * (turn[0] ** 2 + turn[1] ** 2))
-        scale = 2.0 * thrust / (x * x + y * y + z * z + w * w)
-        accelerations[n, 0] = scale * (x * z + y * w)
-        accelerations[n, 1] = scale * (y * z - x * w)
-        accelerations[n, 2] = thrust - scale * (x * x + y * y) - GRAVITY
+    panel = np.empty(_ROWS * WIDTH)
+    sides = (walls[0, 0], walls[1, 0]), (walls[0, 1], walls[1, 1])
+    goal = (level_out[0], level_out[1], level_out[2], level_out[3], level_out[4])
+    for begin in range(0, len(velocity), WIDTH):
+        lanes = lanes_for(len(velocity) - begin)
+        take_in(panel, _PLACE, position[:, :2], begin, lanes)
+        take_in(panel, _SPEED, velocity[:, :2], begin, lanes)
+        take_in(panel, _FORCE, acceleration, begin, lanes)
+        take_in(panel, _AHEAD, acceleration_ahead[:, :2], begin, lanes)
+        take_in(panel, _ATTITUDE, quaternion, begin, lanes)
+        take_in(panel, _TURNING, body_rate[:, :2], begin, lanes)
+        _find_trades(panel, lanes, sides, goal, full_rate)
+        for n in range(lanes):
+            if math.isnan(panel[_MOST * WIDTH + n]):
+                attitude = product(quaternion_in(panel, _ATTITUDE, n), quaternion_in(panel, _BACK, n))
+                dx, dy = pair_in(panel, _TRADED, n)
+                panel[_MOST * WIDTH + n] = _most_by_lean(attitude, dx, dy, panel[_SIZE * WIDTH + n], full_rate)
+        _make_trades(panel, lanes, full_rate)
+        give_out(rates[:, :2], begin, panel, _RATE)
+        give_out(attitudes, begin, panel, _TURNED)
+        give_out(accelerations, begin, panel, _PUSH)
     return rates, attitudes, accelerations
 
 
+_Sides = tuple[tuple[float, float], tuple[float, float]]  # the walls' x, and y
+_Goal = tuple[float, float, float, float, float]  # LevelOut, packed
+
+
 @register_jitable
+def _find_trades(panel: NDArray, lanes: int, sides: _Sides, goal: _Goal, full_rate: float) -> None:
+    lanes = min(lanes, WIDTH)  # the compiler must see that no index overflows
+    for n in range(lanes):
+        _find_trade(panel, n, sides, goal, full_rate)
+
+
+@register_jitable(forceinline=True)
+def _find_trade(panel: NDArray, n: int, sides: _Sides, goal: _Goal, full_rate: float) -> None:
+    """Write how the attitude is believed turned back, the rate that would best be traded, and how much of it may be.
+
+    That is the full rate where all of it, or TRADED_RATE_MAX, may, which is seen without an angle; else it is NaN.
+    """
+    attitude, (wx, wy) = quaternion_in(panel, _ATTITUDE, n), pair_in(panel, _TURNING, n)
+    place, speed, coming = pair_in(panel, _PLACE, n), pair_in(panel, _SPEED, n), pair_in(panel, _AHEAD, n)
+    good_x, good_y = _good_rate(place, speed, coming, attitude, sides, full_rate, goal)
+    half = -0.5 * ATTITUDE_AGE * math.sqrt(wx * wx + wy * wy)
+    back = _turn(sine(half), cosine(half), wx, wy)
+    dx, dy = wx - good_x, wy - good_y
+    size = math.sqrt(dx * dx + dy * dy)
+    aside, lift = _lean(product(attitude, back), dx, dy, size)
+    share = min(size, TRADED_RATE_MAX) / full_rate  # the sine of the turn
+    upright = lift * math.sqrt(1.0 - share * share) + aside * share
+    most = full_rate if upright >= _LEAST_LIFT else math.nan
+    most = most if share < 1.0 else math.nan
+    write_quaternion_in(panel, _BACK, n, back)
+    write_pair(panel, _TRADED, n, dx, dy)
+    panel[_SIZE * WIDTH + n], panel[_MOST * WIDTH + n] = size, full_rate if size == 0.0 else most
+
+
+@register_jitable
+def _make_trades(panel: NDArray, lanes: int, full_rate: float) -> None:
+    lanes = min(lanes, WIDTH)
+    for n in range(lanes):
+        _make_trade(panel, n, full_rate)
+
+
+@register_jitable(forceinline=True)
+def _make_trade(panel: NDArray, n: int, full_rate: float) -> None:
+    """Write the rates that are sent, the attitude with what is traded, and the acceleration along it."""
+    (wx, wy), (dx, dy), size = pair_in(panel, _TURNING, n), pair_in(panel, _TRADED, n), panel[_SIZE * WIDTH + n]
+    most = min(TRADED_RATE_MAX, panel[_MOST * WIDTH + n])
+    share = most / size if size > most else 1.0
+    rate_x = np.floor((wx - share * dx) / _QUANTUM + 0.5) * _QUANTUM
+    rate_y = np.floor((wy - share * dy) / _QUANTUM + 0.5) * _QUANTUM
+
+    dx, dy = wx - rate_x, wy - rate_y
+    size = math.sqrt(dx * dx + dy * dy)
+    share = min(size / full_rate, 1.0)  # the sine of the turn
+    half = math.sqrt(0.5 + 0.5 * math.sqrt(1.0 - share * share))  # the cosine of half of it
+    turn = product(quaternion_in(panel, _BACK, n), _turn(0.5 * share / half, half, dx, dy))
+    turned = product(quaternion_in(panel, _ATTITUDE, n), turn)
+
+    x, y, z, w = turned
+    fx, fy, fz = triple_in(panel, _FORCE, n)
+    fz += GRAVITY
+    thrust = math.sqrt(fx * fx + fy * fy + fz * fz) / (1.0 - 2.0 * (turn[0] ** 2 + turn[1] ** 2))
+    scale = 2.0 * thrust / (x * x + y * y + z * z + w * w)
+    push = scale * (x * z + y * w), scale * (y * z - x * w), thrust - scale * (x * x + y * y) - GRAVITY
+    write_pair(panel, _RATE, n, rate_x, rate_y)
+    write_quaternion_in(panel, _TURNED, n, turned)
+    write_triple(panel, _PUSH, n, push)
+
+
+@register_jitable(forceinline=True)
 def _turn(sin_half: float, cos_half: float, x: float, y: float) -> tuple[float, float, float, float]:
     """Return the quaternion that turns about (x, y, 0), by twice the angle with that sine and cosine."""
     size = math.sqrt(x * x + y * y)
-    along = sin_half / size if size > 0.0 else 0.0
+    along = sin_half / size
+    along = along if size > 0.0 else 0.0
     return along * x, along * y, 0.0, cos_half
+
+
+@register_jitable(forceinline=True)
+def _lean(quaternion: tuple[float, float, float, float], dx: float, dy: float, size: float) -> tuple[float, float]:
+    """Return by how much the thrust leans in the vertical plane in which a rate along (dx, dy) turns it, and rises."""
+    x, y, z, w = quaternion
+    square = x * x + y * y + z * z + w * w
+    aside = 2.0 * ((x * z - y * w) * dy - (y * z + x * w) * dx) / (size * square)
+    return aside, 1.0 - 2.0 * (x * x + y * y) / square
 
 
 @register_jitable
 def _most_by_lean(
     quaternion: tuple[float, float, float, float], dx: float, dy: float, size: float, full_rate: float
 ) -> float:
-    """Return how much of a rate along (dx, dy), of that size, rad/s, may be traded until the thrust leans too far.
-
-    Where all of it may, or TRADED_RATE_MAX, which is seen without an angle, that is said to be the full rate.
-    """
-    if size == 0.0:
-        return full_rate
-    x, y, z, w = quaternion
-    square = x * x + y * y + z * z + w * w
-    aside = 2.0 * ((x * z - y * w) * dy - (y * z + x * w) * dx) / (size * square)
-    lift = 1.0 - 2.0 * (x * x + y * y) / square
-    share = min(size, TRADED_RATE_MAX) / full_rate  # the sine of the turn
-    if share < 1.0 and lift * math.sqrt(1.0 - share * share) + aside * share >= _LEAST_LIFT:
-        return full_rate
+    """Return how much of a rate along (dx, dy), of that size, rad/s, may be traded until the thrust leans too far."""
+    aside, lift = _lean(quaternion, dx, dy, size)
     reached = math.sqrt(aside * aside + lift * lift)
     turn = math.atan2(aside, lift)
     if reached > _LEAST_LIFT:
@@ -291,40 +367,44 @@ def _most_by_lean(
     return full_rate * math.sin(min(max(turn, 0.0), 0.5 * math.pi))
 
 
-@register_jitable
+@register_jitable(forceinline=True)
 def _good_rate(
-    position: NDArray,
-    velocity: NDArray,
-    acceleration_ahead: NDArray,
-    quaternion: NDArray,
-    walls: NDArray,
+    place: tuple[float, float],
+    velocity: tuple[float, float],
+    ahead: tuple[float, float],
+    quaternion: tuple[float, float, float, float],
+    sides: _Sides,
     full_rate: float,
-    level_out: NDArray,
+    goal: _Goal,
 ) -> tuple[float, float]:
     """Return the roll and pitch rates, rad/s, at which level-out brakes the speed left and leans away from walls."""
-    braking, rate_max = level_out[0], level_out[1]
+    braking, rate_max = goal[0], goal[1]
     x, y = heading_of(quaternion)
     size = math.sqrt(x * x + y * y)
-    cos, sin = (x / size, y / size) if size > 0.0 else (1.0, 0.0)
-    pull_x = -braking * (SPEED_LEFT * velocity[0] + SPEED_GAINED * acceleration_ahead[0])
-    pull_y = -braking * (SPEED_LEFT * velocity[1] + SPEED_GAINED * acceleration_ahead[1])
-    pull_x += _pull_off(position[0] + WALL_LEAD * velocity[0], walls[0, 0], walls[1, 0], level_out)
-    pull_y += _pull_off(position[1] + WALL_LEAD * velocity[1], walls[0, 1], walls[1, 1], level_out)
+    cos, sin = x / size, y / size
+    cos, sin = cos if size > 0.0 else 1.0, sin if size > 0.0 else 0.0
+    pull_x = -braking * (SPEED_LEFT * velocity[0] + SPEED_GAINED * ahead[0])
+    pull_y = -braking * (SPEED_LEFT * velocity[1] + SPEED_GAINED * ahead[1])
+    pull_x += _pull_off(place[0] + WALL_LEAD * velocity[0], sides[0], goal)
+    pull_y += _pull_off(place[1] + WALL_LEAD * velocity[1], sides[1], goal)
     forward, left = cos * pull_x + sin * pull_y, cos * pull_y - sin * pull_x
     pull = math.sqrt(forward * forward + left * left)
     scale = full_rate / math.sqrt(GRAVITY * GRAVITY + pull * pull)  # sin(atan(pull / g)) / pull
-    if scale * pull > rate_max:
-        scale = rate_max / pull
+    scale = rate_max / pull if scale * pull > rate_max else scale
     return -scale * left, scale * forward
 
 
-@register_jitable
-def _pull_off(place: float, low: float, high: float, level_out: NDArray) -> float:
+@register_jitable(forceinline=True)
+def _pull_off(place: float, sides: tuple[float, float], goal: _Goal) -> float:
     """Return the acceleration, m/s², away from two opposite walls."""
-    _, _, reach, stiffness, pull_max = level_out
-    off_low = min(max(stiffness * (reach - (place - low)), 0.0), pull_max)
-    off_high = min(max(stiffness * (reach - (high - place)), 0.0), pull_max)
+    _, _, reach, stiffness, pull_max = goal
+    off_low = min(max(stiffness * (reach - (place - sides[0])), 0.0), pull_max)
+    off_high = min(max(stiffness * (reach - (sides[1] - place)), 0.0), pull_max)
     return off_low - off_high
+
+
+# Rows of the panels of _harmless: what comes in, what is in between, and what goes out.
+_EXCESS, _LENGTH, _LEANING, _ALLOWED, _HARMLESS, _HARMLESS_ROWS = 15, 17, 18, 20, 21, 23
 
 
 @njit(error_model="numpy")
@@ -339,37 +419,92 @@ def _harmless(
     level_out: NDArray,
 ) -> NDArray:
     """Return what harmless_rates gives, (N, 2) rad/s."""
-    out = np.empty((len(position), 2))
-    braking, rate_max, reach, stiffness, pull_max = level_out
-    frame, seen, wanted = np.empty((3, 3)), np.empty((3, 3)), np.empty(2)
-    for n in range(len(position)):
-        for k in range(2):
-            place = position[n, k] + WALL_LEAD * velocity[n, k]
-            off_low = min(stiffness * max(reach - (place - walls[0, k]), 0.0), pull_max)
-            off_high = min(stiffness * max(reach - (walls[1, k] - place), 0.0), pull_max)
-            speed_left = SPEED_LEFT * velocity[n, k] + SPEED_GAINED * acceleration_ahead[n, k]
-            wanted[k] = off_low - off_high - braking * speed_left
-        x, y = heading_of(quaternion[n])
-        size = max(math.sqrt(x * x + y * y), 1e-12)
-        cos, sin = x / size, y / size
-        forward, left = wanted[0] * cos + wanted[1] * sin, wanted[1] * cos - wanted[0] * sin
-        size = max(math.sqrt(forward * forward + left * left), 1e-12)
-        rate = min(full_rate * math.sin(math.atan(size / GRAVITY)), rate_max) / size
-        wx, wy = body_rate[n, 0], body_rate[n, 1]
-        dx, dy = wx + rate * left, wy - rate * forward
-        size = max(math.sqrt(dx * dx + dy * dy), 1e-12)
-        x, y, z, w = quaternion[n]
-        write_matrix(frame, quaternion[n], 2.0 / (x * x + y * y + z * z + w * w))
-        write_rotation(seen, -ATTITUDE_AGE * wx, -ATTITUDE_AGE * wy, 0.0)
-        up_x, up_y, up_z = (  # in the axes believed
-            frame[2, 0] * seen[0, 0] + frame[2, 1] * seen[1, 0] + frame[2, 2] * seen[2, 0],
-            frame[2, 0] * seen[0, 1] + frame[2, 1] * seen[1, 1] + frame[2, 2] * seen[2, 1],
-            frame[2, 0] * seen[0, 2] + frame[2, 1] * seen[1, 2] + frame[2, 2] * seen[2, 2],
-        )
-        aside = (up_x * dy - up_y * dx) / size
-        upright = math.atan2(aside, up_z)  # the turn after which the axis leans least, by acos(reached)
-        reached = math.sqrt(aside * aside + up_z * up_z)
-        widest = upright + math.acos(min(_LEAST_LIFT / reached, 1.0))
-        most = min(TRADED_RATE_MAX, full_rate * math.sin(min(max(widest, 0.0), 0.5 * math.pi)))
-        out[n, 0], out[n, 1] = wx - min(size, most) / size * dx, wy - min(size, most) / size * dy
+    out, panel = np.empty((len(position), 2)), np.empty(_HARMLESS_ROWS * WIDTH)
+    sides = (walls[0, 0], walls[1, 0]), (walls[0, 1], walls[1, 1])
+    goal = (level_out[0], level_out[1], level_out[2], level_out[3], level_out[4])
+    for begin in range(0, len(position), WIDTH):
+        lanes = lanes_for(len(position) - begin)
+        take_in(panel, _PLACE, position[:, :2], begin, lanes)
+        take_in(panel, _SPEED, velocity[:, :2], begin, lanes)
+        take_in(panel, _AHEAD, acceleration_ahead[:, :2], begin, lanes)
+        take_in(panel, _ATTITUDE, quaternion, begin, lanes)
+        take_in(panel, _TURNING, body_rate[:, :2], begin, lanes)
+        _find_excesses(panel, lanes, sides, goal, full_rate)
+        for n in range(lanes):
+            if math.isnan(panel[_ALLOWED * WIDTH + n]):
+                aside, up_z = pair_in(panel, _LEANING, n)
+                upright = math.atan2(aside, up_z)  # the turn after which the axis leans least, by acos(reached)
+                reached = math.sqrt(aside * aside + up_z * up_z)
+                widest = upright + math.acos(min(_LEAST_LIFT / reached, 1.0))
+                panel[_ALLOWED * WIDTH + n] = full_rate * math.sin(min(max(widest, 0.0), 0.5 * math.pi))
+        _leave_excesses(panel, lanes)
+        give_out(out, begin, panel, _HARMLESS)
     return out
+
+
+@register_jitable
+def _leave_excesses(panel: NDArray, lanes: int) -> None:
+    """Write the rates less what of the excess may be traded."""
+    lanes = min(lanes, WIDTH)
+    for n in range(lanes):
+        (wx, wy), (dx, dy) = pair_in(panel, _TURNING, n), pair_in(panel, _EXCESS, n)
+        size = panel[_LENGTH * WIDTH + n]
+        share = min(size, min(TRADED_RATE_MAX, panel[_ALLOWED * WIDTH + n])) / size
+        write_pair(panel, _HARMLESS, n, wx - share * dx, wy - share * dy)
+
+
+@register_jitable
+def _find_excesses(panel: NDArray, lanes: int, sides: _Sides, goal: _Goal, full_rate: float) -> None:
+    lanes = min(lanes, WIDTH)
+    for n in range(lanes):
+        _find_excess(panel, n, sides, goal, full_rate)
+
+
+@register_jitable(forceinline=True)
+def _find_excess(panel: NDArray, n: int, sides: _Sides, goal: _Goal, full_rate: float) -> None:
+    """Write the rate that does no good, and how much of it may be traded: all, or NaN where that takes angles to tell.
+
+    All may be traded where the thrust, turned as far as that takes, does not lean too far.
+    """
+    braking, rate_max, reach, stiffness, pull_max = goal
+    place, speed, coming = pair_in(panel, _PLACE, n), pair_in(panel, _SPEED, n), pair_in(panel, _AHEAD, n)
+    quaternion, (wx, wy) = quaternion_in(panel, _ATTITUDE, n), pair_in(panel, _TURNING, n)
+    pushed_x = _push(place[0], speed[0], sides[0], reach, stiffness, pull_max)
+    pushed_y = _push(place[1], speed[1], sides[1], reach, stiffness, pull_max)
+    wanted_x = pushed_x - braking * (SPEED_LEFT * speed[0] + SPEED_GAINED * coming[0])
+    wanted_y = pushed_y - braking * (SPEED_LEFT * speed[1] + SPEED_GAINED * coming[1])
+    x, y = heading_of(quaternion)
+    size = max(math.sqrt(x * x + y * y), 1e-12)
+    cos, sin = x / size, y / size
+    forward, left = wanted_x * cos + wanted_y * sin, wanted_y * cos - wanted_x * sin
+    size = max(math.sqrt(forward * forward + left * left), 1e-12)
+    tangent = size / GRAVITY  # of the tilt
+    rate = min(full_rate * (tangent / math.sqrt(1.0 + tangent * tangent)), rate_max) / size
+    dx, dy = wx + rate * left, wy - rate * forward
+    size = max(math.sqrt(dx * dx + dy * dy), 1e-12)
+
+    x, y, z, w = quaternion
+    _, _, vertical = matrix_rows(quaternion, 2.0 / (x * x + y * y + z * z + w * w))
+    turned = max(ATTITUDE_AGE * math.sqrt(wx * wx + wy * wy), 1e-12)
+    half = sine(0.5 * turned) / turned
+    seen = turn_rows(-ATTITUDE_AGE * wx, -ATTITUDE_AGE * wy, sine(turned) / turned, 2.0 * half * half)
+    of_x, of_y, of_z = transpose(seen)
+    up_x, up_y, up_z = dot(vertical, of_x), dot(vertical, of_y), dot(vertical, of_z)  # in the axes believed
+    aside = (up_x * dy - up_y * dx) / size
+    turn = min(size, TRADED_RATE_MAX) / full_rate  # its sine
+    lift = up_z * math.sqrt(1.0 - turn * turn) + aside * turn
+    write_pair(panel, _EXCESS, n, dx, dy)
+    write_pair(panel, _LEANING, n, aside, up_z)
+    panel[_LENGTH * WIDTH + n] = size
+    panel[_ALLOWED * WIDTH + n] = TRADED_RATE_MAX if lift >= _LEAST_LIFT else math.nan
+
+
+@register_jitable(forceinline=True)
+def _push(
+    place: float, speed: float, sides: tuple[float, float], reach: float, stiffness: float, pull_max: float
+) -> float:
+    """Return the acceleration, m/s², that two opposite walls ask for."""
+    soon = place + WALL_LEAD * speed
+    off_low = min(stiffness * max(reach - (soon - sides[0]), 0.0), pull_max)
+    off_high = min(stiffness * max(reach - (sides[1] - soon), 0.0), pull_max)
+    return off_low - off_high

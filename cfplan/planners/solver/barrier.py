@@ -243,13 +243,13 @@ def accept_step(
 
     Multipliers stay within a factor of what the barrier makes of their slacks.
     """
-    after, terms = slacks.copy(), np.empty((4, len(g)))
-    return after, terms, Errors(*_accept_step(g, bounds, after, step, share, share_dual, barrier, terms))
+    after, terms = np.empty_like(slacks), np.empty((4, len(g)))
+    return after, terms, Errors(*_accept_step(g, bounds, slacks, step, share, share_dual, barrier, after, terms))
 
 
 def _accept_step_interpreted(
     g: NDArray, bounds: NDArray, slacks: NDArray, step: NDArray, share: float, share_dual: float, barrier: float,
-    terms: NDArray,
+    after: NDArray, terms: NDArray,
 ) -> Errors:  # fmt: skip
     lower, upper, has_low, has_high, bounded = bounds
     s = slacks[0] + share * step[0]
@@ -258,18 +258,19 @@ def _accept_step_interpreted(
         np.clip(slacks[k] + share_dual * step[k], barrier * by / COMPLEMENTARY, barrier * by * COMPLEMENTARY)
         for k, by in ((1, by_below), (2, by_above))
     )
-    slacks[:] = s, low, high
+    after[:] = s, low, high
     sigma = low * by_below + high * by_above
     terms[:] = sigma, high - low, by_above - by_below, sigma * bounded * (g - s)
-    return _errors_interpreted(g, bounds, slacks, barrier)
+    return _errors_interpreted(g, bounds, after, barrier)
 
 
 @njit(interpreted=_accept_step_interpreted, error_model="numpy", fastmath=_SUMS)
-def _accept_step(g, bounds, slacks, step, share, share_dual, barrier, terms):
-    """Take the step, fill in the terms, and return the Errors."""
+def _accept_step(g, bounds, slacks, step, share, share_dual, barrier, after, terms):
+    """Fill in the slacks after the step, and the terms; return the Errors."""
     lower, upper, has_low, has_high, bounded = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
     ds, dlow, dhigh = step[0], step[1], step[2]
     s, low, high = slacks[0], slacks[1], slacks[2]
+    new_s, new_low, new_high = after[0], after[1], after[2]
     sigma, multiplier, slope, residual = terms[0], terms[1], terms[2], terms[3]
     infeasible, off = np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
@@ -281,7 +282,7 @@ def _accept_step(g, bounds, slacks, step, share, share_dual, barrier, terms):
         of_low = min(max(low[j] + share_dual * dlow[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
         middle = barrier * by_above
         of_high = min(max(high[j] + share_dual * dhigh[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
-        s[j], low[j], high[j] = there, of_low, of_high
+        new_s[j], new_low[j], new_high[j] = there, of_low, of_high
         curvature = of_low * by_below + of_high * by_above
         missed = bounded[j] * (g[j] - there)
         sigma[j], multiplier[j] = curvature, of_high - of_low

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from cfplan.deadline import NEVER, Deadline
 from cfplan.geometry import banded
+from cfplan.machine_code import njit
 from cfplan.planners.solver.barrier import (
     Errors,
     SearchDirection,
@@ -164,8 +165,7 @@ def minimise(
     filtered, regularised = _Filter(1e4 * max(1.0, infeasible)), 0.0
     for iteration in range(search.iterations):
         near = program.linearise(v, terms)
-        gradient, by_multiplier, by_barrier, by_residual = near.gradients
-        off_gradient = float(np.abs(gradient + by_multiplier).max())
+        off_gradient = _largest_gradient(near.gradients)
         if deadline.passed:
             return ended(False, iteration, f"{OUT_OF_TIME} after {iteration} iterations")
         if not math.isfinite(infeasible + off_gradient + values.cost):
@@ -181,9 +181,8 @@ def minimise(
             filtered.pairs.clear()
             infeasible, walls = merit_terms(values.constraints, bounds, slacks, slacks, 0.0, barrier, rows)
 
-        dv, added = banded.solve_regularised(near.matrix, -(gradient + barrier * by_barrier + by_residual), regularised)
+        dv, added, slope = _newton_step(near.matrix, near.gradients, barrier, regularised)
         regularised = added if added > 0.0 else regularised / 3.0
-        slope = float(gradient @ dv)
         if not math.isfinite(slope):
             return ended(False, iteration, "no direction of descent")
         dg = near.jvp(dv)
@@ -206,6 +205,29 @@ def minimise(
             if _error(off, left, search) <= BARRIER_SOLVED * barrier:
                 return ended(True, iteration + 1, f"solved in {iteration + 1} iterations")
     return ended(False, search.iterations, f"not solved in {search.iterations} iterations")
+
+
+@njit(error_model="numpy")
+def _largest_gradient(gradients):
+    """Return the largest entry of the gradient of the Lagrangian; not finite where one is not."""
+    largest, total = 0.0, 0.0
+    for k in range(gradients.shape[1]):
+        value = abs(gradients[0, k] + gradients[1, k])
+        largest, total = max(largest, value), total + value
+    return largest if math.isfinite(total) else total
+
+
+@njit(error_model="numpy")
+def _newton_step(matrix, gradients, barrier, regularised):
+    """Return the step of v, what was added to the diagonal of the matrix, and the slope of f along the step."""
+    right = np.empty(gradients.shape[1])
+    for k in range(len(right)):
+        right[k] = -(gradients[0, k] + barrier * gradients[2, k] + gradients[3, k])
+    dv, added = banded.solve_regularised(matrix, right, regularised)
+    slope = 0.0
+    for k in range(len(dv)):
+        slope += gradients[0, k] * dv[k]
+    return dv, added, slope
 
 
 def _line_search(

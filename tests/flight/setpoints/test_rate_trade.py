@@ -131,6 +131,25 @@ def test_rates_that_are_sent_change_steadily_with_the_motion(tilt, direction, ya
     assert np.abs(np.diff(trade_rates(motion, none).body_rate, axis=0)).max() < 0.1
 
 
+@pytest.mark.parametrize("count", [1, 7, 8, 63, 64, 65, 130])
+def test_a_setpoint_does_not_depend_on_those_beside_it(count):
+    """Wherever it lies among those that are computed at once; half of them may not be traded whole."""
+    rng = np.random.default_rng(count)
+    turns = [Rotation.from_rotvec(tilt * np.array([1.0, 0.0, 0.0])) for tilt in rng.uniform(0.0, LEAN_MAX + 0.2, count)]
+    motion = FullStateSetpoints(
+        *rng.uniform(-2.0, 2.0, (3, count, 3)), np.array([turn.as_quat() for turn in turns]),
+        rng.uniform(-4.0, 4.0, (count, 3)),
+    )  # fmt: skip
+    coming = rng.uniform(-3.0, 3.0, (count, 3))
+    together, harmless = trade_rates(motion, coming), harmless_rates(motion, coming)
+    for n in range(count):
+        one = FullStateSetpoints(*(getattr(motion, name)[n : n + 1] for name in FullStateSetpoints.__slots__))
+        alone = trade_rates(one, coming[n : n + 1])
+        for name in FullStateSetpoints.__slots__:
+            np.testing.assert_array_equal(getattr(together, name)[n], getattr(alone, name)[0], err_msg=name)
+        assert harmless[n] == pytest.approx(harmless_rates(one, coming[n : n + 1])[0], abs=1e-12)
+
+
 def test_an_attitude_that_leans_as_far_itself_is_only_righted():
     """Roll by a rate that turns it on stays a rate; one that rights it is traded as ever."""
     on, back = (leaning(LEAN_MAX + 0.02, 0.0, 0.0, (rate, 0.0, 0.0)) for rate in (2.0, -2.0))
