@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,14 +15,17 @@ import click
 
 from cfplan.cli import options
 from cfplan.cli.output import Steps
-from cfplan.errors import LinkError
+from cfplan.errors import InputError, LinkError
 
 if TYPE_CHECKING:
     from cfplan.recording.rerun.live import LiveView
     from cfplan.safety.limits import Limits
-    from cfplan.simulation.lab.lab import Truth
+    from cfplan.simulation.lab.lab import Lab, Truth
 
 _LOOK = 0.05  # s
+_MOST = 5  # vehicles: cfclient scans ten ports, and each has two
+_APART = 1.0  # m between vehicles that stand side by side
+_LAST_PORT = 65535
 LOCKED = (
     "the supervisor has locked: its last flight ended without the word that no setpoints follow, and motors stay off "
     "until the vehicle is restarted (key r; without a keyboard, end this command and start it again)"
@@ -34,17 +38,30 @@ LOCKED = (
 Examples:
   cfplan virtual                                  then connect to udp://127.0.0.1:19850
   cfplan virtual --live                           the same, seen in rerun
+  cfplan virtual --vicon 8010                     with poses by a virtual Vicon, as in a lab; in a second terminal:
+  cfplan fly first.yaml --uri udp://127.0.0.1:19850 --mocap vicon://127.0.0.1:8010/cf1
+  cfplan virtual --count 3 --vicon 8010           three in one room: cf1, cf2 and cf3
   CFLIB_URI=udp://127.0.0.1:19850 python examples/logging/basiclog.py""",
 )
 @click.option(
     "--port", type=click.IntRange(1024, 65534), default=19850, show_default=True,
-    help="UDP; cfclient scans 19850 to 19859. The next port gives poses.",
+    help="UDP; cfclient scans 19850 to 19859. The next port gives poses; each other vehicle has two more.",
+)  # fmt: skip
+@click.option(
+    "--count", type=click.IntRange(1, _MOST), default=1, show_default=True,
+    help="Vehicles in the room, a metre apart along y. They do not collide.",
+)  # fmt: skip
+@click.option(
+    "--vicon", "vicon_port", type=click.IntRange(1024, 65535),
+    help="TCP; a virtual Vicon shows them there as cf1, cf2, …, and they have no poses on board.",
 )  # fmt: skip
 @click.option("--seconds", type=click.FloatRange(0.1), help="End after this time; else with Ctrl-C.")
 @click.option("--live", is_flag=True, help="Show it in rerun.")
 @click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="File that names the vehicle to serve.")
-def virtual(port: int, seconds: float | None, live: bool, safety_file: Path | None) -> None:
-    """Serve the virtual Crazyflie over UDP, with poses on board as from a positioning deck.
+def virtual(
+    port: int, count: int, vicon_port: int | None, seconds: float | None, live: bool, safety_file: Path | None
+) -> None:
+    """Serve virtual Crazyflies over UDP, with poses on board as from a positioning deck, or by a virtual Vicon.
 
     As on the real one, the supervisor locks after a flight that ended without a word: then nothing flies until the
     vehicle is restarted, with the key r.
@@ -52,11 +69,13 @@ def virtual(port: int, seconds: float | None, live: bool, safety_file: Path | No
     from cfplan.safety.limits_file import load_limits
 
     limits = load_limits(options.find_safety_file(safety_file, Path.cwd() / "here"))
+    room = VirtualRoom(limits, port, count, vicon_port)
+    room.require_ports()
     end = time.monotonic() + seconds if seconds is not None else float("inf")
     view = _open_view(limits) if live else None
     try:
         with _typed() as typed:
-            while _serve(limits, port, end, view, typed):
+            while _serve(room, end, view, typed):
                 click.echo("\nrestarted: connect again", err=True)
     except KeyboardInterrupt:
         pass
@@ -67,36 +86,91 @@ def virtual(port: int, seconds: float | None, live: bool, safety_file: Path | No
             click.echo(err=True)
 
 
-def _serve(limits: "Limits", port: int, end: float, view: "LiveView | None", typed: Callable[[], bytes]) -> bool:
-    """Serve one vehicle until time is up, or until the key r is typed: then return True."""
-    from cfplan.simulation.lab.lab import start_lab
-    from cfplan.simulation.lab.room import RoomSettings
+@dataclass(frozen=True, slots=True)
+class VirtualRoom:
+    """The vehicles to serve, and how."""
+
+    limits: "Limits"
+    port: int
+    count: int
+    vicon_port: int | None  # None: poses come on board
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the vehicles, as motion capture has them."""
+        return [f"cf{number}" for number in range(1, self.count + 1)]
+
+    def places(self) -> list[tuple[float, float, float]]:
+        """Return where they stand, m: the first at the origin, the others on its sides along y, inside the space."""
+        space = self.limits.space
+        reach = min(-space.low[1], space.high[1]) - space.margin
+        apart = min(_APART, max(reach, 0.0) / max(self.count // 2, 1))
+        return [(0.0, apart * ((k + 1) // 2) * (1 if k % 2 else -1), 0.0) for k in range(self.count)]
+
+    def require_ports(self) -> None:
+        """Raise InputError where the ports of the vehicles go beyond what there is, or the Vicon's is among them."""
+        last = self.port + 2 * self.count - 1
+        if last > _LAST_PORT:
+            raise InputError(f"{self.count} vehicles need ports to {last}", where="--port", hint="choose a lower one")
+
+    def start(self) -> "Lab":
+        """Start the lab. Raises LinkError, or InputError where a port is taken."""
+        from cfplan.simulation.lab.lab import start_lab
+        from cfplan.simulation.lab.room import RoomSettings
+        from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+        from cfplan.simulation.virtual_vicon.cameras import ViconSettings
+
+        vicon = ViconSettings(subject=self.names[0], port=self.vicon_port) if self.vicon_port else None
+        vehicles = [VehicleSettings(position=place, seed=k) for k, place in enumerate(self.places(), start=1)]
+        return start_lab(
+            self.limits.airframe,
+            vehicle=vehicles[0],
+            companions=dict(zip(self.names[1:], vehicles[1:], strict=True)),
+            room=RoomSettings(on_board=vicon is None, vicon=vicon),
+            port=self.port,
+        )
+
+    def describe(self, lab: "Lab") -> str:
+        """Return where each is found."""
+        mocap = f" --mocap vicon://127.0.0.1:{self.vicon_port}/" if self.vicon_port else ""
+        found = [f"{self.limits.vehicle} {name}: --uri udp://127.0.0.1:{port}" + (mocap and mocap + name)
+                 for name, port in zip(self.names, lab.ports, strict=True)]  # fmt: skip
+        return "\n".join([*found, f"r restarts {'it' if self.count == 1 else 'them'}, Ctrl-C ends this"])
+
+
+def _serve(room: VirtualRoom, end: float, view: "LiveView | None", typed: Callable[[], bytes]) -> bool:
+    """Serve the vehicles until time is up, or until the key r is typed: then return True."""
     from cfplan.simulation.virtual_crazyflie.supervisor import State
 
-    shown = StateLine()
+    shown = [StateLine(name if room.count > 1 else "") for name in room.names]
     with Steps(as_json=False).waiting("starting the virtual Crazyflie"):
-        started = start_lab(limits.airframe, room=RoomSettings(on_board=True), port=port)
+        started = room.start()
     with started as lab:
-        click.echo(f"{limits.vehicle} at udp://127.0.0.1:{lab.port}; r restarts it, Ctrl-C ends it", err=True)
+        click.echo(room.describe(lab), err=True)
         while time.monotonic() < end:
             time.sleep(_LOOK)
             if b"r" in typed():
                 return True
             if not lab.alive:
                 raise LinkError("the virtual lab has died", where=lab.uri, hint="start it again")
-            truth = lab.latest()
-            if len(truth.time):
-                shown.show(State(int(truth.supervisor[-1])), truth.position[-1].tolist())
-                _show(truth, view)
+            for number, line in enumerate(shown):
+                truth = lab.latest(number)
+                if len(truth.time):
+                    line.show(State(int(truth.supervisor[-1])), truth.position[-1].tolist())
+                    _show(truth, view if number == 0 else None)
     return False
 
 
 class StateLine:
-    """Says what the supervisor does: on a terminal in its last line with the position, elsewhere a line a change."""
+    """Says what the supervisor does: on a terminal in its last line with the position, elsewhere a line a change.
 
-    def __init__(self) -> None:
+    With a name, of one of several vehicles, always the latter.
+    """
+
+    def __init__(self, name: str = "") -> None:
         self._state: IntEnum | None = None  # as shown last
-        self._on_terminal = sys.stderr.isatty()
+        self._begin = f"{name}: " if name else ""
+        self._on_terminal = sys.stderr.isatty() and not name
 
     def show(self, state: IntEnum, position: Sequence[float]) -> None:
         """Show the state and where the vehicle is; that it is locked, in words wherever the output goes."""
@@ -107,9 +181,9 @@ class StateLine:
             x, y, z = position
             click.echo(f"\r\033[K{x:.2f} {y:.2f} {z:.2f} m, {name}", nl=False, err=True)
         elif changed:
-            click.echo(name, err=True)
+            click.echo(self._begin + name, err=True)
         if changed and locked:
-            click.echo(("\n" if self._on_terminal else "") + LOCKED, err=True)
+            click.echo(("\n" if self._on_terminal else self._begin) + LOCKED, err=True)
 
 
 def _show(truth: "Truth", view: "LiveView | None") -> None:

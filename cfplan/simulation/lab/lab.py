@@ -1,7 +1,8 @@
 """The virtual lab in its own process: a virtual Crazyflie and a room with motion capture, in real time.
 
 The lab speaks CRTP over UDP on the loopback, one datagram a packet, as cflib's own UDP driver does; the room's poses
-come from the next port. It ends with the process that started it.
+come from the next port. More vehicles may be in the room, each with two ports of its own; they do not collide. The lab
+ends with the process that started it.
 
 A lab announces its address in the environment variable CFPLAN_SIM_n, because `sim://n` alone must find it: cflib makes
 its link drivers itself, from nothing but the URI, in the pilot's process and in users' scripts.
@@ -12,6 +13,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -29,6 +31,7 @@ from cfplan.simulation.virtual_vicon.faults import ViconFault
 from cfplan.vehicle.airframe import Airframe
 
 TRUTH, LATEST, CLOSE = "truth", "latest", "close"
+PORTS = 2  # of each vehicle
 Fault = VehicleFault | RadioFault | ViconFault
 _START_TIMEOUT = 180.0  # s; the first start on a machine compiles
 _ANSWER_TIMEOUT = 10.0  # s
@@ -78,16 +81,17 @@ class Lab:
         process: subprocess.Popen,
         connection: Connection,
         number: int,
-        port: int,
+        ports: tuple[int, ...],
         mocap_uri: str = "",
     ):
         self.number = number
         self.uri = f"sim://{number}"
-        self.port = port
+        self.ports = ports  # of the vehicle, and of each other one in its room
+        self.port = ports[0]
         self.mocap_uri = mocap_uri  # of the vehicle in the virtual Vicon; "" if the room has none
         self._process = process
         self._connection = connection
-        self._address = f"127.0.0.1:{port}"
+        self._address = f"127.0.0.1:{self.port}"
         self._hidden = os.environ.get(lab_variable(number))
         os.environ[lab_variable(number)] = self._address
 
@@ -99,17 +103,17 @@ class Lab:
     def alive(self) -> bool:
         return self._process.poll() is None
 
-    def truth(self) -> Truth:
-        """Return the truth so far; for tests and reports. Raises LinkError if the lab has died."""
-        return self._ask(TRUTH)
+    def truth(self, vehicle: int = 0) -> Truth:
+        """Return the truth of a vehicle so far; for tests and reports. Raises LinkError if the lab has died."""
+        return self._ask(TRUTH, vehicle)
 
-    def latest(self) -> Truth:
+    def latest(self, vehicle: int = 0) -> Truth:
         """Return the last row of the truth."""
-        return self._ask(LATEST)
+        return self._ask(LATEST, vehicle)
 
-    def _ask(self, request: str) -> Truth:
+    def _ask(self, request: str, vehicle: int) -> Truth:
         try:
-            self._connection.send(request)
+            self._connection.send((request, vehicle))
             if not self._connection.poll(_ANSWER_TIMEOUT):
                 raise LinkError("the lab does not answer", where=self.uri, hint="is the machine overloaded? Try again")
             rows, locked = self._connection.recv()
@@ -172,10 +176,10 @@ class StartingLab:
             ) from why
         if isinstance(answer, CfplanError):
             raise answer
-        port, vicon_port = answer
+        ports, vicon_port = answer
         cameras = self._room.vicon
         mocap_uri = f"vicon://127.0.0.1:{vicon_port}/{cameras.subject}" if cameras is not None else ""
-        self._lab = Lab(self._process, self._connection, self._number, port, mocap_uri)
+        self._lab = Lab(self._process, self._connection, self._number, ports, mocap_uri)
         return self._lab
 
     def close(self) -> None:
@@ -200,6 +204,7 @@ def launch_lab(
     airframe: Airframe,
     *,
     vehicle: VehicleSettings | None = None,
+    companions: Mapping[str, VehicleSettings] | None = None,
     room: RoomSettings | None = None,
     number: int = 0,
     port: int = 0,
@@ -217,7 +222,7 @@ def launch_lab(
     signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
     connection = Connection(ours.detach())
     with suppress(OSError):  # it has died, which waiting for it notices
-        connection.send((airframe, vehicle or VehicleSettings(), room, port))
+        connection.send((airframe, vehicle or VehicleSettings(), dict(companions or {}), room, port))
     return StartingLab(process, connection, number, room)
 
 
@@ -225,15 +230,18 @@ def start_lab(
     airframe: Airframe,
     *,
     vehicle: VehicleSettings | None = None,
+    companions: Mapping[str, VehicleSettings] | None = None,
     room: RoomSettings | None = None,
     number: int = 0,
     port: int = 0,
 ) -> Lab:
     """Start a lab with a vehicle of this airframe as `sim://number`, and as `udp://127.0.0.1:port`; 0 takes a free one.
 
-    Raises LinkError if the lab does not start, InputError if the port or the one above it is taken.
+    `companions` are more of them in its room, by their names in its virtual Vicon; each has the second port from the
+    one before. Raises LinkError if the lab does not start, InputError if a port that it needs is taken.
 
     A lab that had that number is hidden until this one is closed. A plain child process rather than one of
     multiprocessing's, so that it can be started from a daemonic process and from a script without a main guard.
     """
-    return launch_lab(airframe, vehicle=vehicle, room=room, number=number, port=port).wait()
+    starting = launch_lab(airframe, vehicle=vehicle, companions=companions, room=room, number=number, port=port)
+    return starting.wait()

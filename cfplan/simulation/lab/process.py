@@ -1,4 +1,4 @@
-"""The lab's process: it runs the virtual Crazyflie and the room by a clock, against absolute deadlines."""
+"""The lab's process: it runs virtual Crazyflies and their room by a clock, against absolute deadlines."""
 
 import gc
 import math
@@ -7,7 +7,9 @@ import signal
 import socket
 import struct
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -15,7 +17,7 @@ import numpy as np
 from cfplan.errors import CfplanError, InputError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.real_time import lock_memory
-from cfplan.simulation.lab.lab import CLOSE, LATEST, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME, TRUTH
+from cfplan.simulation.lab.lab import CLOSE, LATEST, MOTORS, OFF_IN_AIR, PORTS, ROW_SIZE, STATE, SUPERVISOR, TIME
 from cfplan.simulation.lab.radio import Radio, RadioFault
 from cfplan.simulation.lab.room import SUBSCRIBE, SUBSCRIPTION_LASTS, MotionCapture, RoomSettings
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
@@ -23,7 +25,7 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.vehicle import COMMANDER_PERIOD, VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import NULL_PACKET, Port, pack
-from cfplan.simulation.virtual_vicon.faults import ViconFault
+from cfplan.simulation.virtual_vicon.faults import Seen, ViconFault
 from cfplan.simulation.virtual_vicon.vicon import VirtualVicon
 from cfplan.vehicle.airframe import Airframe
 
@@ -60,7 +62,7 @@ class Recorder:
 
 
 class LabLoop:
-    """Vehicle, room and sockets on one clock."""
+    """Vehicle, room and sockets on one clock; and the loops of other vehicles in that room."""
 
     def __init__(
         self,
@@ -70,6 +72,7 @@ class LabLoop:
         port: int = 0,
         clock: Clock = REAL_CLOCK,
     ):
+        self.companions: Mapping[str, LabLoop] = {}  # by the names that the virtual Vicon has for them
         self.vehicle = VirtualCrazyflie(airframe, vehicle)
         self._clock = clock
         self._seed = vehicle.seed
@@ -95,14 +98,22 @@ class LabLoop:
 
     def run(self, control: Connection) -> None:
         """Run until told to end, or until the parent process has ended."""
-        parent = os.getppid()
-        sources: list[int] = [self.link.fileno(), self.poses.fileno(), control.fileno()]
-        self.serve()
+        parent, loops = os.getppid(), self.loops
+        sources: list[int] = [each.fileno() for loop in loops for each in (loop.link, loop.poses)]
+        sources.append(control.fileno())
+        for loop in loops:
+            loop.serve()
         while os.getppid() == parent:
-            readable = self._clock.readable(sources, self.until_due())
-            self.serve()
-            if sources[2] in readable and not self._obey(control):
+            readable = self._clock.readable(sources, min(loop.until_due() for loop in loops))
+            for loop in loops:
+                loop.serve()
+            if control.fileno() in readable and not self._obey(control):
                 return
+
+    @property
+    def loops(self) -> tuple["LabLoop", ...]:
+        """Return the loops of all vehicles in the room, this one first."""
+        return self, *self.companions.values()
 
     def serve(self) -> None:
         """Do what is due by now, for the vehicle, the room and the sockets."""
@@ -131,7 +142,17 @@ class LabLoop:
         now = self._clock.now()
         if now - self._origin - self.vehicle.tick / 1000 > _LARGEST_LAG:
             self._origin = now - self.vehicle.tick / 1000
-        target = int((now - self._origin) * 1000)
+        self._run_to(int((now - self._origin) * 1000))
+        self._send_out(now)
+
+    def pose_at(self, now: float) -> Seen:
+        """Return where the vehicle is at a time, s, to which it is advanced where that is due."""
+        if not math.isnan(self._origin):
+            self._run_to(int((now - self._origin) * 1000))
+        truth = self.vehicle.stabilizer.loop.truth.tolist()
+        return (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9])
+
+    def _run_to(self, target: int) -> None:
         while self.vehicle.tick < target:
             tick = self.vehicle.tick
             if tick >= self.capture.next_tick:
@@ -143,13 +164,13 @@ class LabLoop:
             if self.vicon is not None:
                 stop = min(stop, max(tick + 1, math.ceil((self.vicon.next_look - self._origin) * 1000)))
             self.vehicle.advance(stop - tick)
-        self._send_out(now)
 
     def _look(self, now: float) -> None:
-        """Let the virtual Vicon see the vehicle when it is due."""
+        """Let the virtual Vicon see the vehicles when it is due."""
         if self.vicon is not None and now >= self.vicon.next_look:
             truth = self.vehicle.stabilizer.loop.truth.tolist()
-            self.vicon.look(now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]))
+            others = {name: loop.pose_at(now) for name, loop in self.companions.items()}
+            self.vicon.look(now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]), others)
 
     def _send_out(self, now: float) -> None:
         packets = self.vehicle.sent()
@@ -202,9 +223,10 @@ class LabLoop:
             request = control.recv()
         except (EOFError, OSError):  # the parent process has ended
             return False
-        if request in (TRUTH, LATEST):
-            rows = self.record.rows(-1 if request == LATEST else 0)
-            control.send((rows, self.vehicle.supervisor.ever_locked))
+        if isinstance(request, tuple):
+            what, number = request
+            loop = self.loops[number]
+            control.send((loop.record.rows(-1 if what == LATEST else 0), loop.vehicle.supervisor.ever_locked))
         elif isinstance(request, ViconFault) and self.vicon is not None:
             self.vicon.inject(request, self._clock.now())
         elif isinstance(request, VehicleFault):
@@ -259,18 +281,22 @@ def _sockets_at(port: int) -> tuple[socket.socket, socket.socket]:
 
 def serve(control: Connection) -> None:
     """Make the lab that the parent asks for, tell it the port, and run the lab."""
-    airframe, vehicle, room, port = control.recv()
+    airframe, vehicle, companions, room, port = control.recv()
     try:
         loop = LabLoop(airframe, vehicle, room, port)
+        loop.companions = {
+            name: LabLoop(airframe, settings, replace(room, seed=room.seed + number), port and port + PORTS * number)
+            for number, (name, settings) in enumerate(companions.items(), start=1)
+        }
+        if room.vicon is not None:
+            loop.vicon = VirtualVicon(room.vicon, REAL_CLOCK.now())
     except CfplanError as error:
         control.send(error)
         return
-    if room.vicon is not None:
-        loop.vicon = VirtualVicon(room.vicon, REAL_CLOCK.now())
     gc.collect()
     gc.freeze()
     _take_priority()
-    control.send((loop.port, loop.vicon.port if loop.vicon is not None else None))
+    control.send((tuple(each.port for each in loop.loops), loop.vicon.port if loop.vicon is not None else None))
     loop.run(control)
 
 

@@ -92,8 +92,10 @@ class Cameras:
         """Let everything that went wrong be right again."""
         self._faults.end(now)
 
-    def look(self, time: float, position: Triple, quaternion: Quaternion) -> None:
-        """See the vehicle where it is at a time, s."""
+    def look(
+        self, time: float, position: Triple, quaternion: Quaternion, moving: Mapping[str, Seen] | None = None
+    ) -> None:
+        """See the vehicle, and other bodies that move, where they are at a time, s."""
         settings, faults = self._settings, self._faults
         # Frames that the owner had no time to take are counted, and missing.
         self._looks = max(self._looks, round((time - self._start) * settings.rate)) + 1
@@ -102,7 +104,8 @@ class Cameras:
             self._queue(time, self._last)
             return
         markers = self._markers(position, quaternion)
-        truth = {settings.subject: markers, **{name: (place, _LEVEL) for name, place in settings.others}}
+        standing = {name: (place, _LEVEL) for name, place in settings.others}
+        truth = {settings.subject: markers, **(moving or {}), **standing}
         seen = faults.seen(time, {name: self._with_noise(*pose) for name, pose in truth.items()})
         self._queue(time, self._picture(seen, truth))
 
