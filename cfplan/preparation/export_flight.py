@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError, NotCertifiedError
 from cfplan.files.text import read_table
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory, certified_compressed, certified_pieces
+from cfplan.flight.on_board.correction import correct
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
 from cfplan.flight.on_board.pieces import Pieces
 from cfplan.geometry.polynomial_csv import polynomial_rows, read_polynomial_rows
@@ -34,6 +35,7 @@ GENTLE = 0.57  # of the limit on angular acceleration: polynomials cannot follow
 COLUMNS = ["t", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "yaw", "wx", "wy", "wz", "qx", "qy", "qz", "qw"]
 _DIGITS = 6
 _ROUNDING = 0.5 * 10.0**-_DIGITS
+_STRIDE = 10  # ms between the moments of a dry run from which a correction is learned
 
 
 class Form(Enum):
@@ -114,16 +116,50 @@ def fit_polynomials(
                 if form is not Form.MEMORY:
                     raise
                 made = certified_compressed(trajectory, limits, leads=leads, room=room)
-        kind = f"compressed, {len(made.memory)} bytes" if made.compressed else f"{len(made.memory)} bytes"
-        longer = made.duration / planned.duration - 1.0
-        results.append(f"{len(made.pieces.durations)} pieces, {kind}, {made.duration:.2f} s ({100 * longer:+.1f} %)")
-        results.append(f"within {1000 * made.error:.0f} mm")
+        results.append(_describe(made, planned))
     compile_from_here()
     with step(on_step, "dry run") as results:
         run = on_board_run(made, limits.airframe, limits.flight)
         results.append(f"deviation {100 * run.deviation:.1f} cm at most, {100 * run.deviation_rms:.1f} cm rms")
-        run.require_passed()
+    if leads:
+        made, run = _corrected(made, run, planned, most, room, on_step)
+    run.require_passed()
     return ExportedFlight(planned, made, run)
+
+
+def _corrected(
+    made: OnBoardTrajectory, run: DryRun, planned: PlannedFlight, most: int, room: int, on_step: OnStep
+) -> tuple[OnBoardTrajectory, DryRun]:
+    """Return polynomials that take back by how much these strayed in their dry run, and theirs, if that is less."""
+    trajectory, limits = planned.plan.trajectory, planned.limits
+    times = run.loop.time[::_STRIDE]
+    strayed = run.loop.position[::_STRIDE] - made.reference.plan_at(times)[:, 0, :3]
+    with step(on_step, "correction") as results:
+        correction = correct(times, strayed, made.duration)
+        try:
+            if made.compressed:
+                better = certified_compressed(trajectory, limits, room=room, correction=correction)
+            else:
+                better = certified_pieces(trajectory, limits, most=most, correction=correction)
+        except NotCertifiedError as error:
+            results.append(f"none: {error.what}")
+            return made, run
+        again = on_board_run(better, limits.airframe, limits.flight)
+        if not again.deviation < run.deviation:
+            results.append("none: the vehicle strays no less")
+            return made, run
+        results.append(_describe(better, planned))
+        results.append(f"deviation {100 * again.deviation:.1f} cm at most, {100 * again.deviation_rms:.1f} cm rms")
+    return better, again
+
+
+def _describe(made: OnBoardTrajectory, planned: PlannedFlight) -> str:
+    kind = f"compressed, {len(made.memory)} bytes" if made.compressed else f"{len(made.memory)} bytes"
+    longer = made.duration / planned.duration - 1.0
+    return (
+        f"{len(made.pieces.durations)} pieces, {kind}, {made.duration:.2f} s ({100 * longer:+.1f} %), "
+        f"within {1000 * made.error:.0f} mm"
+    )
 
 
 def write_polynomials(exported: ExportedFlight, form: Form, file: Path) -> None:

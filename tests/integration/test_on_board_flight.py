@@ -30,7 +30,7 @@ WORSE = 0.02  # m, by which the deviation may be larger than that of the same pl
 BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
 NO_STREAM = ("stream stalled for 0.6 s",)  # which it does without
 BY_WATCHDOG = ("radio dead for 1 s",)  # which stops the motors then
-FLIGHTS = ["circle", "figure8", "helix", "identify", "line", "lissajous", "loop3d", "random", "slalom", "trefoil"]
+FLIGHTS = sorted(file.stem for file in (REPOSITORY / "flights").glob("*.yaml"))
 QUICK = (
     "poses stop for 0.3 s",
     "poses stop for 5 s",

@@ -3,6 +3,7 @@
 __all__ = [
     "certified_pieces",
     "commands",
+    "correction",
     "fall",
     "fitting",
     "go_to",

@@ -5,6 +5,7 @@ several counts are made, each slowed until its certificate passes, and the neare
 taken.
 """
 
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -12,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
+from cfplan.flight.on_board.correction import Correction
 from cfplan.flight.on_board.fitting import drawn_knots, even_knots, fit_control_points, fit_pieces
 from cfplan.flight.on_board.memory_format import (
     MEMORY_SIZE,
     MOST_PIECES,
     compressed_bytes,
+    compressed_size,
     raw_bytes,
     read_compressed,
     read_raw,
@@ -42,6 +45,8 @@ _LENGTHS = (
     0.5,
     0.4,
 )  # s of a compressed piece, about: shorter ones suffer from whole millimetres
+_NEAR_FULL = 2  # pieces fewer than those that fill the memory: a few more or less fit better or worse
+_MOST_SOUGHT, _SOUGHT_STEP = 3.0, 0.05  # times as many pieces as there may be, that are sought for how long may fly
 _COARSE = 0.004  # s between samples while the slowing is searched for
 _HALVINGS = 7
 _NUDGE, _TRIES = 1.003, 6  # where the fine certificate does not pass at what the coarse one found
@@ -75,13 +80,18 @@ _Maker = Callable[[PolynomialReference], _Made]
 
 
 def certified_pieces(
-    trajectory: Trajectory, limits: Limits, *, leads: bool = True, most: int = MOST_PIECES
+    trajectory: Trajectory,
+    limits: Limits,
+    *,
+    leads: bool = True,
+    most: int = MOST_PIECES,
+    correction: Correction | None = None,
 ) -> OnBoardTrajectory:
     """Return at most `most` pieces, uncompressed, that fly a trajectory within the limits.
 
-    `leads` puts them ahead of it, so that the vehicle, which drag holds back, is on it; see reference.py. Raises
-    NotCertifiedError where they would stray by more than FARTHEST from what they are to be, or take longer than SLOWEST
-    times as long.
+    `leads` puts them ahead of it, so that the vehicle, which drag holds back, is on it, see reference.py; a correction
+    adds what a dry run of others showed. Raises NotCertifiedError where they would stray by more than FARTHEST from
+    what they are to be, or take longer than SLOWEST times as long.
     """
 
     def maker(knots_of: Callable[[PolynomialReference, int], NDArray], count: int) -> _Maker:
@@ -96,29 +106,66 @@ def certified_pieces(
 
     counts = sorted({max(1, round(most * share)) for share in _SHARES})
     makers = (maker(knots_of, count) for count in counts for knots_of in (even_knots, drawn_knots))
-    return _best(makers, PolynomialReference(trajectory, leads=leads), limits, f"{most} pieces")
+    reference = PolynomialReference(trajectory, leads=leads, correction=correction)
+    return _best(makers, reference, limits, f"{most} pieces")
 
 
 def certified_compressed(
-    trajectory: Trajectory, limits: Limits, *, leads: bool = True, room: int = MEMORY_SIZE
+    trajectory: Trajectory,
+    limits: Limits,
+    *,
+    leads: bool = True,
+    room: int = MEMORY_SIZE,
+    correction: Correction | None = None,
 ) -> OnBoardTrajectory:
     """Return compressed pieces that fly a trajectory within the limits, in `room` bytes at most.
 
-    Raises NotCertifiedError as above.
+    Raises NotCertifiedError as above; for a flight too long for the room with what would fit.
     """
 
     def maker(count: int) -> _Maker:
-        def make(reference: PolynomialReference) -> _Made:
-            memory = compressed_bytes(fit_control_points(reference, count))
-            if len(memory) > room:
-                raise NotCertifiedError(f"{len(memory)} bytes", where="trajectory memory", hint="use longer pieces")
-            return _Made(memory, True, read_compressed(memory))
+        return lambda reference: _compressed(reference, count, room)
 
-        return make
+    reference = PolynomialReference(trajectory, leads=leads, correction=correction)
+    counts = {max(1, int(np.ceil(reference.duration / length))) for length in _LENGTHS}
+    fullest = _fullest(reference, max(counts), room)
+    if fullest == max(counts):
+        return _best(map(maker, sorted(counts)), reference, limits, f"{room} bytes")
+    counts = {count for count in counts if count < fullest} | set(range(max(fullest - _NEAR_FULL, 1), fullest + 1))
+    try:
+        return _best(map(maker, sorted(counts)), reference, limits, f"{room} bytes")
+    except NotCertifiedError as error:
+        if fits := _longest(reference, fullest, room):
+            raise NotCertifiedError(
+                f"a flight of {reference.duration:.0f} s; of one like this {room} bytes hold some {fits:.0f} s",
+                where="trajectory memory",
+                hint="fly fewer laps, less of the path, or faster (far from walls it need not be slow for the fall), "
+                "or fly it streamed",
+            ) from error
+        raise
 
-    reference = PolynomialReference(trajectory, leads=leads)
-    counts = sorted({max(1, int(np.ceil(reference.duration / length))) for length in _LENGTHS})
-    return _best(map(maker, counts), reference, limits, f"{room} bytes")
+
+def _compressed(reference: PolynomialReference, count: int, room: int) -> _Made:
+    memory = compressed_bytes(fit_control_points(reference, count), room)
+    return _Made(memory, True, read_compressed(memory))
+
+
+def _fullest(reference: PolynomialReference, count: int, room: int) -> int:
+    """Return the most compressed pieces, at most `count`, that `room` bytes hold."""
+    while count > 1 and (size := compressed_size(fit_control_points(reference, count).moves)) > room:
+        count = max(min(count - 1, int(count * room / size) + _NEAR_FULL), 1)
+    return count
+
+
+def _longest(reference: PolynomialReference, count: int, room: int) -> float:
+    """Return how long, s, a flight like this may be for pieces that are near enough to fit; 0 where that is no matter
+    of room: `count` pieces do.
+    """
+    for share in np.arange(1.0, _MOST_SOUGHT, _SOUGHT_STEP):
+        made = _compressed(reference, round(share * count), sys.maxsize)
+        if _error(made.pieces, reference) <= FARTHEST:
+            return reference.duration * room / len(made.memory) if share > 1.0 else 0.0
+    return 0.0
 
 
 def _best(makers: Iterable[_Maker], reference: PolynomialReference, limits: Limits, room: str) -> OnBoardTrajectory:
@@ -155,10 +202,16 @@ def _certified(make: _Maker, reference: PolynomialReference, limits: Limits) -> 
         if certificate.passed:
             break
         slowing *= _NUDGE
-    samples = sample_pieces(made.pieces, _COARSE)
-    off = samples.derivatives[:, 0, :3] - slowed.at(samples.time)[:, 0, :3]
-    error = float(np.linalg.norm(off, axis=1).max())
-    return OnBoardTrajectory(made.memory, made.compressed, made.pieces, certificate, slowed, error)
+    return OnBoardTrajectory(
+        made.memory, made.compressed, made.pieces, certificate, slowed, _error(made.pieces, slowed)
+    )
+
+
+def _error(pieces: Pieces, reference: PolynomialReference) -> float:
+    """Return the farthest that pieces are from their reference, m."""
+    samples = sample_pieces(pieces, _COARSE)
+    off = samples.derivatives[:, 0, :3] - reference.at(samples.time)[:, 0, :3]
+    return float(np.linalg.norm(off, axis=1).max())
 
 
 def _flaw(made: OnBoardTrajectory) -> str:

@@ -75,16 +75,16 @@ def compressed_size(moves: NDArray) -> int:
     return _START.size + len(moves) * _HEADER.size + 2 * POINTS * int(np.sum(moves)) + _HEADER.size
 
 
-def compressed_bytes(curve: ControlPoints) -> bytes:
-    """Return control points as the memory holds them.
+def compressed_bytes(curve: ControlPoints, room: int = MEMORY_SIZE) -> bytes:
+    """Return control points as the memory holds them, in `room` bytes at most.
 
-    Raises NotCertifiedError where they do not fit the memory, or one its 16 bits.
+    Raises NotCertifiedError where they do not fit these, or one its 16 bits.
     """
     moves = curve.moves
     size = compressed_size(moves)
-    if size > MEMORY_SIZE:
+    if size > room:
         raise NotCertifiedError(
-            f"{size} bytes, but the vehicle's memory holds {MEMORY_SIZE}", where="trajectory memory",
+            f"{size} bytes, but the vehicle's memory holds {room}", where="trajectory memory",
             hint="use fewer, longer pieces",
         )  # fmt: skip
     highest = max(np.abs(curve.points).max(), np.abs(curve.start).max())

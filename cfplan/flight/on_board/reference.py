@@ -8,6 +8,8 @@ makes it fly the plan: with e ahead of the plan, and F = m a + kp e + kd e' + ki
 
 where L, along z alone, is for the lag with which motors give a thrust that changes. e is zero before the flight, and
 fades out behind it, as the controller's integral takes ten seconds to forget it.
+
+That takes attitude for what the controller asks for. What it leaves is learned in a dry run, see correction.py.
 """
 
 from dataclasses import dataclass, field
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.signal import bilinear, lfilter
 
 from cfplan.flight.firmware import gains_for
+from cfplan.flight.on_board.correction import Correction
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -35,6 +38,7 @@ class PolynomialReference:
     trajectory: Trajectory
     slowing: float = 1.0  # times the plan's duration
     leads: bool = False  # whether it is ahead of the plan, for the firmware's Mellinger controller
+    correction: Correction | None = None  # of what the lead leaves
     _ahead: NDArray = field(init=False, repr=False)  # (N, 5, 3): e and its derivatives, every _STEP
 
     def __post_init__(self) -> None:
@@ -73,6 +77,8 @@ class PolynomialReference:
                 more += e[:, k] * term
                 term = term * by / (k - order + 1)
             out[:, order, :3] += more
+        if self.correction is not None:
+            out[:, :, :3] += self.correction.at(times, self.duration)
         return out
 
     def ends(self) -> NDArray:

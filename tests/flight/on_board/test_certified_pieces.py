@@ -202,6 +202,20 @@ def test_too_few_pieces_for_a_plan_are_refused_with_how_far_they_stray(limits):
         certified_pieces(trajectory, limits, most=5)
 
 
+def test_a_flight_too_long_for_the_memory_is_refused_with_how_long_it_may_be(turning, limits):
+    with pytest.raises(NotCertifiedError, match=r"of 8 s; of one like this 250 bytes hold some [3-7] s") as why:
+        certified_compressed(turning, limits, room=250)
+    assert "laps" in why.value.hint
+    enough = certified_compressed(turning, limits)
+    assert enough.error <= FARTHEST
+    assert len(enough.memory) > 250
+
+
+def test_as_many_compressed_pieces_are_tried_as_the_room_holds(trajectory, limits):
+    room = len(certified_compressed(trajectory, limits).memory) - 1
+    assert len(certified_compressed(trajectory, limits, room=room).memory) > room - 3 * 60  # bytes of three pieces
+
+
 def test_motors_reach_their_limit_where_the_certificate_says(made, limits):
     samples = sample_pieces(made.pieces)
     highest = measures_along(samples, limits.airframe)[MOTOR_THRUST : MOTOR_THRUST + 4].max()
