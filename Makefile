@@ -47,6 +47,7 @@ pictures: install
 	$(BIN)/cfplan fly flights/line.yaml --records build/pictures/line --mocap vicon://lab/cf1
 	$(BIN)/cfplan replay build/pictures/figure8/* --png docs/images/replay.png --at 17.8 --force
 	$(BIN)/cfplan replay build/pictures/line/* --png docs/images/trials.png --at 2.4 --force
+	$(BIN)/cfplan replay build/pictures/figure8/* --gif docs/images/flight.gif --force
 	$(BIN)/cfplan fly flights/loop3d.yaml --records build/pictures/loop3d
 	$(BIN)/cfplan replay build/pictures/loop3d/* --figure docs/images/flight.png --force
 	$(BIN)/cfplan report build/pictures/figure8/* -o build/pictures/report.html --force

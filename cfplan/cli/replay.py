@@ -21,6 +21,7 @@ Examples:
   cfplan replay records                                              list the flights
   cfplan replay records/20261122-094221-figure8                      look at one
   cfplan replay records/20261122-094221-figure8 --save flight.rrd    for later: rerun flight.rrd
+  cfplan replay records/20261122-094221-figure8 --gif flight.gif     for a page or a talk
   cfplan replay records/20261122-094221-figure8 records/20261122-101500-figure8
   cfplan replay vicon.csv --subject cf1 --plan records/20261122-094221-figure8
   cfplan replay vicon.csv --subject cf1 --plan flights/figure8.yaml"""
@@ -46,6 +47,7 @@ Examples:
 @click.option("--save", type=click.Path(path_type=Path), help="Write a rerun file here instead of opening the viewer.")
 @click.option("--png", type=click.Path(path_type=Path), help="Draw the view into this picture; needs no screen.")
 @click.option("--figure", type=click.Path(path_type=Path), help="Draw a record for print here: .png, .pdf or .svg.")
+@click.option("--gif", type=click.Path(path_type=Path), help="Animate a record's flight along its path here.")
 @click.option("--at", "moment", type=float, help="s on the timeline, of the picture; else amid the path.")
 @click.option("--force", is_flag=True, help="Overwrite the file.")
 @options.as_json
@@ -58,6 +60,7 @@ def replay(
     save: Path | None,
     png: Path | None,
     figure: Path | None,
+    gif: Path | None,
     moment: float | None,
     force: bool,
     as_json: bool,
@@ -74,7 +77,7 @@ def replay(
         print_flights(records, as_json=as_json)
         return
     steps = Steps(as_json=as_json)
-    files = Files(save, png, figure, moment, force)
+    files = Files(save, png, figure, gif, moment, force)
     one_record = len(flights) == 1 and plan_file is None and is_record(flights[0])
     files.check(one_record=one_record)
     if one_record:
@@ -93,6 +96,7 @@ class Files:
     save: Path | None
     png: Path | None
     figure: Path | None  # of one record
+    gif: Path | None  # likewise
     moment: float | None  # s, of the picture
     force: bool
 
@@ -104,14 +108,16 @@ class Files:
             from cfplan.planning.figure import check_figure_file
 
             check_figure_file(self.figure, overwrite=self.force)
-            if not one_record:
-                raise InputError(
-                    "a figure is of one record", where=str(self.figure), hint="name one record, without --plan"
-                )
+        if self.gif is not None:
+            from cfplan.recording.animation import check_animation_file
+
+            check_animation_file(self.gif, overwrite=self.force)
+        if (drawn := self.figure or self.gif) and not one_record:
+            raise InputError("a figure is of one record", where=str(drawn), hint="name one record, without --plan")
 
     def to_json(self) -> dict[str, str | None]:
         """Return the names of the files; null where one was not asked for."""
-        files = {"rrd": self.save, "png": self.png, "figure": self.figure}
+        files = {"rrd": self.save, "png": self.png, "figure": self.figure, "gif": self.gif}
         return {kind: str(file) if file else None for kind, file in files.items()}
 
     def make(
@@ -127,7 +133,7 @@ class Files:
                 complaints = picture(self.png, moment=self.moment, overwrite=self.force)
                 said.append(f"{self.png} ({_size(self.png)})")
                 said.extend(complaints)
-        if self.save is None and self.png is None and self.figure is None:
+        if self.save is None and self.png is None and self.figure is None and self.gif is None:
             with steps.step("viewer"):
                 show()
 
@@ -153,6 +159,12 @@ def _replay_record(place: Path, files: Files, steps: Steps) -> dict[str, Any]:
         with steps.step("figure") as said:
             save_figure(draw_flight(flight), files.figure, overwrite=files.force)
             said.append(str(files.figure))
+    if files.gif is not None:
+        from cfplan.recording.animation import animate_flight, save_animation
+
+        with steps.step("animation") as said:
+            save_animation(animate_flight(flight), files.gif, overwrite=files.force)
+            said.append(f"{files.gif} ({_size(files.gif)})")
     files.make(steps, partial(write_rrd, flight), partial(picture, flight), partial(show, flight))
     return {"record": str(place), **(summarise(flight).to_json() if steps.as_json else {})}
 

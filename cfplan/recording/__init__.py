@@ -1,6 +1,7 @@
 """Records of flights: written as they happen, read back, summarised."""
 
 __all__ = [
+    "animation",
     "commitments",
     "flight_figure",
     "header",
