@@ -1,6 +1,7 @@
 """Compare the planners on the same paths: time to plan, time of flight, the certificate's verdict, the proven bound.
 
 Every path is given to every planner before the next path is drawn, so that other load on the machine meets all alike.
+Every other path meets them in the opposite order, so that processor caches do too.
 Each planner first solves one path that does not count: compiling and building are not planning time.
 """
 
