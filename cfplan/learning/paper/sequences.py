@@ -4,6 +4,7 @@ Nothing is scaled by limits or made relative to a place, as the features of cfpl
 networks know one vehicle, one set of limits and one box.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path as FilePath
@@ -89,9 +90,10 @@ class Sequences:
         """Return (R, N, 2): the answers of other paths, solved as these were."""
         answers = self.answers.copy()
         for k, path in enumerate(paths):
-            profile = solve(self.spec, int(self.rows[k]) // (1 + self.spec.copies), path).profile
-            if profile is not None:
-                answers[k] = np.stack([profile.h, np.cos(profile.yaw)], axis=1)
+            with suppress(CfplanError):  # a perturbed path has more pieces, at times too many for the nodes
+                profile = solve(self.spec, int(self.rows[k]) // (1 + self.spec.copies), path).profile
+                if profile is not None:
+                    answers[k] = np.stack([profile.h, np.cos(profile.yaw)], axis=1)
         return answers
 
 

@@ -11,6 +11,7 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.learning.checkpoints import Epoch
 from cfplan.learning.dataset import make_dataset
 from cfplan.learning.dataset_spec import DatasetSpec, Relabel
+from cfplan.learning.paper import sequences as paper_sequences
 from cfplan.learning.paper.networks import Kind, Size, build_network
 from cfplan.learning.paper.recovery import nodal_time, recover_profile, yaw_of_cosines
 from cfplan.learning.paper.sequences import Inputs, path_inputs, read_sequences, select_inputs
@@ -148,6 +149,15 @@ def test_paths_that_are_solved_again_have_labels_of_their_own(sequences, tmp_pat
     assert {kept.name, solved.name} == {"LSTM-0.05", "LSTM-0.05-solved"}
     ends = [train_network(sequences, tmp_path / each.name, each) for each in (kept, solved)]
     assert any(not torch.equal(*pair) for pair in zip(*(end.state_dict().values() for end in ends), strict=True))
+
+
+def test_a_perturbed_path_that_cannot_be_solved_keeps_the_clean_label(sequences, monkeypatch):
+    def refuse(spec, number, path):
+        raise InputError("too few nodes", hint="take more")
+
+    monkeypatch.setattr(paper_sequences, "solve", refuse)
+    noisy = sequences.perturbed_by(0.05, np.random.SeedSequence(3), Relabel.SOLVE)
+    assert np.array_equal(noisy.answers, sequences.answers)
 
 
 def test_damaged_weights_are_named(sequences, tmp_path):
