@@ -48,7 +48,7 @@ GUIDES = (0.15, 0.3, 0.08, 0.5)  # m from waypoints, at which guides lie, in the
 GUIDES_IN_MOTION, FIRST_TIMES_GUIDED = (0.3, 0.1), (1.0, 1.6)  # likewise, and of the first segment
 NEAR_VIA = 0.1  # m from the joint or a waypoint, nearer than which there is no such place
 RATE = 1.0  # units of s a second, where it is time: about the speed in m/s
-TRIES = 6  # paths that are planned, and as many that go on a little first
+TRIES, MOST_TRIES = 6, 9  # paths of a kind that are planned, and of all
 SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², and s before that, with which the vehicle slows down to a lower speed
 STOPPING = 0.6  # s of the way left, on which a vehicle that stops comes to rest
 OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
@@ -99,7 +99,7 @@ def continue_plan(
     failure = ""
     first = _ways(joint, trajectory, points, times)
     ways = (first, _ways_guided(joint, trajectory, points), _ways_later(joint, trajectory, points))
-    for way in chain.from_iterable(_sound(each, limits, known) for each in ways):
+    for way in islice(chain.from_iterable(_sound(each, limits, known) for each in ways), MOST_TRIES):
         task = PlanningTask(
             way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,
             speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,

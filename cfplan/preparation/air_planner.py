@@ -5,6 +5,7 @@ waits is dropped when another comes. It may die, hang or be killed; then the veh
 """
 
 import contextlib
+import gc
 import math
 import multiprocessing
 import os
@@ -18,36 +19,45 @@ from types import TracebackType
 
 import numpy as np
 
-from cfplan.errors import CfplanError
+from cfplan.errors import CfplanError, NotCertifiedError
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.proposals import PilotAnswer, read_answer
 from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, Refusal, splice
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
+from cfplan.planning.continuation import NoWayError
 from cfplan.planning.plan_result import Plan
+from cfplan.preparation.certified_flight import EndsBadlyError
 from cfplan.preparation.replan import (
     PACE,
     HeldFlight,
     Replanned,
     accepted,
+    after_failure,
     at_pace,
-    given_up,
+    following,
     go_on,
     halt,
     pace,
     replan,
+    replan_behind_stop,
 )
 from cfplan.safety.limits import Limits
 
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
-LEARNED_FROM = 8  # plans, the longest of which says how long the next may take
-LEAST_PART, PART = 0.8, 4.0  # s of a plan committed at once, at least; and for each s that planning looks ahead
+LEARNED_FROM = 10  # plans, by which one knows how long the next may take
+IN_TIME = 0.8  # share of them for which what is taken to be needed was enough: one that comes late is planned again
+AGAIN = 1.2  # by how much longer than the first the next one is taken to need then, at least
+FIRST_PART, NEXT_PART = 0.5, 0.8  # s of a plan committed at once, at least: its beginning, and more of it
+PART = 4.0  # likewise, for each s that planning looks ahead
 SLACK = 0.02  # s more than that, for the way to the pilot, which looks every 10 ms
-TRIES = 2  # of a request whose proposal comes late
+TRIES = 3  # of a request whose proposal comes late
 FARTHEST = 3000  # setpoints ahead of which no more of a plan is committed, until the vehicle comes nearer
+PRIORITY = -10  # niceness of the planner where that is allowed: behind the pilot, before all else
 _LOOK_AGAIN = 1.0  # s, until the planner sees whether it has
-_ANSWER_WITHIN = 1.0  # s in which a pilot answers
+_ANSWER_WITHIN = 1.0  # s in which a pilot answers; what comes later counts as well
+NO_ANSWER = "the pilot does not answer; where it still accepts what was proposed last, that is flown"
 _CLOSE_WITHIN = 1.0  # s
 
 
@@ -65,6 +75,7 @@ class PathVerdict(StrEnum):
     """What became of a request."""
 
     ACCEPTED = "accepted"
+    CHANGED = "changed"  # accepted, but the rest of it is flown otherwise: slower from here on, or after a stop
     REFUSED = "refused"  # no plan, or the pilot did not verify it
     LATE = "late"  # planned, but not in time
     CUT_SHORT = "cut short"  # accepted, but what follows did not pass later: the vehicle rests before its end
@@ -81,6 +92,17 @@ class PathRequest:
 
 
 @dataclass(frozen=True, slots=True)
+class AnswerTimes:
+    """When a planner's process did what for a request that was accepted, s on the clock of time.monotonic()."""
+
+    received: float  # the request
+    begun: float  # to plan; of a request whose first proposal came late, the last time
+    planned: float  # s that the plan took of what follows, before it was checked
+    proposed: float  # to the pilot
+    answered: float  # by the pilot
+
+
+@dataclass(frozen=True, slots=True)
 class PathAnswer:
     """The answer to a request."""
 
@@ -93,14 +115,16 @@ class PathAnswer:
     splice: int = -1  # number of the first setpoint of the proposal that was accepted; -1 where nothing was proposed
     checksum: int = 0  # of that proposal
     plan: Plan | None = None  # behind it; a stop has none
+    stop: int = 0  # checksum of the stop that was proposed before it, to go on from rest; 0 where none was
+    times: AnswerTimes | None = None  # where it was accepted by a process
 
 
-def part_within(ahead: float) -> int:
-    """Return how many setpoints of a plan to commit at once, where planning looks `ahead`, s.
+def part_within(ahead: float, least: float = FIRST_PART) -> int:
+    """Return how many setpoints of a plan to commit at once, where planning looks `ahead`, s; `least`, s, at least.
 
     The next part is to be committed before the vehicle stops behind this one, a request in between or not.
     """
-    return round(max(LEAST_PART, PART * ahead) * RATE)
+    return round(max(least, PART * ahead) * RATE)
 
 
 def wants_more(held: HeldFlight, first: int) -> bool:
@@ -135,18 +159,39 @@ def plan_request(
     return replan(held, first, request.waypoints, limits, keep=keep, yaw_angle=yaw, part=part)
 
 
+def plan_behind_stop(
+    held: HeldFlight, request: PathRequest, first: int, limits: Limits, part: int, refused: CfplanError
+) -> Replanned:
+    """Return the proposal to stop from setpoint `first` on, and to do from rest what was `refused` from the motion.
+
+    Raises that where it asks for something else, or cannot be done from rest either.
+    """
+    if request.wish is Wish.REPLACE and isinstance(refused, (NoWayError, EndsBadlyError, NotCertifiedError)):
+        yaw = float(held.flown.at(held.ends).yaw)
+        with contextlib.suppress(CfplanError):
+            return replan_behind_stop(held, first, request.waypoints, limits, yaw_angle=yaw, part=part)
+    raise refused
+
+
 def plan_next_part(held: HeldFlight, first: int, limits: Limits, part: int) -> Replanned | HeldFlight:
     """Return the proposal, from setpoint `first` on, of the next part of the plan that is held. Raises as go_on()."""
     return go_on(held, first, limits, part, yaw_angle=float(held.flown.at(held.ends).yaw))
 
 
-def answer_accepted(request: PathRequest, made: Replanned) -> PathAnswer:
-    """Return the answer to a request whose proposal the pilot has accepted."""
+def answer_accepted(
+    number: int, made: Replanned, stop: int = 0, verdict: PathVerdict = PathVerdict.ACCEPTED
+) -> PathAnswer:
+    """Return the answer to a request whose proposal the pilot has accepted, behind a stop with that checksum."""
     flown, proposal = made.held.flown, made.proposal
     return PathAnswer(
-        request.number, PathVerdict.ACCEPTED, joint=made.joint, ends=flown.duration, splice=proposal.splice,
-        checksum=proposal.checksum, plan=made.plan,
+        number, verdict, joint=made.joint, ends=flown.duration, splice=proposal.splice, checksum=proposal.checksum,
+        plan=made.plan, stop=stop,
     )  # fmt: skip
+
+
+def answer_changed(number: int, made: Replanned) -> PathAnswer:
+    """Return what is told of a request that was accepted, where the rest of it is flown by another plan."""
+    return answer_accepted(number, made, verdict=PathVerdict.CHANGED)
 
 
 def answer_held(request: PathRequest, held: HeldFlight) -> PathAnswer:
@@ -225,16 +270,42 @@ class AirPlanner:
         self.close()
 
 
+class _Lead:
+    """How far ahead of the clock to plan, by how long plans took lately: most, not all, are to be in time."""
+
+    def __init__(self, first: float):
+        """Begin with what a plan is taken to need before any was made, s."""
+        self._took: deque[float] = deque([first], maxlen=LEARNED_FROM)
+
+    def note(self, seconds: float, *, only: bool = False) -> None:
+        """Learn how long a plan took, s; with `only`, forget what was known before."""
+        if only:
+            self._took.clear()
+        self._took.append(seconds)
+
+    @property
+    def ahead(self) -> float:
+        """Return what the next plan is taken to need, s, with its way to the pilot."""
+        return float(np.quantile(self._took, IN_TIME)) + SLACK
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Proposed:
+    """A proposal that the pilot has not answered yet."""
+
+    made: Replanned
+    request: PathRequest | None  # None where it is the next part of the plan that is flown
+
+
 class _Worker:
     """The planner in its own process."""
 
     def __init__(self, held: HeldFlight, limits: Limits, requests: Connection, pilot: Connection):
         self._held, self._limits, self._requests, self._pilot = held, limits, requests, pilot
         self._begun: float | None = None  # s, when setpoint 0 was due
-        self._took: deque[float] = deque([FIRST_TIME], maxlen=LEARNED_FROM)
-        self._stops_took: deque[float] = deque([FIRST_STOP], maxlen=LEARNED_FROM)
-        self._part_took: deque[float] = deque([FIRST_STOP], maxlen=LEARNED_FROM)
+        self._plans, self._stops, self._parts = _Lead(FIRST_TIME), _Lead(FIRST_STOP), _Lead(FIRST_STOP)
         self._waiting: tuple[PathRequest, float] | None = None
+        self._proposed: _Proposed | None = None
         self._accepted = 0  # number of the request whose plan is flown
 
     @property
@@ -257,35 +328,43 @@ class _Worker:
                 away = max(places, key=lambda place: float(np.linalg.norm(place - held.ahead[-1])))
                 first, part = max(round(held.ends / 4 * RATE), 1), part_within(0.0)
                 made = replan(held, first, [away, held.ahead[-1]], self._limits, part=part)
-                self._took[0] = REAL_CLOCK.now() - begun
+                self._plans.note(REAL_CLOCK.now() - begun, only=True)
                 go_on(made.held, made.proposal.splice + part // 2, self._limits, part)
                 halt(made.held, made.proposal.splice + part // 2, self._limits)
 
     def serve(self) -> None:
         """Plan until the main process or the pilot has ended."""
         while True:
-            if self._waiting is None and not self._wants_more():
-                wait([self._requests, self._pilot], _LOOK_AGAIN if self._held.unfinished else None)
-            self._read(0.0)
-            if self._wants_more() and (self._waiting is None or presses(self._held, *self._next(self._took))):
-                if answer := self._go_on():
-                    self._requests.send(answer)
-            elif self._waiting is not None:
-                (request, since), self._waiting = self._waiting, None
-                answer = self._answer(request)
-                self._requests.send(replace(answer, seconds=REAL_CLOCK.now() - since))
+            answer = self._settle() if self._proposed is not None else self._serve_next()
+            if answer is not None:
+                self._requests.send(answer)
+
+    def _serve_next(self) -> PathAnswer | None:
+        """Wait for something to do, and do it; return what there is to tell."""
+        if self._waiting is None and not self._wants_more():
+            wait([self._requests, self._pilot], _LOOK_AGAIN if self._held.unfinished else None)
+        self._read(0.0)
+        if self._wants_more() and (self._waiting is None or presses(self._held, *self._next(self._plans))):
+            return self._go_on()
+        if self._waiting is None:
+            return None
+        (request, since), self._waiting = self._waiting, None
+        return replace(self._answer(request, since), seconds=REAL_CLOCK.now() - since)
 
     def _wants_more(self) -> bool:
-        return self._held.unfinished and wants_more(self._held, self._next(self._part_took)[0])
+        return self._held.unfinished and wants_more(self._held, self._next(self._parts)[0])
 
-    def _next(self, took: deque[float]) -> tuple[int, float]:
-        """Return the setpoint from which on one may plan now, by how long that took before, and how far ahead it is."""
+    def _next(self, lead: _Lead, least: float = 0.0) -> tuple[int, float]:
+        """Return the setpoint from which on one may plan now, and how far ahead it is, s, `least` at least."""
         assert self._begun is not None
-        ahead = max(took) + SLACK
+        ahead = max(lead.ahead, least)
         return math.ceil((REAL_CLOCK.now() - self._begun + ahead) * RATE) + LEAST_AHEAD, ahead
 
     def _read(self, patience: float) -> PilotAnswer | None:
-        """Take what has come; return the pilot's answer to a proposal if there is one, waiting for it if asked to."""
+        """Take what has come; return the pilot's answer to a proposal if there is one, waiting for it if asked to.
+
+        What it accepts is held from then on, however late that is heard of.
+        """
         found = None
         until = REAL_CLOCK.now() + patience
         while ready := wait([self._requests, self._pilot], max(until - REAL_CLOCK.now(), 0.0)):
@@ -293,7 +372,8 @@ class _Worker:
                 answer = read_answer(self._pilot.recv_bytes())
                 if answer.begun is not None:
                     self._begun = answer.begun
-                else:
+                elif self._proposed is not None and answer.proposal == self._proposed.made.proposal.checksum:
+                    self._hold(self._proposed.made, answer)
                     found = answer
                     until = 0.0
             if self._requests in ready:
@@ -303,74 +383,118 @@ class _Worker:
                 self._waiting = request, REAL_CLOCK.now()
         return found
 
-    def _answer(self, request: PathRequest) -> PathAnswer:
-        """Plan what is asked for, and propose it."""
+    def _answer(self, request: PathRequest, received: float) -> PathAnswer:
+        """Plan what is asked for, and propose it; it was `received` at that time, s."""
         if self._begun is None:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
-        reason = ""
-        took = self._stops_took if request.wish is Wish.STOP else self._took
+        reason, took = "", 0.0
+        lead = self._stops if request.wish is Wish.STOP else self._plans
         for _ in range(TRIES):
-            begun, (first, ahead) = REAL_CLOCK.now(), self._next(took)
+            begun, (first, ahead) = REAL_CLOCK.now(), self._next(lead, AGAIN * took)
             try:
-                made = plan_request(self._held, request, first, self._limits, part_within(ahead))
+                made = self._planned(request, first, part_within(ahead))
             except CfplanError as error:
                 return PathAnswer(request.number, PathVerdict.REFUSED, str(error))
             except Exception as error:  # a fault here must not leave the rest of the flight without a planner
                 return PathAnswer(request.number, PathVerdict.REFUSED, f"fault in the planner: {error!r}")
-            finally:
-                took.append(REAL_CLOCK.now() - begun)
+            proposed = REAL_CLOCK.now()
+            took = proposed - begun
+            lead.note(took)
             if isinstance(made, HeldFlight):
                 self._held = made
                 return answer_held(request, made)
-            answer = self._propose(made)
+            stop, answer = made.stop, None
+            if stop is not None:
+                answer = self._propose(_Proposed(stop, request))
+                made = following(made, self._held.commitment)
+            if stop is None or (answer is not None and answer.commitment is not None):
+                answer = self._propose(_Proposed(made, request))
             if answer is None:
-                return PathAnswer(request.number, PathVerdict.REFUSED, "the pilot does not answer")
+                return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER)
             if answer.commitment is not None:
                 self._accepted = request.number
-                return answer_accepted(request, made)
+                accepted_made = answer_accepted(request.number, made, 0 if stop is None else stop.proposal.checksum)
+                seconds = 0.0 if made.plan is None else made.plan.seconds
+                return replace(accepted_made, times=AnswerTimes(received, begun, seconds, proposed, REAL_CLOCK.now()))
             reason = answer.reason
             if not reason.startswith(Fault.LATE):
                 return PathAnswer(request.number, PathVerdict.REFUSED, reason)
         return PathAnswer(request.number, PathVerdict.LATE, reason)
 
-    def _go_on(self) -> PathAnswer | None:
-        """Propose the next part of the plan that is flown; return what to tell where there will be none."""
-        begun, (first, ahead) = REAL_CLOCK.now(), self._next(self._part_took)
+    def _planned(self, request: PathRequest, first: int, part: int) -> Replanned | HeldFlight:
+        """Return what is to be proposed, from rest where no plan leads there from the motion."""
         try:
-            made = plan_next_part(self._held, first, self._limits, part_within(ahead))
-        except Exception as error:  # as in _answer
-            reason = str(error) if isinstance(error, CfplanError) else f"fault in the planner: {error!r}"
-        else:
-            if isinstance(made, HeldFlight):
-                self._held = made
-                return None
-            answer = self._propose(made)
-            if answer is not None and (answer.commitment is not None or answer.reason.startswith(Fault.LATE)):
-                return None
-            reason = answer.reason if answer is not None else ""  # then it lands, or is gone
-        finally:
-            self._part_took.append(REAL_CLOCK.now() - begun)
-        self._held = given_up(self._held, self._limits)
-        return answer_cut_short(self._accepted, self._held, reason) if reason else None
+            return plan_request(self._held, request, first, self._limits, part)
+        except CfplanError as error:
+            later, _ = self._next(self._plans)
+            return plan_behind_stop(self._held, request, later, self._limits, part, error)
 
-    def _propose(self, made: Replanned) -> PilotAnswer | None:
-        """Send a proposal and wait for the pilot's answer; what it accepts is held from then on."""
-        self._pilot.send_bytes(made.proposal.to_bytes())
-        until = REAL_CLOCK.now() + _ANSWER_WITHIN
-        while (left := until - REAL_CLOCK.now()) > 0.0:
-            answer = self._read(left)
-            if answer is None or answer.proposal != made.proposal.checksum:
-                continue
-            if answer.commitment is not None:
-                assert self._begun is not None
-                due = math.floor((REAL_CLOCK.now() - self._begun) * RATE)  # the pilot looked a little earlier
-                now = min(due, made.proposal.splice - LEAST_AHEAD)
-                committed = splice(self._held.commitment, made.proposal, now, self._limits.space)
-                assert isinstance(committed, Commitment)
-                assert committed.checksum == answer.commitment
-                self._held = accepted(made, committed)
-            return answer
-        return None
+    def _go_on(self) -> PathAnswer | None:
+        """Propose the next part of the plan that is flown; return what there is to tell."""
+        begun, (first, ahead) = REAL_CLOCK.now(), self._next(self._parts)
+        try:
+            made = plan_next_part(self._held, first, self._limits, part_within(ahead, NEXT_PART))
+        except Exception as error:  # as in _answer
+            return self._interrupt(str(error) if isinstance(error, CfplanError) else f"fault in the planner: {error!r}")
+        self._parts.note(REAL_CLOCK.now() - begun)
+        if isinstance(made, HeldFlight):
+            self._held = made
+            return None
+        answer = self._propose(_Proposed(made, None))
+        return None if answer is None else self._gone_on(made, answer)
+
+    def _gone_on(self, made: Replanned, answer: PilotAnswer) -> PathAnswer | None:
+        """Return what there is to tell of the next part of a plan that the pilot has answered."""
+        if answer.commitment is not None:
+            return None if made.plan is None else answer_changed(self._accepted, made)
+        return None if answer.reason.startswith(Fault.LATE) else self._interrupt(answer.reason)
+
+    def _interrupt(self, reason: str) -> PathAnswer | None:
+        """Let the vehicle rest behind what is committed, as more does not pass; return what there is to tell.
+
+        From there it goes on, unless that is what does not pass.
+        """
+        self._held = after_failure(self._held, self._limits)
+        return None if self._held.unfinished else answer_cut_short(self._accepted, self._held, reason)
+
+    def _propose(self, proposed: _Proposed) -> PilotAnswer | None:
+        """Send a proposal and wait for the pilot's answer; None where that does not come soon."""
+        self._pilot.send_bytes(proposed.made.proposal.to_bytes())
+        self._proposed = proposed
+        return self._read(_ANSWER_WITHIN)
+
+    def _settle(self) -> PathAnswer | None:
+        """Wait for the answer to a proposal that the pilot did not answer soon; return what there is to tell.
+
+        Until it has come nothing can be planned: nobody knows what the pilot is bound to.
+        """
+        proposed = self._proposed
+        assert proposed is not None
+        answer = self._read(_ANSWER_WITHIN)
+        if answer is None:
+            if self._waiting is None:
+                return None
+            (request, since), self._waiting = self._waiting, None
+            return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER, seconds=REAL_CLOCK.now() - since)
+        if proposed.request is None:
+            return self._gone_on(proposed.made, answer)
+        if answer.commitment is None:
+            return None  # as it was told to be
+        self._accepted = proposed.request.number
+        return answer_accepted(self._accepted, proposed.made)
+
+    def _hold(self, made: Replanned, answer: PilotAnswer) -> None:
+        """Take the pilot's answer to a proposal."""
+        self._proposed = None
+        if answer.commitment is None:
+            return
+        assert self._begun is not None
+        due = math.floor((REAL_CLOCK.now() - self._begun) * RATE)  # the pilot looked a little earlier
+        now = min(due, made.proposal.splice - LEAST_AHEAD)
+        committed = splice(self._held.commitment, made.proposal, now, self._limits.space)
+        assert isinstance(committed, Commitment)
+        assert committed.checksum == answer.commitment
+        self._held = accepted(made, committed)
 
 
 def _run(held: HeldFlight, limits: Limits, requests: Connection, pilot: Connection) -> None:
@@ -381,6 +505,10 @@ def _run(held: HeldFlight, limits: Limits, requests: Connection, pilot: Connecti
         signal.signal(number, signal.SIG_IGN)
     worker = _Worker(held, limits, requests, pilot)
     worker.warm_up()
+    gc.collect()
+    gc.freeze()  # what was imported is not looked through again in flight
+    with contextlib.suppress(OSError, AttributeError):  # not everybody may; other systems have other ways
+        os.nice(PRIORITY)
     with contextlib.suppress(EOFError, OSError):
         requests.send("ready")
         worker.serve()

@@ -73,21 +73,23 @@ def certify_beginning(
     encoded = encode_trajectory(flown, gains=gains_under(limits), space=limits.space)
     if following + STOP >= flown.duration * RATE:
         return certify_whole(flown, limits, starts)
-    if foresee and not limits.link_loss.only_warn:
-        foreseen = foreseen_link_loss(encoded.payloads, limits, starts=starts).worst
-        if foreseen.beyond > _FORESEEN:
-            raise EndsBadlyError(str(foreseen), where="link loss", hint=OUTSIDE_HINT)
     last = np.array([following])
     stop = encode_stops(encoded.motion, RATE, rows=last, gains=encoded.gains, space=encoded.space)[0]
     payloads = np.concatenate([encoded.payloads[:following], stop, np.repeat(stop[-1:], BEHIND - len(stop), axis=0)])
     begun = _first_rows(encoded, following + 1)
+
+    def foresee_link_loss() -> None:
+        if foresee and not limits.link_loss.only_warn:
+            foreseen = foreseen_link_loss(encoded.payloads, limits, starts=starts).worst
+            if foreseen.beyond > _FORESEEN:
+                raise EndsBadlyError(str(foreseen), where="link loss", hint=OUTSIDE_HINT)
 
     def rehearse() -> None:
         check_setpoints(begun, flown, limits.plan)
         believed = as_believed(starts, limits)
         dry_run_of_setpoints(payloads, limits.airframe, limits.flight, snapshot=believed).require_passed()
 
-    stops, lost = _certified(begun, payloads, limits, starts, rehearse, encoded.motion)
+    stops, lost = _certified(begun, payloads, limits, starts, rehearse, encoded.motion, foresee_link_loss)
     rest = rest_behind(encoded.motion, following, RATE)
     return CertifiedFlight(payloads, np.concatenate([stops[:-1], left_of(stop)]), lost.snapshots, following, rest)
 
@@ -117,10 +119,12 @@ def _certified(
     starts: NDArray | None,
     rehearse: Callable[[], None],
     motion: FullStateSetpoints | None = None,
+    foresee: Callable[[], None] = lambda: None,
 ) -> tuple[NDArray, LinkLossMoments]:
     """Return a stop from each setpoint of `encoded`, and link loss of `payloads`, which begin with those setpoints.
 
-    `motion` is that of the setpoints behind them too, where the stops lead along it. Raises as certify_whole() does.
+    `motion` is that of the setpoints behind them too, where the stops lead along it. Raises as certify_whole() does,
+    and first what `foresee` raises.
     """
 
     def stop_everywhere() -> NDArray:
@@ -144,6 +148,7 @@ def _certified(
     with ThreadPoolExecutor() as pool:  # compiled loops and most of numpy run side by side
         stops, lost = pool.submit(stop_everywhere), pool.submit(lose_link)
         gaps, rehearsed = pool.submit(meet_gaps, payloads, limits, starts), pool.submit(rehearse)
+        pool.submit(foresee).result()
         gaps.result()
         rehearsed.result()
         return stops.result(), lost.result()

@@ -46,6 +46,7 @@ LEAST_SPEED = 0.2  # m/s, to which requests may lower the speed
 PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
 LOOKS_BACK = math.ceil(RATE_LEAD * RATE)  # setpoints before one, of whose motion it is made too
 HOVER = 0.05  # s, of the motion that a hover counts as
+_SNAPSHOTS_KEPT = 6000  # setpoints before a splice, of which snapshots are kept: no plan leaves before these
 STOPS = (0.46, 0.48, 0.5, 0.52, 0.54, 0.55, 0.56, 0.58, 0.6, 0.65, 0.7, 0.8, 1.0, DURATION)
 """s within which a request to stop is tried to be met. From 2 m/s straight on 0.54 s brake at 6.9 m/s², a tilt of 35°;
 where the vehicle turns or slows down already it is more or less. One that holds its deceleration is planned to rest
@@ -71,7 +72,10 @@ class HeldFlight:
     The trajectories are those of the whole plan."""
     rest: tuple[Triple, float] | None = None  # m, rad: place and yaw where that stop rests
     left: NDArray = field(default_factory=lambda: np.empty((0, 3)))
-    """(J, 3) m, waypoints of a plan that was stopped before them, as its next part did not come in time."""
+    """(J, 3) m, waypoints of a plan that was stopped before them, as its next part did not pass, or came too late."""
+    halts: tuple[tuple[int, int], ...] = ()
+    """Of each stop on the way, the setpoints from which on and before which the trajectories are not those behind the
+    bytes."""
 
     @property
     def ends(self) -> float:
@@ -92,6 +96,7 @@ class Replanned:
     held: HeldFlight
     plan: Plan | None  # None for a stop, which brakes along the plan before
     joint: float  # s from setpoint 0, from when on the motion is another
+    stop: "Replanned | None" = None  # to be proposed before it, where it begins from the rest behind that
 
 
 def hold(planned: Plan, waypoints: ArrayLike) -> HeldFlight:
@@ -138,10 +143,11 @@ def replan(
 ) -> Replanned:
     """Return the proposal to leave what is held at setpoint `splice` and to go through waypoints, (K, 3) m, to rest.
 
-    The motion changes SPLICE_AHEAD setpoints after the splice, or a little later where it cannot do so at once; never
-    before what is held last has begun. With `keep`, the waypoints follow those that are ahead there; else they replace
-    them. Where the vehicle rests by then, the plan begins from rest. Where link loss or a gap would end badly, the
-    vehicle flies slower. So many setpoints are proposed as `part` says, and the stop behind them; without it, all.
+    The motion changes SPLICE_AHEAD setpoints after the splice, or a little later where it cannot do so at once. With
+    `keep`, the waypoints follow those that are ahead, and the motion changes only once that to them has begun; else
+    they replace them. Where the vehicle rests by then, the plan begins from rest. Where link loss or a gap would end
+    badly, the vehicle flies slower. So many setpoints are proposed as `part` says, and the stop behind them; without
+    it, all.
 
     Raises:
         InputError: what is given are no waypoints.
@@ -162,7 +168,8 @@ def pace(
 
     Then nothing need be proposed: what is asked for later flies so. See at_pace(). Raises as replan() does.
     """
-    if (splice + SPLICE_AHEAD) / RATE >= held.ends:
+    nothing_ahead = held.exact_from > 0 and not len(held.left)  # but to come to rest
+    if nothing_ahead or (splice + SPLICE_AHEAD) / RATE >= held.ends:
         return None
     return _replan_within(at_pace(held, speed), splice, np.empty((0, 3)), limits, True, yaw_angle, part)
 
@@ -193,7 +200,15 @@ def given_up(held: HeldFlight, limits: Limits) -> HeldFlight:
     if held.stops_from is None:
         return replace(held, left=np.empty((0, 3)))
     assert held.rest is not None
-    return _resting(held, held.rest, held.stops_from + STOP, limits)
+    return _resting(held, held.rest, held.stops_from, held.stops_from + STOP, limits)
+
+
+def after_failure(held: HeldFlight, limits: Limits) -> HeldFlight:
+    """Return what is held where the next part of a plan does not pass: it goes on from the rest behind the last one.
+
+    Where that is what does not pass, there is to be no more.
+    """
+    return given_up(held, limits) if held.stops_from is None else interrupted(held, limits)
 
 
 def at_rest_from(held: HeldFlight, splice: int, limits: Limits) -> HeldFlight:
@@ -202,7 +217,15 @@ def at_rest_from(held: HeldFlight, splice: int, limits: Limits) -> HeldFlight:
     Where all that is committed until then is a part of a plan, the vehicle stops behind that: what is flown of the
     plan is that stop, and the waypoints behind it are left.
     """
-    if held.stops_from is None or splice < held.stops_from:
+    return held if held.stops_from is None or splice < held.stops_from else interrupted(held, limits)
+
+
+def interrupted(held: HeldFlight, limits: Limits) -> HeldFlight:
+    """Return what is held where the vehicle rests behind the part of a plan that is committed, and goes on from there.
+
+    A plan that is committed whole goes on as it is.
+    """
+    if held.stops_from is None:
         return held
     rests_at = (held.stops_from + 0.5 * STOP) / RATE + LEAD - held.flown.starts[-1]  # on the clock of the plan
     left, _ = _still_ahead(held, rests_at, np.empty((0, 3)))
@@ -251,10 +274,11 @@ def _replan_at(
 ) -> Replanned:
     """Return what replan() does, at that speed, m/s, or less."""
     held = at_rest_from(held, splice, limits)
-    splice = _not_before(held, splice)
+    splice, left = _leaving(held, splice, keep)
     joint = (splice + SPLICE_AHEAD) / RATE
-    if joint >= held.ends:
-        place = held.flown.at(held.ends)
+    leave, trajectory = joint - held.flown.starts[left], held.flown.trajectories[left]
+    if leave >= trajectory.duration:
+        place = held.flown.at(joint)
         points = np.concatenate([place.position[None], held.left, points] if keep else [place.position[None], points])
         path, reached = path_from_rest(points, limits)
         planned = plan(
@@ -267,7 +291,6 @@ def _replan_at(
         )
         points = points[1:]
     else:
-        leave = joint - held.flown.starts[-1]
         times = None
         if keep:
             kept, times = _still_ahead(held, leave, points)
@@ -278,9 +301,7 @@ def _replan_at(
                     where="request",
                     hint="ask for waypoints instead; they are flown so",
                 )
-        made = continue_plan(
-            held.flown.trajectories[-1], leave, points, limits, times=times, yaw_angle=yaw_angle, speed=speed
-        )
+        made = continue_plan(trajectory, leave, points, limits, times=times, yaw_angle=yaw_angle, speed=speed)
         planned, reached = made.plan, made.reached
     flown = held.flown.continued(joint, planned.trajectory)
     since, starts = flown.since(splice / RATE), snapshots_at(held, splice)
@@ -296,21 +317,23 @@ def _proposed(held: HeldFlight, splice: int, made: CertifiedFlight, planned: Pla
 
 def held_with(held: HeldFlight, splice: int, made: CertifiedFlight) -> HeldFlight:
     """Return what is held once what was certified from setpoint `splice` on is committed."""
-    before = held.snapshots[:, : splice - held.begin]
+    rows = np.arange(max(splice - _SNAPSHOTS_KEPT, held.begin), splice) - held.begin
+    before = held.snapshots[:, np.minimum(rows, held.snapshots.shape[1] - 1)]  # behind the last the vehicle waits
     return replace(
         held,
-        begin=splice - before.shape[1],  # behind the end of what was held the vehicle waits
+        begin=splice - len(rows),
         snapshots=np.concatenate([before, made.snapshots], axis=1),
         exact_from=0,
         stops_from=None if made.following is None else splice + made.following,
         rest=made.rest,
         left=np.empty((0, 3)),
+        halts=tuple(halt for halt in held.halts if splice - _SNAPSHOTS_KEPT < halt[0] < splice),
     )
 
 
 def snapshots_at(held: HeldFlight, splice: int) -> NDArray:
     """Return (L, 31), the simulated vehicle at a setpoint; behind the last it hovers."""
-    return np.asarray(held.snapshots[:, min(splice - held.begin, held.snapshots.shape[1] - 1)])
+    return np.asarray(held.snapshots[:, min(max(splice - held.begin, 0), held.snapshots.shape[1] - 1)])
 
 
 def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned | HeldFlight:
@@ -321,8 +344,8 @@ def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned | HeldFligh
     rests as soon anyway, or no stop passes: then it rests at the end of what is held.
     """
     held = at_rest_from(held, splice, limits)
-    splice = max(splice, held.exact_from)
-    ends = held.ends if held.stops_from is None else (held.stops_from + STOP) / RATE
+    splice, _ = _leaving(held, splice, keep=False)
+    ends = _rests_next(held, splice)
     if sooner := [duration for duration in STOPS if duration < ends - splice / RATE]:
         encoded = _encoded_from(held, splice, limits)
         for duration in sooner:
@@ -335,6 +358,38 @@ def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned | HeldFligh
         where="stop",
         hint="it rests at the end of what is committed",
     )
+
+
+def _rests_next(held: HeldFlight, splice: int) -> float:
+    """Return when one who goes on at setpoint `splice` rests next, s from setpoint 0."""
+    ahead = [(end - LOOKS_BACK) / RATE for begin, end in held.halts if begin > splice]
+    return min([held.ends if held.stops_from is None else (held.stops_from + STOP) / RATE, *ahead])
+
+
+def replan_behind_stop(
+    held: HeldFlight,
+    splice: int,
+    waypoints: ArrayLike,
+    limits: Limits,
+    *,
+    yaw_angle: float = 0.0,
+    part: int | None = None,
+) -> Replanned:
+    """Return the proposal to go through waypoints, (K, 3) m, from rest, behind the stop from setpoint `splice` on.
+
+    For where no way leads there from the motion. The `stop` is to be proposed first, unless the vehicle stops as soon
+    anyway. Raises as replan() and halt() do; then nothing is to be proposed.
+    """
+    stop = halt(held, splice, limits)
+    resting = stop if isinstance(stop, HeldFlight) else stop.held
+    made = replan(resting, max(splice, resting.exact_from), waypoints, limits, yaw_angle=yaw_angle, part=part)
+    return made if isinstance(stop, HeldFlight) else replace(made, stop=stop)
+
+
+def following(replanned: Replanned, commitment: Commitment) -> Replanned:
+    """Return what was made behind a stop, to be proposed now that the pilot is committed to that."""
+    proposal = replace(replanned.proposal, follows=commitment.checksum)
+    return replace(replanned, proposal=proposal, held=replace(replanned.held, commitment=commitment), stop=None)
 
 
 def stop_within(held: HeldFlight, splice: int, duration: float, limits: Limits) -> Replanned:
@@ -369,24 +424,38 @@ def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration:
     lost = link_loss_at_walls(payloads, limits, starts=starts)
     require_inside(lost, limits)
     meet_gaps(payloads, limits, starts)
-    resting = _resting(held, rest_behind(motion, 1, RATE, duration), splice + len(rows), limits)
+    resting = _resting(held, rest_behind(motion, 1, RATE, duration), splice + 1, splice + len(rows), limits)
     later = replace(resting, begin=splice, snapshots=lost.snapshots)
     return Replanned(propose(held.commitment, splice, payloads, stops), later, None, splice / RATE)
 
 
-def _resting(held: HeldFlight, rest: tuple[Triple, float], rests_from: int, limits: Limits) -> HeldFlight:
-    """Return the flight that stops, and from a setpoint on rests at a place, m, with a yaw, rad."""
+def _resting(
+    held: HeldFlight, rest: tuple[Triple, float], stops_from: int, rests_from: int, limits: Limits
+) -> HeldFlight:
+    """Return the flight that stops from a setpoint on, and from another on rests at a place, m, with a yaw, rad."""
     place, yaw = rest
     flown = held.flown.continued(rests_from / RATE, hover_at(place, yaw, HOVER, limits.airframe))
+    exact_from = rests_from + LOOKS_BACK
     return replace(
-        held, flown=flown, ahead=np.array([place]), reached=(HOVER,), exact_from=rests_from + LOOKS_BACK,
-        stops_from=None, rest=None, left=np.empty((0, 3)),
+        held, flown=flown, ahead=np.array([place]), reached=(HOVER,), exact_from=exact_from, stops_from=None, rest=None,
+        left=np.empty((0, 3)), halts=(*held.halts, (stops_from, exact_from)),
     )  # fmt: skip
 
 
-def _not_before(held: HeldFlight, splice: int) -> int:
-    """Return the splice, or the first whose joint is not before what is held last begins."""
-    return max(splice, held.exact_from, math.ceil(held.flown.starts[-1] * RATE - 1e-6) - SPLICE_AHEAD)
+def _leaving(held: HeldFlight, splice: int, keep: bool) -> tuple[int, int]:
+    """Return from which setpoint on another plan can be flown, not before `splice`, and which trajectory it leaves.
+
+    With `keep` it is the last one, as the waypoints on it stay. Else the vehicle may turn off on the way to what is
+    held last, but not within a stop.
+    """
+    if keep:
+        begins = math.ceil(held.flown.starts[-1] * RATE - 1e-6) - SPLICE_AHEAD
+        return max(splice, held.exact_from, begins), len(held.flown.starts) - 1
+    for begin, end in held.halts:
+        if begin <= splice < end:
+            splice = end
+    joint = (splice + SPLICE_AHEAD) / RATE
+    return splice, max(int(np.searchsorted(held.flown.starts, joint + 1e-9, side="right")) - 1, 0)
 
 
 def accepted(replanned: Replanned, commitment: Commitment) -> HeldFlight:

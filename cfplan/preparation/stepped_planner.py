@@ -17,22 +17,25 @@ from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, P
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
 from cfplan.preparation.air_planner import (
+    NEXT_PART,
     SLACK,
     PathAnswer,
     PathRequest,
     PathVerdict,
     Wish,
     answer_accepted,
+    answer_changed,
     answer_cut_short,
     answer_held,
     answer_refused,
     part_within,
+    plan_behind_stop,
     plan_next_part,
     plan_request,
     presses,
     wants_more,
 )
-from cfplan.preparation.replan import HeldFlight, Replanned, accepted, given_up
+from cfplan.preparation.replan import HeldFlight, Replanned, accepted, after_failure, following
 from cfplan.safety.limits import Limits
 
 PLANNING = 0.1  # s that planning takes
@@ -58,6 +61,8 @@ class _InHand:
     made: Replanned
     proposal: Proposal  # as it is sent
     due: float  # s, when it arrives
+    behind: Replanned | None = None  # to be proposed next, where this is the stop before it
+    stop: int = 0  # checksum of the stop before it
 
 
 class SteppedPlanner:
@@ -101,7 +106,7 @@ class SteppedPlanner:
         if self._in_hand is None and self.fault is not PlannerFault.KILLED:
             first, ahead = self._next(now)
             if wants_more(self.held, first) and (self._waiting is None or presses(self.held, first, ahead)):
-                self._go_on(now, first, part_within(ahead))
+                self._go_on(now, first, part_within(ahead, NEXT_PART))
             elif self._waiting is not None:
                 (request, asked), self._waiting = self._waiting, None
                 self._plan(request, asked, now)
@@ -117,14 +122,19 @@ class SteppedPlanner:
         if isinstance(answer, Commitment):
             self.held = accepted(done.made, answer)
             self.on_committed(replace(done.made, held=self.held))
-        if done.request is None:
-            if isinstance(answer, Refusal) and answer.fault is not Fault.LATE:
-                self._give_up(str(answer))
-        elif isinstance(answer, Commitment):
-            self._accepted = done.request.number
-            self._tell(answer_accepted(done.request, done.made), done.asked)
-        else:
+            if done.behind is not None:
+                made = following(done.behind, answer)
+                self._send(replace(done, made=made, proposal=self._spoilt(made.proposal), due=self._clock.now(),
+                                   behind=None, stop=proposal.checksum))  # fmt: skip
+            elif done.request is not None:
+                self._accepted = done.request.number
+                self._tell(answer_accepted(self._accepted, done.made, done.stop), done.asked)
+            elif done.made.plan is not None:
+                self._on_answer(answer_changed(self._accepted, done.made))
+        elif done.request is not None:
             self._tell(answer_refused(done.request, answer), done.asked)
+        elif answer.fault is not Fault.LATE:
+            self._interrupt(str(answer))
 
     def _next(self, now: float) -> tuple[int, float]:
         """Return the setpoint from which on one may plan now, and how far ahead that is, s."""
@@ -134,7 +144,7 @@ class SteppedPlanner:
     def _plan(self, request: PathRequest, asked: float, now: float) -> None:
         first, ahead = self._next(now)
         try:
-            made = plan_request(self.held, request, first, self._limits, part_within(ahead))
+            made = self._planned(request, first, part_within(ahead))
         except CfplanError as error:
             self._tell(PathAnswer(request.number, PathVerdict.REFUSED, str(error)), asked)
             return
@@ -142,23 +152,34 @@ class SteppedPlanner:
             self.held = made
             self._tell(answer_held(request, made), asked)
             return
-        self._send(_InHand(request, asked, made, self._spoilt(made.proposal), now + self._planning))
+        sent = made if made.stop is None else made.stop
+        behind = None if made.stop is None else made
+        self._send(_InHand(request, asked, sent, self._spoilt(sent.proposal), now + self._planning, behind))
+
+    def _planned(self, request: PathRequest, first: int, part: int) -> Replanned | HeldFlight:
+        """Return what is to be proposed, from rest where no plan leads there from the motion."""
+        try:
+            return plan_request(self.held, request, first, self._limits, part)
+        except CfplanError as error:
+            return plan_behind_stop(self.held, request, first, self._limits, part, error)
 
     def _go_on(self, now: float, first: int, part: int) -> None:
         """Make the proposal of the next part of the plan that is flown."""
         try:
             made = plan_next_part(self.held, first, self._limits, part)
         except CfplanError as error:
-            self._give_up(str(error))
+            self._interrupt(str(error))
             return
         if isinstance(made, HeldFlight):
             self.held = made
             return
         self._send(_InHand(None, now, made, self._spoilt(made.proposal), now + self._planning))
 
-    def _give_up(self, reason: str) -> None:
-        self.held = given_up(self.held, self._limits)
-        self._on_answer(answer_cut_short(self._accepted, self.held, reason))
+    def _interrupt(self, reason: str) -> None:
+        """Let the vehicle rest behind what is committed, and go on from there unless that is what does not pass."""
+        self.held = after_failure(self.held, self._limits)
+        if not self.held.unfinished:
+            self._on_answer(answer_cut_short(self._accepted, self.held, reason))
 
     def _send(self, proposal: _InHand) -> None:
         if self.fault is PlannerFault.STOPPED:

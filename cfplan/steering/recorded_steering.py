@@ -65,7 +65,7 @@ class SteeringRecord:
                 answer.seconds,
             )
         )  # fmt: skip
-        level = Level.INFO if answer.verdict is PathVerdict.ACCEPTED else Level.WARNING
+        level = Level.INFO if answer.verdict in (PathVerdict.ACCEPTED, PathVerdict.CHANGED) else Level.WARNING
         self.tell(Event(now, level, f"answer {answer.number}: {answer_text(answer)}"))
         if answer.plan is not None:
             with suppress(CfplanError):  # `cfplan check` says that it is missing
@@ -102,8 +102,9 @@ def described(wish: Wish, waypoints: tuple[Triple, ...]) -> str:
 
 def answer_text(answer: PathAnswer) -> str:
     """Say what became of a request, in a line."""
-    if answer.verdict is not PathVerdict.ACCEPTED:
+    if answer.verdict not in (PathVerdict.ACCEPTED, PathVerdict.CHANGED):
         return f"{answer.verdict.value}: {answer.reason}" if answer.reason else answer.verdict.value
     if answer.splice < 0:
         return "accepted, for what is asked for next"
-    return f"accepted: another motion from {answer.joint:.2f} s on, at rest at {answer.ends:.2f} s"
+    begins = f"from {answer.joint:.2f} s on{', after a stop' if answer.stop else ''}"
+    return f"{answer.verdict.value}: another motion {begins}, at rest at {answer.ends:.2f} s"

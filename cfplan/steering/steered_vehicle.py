@@ -308,8 +308,10 @@ class SteeredVehicle:
     def _hear_answer(self, answer: PathAnswer) -> None:
         if math.isfinite(answer.ends):
             self._ends = answer.ends
-        self._answers[answer.number] = replace(answer, plan=None)
-        self._unread.append(self._answers[answer.number])
+        brief = replace(answer, plan=None)
+        if answer.verdict is not PathVerdict.CHANGED:  # that comes behind the answer
+            self._answers[answer.number] = brief
+        self._unread.append(brief)
         if self._recording is not None:
             self._recording.answered(answer)
 

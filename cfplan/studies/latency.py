@@ -61,6 +61,15 @@ RATE_COLUMNS = (
 )
 
 
+BUDGET_COLUMNS = (
+    Column("what", "part of the time until the first changed setpoint"),
+    Column("median", "median", "ms", ".0f"),
+    Column("mean", "mean", "ms", ".0f"),
+    Column("p90", "p90", "ms", ".0f"),
+    Column("max", "max", "ms", ".0f"),
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Replan:
     """One request that was accepted."""
@@ -69,6 +78,23 @@ class Replan:
     first_changed: float  # s from then until the first setpoint was sent that is another than before
     motion: float  # s from then to the joint
     answer: float  # s from then to the answer, as the planner counts
+    # What `first_changed` consists of, s, in order:
+    to_planner: float = 0.0  # until the planner's process has the request
+    waiting: float = 0.0  # until it begins to plan; with its proposals that came late
+    planning: float = 0.0  # the plan, whole
+    checking: float = 0.0  # bytes, stops, link loss, gaps and dry run of its first part
+    verifying: float = 0.0  # the way to the pilot, which looks every 10 ms, verifies and answers
+    spare: float = 0.0  # until the splice, which lies as far ahead as most plans need
+
+
+_PARTS = (
+    ("to the planner's process", "to_planner"),
+    ("what it does before", "waiting"),
+    ("plan", "planning"),
+    ("checks", "checking"),
+    ("verified by the pilot", "verifying"),
+    ("left until the splice", "spare"),
+)
 
 
 class _HeardSteering(RealTimeSteering):
@@ -143,7 +169,8 @@ def latency(
         vehicle.land()
     replans = _replans(flight, one_by_one)
     settings = {"requests": requests, "seconds": seconds, "rate": rate, "seed": first_seed, "horizon": HORIZON}
-    tables = (latency_table(replans), Table("rate", "Requests much faster than plans", RATE_COLUMNS, tuple(rows)))
+    many_table = Table("rate", "Requests much faster than plans", RATE_COLUMNS, tuple(rows))
+    tables = (latency_table(replans), budget_table(replans), many_table)
     return StudyResult("latency", settings, tables, (detail_table("replans", replans),))
 
 
@@ -163,6 +190,16 @@ def latency_table(replans: Sequence[Replan]) -> Table:
     return Table("latency", "Requests one at a time", LATENCY_COLUMNS, tuple(rows))
 
 
+def budget_table(replans: Sequence[Replan]) -> Table:
+    """Return a row for each part of the time until the first changed setpoint."""
+    rows = []
+    for what, name in _PARTS:
+        values = np.array([getattr(each, name) for each in replans])
+        rows.append({"what": what, "median": np.median(values), "mean": values.mean(),
+                     "p90": np.quantile(values, 0.9), "max": values.max()})  # fmt: skip
+    return Table("budget", "What that time consists of", BUDGET_COLUMNS, tuple(rows))
+
+
 def first_change(sequence: NDArray, splice: int, payloads: NDArray) -> int | None:
     """Return the number of the first setpoint that is another with setpoints (K, 29) from a splice on; None for none.
 
@@ -174,8 +211,12 @@ def first_change(sequence: NDArray, splice: int, payloads: NDArray) -> int | Non
 
 
 def _replans(flight: _HeardSteering, asked: dict[int, float]) -> list[Replan]:
-    """Return what became of the requests that were accepted, by the bytes that the pilot was bound to."""
-    answers = {each.checksum: each for each in flight.heard if each.splice >= 0 and each.number in asked}
+    """Return what became of the requests that were accepted, by the bytes that the pilot was bound to.
+
+    Where the vehicle is to stop first, the first setpoint of that is the one that changes.
+    """
+    accepted = [each for each in flight.heard if each.verdict is PathVerdict.ACCEPTED and each.number in asked]
+    answers = {each.stop or each.checksum: each for each in accepted if each.splice >= 0}
     sequence, found = np.empty((0, PAYLOAD_SIZE), dtype=np.uint8), []
     for each in flight.committed:
         payloads = np.frombuffer(each.payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
@@ -183,13 +224,24 @@ def _replans(flight: _HeardSteering, asked: dict[int, float]) -> list[Replan]:
             number, begun = first_change(sequence, each.splice, payloads), asked[answer.number]
             if number in flight.sent:
                 sent = flight.sent[number]
-                joint = sent.due + answer.joint - number / RATE
-                found.append(Replan(begun, sent.time - begun, joint - begun, answer.seconds))
+                joint = sent.due if answer.stop else sent.due + answer.joint - number / RATE
+                parts = _parts(answer, begun, sent.time)
+                found.append(Replan(begun, sent.time - begun, joint - begun, answer.seconds, *parts))
         if len(sequence) < each.splice:
             waits = np.repeat(sequence[-1:], each.splice - len(sequence), axis=0)
             sequence = np.concatenate([sequence, waits])
         sequence = np.concatenate([sequence[: each.splice], payloads])
     return found
+
+
+def _parts(answer: PathAnswer, asked: float, changed: float) -> tuple[float, ...]:
+    """Return the parts of the time from when it was asked until the first changed setpoint was sent, s, as _PARTS."""
+    times = answer.times
+    assert times is not None
+    return (
+        times.received - asked, times.begun - times.received, times.planned,
+        times.proposed - times.begun - times.planned, times.answered - times.proposed, changed - times.answered,
+    )  # fmt: skip
 
 
 def _stretch(what: str, flight: _HeardSteering, begin: float, end: float, asked: dict[int, float]) -> dict[str, Any]:

@@ -138,7 +138,6 @@ class _WatchedSteering(SteppedSteering):
         self.commitments: list[Committed] = []
         self.sent: dict[int, SetpointSent] = {}
         self.answered: Counter[int] = Counter()
-        self.cut_short = 0
         self._flies_plan = False
 
     def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
@@ -152,9 +151,7 @@ class _WatchedSteering(SteppedSteering):
             listeners.telemetry(message)
 
         def hear_answer(answer: PathAnswer) -> None:
-            if answer.verdict is PathVerdict.CUT_SHORT:
-                self.cut_short += 1
-            else:
+            if answer.verdict not in (PathVerdict.CUT_SHORT, PathVerdict.CHANGED):
                 self.answered[answer.number] += 1
             listeners.answer(answer)
 
@@ -171,8 +168,10 @@ class _WatchedSteering(SteppedSteering):
         commitment, flown = held.commitment, held.flown
         later = commitment.splices[-1] - splice if commitment.splices else 0
         if self.commitments:
-            begins = flown.starts[-1] + later / RATE
-            flown = self.commitments[-1].flown.continued(begins, flown.trajectories[-1])
+            known, flown = {id(each) for each in self.commitments[-1].flown.trajectories}, self.commitments[-1].flown
+            for start, leg in zip(held.flown.starts, held.flown.trajectories, strict=True):
+                if id(leg) not in known:
+                    flown = flown.continued(start + later / RATE, leg)
         rows = slice(splice + later - commitment.first, None)
         ends = np.array(commitment.stops[rows][:, [0, -1]])
         payloads = np.array(commitment.payloads[rows])

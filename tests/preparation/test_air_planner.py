@@ -27,6 +27,7 @@ from cfplan.planning.plan import plan
 from cfplan.preparation.air_planner import AirPlanner, PathAnswer, PathRequest, PathVerdict, Wish, _Worker
 from cfplan.preparation.replan import hold
 
+LATE = 1.5  # s, longer than a planner waits for an answer
 NOT_FLOWN = "the plan is not flown yet"
 WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
 
@@ -42,6 +43,7 @@ class PilotSide:
         self.proposals = ReceivedProposals(connection)
         self.begun = 0.0
         self.given: list[Commitment | Refusal] = []
+        self.silent_for: float | None = None  # s, for which the next answer is kept back
 
     def begin(self) -> None:
         self.begun = REAL_CLOCK.now()
@@ -55,6 +57,9 @@ class PilotSide:
             if isinstance(answer, Commitment):
                 self.commitment = answer
             self.given.append(answer)
+            if self.silent_for is not None:
+                REAL_CLOCK.sleep(self.silent_for)
+                self.silent_for = None
             self.proposals.answer(proposal, answer)
 
 
@@ -156,6 +161,24 @@ def test_the_latest_request_wins(both):
     assert last.verdict is PathVerdict.ACCEPTED, last
 
 
+def test_an_answer_that_comes_late_leaves_both_sides_with_the_same_commitment(both):
+    """Longer than the planner waits for it: nobody is to plan on from what the pilot has left meanwhile."""
+    planner, pilot = both
+    pilot.begin()
+    assert until(lambda: answer_to(planner.request(Wish.EXTEND), planner, pilot).reason != NOT_FLOWN)
+    far = [(-0.5, 0.8, 1.0), (0.5, 2.0, 1.0), (-0.8, 0.4, 1.2), (0.8, -1.5, 0.9)]
+    while not any(isinstance(answer, Commitment) for answer in pilot.given):
+        pilot.silent_for = LATE
+        number = planner.request(Wish.REPLACE, far)
+        told = answer_to(number, planner, pilot)
+    assert (told.number, told.verdict) == (number, PathVerdict.REFUSED)
+    assert "the pilot does not answer" in told.reason
+    assert answer_to(number, planner, pilot).verdict is PathVerdict.ACCEPTED  # it is flown after all
+    later = [answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)]), planner, pilot) for _ in range(2)]
+    assert not any(answer.reason.startswith(Fault.ORDER) for answer in later), later
+    assert any(answer.verdict is PathVerdict.ACCEPTED for answer in later), later
+
+
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_planner_that_is_killed_or_stopped_leaves_the_pilot_its_commitment(both, held, how):
     planner, pilot = both
@@ -190,7 +213,7 @@ def test_a_fault_in_planning_is_an_answer_and_what_is_held_stays(held, limits):
     worker = _Worker(held, limits, requests, proposals)
     pilot.send_bytes(_ANSWER.pack(_BEGUN, 0, 0, REAL_CLOCK.now()))
     worker._read(1.0)
-    answer = worker._answer(PathRequest(1, Wish.REPLACE, ("no", "numbers")))
+    answer = worker._answer(PathRequest(1, Wish.REPLACE, ("no", "numbers")), REAL_CLOCK.now())
     assert answer.verdict is PathVerdict.REFUSED
     assert "fault in the planner: ValueError" in answer.reason
     assert worker._held is held

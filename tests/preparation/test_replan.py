@@ -14,14 +14,17 @@ from cfplan.planning.plan import plan
 from cfplan.preparation.replan import (
     LOOKS_BACK,
     accepted,
+    after_failure,
     at_pace,
     at_rest_from,
+    following,
     given_up,
     go_on,
     halt,
     hold,
     hold_hover,
     replan,
+    replan_behind_stop,
     snapshots_at,
 )
 from cfplan.safety.certificate import certify
@@ -254,3 +257,71 @@ def test_after_a_stop_beside_a_wall_a_plan_begins_with_what_is_committed(limits)
     resting = at_rest_from(in_part, in_part.stops_from + 5, limits)
     first = resting.exact_from + 5
     after(resting, limits, replan(resting, first, [[0.0, 0.5, 1.0]], limits), first - 5)
+
+
+@pytest.fixture(scope="module")
+def interrupted(held, limits):
+    """A plan in parts, the third of which did not pass: the vehicle is to stop behind two, and to go on from there."""
+    begun = after(held, limits, replan(held, NOW + 5, FAR, limits, part=PART))
+    begun = after(begun, limits, go_on(begun, NOW + 20, limits, PART), NOW + 10)
+    return after_failure(begun, limits)
+
+
+def test_where_a_part_does_not_pass_the_vehicle_stops_before_it_and_goes_on_from_there(interrupted, limits):
+    assert interrupted.unfinished
+    made = go_on(interrupted, NOW + 30, limits, PART)
+    assert made.proposal.splice == interrupted.exact_from  # long before the vehicle comes there
+    assert made.plan is not None
+    later = after(interrupted, limits, made, NOW + 25)
+    np.testing.assert_allclose(later.ahead[-1], FAR[-1])
+    assert not np.linalg.norm(decode(made.proposal.payloads[:5]).velocity, axis=1).any()
+    again = after_failure(interrupted, limits)
+    assert not again.unfinished  # once it rests, there is nothing else to try
+
+
+@pytest.mark.parametrize("planned", [False, True], ids=["before that is planned", "once that is planned"])
+def test_other_waypoints_are_flown_at_once_before_such_a_stop(interrupted, limits, planned):
+    held = interrupted
+    if planned:
+        held = after(held, limits, go_on(held, NOW + 30, limits, PART), NOW + 25)
+    first = NOW + 40
+    made = replan(held, first, [[-0.8, 0.6, 1.1], [0.5, 1.8, 1.0]], limits, part=PART)
+    assert made.proposal.splice < first + 36
+    new = after(held, limits, made, first - 5)
+    encoded = encode_trajectory(new.flown.since(first / RATE), gains=gains_under(limits), space=limits.space)
+    rows = slice(first - new.commitment.first, made.proposal.splice + PART - new.commitment.first)
+    np.testing.assert_array_equal(new.commitment.payloads[rows], encoded.payloads[: rows.stop - rows.start])
+
+
+@pytest.mark.parametrize("planned", [False, True], ids=["before that is planned", "once that is planned"])
+def test_a_stop_is_as_soon_before_such_a_stop_and_nothing_follows_it(interrupted, limits, planned):
+    held = interrupted
+    if planned:
+        held = after(held, limits, go_on(held, NOW + 30, limits, PART), NOW + 25)
+    made = halt(held, NOW + 40, limits)
+    assert made.proposal.splice == NOW + 40
+    assert made.held.exact_from < interrupted.exact_from - 50
+    stopped = after(held, limits, made, NOW + 35)
+    assert not stopped.unfinished
+    assert stopped.commitment.motion_ends < NOW + 40 + 121
+
+
+def test_within_a_stop_nothing_is_left_until_it_rests(interrupted, limits):
+    within = interrupted.exact_from - 60
+    made = replan(interrupted, within, [[0.0, 0.5, 1.0]], limits)
+    assert made.proposal.splice == interrupted.exact_from
+
+
+def test_where_no_way_leads_on_from_the_motion_one_leads_on_from_rest_behind_a_stop(held, limits):
+    first = NOW + 5
+    behind = held.flown.at(first / RATE).position - 0.15 * held.flown.at(first / RATE).velocity
+    made = replan_behind_stop(held, first, [behind], limits, part=PART)
+    assert made.stop is not None
+    assert made.stop.proposal.splice == first
+    stopped = after(held, limits, made.stop)
+    new = after(stopped, limits, following(made, stopped.commitment))
+    assert new.commitment.splices == (first, stopped.exact_from)
+    end = decode(new.commitment.payloads[-1:]).position[0]
+    np.testing.assert_allclose(end, behind, atol=1e-3)
+    still = stopped.exact_from - new.commitment.first
+    assert not decode(new.commitment.payloads[still : still + 5]).velocity.any()

@@ -13,11 +13,15 @@ from cfplan.cli import cfplan as command_line
 from cfplan.errors import InputError, NotCertifiedError
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE
 from cfplan.planning.plan_file import load_plan, save_plan
+from cfplan.preparation.air_planner import PathVerdict
+from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_IN_FLIGHT
 from cfplan.recording.rerun import layout
 from cfplan.recording.rerun.record_view import write_rrd
 from cfplan.steering.recertify import recertify
+from cfplan.steering.steered_vehicle import SteeredVehicle
+from cfplan.steering.stepped_steering import SteppedSteering
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +67,31 @@ def test_everything_committed_is_certified_again_and_was_streamed(folder):
     assert checked.streamed > 400
     assert checked.left_after == pytest.approx(checked.streamed / 100, abs=0.03)
     assert checked.committed == sum(len(each) // PAYLOAD_SIZE for each in record.commitments.payloads)
+
+
+def test_a_plan_that_goes_on_behind_a_stop_is_recorded_and_certified_again(limits, tmp_path):
+    """Its next part did not pass once; later it was asked for a place that no way leads to but from rest."""
+    flight = SteppedSteering(limits)
+    with SteeredVehicle(flight, limits, uri="sim://0", records=tmp_path) as vehicle:
+        vehicle.take_off(0.8)
+        vehicle.fly([[1.2, 2.5, 1.0], [-1.2, 2.5, 1.2], [-1.2, -2.5, 1.0]])
+        flight.planner.fault = PlannerFault.GARBAGE
+        vehicle.sleep(0.11)
+        flight.planner.fault = None
+        vehicle.sleep(2.4)
+        before = np.array(vehicle.target)
+        vehicle.sleep(0.1)
+        turned = vehicle.replace([before - 0.3 * (np.array(vehicle.target) - before), [0.0, 0.0, 1.0]])
+        assert vehicle.speed > 1.5
+        vehicle.wait()
+        np.testing.assert_allclose(vehicle.position, [0.0, 0.0, 1.0], atol=0.05)
+    changed = [answer for answer in vehicle.answers() if answer.verdict is PathVerdict.CHANGED]
+    record = read_record(vehicle.record)
+    checked = recertify(record)
+    assert checked.plans == checked.joints == 3
+    assert checked.jump < 1e-9
+    assert {changed[0].checksum, turned.checksum} <= set(record.commitments.checksum.tolist())
+    assert checked.stops == (turned.stop > 0)
 
 
 def test_the_command_line_says_so(folder):

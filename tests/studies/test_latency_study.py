@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.studies.latency import Replan, first_change, latency_table
+from cfplan.studies.latency import Replan, budget_table, first_change, latency_table
 from cfplan.studies.result import StudyResult
 
 
@@ -43,3 +43,11 @@ def test_its_table_has_a_row_for_each_delay_and_survives_json():
 def test_where_nothing_was_accepted_that_is_said():
     with pytest.raises(InputError, match="no request was accepted"):
         latency_table([])
+
+
+def test_the_parts_of_the_time_are_told_apart():
+    replans = [Replan(0.0, 0.1, 0.2, 0.08, 0.001, 0.0, 0.02, 0.04, 0.01 * k, 0.02) for k in range(11)]
+    rows = {row["what"]: row for row in budget_table(replans).rows}
+    assert rows["plan"]["median"] == pytest.approx(0.02)
+    assert (rows["verified by the pilot"]["median"], rows["verified by the pilot"]["max"]) == pytest.approx((0.05, 0.1))
+    assert sum(row["mean"] for row in rows.values()) == pytest.approx(0.131)
