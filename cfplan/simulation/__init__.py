@@ -5,6 +5,7 @@ __all__ = [
     "geometric_flight",
     "glitches",
     "lab",
+    "left_alone",
     "link_loss",
     "on_board_run",
     "other_bodies",

@@ -28,44 +28,19 @@ from numpy.typing import NDArray
 from cfplan.flight.firmware import Timeouts, gains_for
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, decode
-from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
-from cfplan.simulation.dynamics.body import (
-    AXIAL_DRAG,
-    DRAG,
-    FULL_EFFICIENCY,
-    LAG,
-    MASS,
-    STEP,
-    STILL_AIR,
-    THRUST_MAX,
-    pack_body,
-)
-from cfplan.simulation.dynamics.branching import (
-    MEMORY,
-    SNAPSHOT_SIZE,
-    STEPS_A_CONTROL,
-    THRUSTS,
-    arrival_steps,
-    hovering_snapshot,
-    setpoint_rows,
-    step_control,
-    step_vehicle,
-)
-from cfplan.simulation.dynamics.mellinger import CONTROL_PERIOD, FULL_STATE, SETPOINT_SIZE, level_out
+from cfplan.simulation.dynamics.body import pack_body
+from cfplan.simulation.dynamics.branching import SNAPSHOT_SIZE, arrival_steps, hovering_snapshot, setpoint_rows
+from cfplan.simulation.dynamics.mellinger import SETPOINT_SIZE
+from cfplan.simulation.left_alone import LIFT, fly_to_each, leave_alone, leave_alone_in_stops
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.rotations import axes_of
 
 # s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
 LEVEL_AFTER, OFF_AFTER = Timeouts().level_out_at_latest, Timeouts().motors_off_at_latest
 OFF_BY_WATCHDOG = Timeouts().watchdog_at_latest  # if the emergency-stop watchdog is enabled
 WALLS = ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1))
 """(axis, low or high side) of the walls and the ceiling; on the floor is where it ends."""
-_LONGEST = 4.0  # s that are simulated after the last setpoint, unless the vehicle lies on the floor before
 _STEP, _COARSE_STEP = 0.004, 0.008  # s, of the simulation after the last setpoint, and where it only looks for walls
-_SETTLED_AFTER = 0.5  # s of level-out, after which a vehicle that hardly turns has settled
-_SETTLED_RATE = 0.2  # rad/s, below which it hardly turns
-_COAST_STEP = 0.01  # s, of the place alone
 _NEAR = 0.1  # m from a wall, within which it also matters that the accelerometer may say too much
 _COARSE_EVERY = 2  # setpoints between those that are looked at coarsely
 _FORESEEN_EVERY = 16  # likewise, for an estimate
@@ -74,7 +49,6 @@ _SLOW_EVERY, _SLOW_ALLOWANCE = (
     8,
     0.02,
 )  # both for motions at 0.9 m/s and 2 m/s²; m, of which 6 mm were seen in 240 motions
-_PUSH, _DAMPING, _LIFT, _SPEED = range(4)  # as _wrong packs what the vehicle has wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,8 +117,7 @@ def link_loss_near_walls(
     finds in a fraction of the time.
     """
     state = decode(payloads)
-    begins = _begins(state, limits, starts)
-    seen, snapshots = _look_coarsely(state, limits, rate, begins), _snapshots(state, limits, rate, begins)
+    snapshots, seen = _flown_and_seen(state, limits, rate, starts)
     forks = ~(seen.beyond + ALLOWANCE < -within)
     forks[seen.beyond.argmax()] = True
     found = _lose_link(state, limits, rate, snapshots, forks, seen)
@@ -162,10 +135,8 @@ def link_loss_at_walls(
     As link_loss_near_walls does, but of a flight that ends inside from everywhere it does not find the worst moment.
     """
     state = decode(payloads)
-    begins = _begins(state, limits, starts)
-    seen = _look_coarsely(state, limits, rate, begins)
-    forks = ~(seen.beyond + ALLOWANCE < 0.0)
-    return _lose_link(state, limits, rate, _snapshots(state, limits, rate, begins), forks, seen)
+    snapshots, seen = _flown_and_seen(state, limits, rate, starts)
+    return _lose_link(state, limits, rate, snapshots, ~(seen.beyond + ALLOWANCE < 0.0), seen)
 
 
 def foreseen_link_loss(
@@ -175,8 +146,16 @@ def foreseen_link_loss(
 
     It takes a tenth of what link_loss_at_walls() takes.
     """
-    state = decode(payloads)
-    return _look_coarsely(state, limits, rate, _begins(state, limits, starts), _FORESEEN_EVERY)
+    return _foreseen(decode(payloads), limits, rate, starts, _FORESEEN_EVERY)
+
+
+def _foreseen(
+    state: FullStateSetpoints, limits: Limits, rate: float, starts: NDArray | None, every: int
+) -> LinkLossMoments:
+    """Return about how each setpoint ends, looking at one in `every`."""
+    begins, bodies = _begins(state, limits, starts), _bodies(limits)
+    middle = len(bodies) // 2
+    return _look_coarsely(state, limits, rate, _flown(state, limits, rate, bodies[middle][0], begins[middle]), every)
 
 
 def _begins(state: FullStateSetpoints, limits: Limits, starts: NDArray | None) -> list[NDArray]:
@@ -186,13 +165,17 @@ def _begins(state: FullStateSetpoints, limits: Limits, starts: NDArray | None) -
 
 def _snapshots(state: FullStateSetpoints, limits: Limits, rate: float, begins: list[NDArray]) -> NDArray:
     """Return (L, N, 31) vehicle and controller at each setpoint, for each motor lag, where the link is not lost."""
-    nowhere, wrong = np.zeros(len(state.position), dtype=np.bool_), _wrong(limits)
-
-    def one(body: tuple[NDArray, NDArray], begin: NDArray) -> NDArray:
-        return _swept(state, limits, body, rate, begin, nowhere, wrong)[1]
-
     with ThreadPoolExecutor() as pool:  # a motor lag each
-        return np.array(list(pool.map(one, _bodies(limits), begins)))
+        bodies = (body for body, _ in _bodies(limits))
+        return np.array(list(pool.map(lambda body, begin: _flown(state, limits, rate, body, begin), bodies, begins)))
+
+
+def _flown(state: FullStateSetpoints, limits: Limits, rate: float, body: NDArray, begin: NDArray) -> NDArray:
+    """Return (N, 31) vehicle and controller at each setpoint, for one motor lag."""
+    rows = setpoint_rows(state)
+    snapshots = np.empty((len(rows), SNAPSHOT_SIZE))
+    fly_to_each(snapshots, rows, begin, _gains(limits), body, arrival_steps(len(rows), rate))
+    return snapshots
 
 
 def _lose_link(
@@ -212,7 +195,7 @@ def _lose_link(
     boxes = _boxes(state, limits, rate, snapshots, forks, wrong, coarse)
     found = _judge(time, state.position, boxes, limits, snapshots)
     near = forks & ~(found.beyond < -_NEAR)
-    if wrong[_LIFT] and near.any():
+    if wrong[LIFT] and near.any():
         sinking = _boxes(state, limits, rate, snapshots, near, wrong * (1.0, 1.0, -1.0, 1.0), boxes[0])
         found = _judge(time, state.position, boxes + sinking, limits, snapshots)
     return found if seen is None else replace(found, beyond=np.where(forks, found.beyond, found.beyond + ALLOWANCE))
@@ -228,14 +211,15 @@ def _boxes(
     others: NDArray | None,
 ) -> list[NDArray]:
     """Return for each motor lag the boxes, (N, 2, 3), swept from where `forks` says so; `others` at the others."""
-    rows = setpoint_rows(state)[forks][:, None]
-    once, arrivals, steps = np.ones((len(rows), 1), dtype=np.bool_), arrival_steps(1, rate), _steps(limits)
+    rows = setpoint_rows(state)[forks]
 
     def one(body: tuple[NDArray, NDArray], begins: NDArray) -> NDArray:
-        swept = np.empty((len(rows), 1, 2, 3))
-        _fly_stops(swept, rows, begins[forks], once, _gains(limits), *body, *steps, arrivals, wrong)
+        swept = np.empty((len(rows), 2, 3))
+        leave_alone(swept, begins[forks], rows, _gains(limits), body[1], *_steps(limits), wrong)
+        if others is None and len(rows) == len(forks):
+            return swept
         boxes = np.empty((len(forks), 2, 3)) if others is None else others.copy()
-        boxes[forks] = swept[:, 0]
+        boxes[forks] = swept
         return boxes
 
     with ThreadPoolExecutor() as pool:  # a motor lag each
@@ -243,21 +227,32 @@ def _boxes(
 
 
 def _look_coarsely(
-    state: FullStateSetpoints, limits: Limits, rate: float, begins: list[NDArray], every: int = _COARSE_EVERY
+    state: FullStateSetpoints, limits: Limits, rate: float, snapshots: NDArray, every: int = _COARSE_EVERY
 ) -> LinkLossMoments:
-    """Return how each setpoint ends, by one motor lag, coarse steps and one in `every` setpoints."""
-    count, middle = len(state.position), len(begins) // 2
-    looked_at = np.zeros(count, dtype=np.bool_)
-    looked_at[::every] = looked_at[-1] = True
-    body, wrong = _coarse_body(limits), _wrong(limits)
-    boxes, _ = _swept(state, limits, body, rate, begins[middle], looked_at, wrong, _COARSE_STEP)
-    rows = np.flatnonzero(looked_at)
+    """Return how each setpoint ends, by one motor lag, coarse steps and one in `every` setpoints.
+
+    `snapshots`, (N, 31), are at each setpoint, for the motor lag in the middle.
+    """
+    count = len(state.position)
+    rows = np.unique(np.append(np.arange(0, count, every), count - 1))
+    boxes = np.empty((len(rows), 2, 3))
+    leave_alone(
+        boxes, snapshots[rows], setpoint_rows(state)[rows], _gains(limits), _coarse_bodies(limits),
+        *_steps(limits, _COARSE_STEP), _wrong(limits),
+    )  # fmt: skip
     before = np.repeat(np.arange(len(rows)), np.diff(rows, append=count))
-    after = np.where(looked_at, before, np.minimum(before + 1, len(rows) - 1))
-    boxes = boxes[rows]
+    after = np.where(np.isin(np.arange(count), rows), before, np.minimum(before + 1, len(rows) - 1))
     low, high = np.minimum(boxes[before, 0], boxes[after, 0]), np.maximum(boxes[before, 1], boxes[after, 1])
     box, no_snapshots = np.stack([low, high], axis=1), np.empty((0, count, SNAPSHOT_SIZE))
     return _judge(np.arange(count) / rate, state.position, [box], limits, no_snapshots)
+
+
+def _flown_and_seen(
+    state: FullStateSetpoints, limits: Limits, rate: float, starts: NDArray | None
+) -> tuple[NDArray, LinkLossMoments]:
+    """Return the snapshots of a flight for each motor lag, and how each setpoint ends as seen coarsely."""
+    snapshots = _snapshots(state, limits, rate, _begins(state, limits, starts))
+    return snapshots, _look_coarsely(state, limits, rate, snapshots[len(snapshots) // 2])
 
 
 def as_believed(snapshots: NDArray, limits: Limits) -> NDArray:
@@ -279,13 +274,14 @@ def link_loss_within_stops(
     steps = _steps(limits, _COARSE_STEP if coarsely else _STEP)
 
     def one(body: tuple[NDArray, NDArray], begin: NDArray) -> NDArray:
-        swept = np.empty((*stops.shape[:2], 2, 3))
-        _fly_stops(swept, rows, begin, forks, gains, *body, *steps, arrivals, wrong)
-        return swept[forks]
+        boxes = np.empty((np.count_nonzero(forks), 2, 3))
+        leave_alone_in_stops(boxes, rows, begin, forks, gains, *body, *steps, arrivals, wrong)
+        return boxes
 
     begins = np.ascontiguousarray(starts)  # compiled for one layout
+    middle = len(begins) // 2
     if coarsely:
-        boxes = [one(_coarse_body(limits), begins[len(begins) // 2])]
+        boxes = [one((_bodies(limits)[middle][0], _coarse_bodies(limits)), begins[middle])]
     else:
         with ThreadPoolExecutor() as pool:  # a motor lag each
             boxes = list(pool.map(one, _bodies(limits), begins))
@@ -298,8 +294,7 @@ def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RA
 
     A coarse look at every eighth one tells unless one ends near a wall: then each is simulated with every motor lag.
     """
-    state = decode(payloads)
-    seen = _look_coarsely(state, limits, rate, _begins(state, limits, None), _SLOW_EVERY)
+    seen = _foreseen(decode(payloads), limits, rate, None, _SLOW_EVERY)
     if seen.worst.beyond < -_SLOW_ALLOWANCE:
         return seen
     return link_loss_at_every_setpoint(payloads, limits, rate)
@@ -337,13 +332,13 @@ def _bodies(limits: Limits) -> list[tuple[NDArray, NDArray]]:
     return [(pack_body(airframe), np.stack([pack_body(airframe, step=_STEP)] * 2)) for airframe in airframes]
 
 
-def _coarse_body(limits: Limits) -> tuple[NDArray, NDArray]:
-    """Return the same for coarse steps, with the motor lag in the middle; falls, (3, P) in all, with both extremes."""
+def _coarse_bodies(limits: Limits) -> NDArray:
+    """Return (3, P): with the motor lag in the middle after the last setpoint, and falling with both extremes."""
     lags = _lags(limits)
-    middle, *falling = (
+    airframes: list[Airframe] = [
         replace(limits.airframe, motor_time_constant=lag) for lag in (lags[len(lags) // 2], lags[0], lags[-1])
-    )
-    return pack_body(middle), np.stack([pack_body(each, step=_COARSE_STEP) for each in (middle, *falling)])
+    ]
+    return np.stack([pack_body(each, step=_COARSE_STEP) for each in airframes])
 
 
 def _lags(limits: Limits) -> list[float]:
@@ -358,225 +353,3 @@ def _steps(limits: Limits, step: float = _STEP) -> tuple[int, int]:
     """Return after how many steps of a branch the vehicle levels out, and after how many its motors stop."""
     off = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER
     return round(LEVEL_AFTER / step), round(off / step)
-
-
-def _swept(
-    state: FullStateSetpoints,
-    limits: Limits,
-    body: tuple[NDArray, NDArray],
-    rate: float,
-    start: NDArray,
-    forks: NDArray,
-    wrong: NDArray,
-    step: float = _STEP,
-) -> tuple[NDArray, NDArray]:
-    """Return boxes (N, 2, 3) where `forks`, (N,), and snapshots of vehicle and controller at each setpoint."""
-    count, rows = len(state.position), setpoint_rows(state)
-    swept, snapshots = np.empty((count, 2, 3)), np.empty((count, SNAPSHOT_SIZE))
-    arrivals = arrival_steps(count, rate)
-    _fly(swept, snapshots, rows, start, forks, _gains(limits), *body, *_steps(limits, step), arrivals, wrong)
-    return swept, snapshots
-
-
-@njit(nogil=True)
-def _fly_stops(
-    swept: NDArray,
-    stops: NDArray,
-    starts: NDArray,
-    forks: NDArray,
-    gains: NDArray,
-    body: NDArray,
-    later_bodies: NDArray,
-    level_after: int,
-    off_after: int,
-    arrivals: NDArray,
-    wrong: NDArray,
-) -> None:
-    snapshots = np.empty((stops.shape[1], SNAPSHOT_SIZE))
-    for n in range(len(stops)):
-        end = stops.shape[1]
-        while end > 0 and not forks[n, end - 1]:
-            end -= 1
-        _fly(
-            swept[n], snapshots, stops[n, :end], starts[n], forks[n], gains, body, later_bodies, level_after, off_after,
-            arrivals, wrong,
-        )  # fmt: skip
-
-
-@njit(nogil=True)
-def _fly(
-    swept: NDArray,
-    snapshots: NDArray,
-    setpoints: NDArray,
-    start: NDArray,
-    forks: NDArray,
-    gains: NDArray,
-    body: NDArray,
-    later_bodies: NDArray,
-    level_after: int,
-    off_after: int,
-    arrivals: NDArray,
-    wrong: NDArray,
-) -> None:
-    """Fly setpoints from a snapshot; branch off where `forks` says so, at the moment at which each arrives."""
-    now, branch, setpoint = start.copy(), start.copy(), np.zeros(SETPOINT_SIZE)
-    control, motors = np.zeros(4), np.zeros(4)
-    full_state, mode, astray = FULL_STATE.copy(), FULL_STATE.copy(), np.zeros(3)
-    for newest in range(len(setpoints)):
-        for k in range(SNAPSHOT_SIZE):
-            snapshots[newest, k] = now[k]
-        if forks[newest]:
-            for k in range(3):
-                swept[newest, 0, k], swept[newest, 1, k] = now[k], now[k]
-            for falling in range(1, len(later_bodies)):
-                for k in range(SNAPSHOT_SIZE):
-                    branch[k] = now[k]
-                _fall(swept[newest], branch, later_bodies[falling])
-            for k in range(SNAPSHOT_SIZE):
-                branch[k] = now[k]
-            for k in range(SETPOINT_SIZE):
-                setpoint[k] = setpoints[newest, k]
-            for k in range(len(mode)):
-                mode[k] = full_state[k]
-            _go_on_alone(
-                swept[newest], branch, setpoint, mode, gains, later_bodies[0], level_after, off_after, wrong, astray,
-                control, motors,
-            )  # fmt: skip
-        for step in range(arrivals[newest], arrivals[newest + 1]):
-            if step % STEPS_A_CONTROL == 0:
-                step_control(now, now, gains, setpoints[newest], full_state, body, CONTROL_PERIOD, control, motors)
-            step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
-
-
-@njit(allocates=False)
-def _fall(swept: NDArray, now: NDArray, body: NDArray) -> None:
-    """Fall, motors off, to the floor; widen the box swept. `now` is overwritten."""
-    for k in range(4):
-        now[THRUSTS + k] = 0.0
-    for _ in range(round(_LONGEST / body[STEP])):
-        step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
-        _widen(swept, now, 0.0)
-        if now[2] <= 0.0:
-            return
-
-
-@njit(allocates=False)
-def _go_on_alone(
-    swept: NDArray,
-    now: NDArray,
-    setpoint: NDArray,
-    mode: NDArray,
-    gains: NDArray,
-    body: NDArray,
-    level_after: int,
-    off_after: int,
-    wrong: NDArray,
-    astray: NDArray,
-    control: NDArray,
-    motors: NDArray,
-) -> None:
-    """Fly on with the last setpoint, to the floor; write the box swept.
-
-    `now`, `setpoint`, `mode`, `astray`, `control` and `motors` are overwritten.
-    """
-    astray[0], astray[1] = 0.0, wrong[_SPEED]  # m, m/s: drift to a side, its speed
-    astray[2] = 0.0  # m/s: at which it believes to sink
-    period = body[STEP]
-    settled_after = level_after + round(_SETTLED_AFTER / period)
-    for after in range(round(_LONGEST / period)):
-        if after == level_after:
-            level_out(setpoint, mode)
-        turning = abs(now[10]) + abs(now[11]) + abs(now[12])
-        if settled_after <= after < off_after and turning < _SETTLED_RATE:
-            _coast(swept, now, setpoint, gains, body, (off_after - after) * period, wrong, astray)
-            return
-        if after < off_after:
-            step_control(now, now, gains, setpoint, mode, body, period, control, motors)
-        else:
-            for k in range(4):
-                now[THRUSTS + k] = 0.0
-        step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
-        _go_astray(astray, setpoint, wrong, after < off_after, period)
-        _widen(swept, now, astray[0])
-        if after > off_after and now[2] <= 0.0:
-            return
-
-
-@njit(allocates=False)
-def _coast(
-    swept: NDArray,
-    now: NDArray,
-    setpoint: NDArray,
-    gains: NDArray,
-    body: NDArray,
-    powered: float,
-    wrong: NDArray,
-    astray: NDArray,
-) -> None:
-    """Follow the place of a vehicle whose attitude stands still, for `powered` s with motors and to the floor.
-
-    Semi-implicit midpoint: height control, motor lag and drag as in the whole simulation.
-    """
-    _, _, (zx, zy, zz) = axes_of(now[6], now[7], now[8], now[9])
-    mass, lag = body[MASS], max(body[LAG], _COAST_STEP)
-    thrust = now[13] + now[14] + now[15] + now[16]
-    integral, time = now[MEMORY + 2], 0.0
-    while time < _LONGEST:
-        wanted = 0.0
-        if time < powered:
-            error = setpoint[2] - now[2]
-            integral += error * _COAST_STEP
-            wanted = (mass * GRAVITY + gains[6] * error + gains[7] * (setpoint[5] - now[5]) + gains[8] * integral) * zz
-            wanted = min(max(wanted, 0.0), 4.0 * body[THRUST_MAX])
-        before = thrust
-        thrust += (wanted - thrust) * _COAST_STEP / (lag + 0.5 * _COAST_STEP)
-        push = 0.5 * (before + thrust) / mass
-        for k in range(3):
-            lift = (zx, zy, zz)[k] * push - (GRAVITY if k == 2 else 0.0)
-            drag = (body[DRAG] if k < 2 else body[AXIAL_DRAG]) / mass
-            speed = now[3 + k]
-            now[3 + k] = _slowed(speed, lift, drag, _COAST_STEP)
-            now[k] += _COAST_STEP * 0.5 * (speed + now[3 + k])
-        _go_astray(astray, setpoint, wrong, time < powered, _COAST_STEP)
-        _widen(swept, now, astray[0])
-        time += _COAST_STEP
-        if time > powered and now[2] <= 0.0:
-            break
-
-
-@njit(allocates=False)
-def _go_astray(astray: NDArray, setpoint: NDArray, wrong: NDArray, powered: bool, step: float) -> None:
-    """Let what the vehicle has wrong act for a step: a wrong attitude pushes to a side, a wrong height lifts.
-
-    All that the controller sees of a height that is believed too low is how far off the setpoint is; so that rises.
-    """
-    push = wrong[_PUSH] if powered else 0.0
-    speed = astray[1]
-    astray[1] = _slowed(speed, push, wrong[_DAMPING], step)
-    astray[0] += step * 0.5 * (speed + astray[1])
-    setpoint[2] += step * (astray[2] + 0.5 * step * wrong[_LIFT])
-    setpoint[5] += step * wrong[_LIFT]
-    astray[2] += step * wrong[_LIFT]
-
-
-@njit(allocates=False)
-def _widen(swept: NDArray, now: NDArray, astray: float) -> None:
-    """Make a box, (2, 3), hold a place and all `astray`, m, to its sides; what is no number is taken over."""
-    for k in range(3):
-        aside = astray if k < 2 else 0.0
-        _hold(swept, k, now[k] - aside, now[k] + aside)
-
-
-@njit(allocates=False)
-def _hold(swept: NDArray, axis: int, low: float, high: float) -> None:
-    """Make a box, (2, 3), reach from `low` to `high`, m, along an axis."""
-    if not swept[0, axis] <= low:
-        swept[0, axis] = low
-    if not swept[1, axis] >= high:
-        swept[1, axis] = high
-
-
-@njit(allocates=False)
-def _slowed(speed: float, push: float, drag: float, step: float) -> float:
-    """Return a speed, m/s, after a step, s, of a push, m/s², and a drag in 1/s; midpoint, implicit in the drag."""
-    return speed + step * (push - drag * speed) / (1.0 + 0.5 * drag * step)

@@ -11,13 +11,15 @@ its feet or, if it came down steeper than `TIPPING_ANGLE`, onto its back, where 
 that its gyroscopes feel it.
 """
 
+from typing import Any
+
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.rotations import about_z, axes_of, product, yaw_of
+from cfplan.vehicle.rotations import Quaternion, Vector, about_z, axes_of, product, yaw_of
 
 TIME_STEP = 0.001  # s
 
@@ -35,6 +37,9 @@ STATE_SIZE = 17
 
 # Where each parameter lies in the array that `pack_body` makes.
 MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, THRUST_MAX, LAG, DRAG, AXIAL_DRAG, FLOOR, _REACTION, STEP = range(13)
+
+Parameters = Any  # what `pack_body` makes, as an array or as a tuple
+Motors = tuple[float, float, float, float]
 
 STILL_AIR = np.zeros(3)
 FULL_EFFICIENCY = np.ones(4)
@@ -82,42 +87,84 @@ def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, ef
     `efficiency` (4,) is the share of its thrust that each motor gives, 1 without a fault.
     """
     step = body[STEP]
-    lag = min(1.0, step / max(body[LAG], 1e-9))
+    lag = lag_share(body)
     push_0, twist_0 = _spin_up(state, command, body, efficiency, lag, 0)
     push_1, twist_1 = _spin_up(state, command, body, efficiency, lag, 1)
     push_2, twist_2 = _spin_up(state, command, body, efficiency, lag, 2)
     push_3, twist_3 = _spin_up(state, command, body, efficiency, lag, 3)
-    thrust = push_0 + push_1 + push_2 + push_3
 
     # On the floor the ground takes all torque and every force that does not lift the body off it.
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes_of(state[6], state[7], state[8], state[9])
-    on_floor = state[2] <= body[FLOOR]
-    if on_floor and state[5] <= 0.0 and thrust * zz <= body[MASS] * GRAVITY:
-        _rest(state, body)
+    axes = axes_of(state[6], state[7], state[8], state[9])
+    lift = (push_0 + push_1 + push_2 + push_3) * axes[2][2]
+    if state[2] <= body[FLOOR] and state[5] <= 0.0 and lift <= body[MASS] * GRAVITY:
+        rest(state, body)
         return
 
-    torque_x = body[_ARM] * (-push_0 - push_1 + push_2 + push_3)
-    torque_y = body[_ARM] * (-push_0 + push_1 + push_2 - push_3)
-    torque_z = -twist_0 + twist_1 - twist_2 + twist_3
-    wx, wy, wz = state[10], state[11], state[12]
-    jx, jy, jz = body[_JX], body[_JY], body[_JZ]
-    state[10] += step * (torque_x + (jy - jz) * wy * wz) / jx
-    state[11] += step * (torque_y + (jz - jx) * wz * wx) / jy
-    state[12] += step * (torque_z + (jx - jy) * wx * wy) / jz
-
-    ax, ay, az = state[3] - wind[0], state[4] - wind[1], state[5] - wind[2]
-    force_x = -body[DRAG] * (xx * ax + xy * ay + xz * az)
-    force_y = -body[DRAG] * (yx * ax + yy * ay + yz * az)
-    force_z = thrust - body[AXIAL_DRAG] * (zx * ax + zy * ay + zz * az)
-    state[3] += step * (xx * force_x + yx * force_y + zx * force_z) / body[MASS]
-    state[4] += step * (xy * force_x + yy * force_y + zy * force_z) / body[MASS]
-    state[5] += step * (xz * force_x + yz * force_y + zz * force_z) / body[MASS]
-    state[5] -= step * GRAVITY
+    velocity, air = (state[3], state[4], state[5]), (state[3] - wind[0], state[4] - wind[1], state[5] - wind[2])
+    pushes, twists = (push_0, push_1, push_2, push_3), (twist_0, twist_1, twist_2, twist_3)
+    state[10], state[11], state[12] = turned_faster((state[10], state[11], state[12]), pushes, twists, body)
+    state[3], state[4], state[5] = accelerated(velocity, air, axes, pushes, body)
     for axis in range(3):
         state[axis] += step * state[3 + axis]
     _turn(state, step)
     if state[2] < body[FLOOR]:
-        _rest(state, body)
+        rest(state, body)
+
+
+@register_jitable(forceinline=True)
+def lag_share(body: Parameters) -> float:
+    """Return the share of what a motor's thrust misses that it makes up for in a step."""
+    return min(1.0, body[STEP] / max(body[LAG], 1e-9))
+
+
+@register_jitable(forceinline=True)
+def spun_up(thrust: float, asked: float, body: Parameters, lag: float) -> tuple[float, float]:
+    """Return a motor's thrust, N, after a step in which it is asked for another, and by how much it changes."""
+    change = (min(max(asked, 0.0), body[THRUST_MAX]) - thrust) * lag
+    return thrust + change, change
+
+
+@register_jitable(forceinline=True)
+def twist_of(push: float, change: float, body: Parameters) -> float:
+    """Return a motor's torque about the thrust axis, N m, by its push, N, and by how much its thrust changes in a step.
+
+    A rotor that speeds up pushes the body the other way round, as its drag does.
+    """
+    return body[_THRUST_TO_TORQUE] * push + body[_REACTION] * change / body[STEP]
+
+
+@register_jitable(forceinline=True)
+def turned_faster(rate: Vector, pushes: Motors, twists: Motors, body: Parameters) -> Vector:
+    """Return the body rate, rad/s, after a step, by the push of each motor, N, and its torque, N m."""
+    push_0, push_1, push_2, push_3 = pushes
+    torque_x = body[_ARM] * (-push_0 - push_1 + push_2 + push_3)
+    torque_y = body[_ARM] * (-push_0 + push_1 + push_2 - push_3)
+    torque_z = -twists[0] + twists[1] - twists[2] + twists[3]
+    (wx, wy, wz), step = rate, body[STEP]
+    jx, jy, jz = body[_JX], body[_JY], body[_JZ]
+    return (
+        wx + step * (torque_x + (jy - jz) * wy * wz) / jx,
+        wy + step * (torque_y + (jz - jx) * wz * wx) / jy,
+        wz + step * (torque_z + (jx - jy) * wx * wy) / jz,
+    )
+
+
+@register_jitable(forceinline=True)
+def accelerated(
+    velocity: Vector, air: Vector, axes: tuple[Vector, Vector, Vector], pushes: Motors, body: Parameters
+) -> Vector:
+    """Return the velocity, m/s, after a step, by that through the air, the axes and the push of each motor, N."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes
+    (ax, ay, az), step = air, body[STEP]
+    thrust = pushes[0] + pushes[1] + pushes[2] + pushes[3]
+    force_x = -body[DRAG] * (xx * ax + xy * ay + xz * az)
+    force_y = -body[DRAG] * (yx * ax + yy * ay + yz * az)
+    force_z = thrust - body[AXIAL_DRAG] * (zx * ax + zy * ay + zz * az)
+    return (
+        velocity[0] + step * (xx * force_x + yx * force_y + zx * force_z) / body[MASS],
+        velocity[1] + step * (xy * force_x + yy * force_y + zy * force_z) / body[MASS],
+        velocity[2] + step * (xz * force_x + yz * force_y + zz * force_z) / body[MASS] - step * GRAVITY,
+    )
 
 
 @register_jitable(forceinline=True)
@@ -125,31 +172,42 @@ def _spin_up(
     state: NDArray, command: NDArray, body: NDArray, efficiency: NDArray, lag: float, motor: int
 ) -> tuple[float, float]:
     """Advance a motor's thrust by a step; return its push, N, and its torque about the thrust axis, N m."""
-    asked = min(max(command[motor], 0.0), body[THRUST_MAX])
-    change = (asked - state[13 + motor]) * lag
-    state[13 + motor] += change
+    state[13 + motor], change = spun_up(state[13 + motor], command[motor], body, lag)
     push = state[13 + motor] * efficiency[motor]
-    # A rotor that speeds up pushes the body the other way round, as its drag does.
-    return push, body[_THRUST_TO_TORQUE] * push + body[_REACTION] * change / body[STEP]
+    return push, twist_of(push, change, body)
+
+
+@register_jitable(forceinline=True)
+def turn_of(rate: Vector, step: float) -> tuple[float, float]:
+    """Return the size of a body rate, rad/s, and half the angle, rad, by which it turns in a step, s."""
+    wx, wy, wz = rate
+    size = np.sqrt(wx * wx + wy * wy + wz * wz)
+    return size, 0.5 * size * step
+
+
+@register_jitable(forceinline=True)
+def turned(
+    attitude: Quaternion, rate: Vector, size: float, half: float, sin: float, cos: float, step: float
+) -> tuple[float, float, float, float]:
+    """Return an attitude turned by a body rate over a step, exactly for a constant rate; `sin` and `cos` of `half`."""
+    share = 0.5 * step if half < 1e-9 else sin / size
+    rx, ry, rz, rw = rate[0] * share, rate[1] * share, rate[2] * share, cos
+    x, y, z, w = attitude
+    norm = np.sqrt((x * x + y * y + z * z + w * w) * (rx * rx + ry * ry + rz * rz + rw * rw))
+    x, y, z, w = product((x, y, z, w), (rx, ry, rz, rw))
+    return x / norm, y / norm, z / norm, w / norm
 
 
 @njit(allocates=False)
 def _turn(state: NDArray, step: float) -> None:
-    """Turn the attitude by the body rate over a step, s, exactly for a constant rate."""
-    wx, wy, wz = state[10], state[11], state[12]
-    rate = np.sqrt(wx * wx + wy * wy + wz * wz)
-    half = 0.5 * rate * step
-    share = 0.5 * step if half < 1e-9 else np.sin(half) / rate
-    rx, ry, rz, rw = wx * share, wy * share, wz * share, np.cos(half)
-    x, y, z, w = state[6], state[7], state[8], state[9]
-    norm = np.sqrt((x * x + y * y + z * z + w * w) * (rx * rx + ry * ry + rz * rz + rw * rw))
-    turned = product((x, y, z, w), (rx, ry, rz, rw))
-    for axis in range(4):
-        state[6 + axis] = turned[axis] / norm
+    """Turn the attitude by the body rate over a step, s."""
+    rate, attitude = (state[10], state[11], state[12]), (state[6], state[7], state[8], state[9])
+    size, half = turn_of(rate, step)
+    state[6], state[7], state[8], state[9] = turned(attitude, rate, size, half, np.sin(half), np.cos(half), step)
 
 
 @njit(allocates=False)
-def _rest(state: NDArray, body: NDArray) -> None:
+def rest(state: NDArray, body: NDArray) -> None:
     """Lie on the floor for a step: in place, tipping over the shorter way; standing, exactly level, yaw kept."""
     state[2] = body[FLOOR]
     state[3:6] = 0.0
