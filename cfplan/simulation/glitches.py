@@ -13,7 +13,7 @@ is far away: there too the worse one of two counts between them.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
@@ -24,7 +24,7 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
-from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STATE_SIZE, STILL_AIR, TIME_STEP, pack_body
+from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STILL_AIR, TIME_STEP, pack_body
 from cfplan.simulation.dynamics.branching import (
     SNAPSHOT_SIZE,
     STEPS_A_CONTROL,
@@ -35,6 +35,19 @@ from cfplan.simulation.dynamics.branching import (
     step_vehicle,
 )
 from cfplan.simulation.dynamics.mellinger import CONTROL_PERIOD, FULL_STATE
+from cfplan.simulation.dynamics.side_by_side import (
+    MISSED,
+    OWN,
+    WIDTH,
+    new_panel,
+    step_controls,
+    step_vehicles,
+    unpacked_body,
+    unpacked_gains,
+    whole,
+    write_setpoint,
+    write_snapshot,
+)
 from cfplan.vehicle.airframe import GRAVITY
 
 GAP = 0.2  # s without setpoints, without poses
@@ -45,6 +58,7 @@ WITHOUT_POSES_EVERY = 5  # setpoints
 SAMPLED_EVERY = 10  # setpoints, where the vehicle is far from lost
 NEARLY = 0.6  # share of what is lost from which on it is not; by 0.15 it was exceeded at most in 26 flights, to 3 m/s
 _NEAR_WORST = 0.03  # share of what is lost, within which of the worst one each setpoint is looked at
+_DUE, _FARTHEST, _LEAST_LIFT, _ALONG = OWN, OWN + 3, OWN + 4, OWN + 5  # rows of a panel
 _STEP = CONTROL_PERIOD  # s, of the simulation from the gap on: motors saturate, which 4 ms show too mildly
 
 
@@ -107,13 +121,14 @@ def _sampled(payloads: NDArray, limits: Limits, rate: float, start: NDArray | No
     """Return what gaps do that begin where sampled, where one nearly loses the vehicle, and that near to the worst."""
     whole = _as_sampled(len(payloads), limits)
     first = np.where(_every(len(payloads), SAMPLED_EVERY), whole.max(), 0)
-    found = _simulate(payloads, limits, first, rate, start=start)
+    flight = _fly_without(payloads, limits, rate, start)
+    found = _let_begin(flight, limits, first, rate)
     moments = _moments(found, limits, rate)
     share = np.fmax(moments.deviation / limits.flight.deviation.cut, moments.tilt / TURNED_OVER).max(axis=0)
     share[moments.lost.any(axis=0)] = np.inf
     kinds = np.where((first == 0) & ~(share < min(NEARLY, share.max() - near_worst)), whole, 0)
     if kinds.any():
-        more = _simulate(payloads, limits, kinds, rate, start=start)
+        more = _let_begin(flight, limits, kinds, rate)
         for kind in range(len(KINDS)):
             found.gaps[:, kind, kinds > kind] = more.gaps[:, kind, kinds > kind]
             found.simulated[kind, kinds > kind] = True
@@ -126,6 +141,14 @@ class _Simulated(NamedTuple):
     gaps: NDArray  # (2, 3, N) after a gap of each of KINDS
     simulated: NDArray  # (3, N) bool, whether it was simulated
     followed: NDArray  # (2, N) of the flight without a gap
+
+
+class _Flight(NamedTuple):
+    """A flight without a gap."""
+
+    rows: NDArray  # (N, 20) setpoints, as the controller takes them
+    snapshots: NDArray  # (N, 31) at the moments at which they arrive
+    followed: NDArray  # (2, N) deviation, m, and tilt, rad, worst from each of them on
 
 
 def _as_sampled(count: int, limits: Limits) -> NDArray:
@@ -145,15 +168,38 @@ def _simulate(
     payloads: NDArray, limits: Limits, kinds: NDArray, rate: float, gap: float = GAP, start: NDArray | None = None
 ) -> _Simulated:
     """Let so many of KINDS begin at each setpoint, `kinds` (N,)."""
+    return _let_begin(_fly_without(payloads, limits, rate, start, gap), limits, kinds, rate, gap)
+
+
+def _fly_without(payloads: NDArray, limits: Limits, rate: float, start: NDArray | None, gap: float = GAP) -> _Flight:
+    """Fly without a gap, and look as far on from each setpoint as for one of `gap`, s."""
     state, airframe, count = decode(payloads), limits.airframe, len(payloads)
     begin = hovering_snapshot(airframe, state) if start is None else start
-    gaps, followed = np.zeros((2, len(KINDS), count)), np.empty((2, count))
-    _fly(
-        *gaps, *followed, setpoint_rows(state), kinds, arrival_steps(count, rate), begin, gains_for(airframe).pack(),
-        pack_body(airframe, floor=-np.inf), pack_body(airframe, floor=-np.inf, step=_STEP), round(gap / _STEP),
-        round((gap + AFTERWARDS) / _STEP), rate, GRAVITY * math.tan(limits.link_loss.attitude_error),
+    rows, snapshots, followed = setpoint_rows(state), np.empty((count, SNAPSHOT_SIZE)), np.empty((2, count))
+    _follow(
+        snapshots, *followed, rows, arrival_steps(count, rate), begin, gains_for(airframe).pack(),
+        pack_body(airframe, floor=-np.inf), round(_steps(gap) * _STEP / TIME_STEP),
     )  # fmt: skip
-    return _Simulated(gaps, np.arange(len(KINDS))[:, None] < kinds, followed)
+    return _Flight(rows, snapshots, followed)
+
+
+def _let_begin(flight: _Flight, limits: Limits, kinds: NDArray, rate: float, gap: float = GAP) -> _Simulated:
+    """Let so many of KINDS begin at each setpoint of a flight, `kinds` (N,)."""
+    simulated = np.arange(len(KINDS))[:, None] < kinds
+    newest, kind = np.nonzero(simulated.T)
+    worst, gaps = np.empty((2, len(newest))), np.zeros((2, len(KINDS), len(kinds)))
+    airframe, push = limits.airframe, GRAVITY * math.tan(limits.link_loss.attitude_error)
+    _fly_gaps(
+        *worst, flight.snapshots, newest, kind, flight.rows, gains_for(airframe).pack(),
+        pack_body(airframe, floor=-np.inf, step=_STEP), round(gap / _STEP), _steps(gap), rate, push,
+    )  # fmt: skip
+    gaps[:, kind, newest] = worst
+    return _Simulated(gaps, simulated, flight.followed)
+
+
+def _steps(gap: float) -> int:
+    """Return how many steps are simulated from the beginning of a gap, s, on."""
+    return round((gap + AFTERWARDS) / _STEP)
 
 
 def _moments(found: _Simulated, limits: Limits, rate: float) -> GlitchMoments:
@@ -176,37 +222,24 @@ def _moments(found: _Simulated, limits: Limits, rate: float) -> GlitchMoments:
 
 
 @njit(nogil=True)
-def _fly(
-    deviation: NDArray,
-    tilt: NDArray,
+def _follow(
+    snapshots: NDArray,
     followed: NDArray,
     followed_tilt: NDArray,
     setpoints: NDArray,
-    kinds: NDArray,
     arrivals: NDArray,
     start: NDArray,
     gains: NDArray,
     body: NDArray,
-    later_body: NDArray,
-    gap: int,
-    steps: int,
-    rate: float,
-    push: float,
+    following: int,
 ) -> None:
-    """Fly the setpoints, and branch off at each for so many kinds of gaps, `kinds`; and follow the flight without."""
-    now, branch, believed = start.copy(), start.copy(), np.empty(STATE_SIZE)
-    control, motors = np.zeros(4), np.zeros(4)
-    following = round(steps * _STEP / TIME_STEP)
+    """Fly the setpoints; write the snapshots at which each arrives, and what is worst in so many steps from there."""
+    now, control, motors = start.copy(), np.zeros(4), np.zeros(4)
     away, lift = np.empty(arrivals[-1] + following), np.empty(arrivals[-1] + following)
     for newest in range(len(setpoints)):
         last = newest + 1 == len(setpoints)
-        for kind in range(kinds[newest]):
-            for k in range(SNAPSHOT_SIZE):
-                branch[k] = now[k]
-            deviation[kind, newest], tilt[kind, newest] = _fly_gap(
-                branch, believed, newest, setpoints, kind != 1, kind != 0, gains, later_body, gap, steps, rate, push,
-                control, motors,
-            )  # fmt: skip
+        for k in range(SNAPSHOT_SIZE):
+            snapshots[newest, k] = now[k]
         for step in range(arrivals[newest], len(away) if last else arrivals[newest + 1]):
             if step % STEPS_A_CONTROL == 0:
                 step_control(now, now, gains, setpoints[newest], FULL_STATE, body, CONTROL_PERIOD, control, motors)
@@ -219,49 +252,87 @@ def _fly(
         followed[newest], followed_tilt[newest] = math.sqrt(farthest), _tilt(least_lift)
 
 
-@njit(allocates=False)
-def _fly_gap(
-    now: NDArray,
-    believed: NDArray,
-    newest: int,
+@njit(nogil=True, error_model="numpy")
+def _fly_gaps(
+    deviation: NDArray,
+    tilt: NDArray,
+    snapshots: NDArray,
+    newest: NDArray,
+    kind: NDArray,
     setpoints: NDArray,
-    no_setpoints: bool,
-    no_poses: bool,
     gains: NDArray,
     body: NDArray,
     gap: int,
     steps: int,
     rate: float,
     push: float,
-    control: NDArray,
-    motors: NDArray,
-) -> tuple[float, float]:
-    """Fly on through a gap; return the worst deviation, m, and tilt, rad, from there on.
+) -> None:
+    """Fly on through gaps, each of a kind, that begin at the setpoints `newest`, (B,).
 
-    `now`, `believed`, `control` and `motors` are overwritten.
+    Written are the worst deviation, m, and tilt, rad, from there on. Snapshots are at each setpoint.
     """
-    farthest, least_lift = 0.0, 1.0
-    speed = math.sqrt(now[3] ** 2 + now[4] ** 2)
-    ahead_x, ahead_y = (now[3] / speed, now[4] / speed) if speed > 0.0 else (1.0, 0.0)
-    for step in range(steps):
-        due = min(newest + int(step * _STEP * rate + 1e-9), len(setpoints) - 1)
-        told = newest if no_setpoints and step < gap else due
-        for k in range(STATE_SIZE):
-            believed[k] = now[k]
-        if no_poses and step < gap:
-            time = step * _STEP  # the estimate falls behind the motion, by what its wrong attitude makes it miss
-            believed[0] -= 0.5 * push * time * time * ahead_x
-            believed[1] -= 0.5 * push * time * time * ahead_y
-            believed[3] -= push * time * ahead_x
-            believed[4] -= push * time * ahead_y
-        step_control(now, believed, gains, setpoints[told], FULL_STATE, body, _STEP, control, motors)
-        step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
-        farthest, least_lift = _most(farthest, _away(now, setpoints[due])), _least(least_lift, _lift(now))
-    return math.sqrt(farthest), _tilt(least_lift)
+    panel, spare = new_panel(), np.empty((WIDTH, SNAPSHOT_SIZE))
+    the_gains, the_body = unpacked_gains(gains), unpacked_body(body)
+    for first in range(0, len(newest), WIDTH):
+        lanes, passed = min(WIDTH, len(newest) - first), -1
+        for n in range(lanes):
+            snapshot = snapshots[newest[first + n]]
+            write_snapshot(panel, n, snapshot)
+            _write_direction(panel, n, snapshot, kind[first + n] != 0)
+            panel[_FARTHEST * WIDTH + n], panel[_LEAST_LIFT * WIDTH + n] = 0.0, 1.0
+        for step in range(steps):
+            since = int(step * _STEP * rate + 1e-9)
+            if since != passed or step == gap:
+                passed = since
+                for n in range(lanes):
+                    due = min(newest[first + n] + since, len(setpoints) - 1)
+                    holds = kind[first + n] != 1 and step < gap
+                    write_setpoint(panel, n, setpoints[newest[first + n] if holds else due])
+                    for k in range(3):
+                        panel[(_DUE + k) * WIDTH + n] = setpoints[due, k]
+            if step <= gap:
+                time = step * _STEP if step < gap else 0.0
+                _fall_behind(panel, whole(lanes), 0.5 * push * time * time, push * time)
+            step_controls(panel, lanes, the_gains, the_body, False, _STEP)
+            step_vehicles(panel, lanes, the_body, body, spare)
+            _judge(panel, whole(lanes))
+        for n in range(lanes):
+            deviation[first + n] = math.sqrt(panel[_FARTHEST * WIDTH + n])
+            tilt[first + n] = _tilt(panel[_LEAST_LIFT * WIDTH + n])
 
 
 @register_jitable
-def _away(now: NDArray, setpoint: NDArray) -> float:
+def _write_direction(panel: NDArray, n: int, snapshot: NDArray, no_poses: bool) -> None:
+    """Write the direction of motion, in which the estimate falls behind; none where there are poses."""
+    speed = math.sqrt(snapshot[3] ** 2 + snapshot[4] ** 2)
+    x, y = (snapshot[3] / speed, snapshot[4] / speed) if speed > 0.0 else (1.0, 0.0)
+    panel[_ALONG * WIDTH + n], panel[(_ALONG + 1) * WIDTH + n] = (x, y) if no_poses else (0.0, 0.0)
+
+
+@register_jitable
+def _fall_behind(panel: NDArray, lanes: int, distance: float, speed: float) -> None:
+    """Let the estimates fall behind the motion, by what a wrong attitude makes them miss: m, m/s."""
+    lanes = min(lanes, WIDTH)
+    for k in range(2):
+        for n in range(lanes):
+            panel[(MISSED + k) * WIDTH + n] = distance * panel[(_ALONG + k) * WIDTH + n]
+            panel[(MISSED + 2 + k) * WIDTH + n] = speed * panel[(_ALONG + k) * WIDTH + n]
+
+
+@register_jitable
+def _judge(panel: NDArray, lanes: int) -> None:
+    """Note how far from its setpoint and how far tilted each vehicle is, if more than before."""
+    lanes = min(lanes, WIDTH)
+    for n in range(lanes):
+        x, y, z = panel[n], panel[WIDTH + n], panel[2 * WIDTH + n]
+        due = panel[_DUE * WIDTH + n], panel[(_DUE + 1) * WIDTH + n], panel[(_DUE + 2) * WIDTH + n]
+        panel[_FARTHEST * WIDTH + n] = _most(panel[_FARTHEST * WIDTH + n], _away((x, y, z), due))
+        qx, qy = panel[6 * WIDTH + n], panel[7 * WIDTH + n]
+        panel[_LEAST_LIFT * WIDTH + n] = _least(panel[_LEAST_LIFT * WIDTH + n], 1.0 - 2.0 * (qx * qx + qy * qy))
+
+
+@register_jitable
+def _away(now: Any, setpoint: Any) -> float:
     """Return the square of the distance from a setpoint, m²."""
     return (now[0] - setpoint[0]) ** 2 + (now[1] - setpoint[1]) ** 2 + (now[2] - setpoint[2]) ** 2
 
