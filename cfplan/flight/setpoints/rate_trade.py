@@ -294,7 +294,7 @@ def _find_trade(panel: NDArray, n: int, sides: _Sides, goal: _Goal, full_rate: f
     size = math.sqrt(dx * dx + dy * dy)
     aside, lift = _lean(product(attitude, back), dx, dy, size)
     share = min(size, TRADED_RATE_MAX) / full_rate  # the sine of the turn
-    upright = lift * math.sqrt(1.0 - share * share) + aside * share
+    upright = lift * math.sqrt(max(1.0 - share * share, 0.0)) + aside * share
     most = full_rate if upright >= _LEAST_LIFT else math.nan
     most = most if share < 1.0 else math.nan
     write_quaternion_in(panel, _BACK, n, back)
@@ -340,7 +340,7 @@ def _make_trade(panel: NDArray, n: int, full_rate: float) -> None:
 def _turn(sin_half: float, cos_half: float, x: float, y: float) -> tuple[float, float, float, float]:
     """Return the quaternion that turns about (x, y, 0), by twice the angle with that sine and cosine."""
     size = math.sqrt(x * x + y * y)
-    along = sin_half / size
+    along = sin_half / (size if size > 0.0 else 1.0)
     along = along if size > 0.0 else 0.0
     return along * x, along * y, 0.0, cos_half
 
@@ -350,7 +350,7 @@ def _lean(quaternion: tuple[float, float, float, float], dx: float, dy: float, s
     """Return by how much the thrust leans in the vertical plane in which a rate along (dx, dy) turns it, and rises."""
     x, y, z, w = quaternion
     square = x * x + y * y + z * z + w * w
-    aside = 2.0 * ((x * z - y * w) * dy - (y * z + x * w) * dx) / (size * square)
+    aside = 2.0 * ((x * z - y * w) * dy - (y * z + x * w) * dx) / ((size if size > 0.0 else 1.0) * square)
     return aside, 1.0 - 2.0 * (x * x + y * y) / square
 
 
@@ -381,7 +381,8 @@ def _good_rate(
     braking, rate_max = goal[0], goal[1]
     x, y = heading_of(quaternion)
     size = math.sqrt(x * x + y * y)
-    cos, sin = x / size, y / size
+    length = size if size > 0.0 else 1.0  # interpreted, a division by zero is an error
+    cos, sin = x / length, y / length
     cos, sin = cos if size > 0.0 else 1.0, sin if size > 0.0 else 0.0
     pull_x = -braking * (SPEED_LEFT * velocity[0] + SPEED_GAINED * ahead[0])
     pull_y = -braking * (SPEED_LEFT * velocity[1] + SPEED_GAINED * ahead[1])
@@ -492,7 +493,7 @@ def _find_excess(panel: NDArray, n: int, sides: _Sides, goal: _Goal, full_rate: 
     up_x, up_y, up_z = dot(vertical, of_x), dot(vertical, of_y), dot(vertical, of_z)  # in the axes believed
     aside = (up_x * dy - up_y * dx) / size
     turn = min(size, TRADED_RATE_MAX) / full_rate  # its sine
-    lift = up_z * math.sqrt(1.0 - turn * turn) + aside * turn
+    lift = up_z * math.sqrt(max(1.0 - turn * turn, 0.0)) + aside * turn
     write_pair(panel, _EXCESS, n, dx, dy)
     write_pair(panel, _LEANING, n, aside, up_z)
     panel[_LENGTH * WIDTH + n] = size
