@@ -111,7 +111,8 @@ def leave_alone_in_stops(
                 lanes += 1
             for m in range(length):
                 if forks[k, m]:
-                    setpoints[count] = stops[k, m]
+                    for column in range(SETPOINT_SIZE):
+                        setpoints[count, column] = stops[k, m, column]
                     count += 1
         for newest in range(length):
             n = 0
