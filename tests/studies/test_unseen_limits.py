@@ -5,9 +5,13 @@ import pytest
 
 from cfplan.learning.dataset_spec import DatasetSpec
 from cfplan.learning.features import scaled_limits
-from cfplan.learning.labels import row_limits
+from cfplan.learning.labels import clean_path, row_limits
+from cfplan.learning.learned import plan_learned
+from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.task import PlanningTask
+from cfplan.planning.repair import refine, repair
 from cfplan.studies import unseen_limits
-from cfplan.studies.unseen_limits import LIMITS, VEHICLES, Neighbourhoods
+from cfplan.studies.unseen_limits import LIMITS, VEHICLES, WITHIN, Neighbourhoods
 
 SPEC = DatasetSpec(count=300, seed=5)
 
@@ -35,3 +39,16 @@ def test_a_draw_outside_is_outside_of_all_and_can_hover(around, group):
         assert around.distance(numbers) > around.radius
         assert chosen.limits.motor_thrust_min < chosen.airframe.hover_thrust < chosen.limits.motor_thrust_max
         assert chosen == unseen_limits._DRAW[group](other, number, around)[0]  # by seed
+
+
+@pytest.mark.parametrize("number", [119, 719])
+def test_refining_ends_at_the_experts_optimum_where_it_crawls_there_from_a_proposal_far_off(number):
+    spec = DatasetSpec(count=10_000_000, seed=unseen_limits.SEED + list(unseen_limits._DRAW).index(WITHIN))
+    chosen, mode, angle = row_limits(spec, number)
+    task = PlanningTask(clean_path(spec, number), chosen.airframe, chosen.limits, unseen_limits.NODES, mode, angle)
+    best = repair(task, plan_expert(task).profile).trajectory.duration
+    proposal = plan_learned(task).profile
+    refined = refine(task, proposal)
+    assert refined.before < 0.95 * best  # far off
+    assert refined.certificate.passed
+    assert refined.trajectory.duration < 1.0005 * best

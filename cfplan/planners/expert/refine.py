@@ -47,6 +47,9 @@ WINDOW = WindowSize(kept=224, ahead=32)
 # Share of h by which the search begins below the given profile: where that uses limits to the full, nearly all
 # constraints then begin inside their bounds, and steps are long.
 SLOWER = 0.1
+# Steps from which a search is taken to have crawled along its bounds, from a profile far off: it may then stop up to 3 %
+# short of the optimum, and starts once more from where it is, which takes a few steps.
+CRAWLED = 16
 
 
 def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WINDOW) -> Solution:
@@ -127,6 +130,9 @@ def _search(problem: Problem, interval: float, capped: bool, deadline: Deadline)
     first, *others = refining_starts(interval, capped=capped)
     attempt = solve(problem, problem.coefficients, (first,), deadline)
     steps = attempt.iterations
+    if attempt.solved and steps >= CRAWLED and not capped:
+        again = solve(problem, attempt.coefficients, (first._replace(lowered=SLOWER),), deadline)
+        return (again if again.solved else attempt)._replace(iterations=steps + again.iterations)
     if attempt.solved or deadline.passed:
         return attempt
     attempt = solve(problem, problem.coefficients, others, deadline)
