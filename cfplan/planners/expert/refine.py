@@ -47,8 +47,8 @@ WINDOW = WindowSize(kept=224, ahead=32)
 # Share of h by which the search begins below the given profile: where that uses limits to the full, nearly all
 # constraints then begin inside their bounds, and steps are long.
 SLOWER = 0.1
-# Steps from which a search is taken to have crawled along its bounds, from a profile far off: it may then stop up to 3 %
-# short of the optimum, and starts once more from where it is, which takes a few steps.
+# Steps from which a search is taken to have crawled along its bounds, from a profile far off: it may then stop up to
+# 3 % short of the optimum, and starts once more from where it is, which takes a few steps.
 CRAWLED = 16
 
 
