@@ -124,7 +124,7 @@ SCENARIOS: tuple[Scenario, ...] = (
     _odd("parameters answered 0.5 s late", parameter_delay=0.5),
     Scenario(
         "locked between arming and take-off", Rung.NONE, (VehicleFault(VehicleFaultKind.LOCK, 0.0, FOR_GOOD),),
-        phase=Phase.ARM, moment=0.25, grounded=True,
+        phase=Phase.ARM, moment=0.2, grounded=True,
     ),
     _odd("firmware of 2025.09", grounded=True, protocol=10, firmware="2025.09"),
     _odd("firmware of 2025.12", protocol=10, firmware="2025.12"),
