@@ -6,6 +6,7 @@
 <!-- figure: results/bench.json#TABLE/ROW/COLUMN -->        one cell, within a line; ROW is what its first column says
 <!-- preflight: parameters -->                               what preflight requires on board; also signs, unknowable,
                                                              time-outs
+<!-- errors: geometry/path_file.py geometry/path.py -->   what these modules can say is wrong
 <!-- end -->                                                 ends any of them
 """
 
@@ -15,6 +16,7 @@ from pathlib import Path
 from cfplan.errors import InputError
 from cfplan.flight.firmware import TIMEOUTS, version_text
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, UNKNOWABLE
+from cfplan.studies.error_tables import error_table, read_meanings
 from cfplan.studies.provenance import Provenance
 from cfplan.studies.result import Table, read_result
 
@@ -31,6 +33,7 @@ _RULES = re.compile(
     r"(?P<begin><!-- preflight: (?P<name>\S+) -->\n).*?(?P<end><!-- end -->)",
     re.DOTALL,
 )
+_ERRORS = re.compile(r"(?P<begin><!-- errors: (?P<modules>[^>]+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
 
 
 def with_tables(page: str, folder: Path) -> str:
@@ -55,6 +58,11 @@ def with_tables(page: str, folder: Path) -> str:
         table = read_result(folder / match["file"]).table(match["table"])
         return f"{match['begin']}{_cell(table, match['row'], match['column'])}{match['end']}"
 
+    def errors(match: re.Match[str]) -> str:
+        titles, cells = error_table(match["modules"].split(), read_meanings(folder))
+        return f"{match['begin']}\n{_grid(titles, cells)}\n\n{match['end']}"
+
+    page = _ERRORS.sub(errors, page)
     return _RULES.sub(rules, _FIGURE.sub(figure, _BLOCK.sub(block, page)))
 
 

@@ -62,9 +62,8 @@ def _take(radio: Any, uri: str) -> None:
         usb.util.claim_interface(radio, 0)
         usb.util.release_interface(radio, 0)
     except usb.core.USBError as error:
-        raise LinkError(
-            f"the radio cannot be opened: {error.strerror or error}", where=uri, hint=usb_hint(error.errno, str(error))
-        ) from error
+        hint = usb_hint(error.errno, str(error)) or "unplug the radio and plug it in again"
+        raise LinkError(f"the radio cannot be opened: {error.strerror or error}", where=uri, hint=hint) from error
     finally:
         usb.util.dispose_resources(radio)
 
