@@ -1,13 +1,10 @@
 """Write an identified airframe as a YAML file, and the lines of safety.yaml that go with it."""
 
-import contextlib
 import json
-import os
-import tempfile
 from dataclasses import fields
 from pathlib import Path
 
-from cfplan.errors import InputError
+from cfplan.files.whole import check_new_file, write_whole
 from cfplan.identification.quantities import Identification
 from cfplan.vehicle.airframe import Airframe
 
@@ -49,39 +46,15 @@ def safety_lines(found: Identification, file: Path) -> str:
 
 def check_target(file: Path, *, overwrite: bool = False) -> None:
     """Raise InputError where an airframe's file may not be written."""
-    if file.suffix not in (".yaml", ".yml"):
-        raise InputError("an airframe is a .yaml file", where=str(file), hint="end the file's name in .yaml")
-    if file.exists() and not overwrite:
-        raise InputError("exists already", where=str(file), hint="--force overwrites it")
-    if not file.parent.is_dir():
-        raise InputError("no such folder", where=str(file.parent), hint="make it first")
+    check_new_file(file, ".yaml", ".yml", overwrite=overwrite)
 
 
 def write_airframe(airframe: Airframe, file: Path, *, overwrite: bool = False) -> None:
     """Write the airframe's file, whole or not at all. Raises InputError where it exists or cannot be written."""
     check_target(file, overwrite=overwrite)
-    unfinished = None
-    try:
-        with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=file.parent, delete=False) as stream:
-            unfinished = Path(stream.name)
-            stream.write(airframe_text(airframe))
-        unfinished.chmod(0o666 & ~_umask())
-        unfinished.replace(file)
-    except OSError as error:
-        if unfinished is not None:
-            with contextlib.suppress(OSError):
-                unfinished.unlink()
-        raise InputError(
-            f"cannot be written ({error.strerror or error})", where=str(file), hint="choose another with -o"
-        ) from error
+    write_whole(file, airframe_text(airframe).encode())
 
 
 def _number(value: float) -> str:
     text = f"{value:.{_KEPT_DIGITS}g}"
     return text.replace("e", ".0e") if "e" in text and "." not in text else text  # YAML reads 1e-05 as text
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -11,6 +11,7 @@ import torch
 from torch import nn, optim
 
 from cfplan.errors import InputError
+from cfplan.files.whole import whole
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.csv"
 
@@ -47,9 +48,8 @@ def save_checkpoint(
     writer.writerows(asdict(epoch) for epoch in log)
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in ((CHECKPOINT, buffer.getvalue()), (LOG, table.getvalue().encode())):
-        temporary = folder / f".{name}.new"
-        temporary.write_bytes(data)
-        temporary.replace(folder / name)
+        with whole(folder / name) as unfinished:
+            unfinished.write_bytes(data)
 
 
 def resume(

@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cfplan.errors import CfplanError, ExitCode, InputError
+from cfplan.files.whole import whole
 from cfplan.learning.dataset_spec import SPEC_FILE, DatasetSpec, load_spec, require_same
 from cfplan.learning.labels import SCHEMA, TIMING_SCHEMA, make_rows
 from cfplan.planners.solution import Status
@@ -63,8 +64,9 @@ def make_dataset(
     with _pool(workers, scheduler) as labelled:
         for number, rows, timing in labelled(spec, missing):
             try:
-                _write(_shard(folder, TIMING, number), timing)
-                _write(_shard(folder, SHARDS, number), rows)
+                for part, content in ((TIMING, timing), (SHARDS, rows)):
+                    with whole(_shard(folder, part, number)) as unfinished:
+                        unfinished.write_bytes(content)
             except OSError as error:
                 raise InputError(
                     f"cannot write: {error.strerror}",
@@ -210,16 +212,6 @@ def _parquet(table: pa.Table) -> bytes:
     buffer = io.BytesIO()
     pq.write_table(table, buffer, compression="zstd")
     return buffer.getvalue()
-
-
-def _write(file: Path, content: bytes) -> None:
-    """Write a file, whole or not at all."""
-    temporary = file.with_suffix(".new")
-    try:
-        temporary.write_bytes(content)
-        temporary.replace(file)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _read(folder: Path, part: str, schema: pa.Schema) -> pa.Table:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from cfplan import __version__
 from cfplan.errors import InputError
+from cfplan.files.whole import whole
 from cfplan.geometry.path_families import USUAL, Family
 from cfplan.geometry.yaw import YawMode
 from cfplan.safety.limit_sets import DATA_SETS, LimitSet
@@ -108,9 +109,8 @@ class DatasetSpec:
 
     def save(self, folder: Path) -> None:
         """Write dataset.json, whole or not at all."""
-        temporary = folder / f".{SPEC_FILE}.new"
-        temporary.write_text(json.dumps(asdict(self), indent=2) + "\n")
-        temporary.replace(folder / SPEC_FILE)
+        with whole(folder / SPEC_FILE) as unfinished:
+            unfinished.write_text(json.dumps(asdict(self), indent=2) + "\n")
 
 
 def _is_box(sides: tuple[float, ...]) -> bool:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InputError
 from cfplan.files.shipped import shipped_folder
+from cfplan.files.whole import whole
 from cfplan.learning import features
 from cfplan.learning.features import LOGARITHMS, NUMBERS, ScaledLimits, scaled_limits
 from cfplan.learning.inference import NETWORKS, Network, tensor_shapes
@@ -95,9 +96,8 @@ def save_model(folder: Path, card: Card, weights: Mapping[str, NDArray]) -> Card
     text = asdict(card) | {"weights_sha256": hashlib.sha256(content).hexdigest()}
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in ((WEIGHTS, content), (CARD, (json.dumps(text, indent=2, ensure_ascii=False) + "\n").encode())):
-        temporary = folder / f".{name}.new"
-        temporary.write_bytes(data)
-        temporary.replace(folder / name)
+        with whole(folder / name) as unfinished:
+            unfinished.write_bytes(data)
     return _card(text)
 
 

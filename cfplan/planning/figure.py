@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.errors import InputError
+from cfplan.files.whole import check_new_file, write_whole
 from cfplan.planning.active_limits import FREE, FREE_COLOUR, LIMIT_COLOURS, ActiveLimits, Colour, active_limits
 from cfplan.planning.plan_result import Plan
 
@@ -37,12 +37,7 @@ class Flown:
 
 def check_figure_file(file: Path, *, overwrite: bool) -> None:
     """Raise InputError where no figure can be written there."""
-    if file.suffix not in SUFFIXES:
-        raise InputError(f"a figure ends in {', '.join(SUFFIXES)}", where=str(file), hint=f"name it {file.stem}.pdf")
-    if not file.parent.is_dir():
-        raise InputError("no such folder", where=str(file.parent), hint="make it first")
-    if file.exists() and not overwrite:
-        raise InputError("there is such a file already", where=str(file), hint="name another, or add --force")
+    check_new_file(file, *SUFFIXES, overwrite=overwrite)
 
 
 def draw_plan(plan: Plan, name: str, flown: Flown | None = None) -> "Figure":
@@ -87,15 +82,7 @@ def save_figure(figure: "Figure", file: Path, *, overwrite: bool = False) -> Non
     check_figure_file(file, overwrite=overwrite)
     content = BytesIO()
     figure.savefig(content, format=file.suffix[1:], dpi=150)
-    unfinished = file.with_name(f".{file.name}.new")
-    try:
-        unfinished.write_bytes(content.getvalue())
-        unfinished.replace(file)
-    except OSError as error:
-        unfinished.unlink(missing_ok=True)
-        raise InputError(
-            f"cannot be written: {error.strerror}", where=str(file), hint="free some space, or name another folder"
-        ) from None
+    write_whole(file, content.getvalue())
 
 
 def _draw_view(axes: "Axes", plan: Plan, active: ActiveLimits, flown: Flown | None, across: int, up: int) -> None:

@@ -5,8 +5,6 @@ saved one. The certificate in the file is for other readers; loading certifies a
 """
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path as FilePath
@@ -16,6 +14,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from cfplan.errors import CfplanError, InputError
+from cfplan.files.whole import whole_file
 from cfplan.geometry.path import Path
 from cfplan.planning.plan_result import LocalSlowing, Plan
 from cfplan.safety.certificate import certify
@@ -62,21 +61,8 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
     }
     table = pyarrow.table(_columns(plan.trajectory))
     table = table.replace_schema_metadata({_KEY: json.dumps(metadata).encode()})
-    target = FilePath(file)
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-        os.close(handle)
-        try:
-            pyarrow.parquet.write_table(table, name, compression="zstd")
-            os.chmod(name, 0o644)
-            os.replace(name, target)
-        except BaseException:
-            os.unlink(name)
-            raise
-    except OSError as error:
-        raise InputError(
-            f"cannot be written: {error.strerror or error}", where=str(target), hint="name another file with -o"
-        ) from None
+    with whole_file(FilePath(file)) as unfinished:
+        pyarrow.parquet.write_table(table, unfinished, compression="zstd")
 
 
 def load_plan(file: FilePath | str) -> Plan:

@@ -4,8 +4,6 @@ What is written is read again as its receiver reads it, and that is certified. P
 simulator as the vehicle's own commander flies them.
 """
 
-import os
-import tempfile
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
@@ -14,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.errors import InputError, NotCertifiedError
+from cfplan.errors import NotCertifiedError
 from cfplan.files.text import read_table
+from cfplan.files.whole import write_whole
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory, certified_compressed, certified_pieces
 from cfplan.flight.on_board.correction import correct
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
@@ -226,21 +225,3 @@ def check_samples(rows: NDArray, trajectory: Trajectory, limits: Limits, where: 
             "the sample is not that of the plan, or exceeds a limit",
             where=f"{where}:{int(np.argmax(bad)) + 2}", hint="plan the path again, and export that",
         )  # fmt: skip
-
-
-def write_whole(file: Path, content: bytes) -> None:
-    """Write a file that appears whole or not at all. Raises InputError where it cannot be written."""
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.absolute().parent)
-        try:
-            with os.fdopen(handle, "wb") as stream:
-                stream.write(content)
-            os.chmod(name, 0o644)
-            os.replace(name, file)
-        except BaseException:
-            os.unlink(name)
-            raise
-    except OSError as error:
-        raise InputError(
-            f"cannot be written: {error.strerror or error}", where=str(file), hint="name another file with -o"
-        ) from None

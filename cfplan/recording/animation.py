@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.errors import InputError
+from cfplan.files.whole import check_new_file, write_whole
 from cfplan.planning.active_limits import FREE, FREE_COLOUR, LIMIT_COLOURS, Colour, active_limits
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
@@ -56,12 +56,7 @@ def animate_flight(record: Record) -> "list[Image.Image]":
 
 def check_animation_file(file: Path, *, overwrite: bool) -> None:
     """Raise InputError where no animation can be written there."""
-    if file.suffix != SUFFIX:
-        raise InputError(f"an animation ends in {SUFFIX}", where=str(file), hint=f"name it {file.stem}{SUFFIX}")
-    if not file.absolute().parent.is_dir():
-        raise InputError("no such folder", where=str(file.parent), hint="make it first")
-    if file.exists() and not overwrite:
-        raise InputError("there is such a file already", where=str(file), hint="name another, or add --force")
+    check_new_file(file, SUFFIX, overwrite=overwrite)
 
 
 def save_animation(frames: "list[Image.Image]", file: Path, *, overwrite: bool = False) -> None:
@@ -73,15 +68,7 @@ def save_animation(frames: "list[Image.Image]", file: Path, *, overwrite: bool =
     few = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     content = BytesIO()
     few[0].save(content, "GIF", save_all=True, append_images=few[1:], duration=1000 // RATE, loop=0, optimize=True)
-    unfinished = file.with_name(f".{file.name}.new")
-    try:
-        unfinished.write_bytes(content.getvalue())
-        unfinished.replace(file)
-    except OSError as error:
-        unfinished.unlink(missing_ok=True)
-        raise InputError(
-            f"cannot be written: {error.strerror}", where=str(file), hint="free some space, or name another folder"
-        ) from None
+    write_whole(file, content.getvalue())
 
 
 @dataclass(frozen=True, slots=True)

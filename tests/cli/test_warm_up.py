@@ -55,7 +55,7 @@ def test_what_a_first_plan_needed_is_compiled_behind_it(tmp_path):
     compiled, done = run(PLAN, tmp_path)
     assert compiled == []
     assert "planning without machine code, which is compiled meanwhile" in done.stdout
-    assert until(lambda: list(tmp_path.glob("ready-plan-*")), 200.0)
+    assert until(lambda: list(tmp_path.glob("ready-plan-*")), 900.0)  # behind whatever else the computer does
     compiled, done = run(PLAN, tmp_path)
     assert compiled == []
     assert "without machine code" not in done.stdout

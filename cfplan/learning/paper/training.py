@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfplan.errors import InputError
+from cfplan.files.whole import whole
 from cfplan.learning.checkpoints import CHECKPOINT, Epoch, resume, save_checkpoint
 from cfplan.learning.dataset_spec import Relabel
 from cfplan.learning.paper.networks import Kind, SequenceNetwork, build_network
@@ -223,8 +224,7 @@ def _save(network: SequenceNetwork, folder: Path, identity: dict[str, Any], log:
     from safetensors.torch import save_file
 
     card = {"identity": identity, "seconds": sum(epoch.seconds for epoch in log), "last": asdict(log[-1])}
-    temporary = folder / f".{WEIGHTS}.new"
-    save_file({name: tensor.contiguous() for name, tensor in network.state_dict().items()}, temporary,
-              metadata={"card": json.dumps(card)})  # fmt: skip
-    temporary.replace(folder / WEIGHTS)
+    weights = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
+    with whole(folder / WEIGHTS) as unfinished:
+        save_file(weights, unfinished, metadata={"card": json.dumps(card)})
     (folder / CHECKPOINT).unlink(missing_ok=True)

@@ -1,14 +1,12 @@
 """Write the report as one self-contained HTML page: tables, charts, events, certificate, provenance."""
 
 import html
-import os
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from cfplan.errors import InputError
+from cfplan.files.whole import check_new_file, write_whole
 from cfplan.flight.telemetry import Level
 from cfplan.recording.overlay import Trial, short_name, trial_of_record
 from cfplan.recording.plots import FLOWN, Colour, finite_limits, plots
@@ -53,22 +51,8 @@ def page(flights: Sequence[ReportedFlight]) -> str:
 
 def write_page(flights: Sequence[ReportedFlight], file: Path, *, overwrite: bool = False) -> None:
     """Write the page; whole or not at all. Raises InputError where the file cannot be."""
-    if file.exists() and not overwrite:
-        raise InputError("the file exists already", where=str(file), hint="name another with -o, or add --force")
-    content = page(flights)
-    unfinished = ""
-    try:
-        handle, unfinished = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(content)
-        os.chmod(unfinished, 0o644)
-        os.replace(unfinished, file)
-    except OSError as error:
-        if unfinished:
-            Path(unfinished).unlink(missing_ok=True)
-        raise InputError(
-            f"cannot be written ({error.strerror or error})", where=str(file), hint="name another place with -o"
-        ) from error
+    check_new_file(file, overwrite=overwrite)
+    write_whole(file, page(flights).encode())
 
 
 def _summary(flights: Sequence[ReportedFlight]) -> str:

@@ -13,8 +13,9 @@ from typing import Any
 import rerun.blueprint as rrb
 
 from cfplan.errors import InputError
+from cfplan.files.whole import check_new_file, whole_file
 from cfplan.recording.rerun.layout import TIMELINE
-from cfplan.recording.rerun.viewer import Draw, free_port, refuse_existing, save, viewer_program, whole_file
+from cfplan.recording.rerun.viewer import Draw, free_port, save, viewer_program
 
 SIZE = (1920, 1080)  # points, of the window that is never shown
 _STARTS_WITHIN = 30.0  # s
@@ -39,7 +40,7 @@ def write_png(
 
     Raises InputError where the file cannot be written or where there is nothing to draw with.
     """
-    refuse_existing(file, overwrite=overwrite)
+    check_new_file(file, overwrite=overwrite)
     with tempfile.TemporaryDirectory(prefix="cfplan-") as folder:
         recording = Path(folder) / "view.rrd"
         save(recording, blueprint, draw)

@@ -1,10 +1,9 @@
 """Save a rerun recording to a file, or open it in the viewer's window."""
 
-import contextlib
 import os
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import rerun as rr
@@ -12,6 +11,7 @@ import rerun.blueprint as rrb
 import rerun_cli
 
 from cfplan.errors import InputError
+from cfplan.files.whole import check_new_file, whole_file
 
 APPLICATION = "cfplan"
 Draw = Callable[[rr.RecordingStream], None]
@@ -19,7 +19,7 @@ Draw = Callable[[rr.RecordingStream], None]
 
 def save(file: Path, blueprint: rrb.Blueprint, draw: Draw, *, overwrite: bool = False) -> None:
     """Write what `draw` sends, with its blueprint; whole or not at all. Raises InputError where the file cannot be."""
-    refuse_existing(file, overwrite=overwrite)
+    check_new_file(file, overwrite=overwrite)
     with whole_file(file) as unfinished:
         unfinished.touch()
         with rr.RecordingStream(APPLICATION) as stream:
@@ -60,30 +60,6 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def refuse_existing(file: Path, *, overwrite: bool) -> None:
-    """Check that the file may be written. Raises InputError where it exists and is not to be overwritten."""
-    if file.exists() and not overwrite:
-        raise InputError("the file exists already", where=str(file), hint="name another file, or add --force")
-
-
-@contextlib.contextmanager
-def whole_file(file: Path) -> Iterator[Path]:
-    """Yield a temporary name; rename it to the file's when the block ends well. Raises InputError for OSError."""
-    unfinished = file.with_name(file.name + ".part")
-    try:
-        yield unfinished
-        unfinished.replace(file)
-    except OSError as error:
-        raise InputError(
-            f"cannot be written ({error.strerror or error})",
-            where=str(file),
-            hint="choose a folder that can be written",
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            unfinished.unlink(missing_ok=True)
 
 
 def viewer_program() -> Path:

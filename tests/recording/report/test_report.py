@@ -213,7 +213,7 @@ def test_a_place_that_is_no_record_is_an_error_and_nothing_is_written(tmp_path, 
 
 
 def test_a_folder_that_cannot_be_written_is_an_error(folder, tmp_path):
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match="no such folder"):
         write_page([read_flight(folder)], tmp_path / "nowhere" / "page.html")
 
 

@@ -1,0 +1,58 @@
+"""Files that appear whole or not at all, and take no other's place unasked."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from cfplan.errors import InputError
+
+
+def check_new_file(file: Path, *suffixes: str, overwrite: bool) -> None:
+    """Raise InputError where no file may be made: the name ends in none of these, there is no folder, or one is there.
+
+    Without suffixes a name may end as it likes.
+    """
+    if suffixes and file.suffix not in suffixes:
+        ends = ", ".join(suffixes)
+        raise InputError(f"the name must end in {ends}", where=str(file), hint=f"name it {file.stem}{suffixes[0]}")
+    if not file.absolute().parent.is_dir():
+        raise InputError("no such folder", where=str(file.parent), hint="make it first")
+    if file.exists() and not overwrite:
+        raise InputError("the file exists already", where=str(file), hint="name another, or add --force")
+
+
+@contextlib.contextmanager
+def whole(file: Path) -> Iterator[Path]:
+    """Yield a name beside the file to write to, which takes the file's place when the block ends well.
+
+    Raises OSError, and what the block raises; nothing is then left behind.
+    """
+    unfinished = file.with_name(f".{file.name}.{os.getpid()}.new")
+    try:
+        yield unfinished
+        unfinished.replace(file)
+    finally:
+        with contextlib.suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def whole_file(file: Path) -> Iterator[Path]:
+    """Yield as whole() does. Raises InputError for OSError, and where the name is that of a device or a pipe."""
+    try:
+        if file.exists() and not file.is_file():
+            raise InputError("is no file", where=str(file), hint="name a file, of which there may be none yet")
+        with whole(file) as unfinished:
+            yield unfinished
+    except OSError as error:
+        raise InputError(
+            f"cannot be written ({error.strerror or error})", where=str(file),
+            hint="name a file in a folder that can be written, on a disk with space",
+        ) from error  # fmt: skip
+
+
+def write_whole(file: Path, content: bytes) -> None:
+    """Write a file. Raises InputError as whole_file()."""
+    with whole_file(file) as unfinished:
+        unfinished.write_bytes(content)

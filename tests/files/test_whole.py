@@ -1,0 +1,66 @@
+"""New files: whole or not at all, and in no other's place unasked."""
+
+import os
+import re
+
+import pytest
+
+from cfplan.errors import InputError
+from cfplan.files.whole import check_new_file, whole, write_whole
+
+
+def test_a_file_is_replaced_in_one_step_and_may_be_read_by_those_who_may(tmp_path):
+    file = tmp_path / "plan.json"
+    file.write_text("old")
+    with whole(file) as unfinished:
+        unfinished.write_text("new")
+        assert file.read_text() == "old"
+    assert file.read_text() == "new"
+    other = tmp_path / "other"
+    other.touch()
+    assert file.stat().st_mode == other.stat().st_mode
+    assert sorted(os.listdir(tmp_path)) == ["other", "plan.json"]
+
+
+def test_what_fails_while_it_is_written_leaves_the_old_one_and_nothing_else(tmp_path):
+    file = tmp_path / "plan.json"
+    file.write_text("old")
+
+    def fail():
+        with whole(file) as unfinished:
+            unfinished.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert file.read_text() == "old"
+    assert os.listdir(tmp_path) == ["plan.json"]
+
+
+def test_a_device_is_no_file_and_stays(tmp_path):
+    link = tmp_path / "null"
+    link.symlink_to("/dev/null")
+    with pytest.raises(InputError, match="is no file"):
+        write_whole(link, b"content")
+    assert link.is_symlink()
+
+
+@pytest.mark.parametrize("place", ["nowhere/plan.json", "folder"])
+def test_where_nothing_can_be_written_is_an_error_with_the_place(tmp_path, place):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match=r"cannot be written|is no file") as caught:
+        write_whole(tmp_path / place, b"content")
+    assert caught.value.where == str(tmp_path / place)
+    assert os.listdir(tmp_path) == ["folder"]
+
+
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [("a.txt", "must end in .png, .pdf"), ("nowhere/a.png", "no such folder"), ("there.pdf", "exists already")],
+)
+def test_where_no_new_file_may_be_is_told_before_it_is_made(tmp_path, name, error):
+    (tmp_path / "there.pdf").touch()
+    with pytest.raises(InputError, match=re.escape(error)):
+        check_new_file(tmp_path / name, ".png", ".pdf", overwrite=False)
+    check_new_file(tmp_path / "there.pdf", ".png", ".pdf", overwrite=True)
+    check_new_file(tmp_path / "a.png", ".png", ".pdf", overwrite=False)
