@@ -20,6 +20,7 @@ from cfplan.version import __version__, commit
 NEEDED = ("numpy", "scipy", "numba", "casadi", "cflib", "pydantic", "mcap", "pyarrow", "rerun-sdk")
 OPTIONAL = {
     "torch": "training, planning needs none: pip install 'cfplan[learn]'",
+    "scikit-learn": "the paper's baselines: pip install 'cfplan[studies]'",
     "motioncapture": "motion capture other than Vicon: pip install 'cfplan[mocap]'",
     "rosbags": "ROS bags in cfplan replay: pip install 'cfplan[ros]'",
     "pymavlink": "MAVLink logs in cfplan replay: pip install 'cfplan[mavlink]'",

@@ -32,6 +32,11 @@ class FollowedFlight:
         """Return whether it crashed or was LOST."""
         return self.deviation >= LOST
 
+    @property
+    def top_speed(self) -> float:
+        """Return the fastest that it flew, m/s; NaN where its state is lost."""
+        return float(np.linalg.norm(self.flight.states[:, VELOCITY], axis=1).max())
+
 
 def fly_geometric(trajectory: Trajectory, airframe: Airframe) -> FollowedFlight:
     """Follow the trajectory from a hover at its start, on `airframe`, for SETTLING longer than it lasts."""

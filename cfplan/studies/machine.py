@@ -12,7 +12,7 @@ from cfplan.errors import InputError
 from cfplan.version import __version__
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-PACKAGES = ("casadi", "copp-py", "numba", "numpy", "scipy", "torch")
+PACKAGES = ("casadi", "copp-py", "numba", "numpy", "scikit-learn", "scipy", "torch")
 
 
 @dataclass(frozen=True, slots=True)

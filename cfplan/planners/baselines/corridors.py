@@ -54,6 +54,13 @@ def corridor_about(path: Path) -> Corridor:
     return Corridor(path(0.0), path(path.end), np.array(axes), np.array(low), np.array(high))
 
 
+def box_corners(corridor: Corridor) -> NDArray:
+    """Return the corners of each box, (B, 8, 3) m; bit k of a corner's number says which side along axis k."""
+    sides = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)])
+    along = np.where(sides[None], corridor.high[:, None], corridor.low[:, None])
+    return np.asarray(np.einsum("bij,bcj->bci", corridor.axes, along))
+
+
 def min_jerk(corridor: Corridor, times: NDArray) -> NDArray:
     """Return the control points, (B, 6, 3) m, of the motion with the least ∫|jerk|² dt for segment times, (B,) s.
 

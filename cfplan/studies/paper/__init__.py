@@ -9,6 +9,7 @@ __all__ = [
     "networks",
     "printed",
     "robustness",
+    "segment_times",
     "trials",
     "yaw_consistency",
 ]

@@ -1,8 +1,8 @@
 """The paper's Table 3: planners of other kinds on the same waypoints, each flown by the geometric controller.
 
 TOPPQuad, the paper's networks, the planner that ships and convex TOPP time the min-snap path, and scaled min-snap flies
-it at one factor on its timing. A learned time allocation flies a path of its own through the corridor about it, as
-AllocNet does.
+it at one factor on its timing. MFBOTrajectory's kind searches for other times of the min-snap segments. A learned time
+allocation flies a path of its own through the corridor about it, as AllocNet does.
 """
 
 import time
@@ -10,33 +10,42 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
+from cfplan.learning.paper.bayesian_times import Budget, require_library
 from cfplan.learning.paper.sequences import MAX_LENGTH
 from cfplan.learning.paper.time_allocation import TimeNetwork, allotted_times, train_times
 from cfplan.learning.paper.training import SequenceOptions
 from cfplan.planners.baselines.convex import plan_convex
-from cfplan.planners.baselines.corridors import ACCELERATION, SPEED, corridor_about, min_jerk, timed_path
+from cfplan.planners.baselines.corridors import (
+    ACCELERATION,
+    SPEED,
+    box_corners,
+    corridor_about,
+    min_jerk,
+    timed_path,
+)
 from cfplan.planners.baselines.min_snap import plan_min_snap
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import LOST, fly_geometric, thrust_violation
-from cfplan.studies.paper.networks import DATA, NETWORKS, NODES, WAYPOINTS, Progress, paper_data, trained_networks
+from cfplan.studies.paper.networks import DATA, NETWORKS, WAYPOINTS, Progress, paper_data, trained_networks
 from cfplan.studies.paper.printed import BASELINES
+from cfplan.studies.paper.segment_times import QUICK_BUDGET, bayesian_motion, timed_trajectory
 from cfplan.studies.paper.trials import (
     EXPERT,
     FLOWN,
     PAPER_LAG,
     SAMPLE,
     TOPPQUAD,
-    Ask,
     Plan,
     finite_mean,
     network_plan,
@@ -45,13 +54,25 @@ from cfplan.studies.paper.trials import (
     trajectory_by,
 )
 from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
-from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 
 BOX = np.array([10.0, 10.0, 5.0])  # m, where waypoints are drawn
 NOISES = (0.0, 0.1)  # m, of the LSTMs of the table
 CORRIDORS, QUICK_CORRIDORS = 2000, 6  # that the time allocation learns from
 SHIPPED, ALLOCATION, CONVEX, MIN_SNAP = "the shipped planner", "AllocNet's kind", "convex TOPP", "scaled min-snap"
+BAYESIAN = "MFBOTrajectory's kind"
+DRAWN, DRAWN_PATHS, DRAWN_POINTS = (SHIPPED, BAYESIAN, ALLOCATION), 3, 121  # of the figure
+
+
+class Course(NamedTuple):
+    """What planners are asked: waypoints, and the min-snap path through them."""
+
+    waypoints: NDArray  # (K, 3) m
+    path: Path
+    seed: int
+
+
+Ask = Callable[[Course], Trajectory]  # raises CfplanError where there is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +113,13 @@ def baselines(
     The time allocation learns from `corridors` corridors about other paths.
 
     Raises:
-        InputError: no path or corridor, or no such dataset.
+        InputError: no path or corridor, no such dataset, or no scikit-learn.
     """
     if paths < 1:
         raise InputError("paths must be at least 1", where="paths", hint="give --paths 50, as in the paper")
+    require_library()
     wanted = [SequenceOptions(epsilon=epsilon) for epsilon in NOISES]
+    budget = QUICK_BUDGET if quick else Budget()
     corridors = QUICK_CORRIDORS if quick else corridors
     with paper_data(data, networks, 1, epochs=epochs, quick=quick) as material:
         more = corridors + paths
@@ -105,83 +128,100 @@ def baselines(
         begun = time.process_time()
         allocation = _time_network(corridors, first_seed, lambda count: progress(done + count, done + more))
         training = time.process_time() - begun
-        asked = _planners({each.name: network_plan(each) for each in trained}, allocation)
+        plans = {each.name: network_plan(each) for each in trained}
+        asked, warm_up = (_planners(plans, allocation, each) for each in (budget, QUICK_BUDGET))
         retraining = {each.name: each.training_seconds for each in trained} | {ALLOCATION: training}
 
         def show(count: int) -> None:
             progress(done + corridors + count, done + more)
 
-        trials, interrupted = collect(_trials(asked, range(first_seed, first_seed + paths), show))
+        seeds = range(first_seed, first_seed + paths)
+        trials, interrupted = collect(_trials(asked, warm_up, seeds, show))
     settings = {
         "paths": paths, "first_seed": first_seed, "corridors": corridors, "motor_lag": PAPER_LAG, "quick": quick,
     }  # fmt: skip
-    table = baselines_table(trials, list(asked), retraining)
-    return StudyResult("baselines", settings, (table,), (detail_table("trials", trials),), interrupted)
+    table = baselines_table([trial for trial, _ in trials], list(asked), retraining)
+    details = (
+        detail_table("trials", [trial for trial, _ in trials]),
+        detail_table("drawn", _drawn(trials, first_seed)),
+    )
+    return StudyResult("baselines", settings, (table,), details, interrupted)
 
 
-def random_path(seed: int) -> Path:
-    """Return the min-snap path of that seed; one that leaves the box by far is drawn anew, as for training."""
+def random_course(seed: int) -> Course:
+    """Return the waypoints and path of that seed; one that leaves the box by far is drawn anew, as for training."""
     attempt = 0
     while True:
         drawn = np.random.SeedSequence(seed, spawn_key=(attempt,))
-        path = min_snap(random_waypoints(drawn, np.array([-BOX / 2, BOX / 2]), (WAYPOINTS, WAYPOINTS)))
+        waypoints = random_waypoints(drawn, np.array([-BOX / 2, BOX / 2]), (WAYPOINTS, WAYPOINTS))
+        path = min_snap(waypoints)
         with suppress(InputError):
             path.check()
             if path.length <= MAX_LENGTH:
-                return path
+                return Course(waypoints, path, seed)
         attempt += 1
 
 
 def _time_network(count: int, first_seed: int, on_label: Callable[[int], None]) -> TimeNetwork:
     """Train a time allocation on paths that are none of the study's."""
-    corridors = [corridor_about(random_path(10 * first_seed + k)) for k in range(count)]
+    corridors = [corridor_about(random_course(10 * first_seed + k).path) for k in range(count)]
     return train_times(corridors, on_label=on_label)
 
 
-def _planners(networks: Mapping[str, Plan], allocation: TimeNetwork) -> dict[str, Ask]:
+def _planners(networks: Mapping[str, Plan], allocation: TimeNetwork, budget: Budget) -> dict[str, Ask]:
     on_the_path = {
         TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert), **networks, SHIPPED: shipped_profile,
     }  # fmt: skip
-    return {name: trajectory_by(plan) for name, plan in on_the_path.items()} | {
-        ALLOCATION: lambda path: _allotted(path, allocation),
-        CONVEX: trajectory_by(profile_by(plan_convex)),
-        MIN_SNAP: trajectory_by(profile_by(plan_min_snap)),
+    return {name: _on_the_path(plan) for name, plan in on_the_path.items()} | {
+        ALLOCATION: lambda course: _allotted(course.path, allocation),
+        BAYESIAN: lambda course: bayesian_motion(course.waypoints, budget=budget, seed=course.seed),
+        CONVEX: _on_the_path(profile_by(plan_convex)),
+        MIN_SNAP: _on_the_path(profile_by(plan_min_snap)),
     }
+
+
+def _on_the_path(plan: Plan) -> Ask:
+    timed = trajectory_by(plan)
+    return lambda course: timed(course.path)
 
 
 def _allotted(path: Path, network: TimeNetwork) -> Trajectory:
     corridor = corridor_about(path)
     times = allotted_times(network, corridor)
-    timed = timed_path(min_jerk(corridor, times), times)
-    grid = np.linspace(0.0, timed.end, NODES + 1)
-    zeros = np.zeros(NODES + 1)
-    profile = SpeedProfile(grid, np.ones(NODES + 1), zeros, zeros, zeros[1:], zeros, zeros, zeros[1:])
-    return Trajectory(timed, profile, PAPER.airframe)
+    return timed_trajectory(timed_path(min_jerk(corridor, times), times))
 
 
-def _trials(asked: Mapping[str, Ask], seeds: range, show: Callable[[int], None]) -> Iterator[BaselineTrial]:
-    warm = random_path(seeds.start)
-    for ask in asked.values():
+Flown = tuple[BaselineTrial, Trajectory | None]
+
+
+def _trials(
+    asked: Mapping[str, Ask], warm_up: Mapping[str, Ask], seeds: range, show: Callable[[int], None]
+) -> Iterator[Flown]:
+    warm = random_course(seeds.start)
+    for ask in warm_up.values():
         with suppress(CfplanError):
             ask(warm)  # loads and compiles
     for done, seed in enumerate(seeds):
-        path = random_path(seed)
+        course = random_course(seed)
         for name, ask in asked.items():
-            yield _flown(ask, path, BaselineTrial(name, seed))
+            yield _flown(ask, course, BaselineTrial(name, seed))
         show(done + 1)
 
 
-def _flown(ask: Ask, path: Path, trial: BaselineTrial) -> BaselineTrial:
+def _flown(ask: Ask, course: Course, trial: BaselineTrial) -> Flown:
     begun = time.process_time()
     try:
-        trajectory = ask(path)
+        trajectory = ask(course)
     except CfplanError as error:
-        return replace(trial, reason=str(error))
+        return replace(trial, reason=str(error)), None
     seconds = time.process_time() - begun
+    return _judged(trajectory, replace(trial, seconds=seconds)), trajectory
+
+
+def _judged(trajectory: Trajectory, trial: BaselineTrial) -> BaselineTrial:
     state = trajectory.at(np.arange(0.0, trajectory.duration, SAMPLE))
     return replace(
         trial,
-        seconds=seconds,
         travel_time=trajectory.duration,
         length=trajectory.path.length,
         deviation=fly_geometric(trajectory, FLOWN).deviation,
@@ -190,6 +230,28 @@ def _flown(ask: Ask, path: Path, trial: BaselineTrial) -> BaselineTrial:
         violation=thrust_violation(state.motor_thrust, PAPER.airframe),
         top_speed=float(np.linalg.norm(state.velocity, axis=1).max()),
     )
+
+
+def _drawn(trials: Sequence[Flown], first_seed: int) -> Iterator[dict[str, Any]]:
+    """Yield what the figure shows of the first paths: the motions of DRAWN, and AllocNet's boxes by their corners."""
+    for seed in range(first_seed, first_seed + DRAWN_PATHS):
+        own = {trial.planner: trajectory for trial, trajectory in trials if trial.seed == seed and not trial.failed}
+        if not own:
+            continue
+        course = random_course(seed)
+        yield {"seed": seed, "what": "waypoints", "points": _millimetres(course.waypoints)}
+        for name in DRAWN:
+            trajectory = own.get(name)
+            if trajectory is not None:
+                path = trajectory.path
+                points = _millimetres(path(np.linspace(0.0, path.end, DRAWN_POINTS)))
+                yield {"seed": seed, "what": name, "points": points}
+        for corners in box_corners(corridor_about(course.path)):
+            yield {"seed": seed, "what": "box", "points": _millimetres(corners)}
+
+
+def _millimetres(points: NDArray) -> list[list[float]]:
+    return [[round(float(value), 3) for value in point] for point in points]
 
 
 def baselines_table(trials: Sequence[BaselineTrial], names: Sequence[str], retraining: Mapping[str, float]) -> Table:

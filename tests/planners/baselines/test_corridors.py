@@ -10,6 +10,7 @@ from cfplan.planners.baselines.corridors import (
     PADDING,
     SPEED,
     Corridor,
+    box_corners,
     corridor_about,
     least_time,
     min_jerk,
@@ -46,6 +47,15 @@ def test_the_boxes_hold_the_path_that_they_are_about_with_room_to_spare(corridor
         assert (along >= corridor.low[k] + PADDING - 1e-9).all()
         assert (along <= corridor.high[k] - PADDING + 1e-9).all()
         np.testing.assert_allclose(corridor.axes[k].T @ corridor.axes[k], np.eye(3), atol=1e-9)
+
+
+def test_the_corners_of_a_box_are_its_sides_apart_and_differ_in_one_bit_along_an_edge(corridor):
+    for box, corners in enumerate(box_corners(corridor)):
+        sides = corridor.high[box] - corridor.low[box]
+        for axis in range(3):
+            for corner in range(8):
+                edge = corners[corner | 1 << axis] - corners[corner & ~(1 << axis)]
+                np.testing.assert_allclose(edge, sides[axis] * corridor.axes[box][:, axis], atol=1e-9)
 
 
 def test_it_rests_at_its_ends_and_jumps_in_nothing_up_to_jerk(corridor):
