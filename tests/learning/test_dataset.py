@@ -171,16 +171,16 @@ def test_an_interrupted_run_goes_on_where_it_stopped(made, tmp_path, monkeypatch
 
 
 def test_a_full_disk_loses_nothing_that_was_written(made, tmp_path, monkeypatch):
-    write = dataset._write
+    write = dataset.whole
     written: list[Path] = []
 
-    def write_until_full(file, content):
+    def write_until_full(file):
         if len(written) == 3:
             raise OSError(errno.ENOSPC, "No space left on device")
         written.append(file)
-        write(file, content)
+        return write(file)
 
-    monkeypatch.setattr(dataset, "_write", write_until_full)
+    monkeypatch.setattr(dataset, "whole", write_until_full)
     with pytest.raises(InputError, match="No space left"):
         make_dataset(tmp_path, SMALL)
     monkeypatch.undo()

@@ -69,7 +69,7 @@ def test_figures_are_written_whole_and_nothing_is_overwritten(figure, tmp_path, 
 
 
 def test_what_is_no_figure_is_refused(figure, tmp_path):
-    with pytest.raises(InputError, match=r"ends in \.png, \.pdf, \.svg"):
+    with pytest.raises(InputError, match=r"must end in \.png, \.pdf, \.svg"):
         save_figure(figure, tmp_path / "plan.jpg")
     with pytest.raises(InputError, match="no such folder"):
         save_figure(figure, tmp_path / "no" / "plan.pdf")

@@ -61,7 +61,7 @@ def test_the_vehicle_moves_from_frame_to_frame(planned):
 
 
 def test_what_cannot_be_written_is_refused_first(flight, tmp_path):
-    for name, words in (("flight.mp4", "ends in"), ("nowhere/flight.gif", "no such folder")):
+    for name, words in (("flight.mp4", "must end in"), ("nowhere/flight.gif", "no such folder")):
         with pytest.raises(InputError, match=words):
             check_animation_file(tmp_path / name, overwrite=False)
     (tmp_path / "flight.gif").write_bytes(b"")
