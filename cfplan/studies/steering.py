@@ -35,6 +35,7 @@ from cfplan.steering.stepped_steering import SteppedSteering
 from cfplan.steering.waypoint_lines import parse_line
 from cfplan.studies.flown_sequence import Committed, SequenceVerdict, judge_sequence
 from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
+from cfplan.vehicle.joint import JoinedTrajectory
 
 REQUESTS = 250  # of a flight, the last of a burst besides
 SECONDS = 90.0  # of a flight, in which they are asked for
@@ -54,6 +55,7 @@ _RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)
 _ENDS = ("flown", "landed", "stopped and landed")  # how a flight is ended: at its end, in motion, after a stop
 _IN_HAND = 2  # requests that may be unanswered as a flight ends: one at the pilot, one that waits
 _BAD_SHOWN = 20
+_STANDING = 1e-9  # m/s, up to which a motion stands still
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,11 +169,13 @@ class _WatchedSteering(SteppedSteering):
         """
         commitment, flown = held.commitment, held.flown
         later = commitment.splices[-1] - splice if commitment.splices else 0
-        if self.commitments:
+        if later:
+            flown = flown_later(flown, splice, later)
+        elif self.commitments:
             known, flown = {id(each) for each in self.commitments[-1].flown.trajectories}, self.commitments[-1].flown
             for start, leg in zip(held.flown.starts, held.flown.trajectories, strict=True):
                 if id(leg) not in known:
-                    flown = flown.continued(start + later / RATE, leg)
+                    flown = flown.continued(start, leg)
         rows = slice(splice + later - commitment.first, None)
         ends = np.array(commitment.stops[rows][:, [0, -1]])
         payloads = np.array(commitment.payloads[rows])
@@ -180,6 +184,19 @@ class _WatchedSteering(SteppedSteering):
         else:
             stop = (0, 0) if held.stops_from is None else (held.stops_from + later, held.stops_from + STOP + later)
         self.commitments.append(Committed(splice + later, payloads, ends, flown, *stop))
+
+
+def flown_later(flown: JoinedTrajectory, splice: int, later: int) -> JoinedTrajectory:
+    """Return a motion that was proposed from setpoint `splice` on, as it is flown so many setpoints later.
+
+    The vehicle hovers on until then: also what was committed to begin meanwhile is flown by nobody. What the proposal
+    leaves moves later too where it moves already, by less than the pilot tells from a hover.
+    """
+    begins = splice / RATE
+    if np.linalg.norm(flown.at(begins).velocity) > _STANDING:
+        begins = max(start for start in flown.starts if start <= begins)
+    starts = tuple(start + later / RATE if start >= begins else start for start in flown.starts)
+    return JoinedTrajectory(flown.trajectories, starts)
 
 
 def fly_steered(seed: int, limits: Limits, *, requests: int = REQUESTS, seconds: float = SECONDS) -> SteeredFlight:

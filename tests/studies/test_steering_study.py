@@ -9,6 +9,10 @@ import pytest
 
 from cfplan.errors import InputError
 from cfplan.flight.setpoints.packets import decode
+from cfplan.preparation.air_planner import Wish
+from cfplan.preparation.stepped_planner import PlannerFault
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.steering.steered_vehicle import SteeredVehicle
 from cfplan.studies import steering as study
 from cfplan.studies.flown_sequence import judge_sequence
 from cfplan.studies.result import read_result
@@ -86,6 +90,30 @@ def test_what_is_wrong_with_a_commitment_is_found(flown, limits):
     assert any("share of a limit" in fault for fault in judge_sequence(sent, commitments, slower).faults)
     gone = {number: one for number, one in sent.items() if number != max(sent) // 2}
     assert any("left out: 1" in fault for fault in judge_sequence(gone, commitments, limits).faults)
+
+
+def test_what_is_flown_later_than_proposed_is_judged_without_what_it_replaced(limits):
+    """A plan from rest, replaced before it begins by one that arrives for three setpoints later: nobody flies it."""
+    flight = study._WatchedSteering(limits, planning=0.1, seed=5, vehicle=VehicleSettings(seed=5))
+    with SteeredVehicle(flight, limits, uri="sim://0") as vehicle:
+        vehicle.take_off(1.0)
+        for _ in range(5):
+            vehicle.request(Wish.SLOWER)
+            vehicle.sleep(0.05)
+        vehicle.request(Wish.REPLACE, [[0.0, 2.0, 1.0]])
+        vehicle.sleep(1.2)
+        for wish, waypoints in ((Wish.STOP, []), (Wish.REPLACE, [[0.5, 0.0, 1.0]])):
+            vehicle.request(wish, waypoints)
+            vehicle.sleep(0.13)
+        flight.planner.fault = PlannerFault.OTHER_JOINT
+        vehicle.request(Wish.REPLACE, [[1.0, 1.0, 1.2]])
+        vehicle.sleep(0.2)
+        flight.planner.fault = None
+        vehicle.sleep(0.5)
+        vehicle.land()
+    splices = [each.splice for each in flight.commitments]
+    assert any(splice - 3 in splices[:number] for number, splice in enumerate(splices))
+    assert judge_sequence(flight.sent, flight.commitments, limits).faults == ()
 
 
 def test_results_are_added_up_and_a_seed_counts_once(tmp_path):
