@@ -36,7 +36,8 @@ from cfplan.preparation.certified_flight import (
     require_inside,
 )
 from cfplan.safety.limits import Limits
-from cfplan.simulation.link_loss import link_loss_at_walls
+from cfplan.simulation.dry_run import dry_run_of_setpoints
+from cfplan.simulation.link_loss import as_believed, link_loss_at_walls
 from cfplan.vehicle.hover import hover_at
 from cfplan.vehicle.joint import JoinedTrajectory
 
@@ -51,6 +52,7 @@ STOPS = (0.46, 0.48, 0.5, 0.52, 0.54, 0.55, 0.56, 0.58, 0.6, 0.65, 0.7, 0.8, 1.0
 """s within which a request to stop is tried to be met. From 2 m/s straight on 0.54 s brake at 6.9 m/s², a tilt of 35°;
 where the vehicle turns or slows down already it is more or less. One that holds its deceleration is planned to rest
 0.1 m sooner, but motors that lag let the vehicle overshoot that by as much."""
+STRAYS = 0.04  # m, that the vehicle may stray in a stop shorter than others: as flights do in the virtual lab
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -339,9 +341,9 @@ def snapshots_at(held: HeldFlight, splice: int) -> NDArray:
 def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned | HeldFlight:
     """Return the proposal to leave what is held at setpoint `splice` and to come to rest as soon as may be on its path.
 
-    That is a stop as there is one from each setpoint, but the shortest that keeps what stops may reach. Where the
-    vehicle stops as soon behind the part of a plan that is committed, that is held. Raises InfeasibleError where it
-    rests as soon anyway, or no stop passes: then it rests at the end of what is held.
+    That is a stop as there is one from each setpoint, but the shortest that keeps what stops may reach and that the
+    vehicle can follow. Where it stops as soon behind the part of a plan that is committed, that is held. Raises
+    InfeasibleError where it rests as soon anyway, or no stop passes: then it rests at the end of what is held.
     """
     held = at_rest_from(held, splice, limits)
     splice, _ = _leaving(held, splice, keep=False)
@@ -395,8 +397,8 @@ def following(replanned: Replanned, commitment: Commitment) -> Replanned:
 def stop_within(held: HeldFlight, splice: int, duration: float, limits: Limits) -> Replanned:
     """Return the proposal to stop along the path from the setpoint behind `splice` on, within `duration`, s.
 
-    Raises NotCertifiedError where the stop exceeds what stops may reach, InfeasibleError where link loss or a gap
-    within it would end badly.
+    Raises NotCertifiedError where the stop exceeds what stops may reach or its dry run does not pass, InfeasibleError
+    where link loss or a gap within it would end badly.
     """
     return _stop_along(_encoded_from(held, splice, limits), held, splice, duration, limits)
 
@@ -421,12 +423,30 @@ def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration:
     after = [padded[min(row, len(rows)) :][: whole.shape[1]] for row in range(len(payloads) - 1)]
     stops = np.concatenate([whole, np.stack(after)])
     starts = snapshots_at(held, splice)
+    _rehearse_stop(payloads, duration, limits, starts)
     lost = link_loss_at_walls(payloads, limits, starts=starts)
     require_inside(lost, limits)
     meet_gaps(payloads, limits, starts)
     resting = _resting(held, rest_behind(motion, 1, RATE, duration), splice + 1, splice + len(rows), limits)
     later = replace(resting, begin=splice, snapshots=lost.snapshots)
     return Replanned(propose(held.commitment, splice, payloads, stops), later, None, splice / RATE)
+
+
+def _rehearse_stop(payloads: NDArray, duration: float, limits: Limits, starts: NDArray) -> None:
+    """Raise NotCertifiedError where the dry run of a stop fails, or strays as far as only a shorter stop does.
+
+    What motors can do is certified of the motion, which they follow late. Where a short stop leans from one side to
+    the other at little thrust, controlling the attitude takes what is left of a motor; then the firmware lowers the
+    thrust of all, and the vehicle sinks: by 0.2 m where it came over the top of a climb.
+    """
+    run = dry_run_of_setpoints(payloads, limits.airframe, limits.flight, snapshot=as_believed(starts, limits))
+    run.require_passed()
+    if duration < DURATION and not run.deviation <= STRAYS:
+        raise NotCertifiedError(
+            f"within {duration:g} s the vehicle strays {run.deviation:.2f} m from the stop, more than {STRAYS:g} m",
+            where="dry run",
+            hint="stop within a longer time",
+        )
 
 
 def _resting(
