@@ -148,4 +148,15 @@ def paper(folder: Path, quick: bool) -> None:
         click.echo(f"{each.file}: {how}")
 
 
-COMMANDS = (architectures, inputs, robustness, baselines, hardware, yaw_consistency, paper)
+@click.command(epilog="Example: cfplan study figures results docs/images")
+@click.argument("results", metavar="[RESULTS]", type=click.Path(path_type=Path), default=Path("results"))
+@click.argument("images", metavar="[IMAGES]", type=click.Path(path_type=Path), default=Path("docs/images"))
+def figures(results: Path, images: Path) -> None:
+    """Draw the paper's figures from the JSON in RESULTS, as .png in IMAGES."""
+    from cfplan.studies.paper.figures import write_figures
+
+    for file in write_figures(results, images):
+        click.echo(file)
+
+
+COMMANDS = (architectures, inputs, robustness, baselines, hardware, yaw_consistency, paper, figures)

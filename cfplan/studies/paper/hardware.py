@@ -3,10 +3,10 @@
 Eight paths in a motion capture room, the first a straight line, and a long one; several flights of each, which differ
 by the noise of sensors, cameras and radio. The paper states two sets of limits, so there are two. Plans are flown in
 two ways: as they are, which cfplan otherwise refuses, and certified, as cfplan flies them. Room, vehicle and all other
-limits are those that `cfplan init` writes.
+limits are those that `cfplan init` writes. Of the first set the poses are kept, for the figures of the tracks.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count
@@ -20,6 +20,7 @@ from cfplan.flight.pilot.mission import Mission, mission_of
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
+from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived, Telemetry
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
@@ -61,6 +62,8 @@ THE_LINE = np.array([[-1.4, -2.8, 0.8], [1.4, 2.8, 1.2]])  # m
 LONG_WAYPOINTS, LONG_WALL_DISTANCE = 16, 0.35  # of the long path, and m that they keep from the margin
 LIMITS = {"appendix": (5.0, 8.0), "text": (10.0, 10.0)}  # m/s² and rad/s, as the paper has them in the two places
 RAW, CERTIFIED = "as planned", "certified"
+TRACKED = next(iter(LIMITS))  # the limits whose flights are drawn
+TRACK_SPACING, TRACK_POINTS = 0.1, 121  # s between two kept poses; points of a path
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +84,33 @@ class HardwareFlight:
     def failed(self) -> bool:
         """Return whether there was no flight to the end of the path, or it was LOST."""
         return bool(self.reason) or not self.deviation < LOST
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Where a vehicle was along a path, by the poses; or, without a planner, the path itself."""
+
+    path: str
+    points: list[list[int]]  # mm
+    way: str = ""
+    planner: str = ""
+    trial: int = 0
+
+
+class _Poses:
+    """Keeps some poses of those that arrive while the path is flown."""
+
+    def __init__(self) -> None:
+        self.points: list[list[int]] = []
+        self._flying, self._next = False, -np.inf
+
+    def hear(self, message: Telemetry) -> None:
+        match message:
+            case PhaseEntered(phase=phase):
+                self._flying = phase is Phase.STREAM
+            case PoseReceived(time=time, position=position) if self._flying and time >= self._next:
+                self.points.append(_millimetres(position))
+                self._next = time + TRACK_SPACING
 
 
 Raw = Callable[[Path, Limits], Trajectory]  # raises CfplanError where there is none
@@ -131,10 +161,12 @@ def hardware(
                 {"limits": name, "network": each.name, "learned_from": len(material.learned_from.rows),
                  "epochs": each.options.epochs, "seconds": each.training_seconds} for each in trained
             ]  # fmt: skip
-    flights, interrupted = collect(_all_flights(usual, planners, flown_paths, 1 if quick else None, progress))
+    flown, interrupted = collect(_all_flights(usual, planners, flown_paths, 1 if quick else None, progress))
+    flights = [flight for flight, _ in flown]
     settings = {"paths": paths, "radio_loss": LOSS, "quick": quick}
     tables = (*hardware_tables(flights), Table("training", "Networks", TRAINING_COLUMNS, tuple(training)))
-    return StudyResult("hardware", settings, tables, (detail_table("flights", flights),), interrupted)
+    details = (detail_table("flights", flights), detail_table("tracks", _tracks(flown_paths, flown)))
+    return StudyResult("hardware", settings, tables, details, interrupted)
 
 
 def paper_limits(usual: Limits, name: str) -> Limits:
@@ -230,7 +262,7 @@ def _task(path: Path, limits: Limits) -> PlanningTask:
 def _all_flights(
     usual: Limits, planners: Mapping[str, Sequence[FlownPlanner]], paths: Mapping[str, Path], most: int | None,
     progress: Progress,
-) -> Iterator[HardwareFlight]:  # fmt: skip
+) -> Iterator[tuple[HardwareFlight, list[list[int]]]]:  # fmt: skip
     wanted = [
         (name, way, planner, path)
         for name, own in planners.items()
@@ -247,7 +279,7 @@ def _all_flights(
         try:
             mission, duration = _mission(way, planner, paths[path], limits)
         except CfplanError as error:
-            yield from (replace(flight, reason=str(error)) for flight in begun)
+            yield from ((replace(flight, reason=str(error)), []) for flight in begun)
             continue
         place = list(paths).index(path)
         yield from (
@@ -271,14 +303,29 @@ def _mission(way: str, planner: FlownPlanner, path: Path, limits: Limits) -> tup
     return mission_of(encoded, patient), trajectory.duration
 
 
-def _flown(flight: HardwareFlight, mission: Mission, seed: int) -> HardwareFlight:
+def _flown(flight: HardwareFlight, mission: Mission, seed: int) -> tuple[HardwareFlight, list[list[int]]]:
+    """Return what became of it, and where it was, mm."""
     lossy = (RadioFault(RadioFaultKind.LOSS, 0.0, FOR_GOOD, LOSS),)
     vehicle = VehicleSettings(auto_arming=False, seed=seed)
-    flown = fly_stepped(Scenario("", Rung.NONE, lossy, from_start=True, vehicle=vehicle), mission, seed=seed)
+    scenario, poses = Scenario("", Rung.NONE, lossy, from_start=True, vehicle=vehicle), _Poses()
+    flown = fly_stepped(scenario, mission, seed=seed, listen=poses.hear)
     outcome = flown.outcome
     if outcome is None or outcome.exit_code is not ExitCode.OK:
-        return replace(flight, reason=flown.reason)
-    return replace(flight, deviation=outcome.deviation.max, settled=outcome.settled_after)
+        return replace(flight, reason=flown.reason), poses.points
+    return replace(flight, deviation=outcome.deviation.max, settled=outcome.settled_after), poses.points
+
+
+def _tracks(paths: Mapping[str, Path], flown: Sequence[tuple[HardwareFlight, list[list[int]]]]) -> Iterator[Track]:
+    """Yield what the paper draws: each path, and the flights of TOPPQuad and of the networks, under TRACKED."""
+    for name, path in paths.items():
+        yield Track(name, [_millimetres(point) for point in path(np.linspace(0.0, path.end, TRACK_POINTS))])
+    for flight, points in flown:
+        if flight.limits == TRACKED and flight.planner != SHIPPED and points:
+            yield Track(flight.path, points, flight.way, flight.planner, flight.trial)
+
+
+def _millimetres(point: Iterable[float]) -> list[int]:
+    return [round(1000.0 * float(value)) for value in point]
 
 
 COLUMNS = (

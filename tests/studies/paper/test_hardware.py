@@ -49,6 +49,20 @@ def test_what_is_certified_lands_near_its_place(quick):
     assert times["LSTM-0.001"] == pytest.approx(times[SHIPPED], rel=0.01)  # repair leads to the same optimum
 
 
+def test_tracks_are_kept_of_all_but_what_ships_and_go_along_the_path(quick):
+    tracks = quick.table("tracks").rows
+    (path,) = (np.array(track["points"]) for track in tracks if not track["planner"])
+    flown = [track for track in tracks if track["planner"]]
+    assert {(track["way"], track["planner"]) for track in flown} == {
+        (way, planner) for way in (RAW, CERTIFIED) for planner in (TOPPQUAD, "LSTM-0.001")
+    }
+    (certified,) = (track for track in flown if (track["way"], track["planner"]) == (CERTIFIED, TOPPQUAD))
+    points = np.array(certified["points"])
+    away = np.linalg.norm(points[:, None] - path, axis=2)
+    assert away.min(axis=1).max() < 60  # mm
+    assert away.min(axis=0).max() < 250  # all of the path: 2 m/s, ten poses a second
+
+
 def test_failures_are_counted_and_left_out_of_the_means():
     def flight(trial, **changes):
         return HardwareFlight("text", RAW, "LSTM-0.1", str(trial), trial, **changes)
@@ -95,8 +109,8 @@ def test_a_planner_without_a_plan_fails_every_flight_of_that_path(monkeypatch):
 
     planner = study.FlownPlanner("none", none, none, 3)
     paths = {LONG: long_path(USUAL), **hardware_paths(USUAL, 1)}
-    flights = list(study._all_flights(USUAL, {"text": [planner]}, paths, None, lambda done, total: None))
-    assert [(flight.path, flight.way, flight.failed) for flight in flights] == 3 * [("1", RAW, True)] + 3 * [
+    flown = study._all_flights(USUAL, {"text": [planner]}, paths, None, lambda done, total: None)
+    assert [(flight.path, flight.way, flight.failed) for flight, _ in flown] == 3 * [("1", RAW, True)] + 3 * [
         ("1", CERTIFIED, True)
     ]
 

@@ -1,0 +1,99 @@
+"""The paper's figures: drawn from results, with all that the paper's show."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.errors import InputError
+from cfplan.planners.baselines.corridors import BOXES, box_corners, corridor_about
+from cfplan.studies.paper.baselines import ALLOCATION, DRAWN, random_course
+from cfplan.studies.paper.figures import (
+    EDGES,
+    NETWORKS,
+    draw_baselines,
+    draw_tracks,
+    draw_yaw_consistency,
+    write_figures,
+)
+from cfplan.studies.paper.hardware import CERTIFIED, LONG, RAW
+from cfplan.studies.paper.trials import TOPPQUAD
+from cfplan.studies.paper.yaw_consistency import WAYS, yaw_consistency
+from cfplan.studies.result import StudyResult, detail_table
+
+SEEDS = (60_000, 60_001)
+
+
+@pytest.fixture
+def baselines():
+    rows = []
+    for seed in SEEDS:
+        course = random_course(seed)
+        rows.append({"seed": seed, "what": "waypoints", "points": course.waypoints.tolist()})
+        rows += [{"seed": seed, "what": name, "points": course.path([0.0, 5.0, 9.0]).tolist()} for name in DRAWN]
+        boxes = box_corners(corridor_about(course.path))
+        rows += [{"seed": seed, "what": "box", "points": box.tolist()} for box in boxes]
+    return StudyResult("baselines", {}, (), (detail_table("drawn", rows),))
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return yaw_consistency(pairs=1)
+
+
+@pytest.fixture(scope="module")
+def hardware():
+    rows = []
+    for path in ("1", "2", LONG):
+        rows.append({"path": path, "planner": "", "way": "", "points": [[0, 0, 0], [900, 900, 0]]})
+        rows += [
+            {"path": path, "planner": planner, "way": way, "points": [[0, 0, 0], [900, 880, 0]]}
+            for way in (RAW, CERTIFIED) for planner in (TOPPQUAD, *NETWORKS) for _ in range(2)
+        ]  # fmt: skip
+    return StudyResult("hardware", {}, (), (detail_table("tracks", rows),))
+
+
+def test_tracks_of_one_network_and_toppquad_stand_over_each_path_as_planned_and_certified(hardware):
+    panels = [panel for panel in draw_tracks(hardware, "LSTM-0.01").axes if panel.get_visible()]
+    assert [panel.get_title() for panel in panels] == 2 * ["path 1", "path 2"]
+    for panel in panels:
+        colours = [line.get_color() for line in panel.lines]
+        assert len(colours) == 5
+        assert colours.count(NETWORKS["LSTM-0.01"]) == 2
+        np.testing.assert_allclose(panel.lines[0].get_xdata(), [0.0, 0.9])
+
+
+def test_each_planner_has_a_panel_for_each_path_and_allocnets_has_its_boxes(baselines):
+    panels = draw_baselines(baselines).axes
+    assert [panel.get_title() for panel in panels[: len(DRAWN)]] == list(DRAWN)
+    assert len(panels) == len(SEEDS) * len(DRAWN)
+    for number, panel in enumerate(panels):
+        boxes = BOXES if DRAWN[number % len(DRAWN)] == ALLOCATION else 0
+        assert len(panel.lines) == 12 * boxes + 2  # the motion, and its waypoints
+
+
+def test_a_box_has_twelve_edges_of_one_axis_each():
+    assert len(set(EDGES)) == 12
+    assert all(bin(first ^ second).count("1") == 1 for first, second in EDGES)
+
+
+def test_every_way_to_plan_has_its_histograms_of_as_many_pairs(pairs):
+    panels = draw_yaw_consistency(pairs).axes
+    assert len(panels) == 3 * len(WAYS)
+    for panel in panels:
+        assert sum(bar.get_height() for bar in panel.patches) == 1
+
+
+def test_figures_are_written_whole_or_what_is_missing_is_named(tmp_path, baselines, pairs, hardware):
+    baselines.write(tmp_path / "baselines.json")
+    with pytest.raises(InputError, match=r"No such file"):
+        write_figures(tmp_path, tmp_path)
+    pairs.write(tmp_path / "yaw-consistency.json")
+    hardware.write(tmp_path / "hardware.json")
+    files = write_figures(tmp_path, tmp_path)
+    assert [file.name for file in files] == [
+        "paper-baselines.png", "paper-yaw.png", *(f"paper-{name}.png" for name in NETWORKS),
+    ]  # fmt: skip
+    assert all(file.stat().st_size > 10_000 for file in files)
+    with pytest.raises(InputError, match="no such folder"):
+        write_figures(tmp_path, Path(tmp_path / "none"))
