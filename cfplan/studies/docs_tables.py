@@ -7,6 +7,7 @@
 <!-- preflight: parameters -->                               what preflight requires on board; also signs, unknowable,
                                                              time-outs
 <!-- errors: geometry/path_file.py geometry/path.py -->   what these modules can say is wrong
+<!-- time-outs: poses -->                                    what happens after which time; the figure beside them, too
 <!-- end -->                                                 ends any of them
 """
 
@@ -19,6 +20,7 @@ from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, 
 from cfplan.studies.error_tables import error_table, read_meanings
 from cfplan.studies.provenance import Provenance
 from cfplan.studies.result import Table, read_result
+from cfplan.studies.time_outs import time_out_table, write_figure
 
 _BLOCK = re.compile(
     r"(?P<begin><!-- (?P<kind>table|columns|measured): (?P<file>[^#\s]+)(?:#(?P<name>\S+))? -->\n).*?"
@@ -34,6 +36,7 @@ _RULES = re.compile(
     re.DOTALL,
 )
 _ERRORS = re.compile(r"(?P<begin><!-- errors: (?P<modules>[^>]+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
+_TIME_OUTS = re.compile(r"(?P<begin><!-- time-outs: (?P<name>\S+) -->\n).*?(?P<end><!-- end -->)", re.DOTALL)
 
 
 def with_tables(page: str, folder: Path) -> str:
@@ -62,12 +65,16 @@ def with_tables(page: str, folder: Path) -> str:
         titles, cells = error_table(match["modules"].split(), read_meanings(folder))
         return f"{match['begin']}\n{_grid(titles, cells)}\n\n{match['end']}"
 
-    page = _ERRORS.sub(errors, page)
+    def time_outs(match: re.Match[str]) -> str:
+        titles, cells = time_out_table(match["name"], folder)
+        return f"{match['begin']}\n{_grid(titles, cells)}\n\n{match['end']}"
+
+    page = _TIME_OUTS.sub(time_outs, _ERRORS.sub(errors, page))
     return _RULES.sub(rules, _FIGURE.sub(figure, _BLOCK.sub(block, page)))
 
 
 def write_tables(folder: Path) -> list[Path]:
-    """Make the tables of README and of every page under docs/ of `folder` anew; return the pages that changed.
+    """Make the tables of README and of every page under docs/ of `folder` anew; return the files that changed.
 
     Raises InputError.
     """
@@ -81,7 +88,8 @@ def write_tables(folder: Path) -> list[Path]:
         if new != old:
             page.write_text(new, encoding="utf-8")
             changed.append(page)
-    return changed
+    figure = write_figure(folder)
+    return [*changed, figure] if figure else changed
 
 
 def pages_of(folder: Path) -> list[Path]:

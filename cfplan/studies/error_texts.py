@@ -381,7 +381,7 @@ def _constant(file: Path, node: ast.expr | None, depth: int = 0) -> object | Non
         case ast.Constant():
             return node.value
         case ast.Name():
-            return _module_constant(file, node.id, depth + 1)
+            return module_constant(file, node.id, depth + 1)
         case ast.UnaryOp(op=ast.USub()) | ast.BinOp():
             return _number(file, node, depth + 1)
         case ast.JoinedStr():
@@ -436,7 +436,7 @@ def _number(file: Path, node: ast.expr, depth: int) -> object | None:
     return None
 
 
-def _module_constant(file: Path, name: str, depth: int) -> object | None:
+def module_constant(file: Path, name: str, depth: int = 0) -> object | None:
     """Return the value of a name that a module defines, by itself or by importing it from cfplan."""
     for node in _source(file).tree.body:
         target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
@@ -447,5 +447,5 @@ def _module_constant(file: Path, name: str, depth: int) -> object | None:
                 if (alias.asname or alias.name) == name:
                     place = PACKAGE.joinpath(*str(node.module).split(".")[1:])
                     other = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
-                    return _module_constant(other, alias.name, depth + 1)
+                    return module_constant(other, alias.name, depth + 1)
     return None

@@ -184,7 +184,7 @@ def _died(process: BaseProcess) -> LinkError:
     process.join(5.0)
     return LinkError(
         f"the pilot's process died (exit code {process.exitcode})",
-        hint="the vehicle levels out after 0.5 s without setpoints and stops its motors after 2 s",
+        hint="the vehicle levels out after 0.5 s without setpoints; its motors stop after 1 s (2 s without watchdog)",
     )
 
 
