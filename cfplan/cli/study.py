@@ -5,9 +5,24 @@ from pathlib import Path
 import click
 
 from cfplan.cli import flying_studies, paper_studies, planning_studies
+from cfplan.errors import InputError
 
 
-@click.group(short_help="Measurements for docs/results.")
+class _Studies(click.Group):
+    """Names all studies where an unknown one is asked for."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0]
+        if not name.startswith("-") and self.get_command(ctx, name) is None:
+            raise InputError(
+                f"there is no study {name!r}", where="cfplan study", hint=f"one of {', '.join(sorted(self.commands))}"
+            )
+        return super().resolve_command(ctx, args)
+
+
+@click.group(short_help="Measurements for docs/results.", cls=_Studies)
 def study() -> None:
     """Measure one thing, with tables for docs/results."""
 

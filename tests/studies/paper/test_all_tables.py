@@ -59,6 +59,17 @@ def test_quick_results_do_not_stand_for_whole_ones(asked, tmp_path):
     assert asked(tmp_path)[0] == ["inputs", "robustness"]
 
 
+@pytest.mark.slow
+def test_a_quick_run_makes_every_table_on_data_of_its_own_in_less_than_ten_minutes(tmp_path):
+    made = paper_tables(tmp_path, quick=True)
+    assert [each.file.stem for each in made] == list(TABLES)
+    for each in made:
+        assert not each.result.interrupted
+        assert all(table.rows for table in each.result.tables if table.name != "long"), each.file.stem
+        assert read_result(each.file).study == each.result.study
+    assert sum(each.seconds for each in made) < 600  # of the processor
+
+
 def test_every_table_has_a_quick_run_and_a_folder_must_be_there(tmp_path):
     assert set(QUICK) == set(TABLES)
     with pytest.raises(InputError, match="no such folder"):

@@ -1,0 +1,22 @@
+"""`cfplan study`: an unknown study is answered with those that there are; help and known ones are as ever."""
+
+import pytest
+from click.testing import CliRunner
+
+from cfplan.cli import cfplan
+from cfplan.errors import InputError
+
+
+def test_an_unknown_study_is_refused_with_all_that_there_are():
+    result = CliRunner().invoke(cfplan, ["study", "nonsense"], standalone_mode=False)
+    assert isinstance(result.exception, InputError)
+    assert "'nonsense'" in result.exception.what
+    for name in ("architectures", "baselines", "paper", "physics", "docs"):
+        assert name in result.exception.hint.replace(",", " ").split()
+
+
+@pytest.mark.parametrize("words", [["--help"], ["paper", "--help"]])
+def test_help_is_shown(words):
+    result = CliRunner().invoke(cfplan, ["study", *words])
+    assert result.exit_code == 0
+    assert result.output.startswith("Usage:")
