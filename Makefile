@@ -50,6 +50,7 @@ pictures: install
 	$(BIN)/cfplan replay build/pictures/figure8/* --gif docs/images/flight.gif --force
 	$(BIN)/cfplan fly flights/loop3d.yaml --records build/pictures/loop3d
 	$(BIN)/cfplan replay build/pictures/loop3d/* --figure docs/images/flight.png --force
+	$(BIN)/cfplan study figures
 	$(BIN)/cfplan report build/pictures/figure8/* -o build/pictures/report.html --force
 	chromium --headless --no-sandbox --hide-scrollbars --window-size=1200,1500 \
 		--screenshot=docs/images/report.png file://$(CURDIR)/build/pictures/report.html

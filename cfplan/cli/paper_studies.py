@@ -152,11 +152,11 @@ def paper(folder: Path, quick: bool) -> None:
 @click.argument("results", metavar="[RESULTS]", type=click.Path(path_type=Path), default=Path("results"))
 @click.argument("images", metavar="[IMAGES]", type=click.Path(path_type=Path), default=Path("docs/images"))
 def figures(results: Path, images: Path) -> None:
-    """Draw the paper's figures from the JSON in RESULTS, as .png in IMAGES."""
+    """Draw the paper's figures from the JSON in RESULTS, as .png in IMAGES; those without a result are left out."""
     from cfplan.studies.paper.figures import write_figures
 
-    for file in write_figures(results, images):
-        click.echo(file)
+    for file, reason in write_figures(results, images):
+        click.echo(f"{file}: left out: {reason}" if reason else file)
 
 
 COMMANDS = (architectures, inputs, robustness, baselines, hardware, yaw_consistency, paper, figures)

@@ -36,20 +36,32 @@ class Drawing(NamedTuple):
     draw: Callable[[StudyResult], "Figure"]
 
 
-def write_figures(results: Path, images: Path) -> list[Path]:
-    """Draw each of FIGURES from the results in one folder, into the other; return the files.
+class Written(NamedTuple):
+    """What became of a figure."""
+
+    file: Path
+    left_out: str  # why there is none; empty where it was drawn
+
+
+def write_figures(results: Path, images: Path) -> list[Written]:
+    """Draw each of FIGURES from the results in one folder, into the other; those without a result are left out.
 
     Raises:
-        InputError: no such folder, no such result, or one without what is drawn.
+        InputError: no such folder, or a figure that cannot be written.
     """
     if not images.is_dir():
         raise InputError("no such folder", where=str(images), hint="make it first")
-    files = []
+    written = []
     for name, drawing in FIGURES.items():
         file = images / f"{name}.png"
-        save_figure(drawing.draw(read_result(results / f"{drawing.study}.json")), file, overwrite=True)
-        files.append(file)
-    return files
+        try:
+            figure = drawing.draw(read_result(results / f"{drawing.study}.json"))
+        except InputError as error:
+            written.append(Written(file, str(error)))
+            continue
+        save_figure(figure, file, overwrite=True)
+        written.append(Written(file, ""))
+    return written
 
 
 def draw_baselines(result: StudyResult) -> "Figure":
