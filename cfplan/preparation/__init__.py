@@ -8,6 +8,7 @@ __all__ = [
     "from_programs",
     "on_board_flight",
     "plan_flight",
+    "planner_process",
     "prepare_flight",
     "replan",
     "stepped_planner",

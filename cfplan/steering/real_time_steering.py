@@ -15,7 +15,8 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import Telemetry, Triple
-from cfplan.preparation.air_planner import AirPlanner, PathAnswer, PathVerdict, Wish
+from cfplan.preparation.air_planner import PathAnswer, PathVerdict, Wish
+from cfplan.preparation.planner_process import AirPlanner
 from cfplan.preparation.replan import HeldFlight
 from cfplan.preparation.steps import OnStep
 from cfplan.safety.limits import Limits

@@ -24,7 +24,8 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.preparation.air_planner import AirPlanner, PathAnswer, PathRequest, PathVerdict, Wish, _Worker
+from cfplan.preparation.air_planner import PathAnswer, PathRequest, PathVerdict, Wish
+from cfplan.preparation.planner_process import AirPlanner, _Worker
 from cfplan.preparation.replan import hold
 
 LATE = 1.5  # s, longer than a planner waits for an answer

@@ -1,0 +1,363 @@
+"""The planner's process, beside the pilot: it makes certified proposals of what is asked for while the vehicle flies.
+
+It plans from the earliest setpoint that it can make, by how long its last plans took. The latest request wins: one that
+waits is dropped when another comes. It may die, hang or be killed; then the vehicle ends on what is committed.
+"""
+
+import contextlib
+import gc
+import math
+import multiprocessing
+import os
+import signal
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection, wait
+from types import TracebackType
+
+import numpy as np
+
+from cfplan.errors import CfplanError
+from cfplan.flight.clock import REAL_CLOCK
+from cfplan.flight.pilot.proposals import PilotAnswer, read_answer
+from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, splice
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.telemetry import Triple
+from cfplan.preparation.air_planner import (
+    NEXT_PART,
+    SLACK,
+    AnswerTimes,
+    PathAnswer,
+    PathRequest,
+    PathVerdict,
+    Wish,
+    answer_accepted,
+    answer_changed,
+    answer_cut_short,
+    answer_held,
+    part_within,
+    plan_behind_stop,
+    plan_next_part,
+    plan_request,
+    presses,
+    wants_more,
+)
+from cfplan.preparation.replan import HeldFlight, Replanned, accepted, after_failure, following, go_on, halt, replan
+from cfplan.safety.limits import Limits
+
+FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
+FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
+LEARNED_FROM = 10  # plans, by which one knows how long the next may take
+IN_TIME = 0.8  # share of them for which what is taken to be needed was enough: one that comes late is planned again
+AGAIN = 1.2  # by how much longer than the first the next one is taken to need then, at least
+TRIES = 3  # of a request whose proposal comes late
+PRIORITY = -10  # niceness of the planner where that is allowed: behind the pilot, before all else
+_LOOK_AGAIN = 1.0  # s, until the planner sees whether it has
+_ANSWER_WITHIN = 1.0  # s in which a pilot answers; what comes later counts as well
+NO_ANSWER = "the pilot does not answer; where it still accepts what was proposed last, that is flown"
+_CLOSE_WITHIN = 1.0  # s
+
+
+class AirPlanner:
+    """The planner's process as the main process sees it; a context manager."""
+
+    def __init__(self, held: HeldFlight, limits: Limits, pilot: Connection):
+        """Start it; `held` is what the pilot's mission was made from, `pilot` the end of its proposals."""
+        context = multiprocessing.get_context("spawn")
+        self._requests, requests_end = context.Pipe()
+        self._process = context.Process(target=_run, args=(held, limits, requests_end, pilot), name="planner")
+        self._process.start()
+        requests_end.close()
+        self._number = 0
+        self.ready = False  # whether it has said that it can plan
+
+    def request(self, wish: Wish, waypoints: Sequence[Triple] = ()) -> int:
+        """Ask for a change; return the number of its answer. A planner that has ended answers nothing."""
+        self._number += 1
+        points = tuple((float(x), float(y), float(z)) for x, y, z in waypoints)
+        with contextlib.suppress(OSError):
+            self._requests.send(PathRequest(self._number, wish, points))
+        return self._number
+
+    def answers(self, patience: float = 0.0) -> list[PathAnswer]:
+        """Return the answers since the last call; wait for one for `patience`, s."""
+        found: list[PathAnswer] = []
+        with contextlib.suppress(EOFError, OSError):
+            while self._requests.poll(0.0 if found else patience):
+                message = self._requests.recv()
+                if isinstance(message, PathAnswer):
+                    found.append(message)
+                else:
+                    self.ready, patience = True, 0.0
+        return found
+
+    @property
+    def process_id(self) -> int | None:
+        """Return the number of the process."""
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Return whether it runs."""
+        return self._process.is_alive()
+
+    def close(self) -> None:
+        """End it. May be called twice."""
+        self._requests.close()
+        self._process.join(_CLOSE_WITHIN)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+    def __enter__(self) -> "AirPlanner":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class _Lead:
+    """How far ahead of the clock to plan, by how long plans took lately: most, not all, are to be in time."""
+
+    def __init__(self, first: float):
+        """Begin with what a plan is taken to need before any was made, s."""
+        self._took: deque[float] = deque([first], maxlen=LEARNED_FROM)
+
+    def note(self, seconds: float, *, only: bool = False) -> None:
+        """Learn how long a plan took, s; with `only`, forget what was known before."""
+        if only:
+            self._took.clear()
+        self._took.append(seconds)
+
+    @property
+    def ahead(self) -> float:
+        """Return what the next plan is taken to need, s, with its way to the pilot."""
+        return float(np.quantile(self._took, IN_TIME)) + SLACK
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Proposed:
+    """A proposal that the pilot has not answered yet."""
+
+    made: Replanned
+    request: PathRequest | None  # None where it is the next part of the plan that is flown
+
+
+class _Worker:
+    """The planner in its own process."""
+
+    def __init__(self, held: HeldFlight, limits: Limits, requests: Connection, pilot: Connection):
+        self._held, self._limits, self._requests, self._pilot = held, limits, requests, pilot
+        self._begun: float | None = None  # s, when setpoint 0 was due
+        self._plans, self._stops, self._parts = _Lead(FIRST_TIME), _Lead(FIRST_STOP), _Lead(FIRST_STOP)
+        self._waiting: tuple[PathRequest, float] | None = None
+        self._proposed: _Proposed | None = None
+        self._accepted = 0  # number of the request whose plan is flown
+
+    @property
+    def _middle(self) -> list[tuple[float, ...]]:
+        """Return two places in the middle of the space, m, apart."""
+        space = self._limits.space
+        shares = (0.4, 0.6)
+        return [
+            tuple(low + share * (high - low) for low, high in zip(space.low, space.high, strict=True))
+            for share in shares
+        ]
+
+    def warm_up(self) -> None:
+        """Make two plans and stops for nobody: what a first call compiles or loads is there before the flight."""
+        held = self._held
+        for _ in range(2):
+            begun = REAL_CLOCK.now()
+            with contextlib.suppress(CfplanError):
+                places = [held.flown.at(held.ends / 2).position, *map(np.array, self._middle)]
+                away = max(places, key=lambda place: float(np.linalg.norm(place - held.ahead[-1])))
+                first, part = max(round(held.ends / 4 * RATE), 1), part_within(0.0)
+                made = replan(held, first, [away, held.ahead[-1]], self._limits, part=part)
+                self._plans.note(REAL_CLOCK.now() - begun, only=True)
+                go_on(made.held, made.proposal.splice + part // 2, self._limits, part)
+                halt(made.held, made.proposal.splice + part // 2, self._limits)
+
+    def serve(self) -> None:
+        """Plan until the main process or the pilot has ended."""
+        while True:
+            answer = self._settle() if self._proposed is not None else self._serve_next()
+            if answer is not None:
+                self._requests.send(answer)
+
+    def _serve_next(self) -> PathAnswer | None:
+        """Wait for something to do, and do it; return what there is to tell."""
+        if self._waiting is None and not self._wants_more():
+            wait([self._requests, self._pilot], _LOOK_AGAIN if self._held.unfinished else None)
+        self._read(0.0)
+        if self._wants_more() and (self._waiting is None or presses(self._held, *self._next(self._plans))):
+            return self._go_on()
+        if self._waiting is None:
+            return None
+        (request, since), self._waiting = self._waiting, None
+        return replace(self._answer(request, since), seconds=REAL_CLOCK.now() - since)
+
+    def _wants_more(self) -> bool:
+        return self._held.unfinished and wants_more(self._held, self._next(self._parts)[0])
+
+    def _next(self, lead: _Lead, least: float = 0.0) -> tuple[int, float]:
+        """Return the setpoint from which on one may plan now, and how far ahead it is, s, `least` at least."""
+        assert self._begun is not None
+        ahead = max(lead.ahead, least)
+        return math.ceil((REAL_CLOCK.now() - self._begun + ahead) * RATE) + LEAST_AHEAD, ahead
+
+    def _read(self, patience: float) -> PilotAnswer | None:
+        """Take what has come; return the pilot's answer to a proposal if there is one, waiting for it if asked to.
+
+        What it accepts is held from then on, however late that is heard of.
+        """
+        found = None
+        until = REAL_CLOCK.now() + patience
+        while ready := wait([self._requests, self._pilot], max(until - REAL_CLOCK.now(), 0.0)):
+            if self._pilot in ready:
+                answer = read_answer(self._pilot.recv_bytes())
+                if answer.begun is not None:
+                    self._begun = answer.begun
+                elif self._proposed is not None and answer.proposal == self._proposed.made.proposal.checksum:
+                    self._hold(self._proposed.made, answer)
+                    found = answer
+                    until = 0.0
+            if self._requests in ready:
+                request = self._requests.recv()
+                if self._waiting is not None:
+                    self._requests.send(PathAnswer(self._waiting[0].number, PathVerdict.SUPERSEDED))
+                self._waiting = request, REAL_CLOCK.now()
+        return found
+
+    def _answer(self, request: PathRequest, received: float) -> PathAnswer:
+        """Plan what is asked for, and propose it; it was `received` at that time, s."""
+        if self._begun is None:
+            return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
+        reason, took = "", 0.0
+        lead = self._stops if request.wish is Wish.STOP else self._plans
+        for _ in range(TRIES):
+            begun, (first, ahead) = REAL_CLOCK.now(), self._next(lead, AGAIN * took)
+            try:
+                made = self._planned(request, first, part_within(ahead))
+            except CfplanError as error:
+                return PathAnswer(request.number, PathVerdict.REFUSED, str(error))
+            except Exception as error:  # a fault here must not leave the rest of the flight without a planner
+                return PathAnswer(request.number, PathVerdict.REFUSED, f"fault in the planner: {error!r}")
+            proposed = REAL_CLOCK.now()
+            took = proposed - begun
+            lead.note(took)
+            if isinstance(made, HeldFlight):
+                self._held = made
+                return answer_held(request, made)
+            stop, answer = made.stop, None
+            if stop is not None:
+                answer = self._propose(_Proposed(stop, request))
+                made = following(made, self._held.commitment)
+            if stop is None or (answer is not None and answer.commitment is not None):
+                answer = self._propose(_Proposed(made, request))
+            if answer is None:
+                return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER)
+            if answer.commitment is not None:
+                self._accepted = request.number
+                accepted_made = answer_accepted(request.number, made, 0 if stop is None else stop.proposal.checksum)
+                seconds = 0.0 if made.plan is None else made.plan.seconds
+                return replace(accepted_made, times=AnswerTimes(received, begun, seconds, proposed, REAL_CLOCK.now()))
+            reason = answer.reason
+            if not reason.startswith(Fault.LATE):
+                return PathAnswer(request.number, PathVerdict.REFUSED, reason)
+        return PathAnswer(request.number, PathVerdict.LATE, reason)
+
+    def _planned(self, request: PathRequest, first: int, part: int) -> Replanned | HeldFlight:
+        """Return what is to be proposed, from rest where no plan leads there from the motion."""
+        try:
+            return plan_request(self._held, request, first, self._limits, part)
+        except CfplanError as error:
+            later, _ = self._next(self._plans)
+            return plan_behind_stop(self._held, request, later, self._limits, part, error)
+
+    def _go_on(self) -> PathAnswer | None:
+        """Propose the next part of the plan that is flown; return what there is to tell."""
+        begun, (first, ahead) = REAL_CLOCK.now(), self._next(self._parts)
+        try:
+            made = plan_next_part(self._held, first, self._limits, part_within(ahead, NEXT_PART))
+        except Exception as error:  # as in _answer
+            return self._interrupt(str(error) if isinstance(error, CfplanError) else f"fault in the planner: {error!r}")
+        self._parts.note(REAL_CLOCK.now() - begun)
+        if isinstance(made, HeldFlight):
+            self._held = made
+            return None
+        answer = self._propose(_Proposed(made, None))
+        return None if answer is None else self._gone_on(made, answer)
+
+    def _gone_on(self, made: Replanned, answer: PilotAnswer) -> PathAnswer | None:
+        """Return what there is to tell of the next part of a plan that the pilot has answered."""
+        if answer.commitment is not None:
+            return None if made.plan is None else answer_changed(self._accepted, made)
+        return None if answer.reason.startswith(Fault.LATE) else self._interrupt(answer.reason)
+
+    def _interrupt(self, reason: str) -> PathAnswer | None:
+        """Let the vehicle rest behind what is committed, as more does not pass; return what there is to tell.
+
+        From there it goes on, unless that is what does not pass.
+        """
+        self._held = after_failure(self._held, self._limits)
+        return None if self._held.unfinished else answer_cut_short(self._accepted, self._held, reason)
+
+    def _propose(self, proposed: _Proposed) -> PilotAnswer | None:
+        """Send a proposal and wait for the pilot's answer; None where that does not come soon."""
+        self._pilot.send_bytes(proposed.made.proposal.to_bytes())
+        self._proposed = proposed
+        return self._read(_ANSWER_WITHIN)
+
+    def _settle(self) -> PathAnswer | None:
+        """Wait for the answer to a proposal that the pilot did not answer soon; return what there is to tell.
+
+        Until it has come nothing can be planned: nobody knows what the pilot is bound to.
+        """
+        proposed = self._proposed
+        assert proposed is not None
+        answer = self._read(_ANSWER_WITHIN)
+        if answer is None:
+            if self._waiting is None:
+                return None
+            (request, since), self._waiting = self._waiting, None
+            return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER, seconds=REAL_CLOCK.now() - since)
+        if proposed.request is None:
+            return self._gone_on(proposed.made, answer)
+        if answer.commitment is None:
+            return None  # as it was told to be
+        self._accepted = proposed.request.number
+        return answer_accepted(self._accepted, proposed.made)
+
+    def _hold(self, made: Replanned, answer: PilotAnswer) -> None:
+        """Take the pilot's answer to a proposal."""
+        self._proposed = None
+        if answer.commitment is None:
+            return
+        assert self._begun is not None
+        due = math.floor((REAL_CLOCK.now() - self._begun) * RATE)  # the pilot looked a little earlier
+        now = min(due, made.proposal.splice - LEAST_AHEAD)
+        committed = splice(self._held.commitment, made.proposal, now, self._limits.space)
+        assert isinstance(committed, Commitment)
+        assert committed.checksum == answer.commitment
+        self._held = accepted(made, committed)
+
+
+def _run(held: HeldFlight, limits: Limits, requests: Connection, pilot: Connection) -> None:
+    """Run the planner's process."""
+    with contextlib.suppress(OSError):
+        os.setsid()  # the terminal's signals are for the main process
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
+        signal.signal(number, signal.SIG_IGN)
+    worker = _Worker(held, limits, requests, pilot)
+    worker.warm_up()
+    gc.collect()
+    gc.freeze()  # what was imported is not looked through again in flight
+    with contextlib.suppress(OSError, AttributeError):  # not everybody may; other systems have other ways
+        os.nice(PRIORITY)
+    with contextlib.suppress(EOFError, OSError):
+        requests.send("ready")
+        worker.serve()
