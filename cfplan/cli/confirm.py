@@ -49,12 +49,13 @@ def describe(prepared: "Prepared", uri: str) -> str:
     )
     remedy = "a lower --speed" if mission.limits.firmware.watchdog else "a lower --speed, or firmware.watchdog,"
     advice = f" With {remedy} it would not come so far." if lost.beyond > 0 else ""
-    alone = "it stops its motors by itself"
+    alone, lasts = "it stops its motors by itself", prepared.planned.duration
     if mission.on_board is not None:
+        lasts = mission.motion_ends
         alone = "it flies on for a second, blind; then its watchdog stops its motors"
     return (
         f"{uri} will take off to {mission.take_off_height:g} m, go to the start of {prepared.planned.name!r}, fly it "
-        f"in {mission.motion_ends:.1f} s at up to {speed:.1f} m/s, and land where it ends.\n"
+        f"in {lasts:.1f} s at up to {speed:.1f} m/s, and land where it ends.\n"
         f"Keep everybody out of {walls}. Space lands it, Esc cuts the motors.\n"
         f"If the pilot's process or the radio dies, {alone}: {lost}.{advice}"
     )

@@ -25,7 +25,8 @@ def print_flights(records: list[Path], *, as_json: bool) -> None:
     if as_json:
         print_json({"records": [{"record": str(record), **_summary(record)} for record in records]})
         return
-    print_table(f"{len(records)} flights", ["record", "on", "ended", "flown", "deviation"], list(map(_row, records)))
+    count = "1 flight" if len(records) == 1 else f"{len(records)} flights"
+    print_table(count, ["record", "on", "ended", "flown", "deviation"], list(map(_row, records)))
     click.echo(f"replay the last: cfplan replay {shlex.quote(str(records[-1]))}")
 
 

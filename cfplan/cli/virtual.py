@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cfplan.cli import options
+from cfplan.cli.options import SAFETY_FILE
 from cfplan.cli.output import Steps
 from cfplan.errors import InputError, LinkError
+from cfplan.files.nearest import nearest
+from cfplan.files.shipped import example_limits
 
 if TYPE_CHECKING:
     from cfplan.recording.rerun.live import LiveView
@@ -26,6 +28,7 @@ _LOOK = 0.05  # s
 _MOST = 5  # vehicles: cfclient scans ten ports, and each has two
 _APART = 1.0  # m between vehicles that stand side by side
 _LAST_PORT = 65535
+FLOW_DECK = "deck.bcFlow2"  # the firmware's parameter, 1 where the deck was found at start
 LOCKED = (
     "the supervisor has locked: its last flight ended without the word that no setpoints follow, and motors stay off "
     "until the vehicle is restarted (key r; without a keyboard, end this command and start it again)"
@@ -41,6 +44,7 @@ Examples:
   cfplan virtual --vicon 8010                     with poses by a virtual Vicon, as in a lab; in a second terminal:
   cfplan fly first.yaml --uri udp://127.0.0.1:19850 --mocap vicon://127.0.0.1:8010/cf1
   cfplan virtual --count 3 --vicon 8010           three in one room: cf1, cf2 and cf3
+  cfplan virtual --flow-deck                      for scripts that fly only with a flow deck
   CFLIB_URI=udp://127.0.0.1:19850 python examples/logging/basiclog.py""",
 )
 @click.option(
@@ -55,11 +59,24 @@ Examples:
     "--vicon", "vicon_port", type=click.IntRange(1024, 65535),
     help="TCP; a virtual Vicon shows them there as cf1, cf2, …, and they have no poses on board.",
 )  # fmt: skip
+@click.option(
+    "--flow-deck", is_flag=True,
+    help="Say that a flow deck is on board, which scripts look for; the poses on board are as good as without.",
+)  # fmt: skip
 @click.option("--seconds", type=click.FloatRange(0.1), help="End after this time; else with Ctrl-C.")
 @click.option("--live", is_flag=True, help="Show it in rerun.")
-@click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="File that names the vehicle to serve.")
+@click.option(
+    "--safety", "safety_file", type=click.Path(path_type=Path),
+    help="File that names the vehicle to serve; else the nearest safety.yaml, else that of the examples.",
+)  # fmt: skip
 def virtual(
-    port: int, count: int, vicon_port: int | None, seconds: float | None, live: bool, safety_file: Path | None
+    port: int,
+    count: int,
+    vicon_port: int | None,
+    flow_deck: bool,
+    seconds: float | None,
+    live: bool,
+    safety_file: Path | None,
 ) -> None:
     """Serve virtual Crazyflies over UDP, with poses on board as from a positioning deck, or by a virtual Vicon.
 
@@ -68,8 +85,8 @@ def virtual(
     """
     from cfplan.safety.limits_file import load_limits
 
-    limits = load_limits(options.find_safety_file(safety_file, Path.cwd() / "here"))
-    room = VirtualRoom(limits, port, count, vicon_port)
+    limits = load_limits(safety_file or nearest(SAFETY_FILE, Path.cwd()) or example_limits())
+    room = VirtualRoom(limits, port, count, vicon_port, flow_deck)
     room.require_ports()
     end = time.monotonic() + seconds if seconds is not None else float("inf")
     view = _open_view(limits) if live else None
@@ -94,6 +111,7 @@ class VirtualRoom:
     port: int
     count: int
     vicon_port: int | None  # None: poses come on board
+    flow_deck: bool = False  # its parameter says that it is there
 
     @property
     def names(self) -> list[str]:
@@ -108,7 +126,13 @@ class VirtualRoom:
         return [(0.0, apart * ((k + 1) // 2) * (1 if k % 2 else -1), 0.0) for k in range(self.count)]
 
     def require_ports(self) -> None:
-        """Raise InputError where the ports of the vehicles go beyond what there is, or the Vicon's is among them."""
+        """Raise InputError where the ports of the vehicles go beyond what there is, or what they have does not fit."""
+        if self.flow_deck and self.vicon_port:
+            raise InputError(
+                "with a virtual Vicon the vehicles have no poses on board, and so no flow deck",
+                where="--flow-deck",
+                hint="leave it out, or leave --vicon out",
+            )
         last = self.port + 2 * self.count - 1
         if last > _LAST_PORT:
             raise InputError(f"{self.count} vehicles need ports to {last}", where="--port", hint="choose a lower one")
@@ -121,7 +145,10 @@ class VirtualRoom:
         from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 
         vicon = ViconSettings(subject=self.names[0], port=self.vicon_port) if self.vicon_port else None
-        vehicles = [VehicleSettings(position=place, seed=k) for k, place in enumerate(self.places(), start=1)]
+        stored = {FLOW_DECK: 1.0} if self.flow_deck else {}
+        vehicles = [
+            VehicleSettings(position=place, seed=k, stored=stored) for k, place in enumerate(self.places(), start=1)
+        ]
         return start_lab(
             self.limits.airframe,
             vehicle=vehicles[0],

@@ -212,7 +212,7 @@ def _vehicle(limits: Limits) -> list[TimeOut]:
 
 def _planner() -> list[TimeOut]:
     commitment, planner, steered = (
-        "flight/setpoints/commitment.py", "preparation/air_planner.py", "steering/steered_vehicle.py"
+        "flight/setpoints/commitment.py", "preparation/planner_process.py", "steering/steered_vehicle.py"
     )  # fmt: skip
     return [
         TimeOut(

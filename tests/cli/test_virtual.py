@@ -1,15 +1,19 @@
 """`cfplan virtual` says in words that its supervisor has locked, wherever its output goes, and who stands where."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from cfplan.cli.virtual import LOCKED, StateLine, VirtualRoom
+from cfplan.cli.virtual import FLOW_DECK, LOCKED, StateLine, VirtualRoom, virtual
 from cfplan.errors import InputError
 from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State
+from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"
 FLIGHT = [State.READY_TO_FLY, State.FLYING, State.FLYING, State.WARNING_LEVEL_OUT, State.LOCKED, State.LOCKED]
@@ -52,3 +56,25 @@ def test_vehicles_stand_apart_inside_the_space(count, wide):
 def test_vehicles_for_which_there_are_no_ports_are_refused():
     with pytest.raises(InputError, match="need ports to 65537"):
         VirtualRoom(load_limits(SAFETY), 65528, 5, None).require_ports()
+
+
+def test_a_flow_deck_is_a_parameter_that_says_so():
+    for flow_deck in (False, True):
+        settings = VehicleSettings(stored={FLOW_DECK: 1.0} if flow_deck else {})
+        vehicle = VirtualCrazyflie(load_limits(SAFETY).airframe, settings)
+        assert vehicle.parameters[FLOW_DECK] == flow_deck
+
+
+def test_no_vehicle_has_a_flow_deck_and_its_poses_by_radio_alone():
+    with pytest.raises(InputError, match="no flow deck"):
+        VirtualRoom(load_limits(SAFETY), 19850, 1, 8010, flow_deck=True).require_ports()
+
+
+def test_without_a_safety_yaml_the_vehicle_of_the_examples_is_served(tmp_path, monkeypatch):
+    served = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys.modules["cfplan.cli.virtual"], "_serve", lambda room, *_: served.append(room))
+    ended = CliRunner().invoke(virtual, ["--flow-deck"])
+    assert ended.exit_code == 0, ended.output
+    assert served[0].limits.vehicle == load_limits(SAFETY).vehicle
+    assert served[0].flow_deck

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from cflib_examples import run_example
 
+from cfplan.cli.virtual import FLOW_DECK
 from cfplan.simulation.lab.lab import Truth, start_lab
 from cfplan.simulation.lab.room import RoomSettings
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.vehicle.airframes import AIRFRAMES
 
 SEQUENCE = [(0.0, 0.0, 1.2), (0.5, -0.5, 1.2), (0.5, 0.5, 1.2), (-0.5, 0.5, 1.2), (-0.5, -0.5, 1.2), (0.0, 0.0, 0.4)]
@@ -38,6 +40,12 @@ def goes_by_velocities(truth: Truth, said: str) -> None:
         assert np.linalg.norm(truth.position - place, axis=1).min() < 0.2
 
 
+def rises_where_there_is_a_flow_deck(truth: Truth, said: str) -> None:
+    """By MotionCommander, half a metre up, which it does only where the vehicle says that it has the deck."""
+    assert "Deck is attached!" in said
+    assert truth.position[:, 2].max() == pytest.approx(0.5, abs=0.15)
+
+
 @pytest.mark.parametrize(
     ("example", "holds"),
     [
@@ -45,10 +53,12 @@ def goes_by_velocities(truth: Truth, said: str) -> None:
         ("autonomy/autonomous_sequence.py", goes_to_each_place),
         ("autonomy/autonomous_sequence_high_level.py", flies_its_figure),
         ("autonomy/motion_commander_demo.py", goes_by_velocities),
+        ("step-by-step/sbs_motion_commander.py", rises_where_there_is_a_flow_deck),
     ],
 )
 def test_an_example_of_cflib_flies_and_lands(example, holds, tmp_path):
-    with start_lab(AIRFRAMES["crazyflie-2.1+"], room=RoomSettings(on_board=True), number=6) as lab:
+    vehicle = VehicleSettings(stored={FLOW_DECK: 1.0})
+    with start_lab(AIRFRAMES["crazyflie-2.1+"], vehicle=vehicle, room=RoomSettings(on_board=True), number=6) as lab:
         said = run_example(example, lab, tmp_path)
         truth = lab.truth()
     holds(truth, said)
