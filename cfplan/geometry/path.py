@@ -74,6 +74,9 @@ class Path:
         """Return the last s."""
         return float(self.breaks[-1])
 
+    def __repr__(self) -> str:
+        return f"<Path of {self.length:.1f} m in {len(self.coefficients)} pieces>"
+
     @property
     def length(self) -> float:
         """Return the arc length, m."""

@@ -57,6 +57,11 @@ class PlannedFlight:
     link_loss: SimulatedLinkLoss | None = None  # of the plan's bytes, where planning looked at it
     was_read: bool = False  # from a plan file, so that nothing but its limits was checked yet
 
+    def __repr__(self) -> str:
+        verdict = "certified" if self.certificate.passed else "not certified"
+        length, planner = self.plan.path.length, self.plan.planner
+        return f"<Plan of {self.name!r}: {length:.1f} m in {self.duration:.2f} s by {planner}, {verdict}>"
+
     @property
     def certificate(self) -> Certificate:
         """Return the plan's certificate."""

@@ -54,6 +54,10 @@ class DryRun:
     real_time_factor: float  # simulated seconds a second
     loop: ClosedLoop  # the whole flight
 
+    def __repr__(self) -> str:
+        off = f"{100 * self.deviation:.1f} cm beside its place at most, {100 * self.deviation_rms:.1f} cm rms"
+        return f"<DryRun: {self.reason or 'passed'}, {off}>"
+
     @property
     def passed(self) -> bool:
         """Return whether the bytes may fly."""

@@ -37,6 +37,16 @@ def test_a_saved_plan_is_the_same_flight(limits, tmp_path):
         plan.save(tmp_path / "plan.csv")
 
 
+def test_what_is_returned_is_printed_in_a_line(limits):
+    path = cfplan.load_path(POINTS)
+    planned = cfplan.plan(path, limits)
+    said = [repr(each) for each in (path.path, planned, cfplan.rehearse(planned))]
+    assert said[0] == f"<Path of {path.path.length:.1f} m in {len(POINTS) - 1} pieces>"
+    assert f"{planned.duration:.2f} s by {planned.plan.planner}, certified" in said[1]
+    assert said[2].startswith("<DryRun: passed, ")
+    assert all(len(line) < 120 for line in said)
+
+
 def test_points_and_a_file_of_them_are_one_path(tmp_path):
     angle = np.linspace(0.0, 3.0, 12)
     points = np.stack([np.cos(angle), np.sin(angle), np.ones(12)], axis=1)
