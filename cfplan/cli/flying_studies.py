@@ -184,6 +184,14 @@ def dry_runs() -> Study:
     return partial(run, find_safety_file=safety_file_of)
 
 
+@measured("flying", "cfplan study exports flights/line.yaml flights/helix.yaml -o results/exports.json", PATHS)
+def exports() -> Study:
+    """Export each PATH for the vehicle's memory and fly it on board: deviations, beside the same plans streamed."""
+    from cfplan.studies.exports import exports as run
+
+    return partial(run, find_safety_file=safety_file_of)
+
+
 @measured("simulating", "cfplan study physics flights/line.yaml flights/helix.yaml -o results/physics.json", PATHS)
 def physics() -> Study:
     """Fly the bytes of each PATH by RotorPy and by drone-models, and compare with cfplan's own closed loop."""
@@ -224,6 +232,6 @@ def giving_way() -> Study:
 
 
 COMMANDS = (
-    flights, lateness, faults, random_faults, steering, latency, link_loss, dry_runs, physics, identification,
-    giving_way,
+    flights, lateness, faults, random_faults, steering, latency, link_loss, dry_runs, exports, physics,
+    identification, giving_way,
 )  # fmt: skip

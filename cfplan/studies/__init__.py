@@ -1,7 +1,7 @@
 """Measurements: each study returns a `StudyResult` with tables, which is written to results/ and shown in docs/results.
 
 Studies: bench, feasibility, scaling, learned, unseen_limits, ablation, proposals, long_paths, hard_paths; flights,
-dry_runs, lateness, latency, faults, random_faults, link_losses, giving_way, identification, steering, horizon,
+dry_runs, exports, lateness, latency, faults, random_faults, link_losses, giving_way, identification, steering, horizon,
 physics; in paper/ the paper's tables. They stand on result, provenance, machine and docs_tables (what a study returns,
 and where it goes), error_tables, error_texts (docs/errors.md) and time_outs (docs/what-breaks.md), trials (one planner
 on one path), adversarial_paths, real_time and sleeper (flights in the virtual lab), fault_scenarios (the faults),
@@ -13,6 +13,7 @@ __all__ = [
     "bench",
     "docs_tables",
     "dry_runs",
+    "exports",
     "fault_scenarios",
     "faults",
     "feasibility",

@@ -1,0 +1,44 @@
+"""The study of exports: a short path exported and flown on board, beside the same plans streamed."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cfplan.flight.on_board.memory_format import MEMORY_SIZE
+from cfplan.studies.exports import exports
+
+REPOSITORY = Path(__file__).parents[2]
+WORSE = 0.02  # m, by which the deviation is at most larger than that of the same plan, streamed
+
+pytestmark = pytest.mark.integration
+
+
+@pytest.fixture(scope="module")
+def result():
+    return exports([REPOSITORY / "flights" / "line.yaml"], lambda _: REPOSITORY / "safety.yaml")
+
+
+@pytest.mark.parametrize("name", ["exports", "on-board"])
+def test_on_board_it_strays_little_more_than_streamed(result, name):
+    (row,) = result.table(name).rows
+    assert row["path"] == "line"
+    assert 0.0 < row["bytes"] <= MEMORY_SIZE
+    assert row["on_board"] < row["streamed"] + WORSE
+    assert row["difference"] == pytest.approx(row["on_board"] - row["streamed"])
+
+
+def test_polynomials_take_the_second_for_the_lead_and_what_they_are_slowed_by(result):
+    (row,) = result.table("exports").rows
+    assert row["duration"] == pytest.approx(row["planned"] * (1.0 + row["slowed"]) + 1.0, abs=0.05)
+
+
+def test_the_flight_lands_and_is_slower_for_the_fall(result):
+    (row,) = result.table("on-board").rows
+    assert row["end"] == "landed"
+    assert row["time_lost"] > 0.0
+
+
+def test_the_result_survives_json(result):
+    tables = json.loads(json.dumps(result.to_json(), allow_nan=False))["tables"]
+    assert [[row[0] for row in table["rows"]] for table in tables] == [["line"], ["line"]]
