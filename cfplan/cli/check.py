@@ -56,7 +56,8 @@ def _check_record(folder: Path, steps: Steps) -> int:
         from cfplan.steering.recertify import recertify
 
         record = read_record(folder)
-        results.append(f"{record.header.name}, {record.duration:.1f} s, {len(record.commitments.time)} commitments")
+        plans = max(len(record.commitments.time), 1)
+        results.append(f"{record.header.name}, {record.duration:.1f} s, {plans} commitment{'s' * (plans > 1)}")
     with steps.waiting("certifying again"):
         checked = recertify(record)
     if steps.as_json:

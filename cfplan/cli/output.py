@@ -21,7 +21,7 @@ VERBOSE = f"{__name__}.verbose"  # in click's context: --verbose was given
 _FIRST_NOTE, _TERMINAL_NOTES, _OTHER_NOTES = 1.0, 0.5, 4.0  # s until a wait is shown, and between later notes
 _MARKS = {StepState.FINISHED: ("✓", "green"), StepState.WARNED: ("!", "yellow"), StepState.FAILED: ("✗", "red")}
 _NARROWEST = 30  # characters for a step's result, below which it is not wrapped
-_FILE_WIDTH = 170  # characters, of tables that go to a file or a pipe
+_FILE_WIDTH = 80  # characters, of tables that go to a file or a pipe, where COLUMNS says nothing else
 
 
 class Steps:
@@ -145,13 +145,13 @@ def print_error(error: CfplanError, *, as_json: bool) -> None:
 
 
 def print_table(title: str, columns: list[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table: text to the left, numbers to the right, no wider than the terminal."""
+    """Print a table: text to the left, numbers to the right, no wider than the terminal, or than 80 characters."""
     from rich.console import Console
 
     from cfplan.cli.tables import print_fitting
 
     console = Console(highlight=False)
-    if not console.is_terminal:
+    if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = _FILE_WIDTH
     print_fitting(console, title, columns, [[printable(cell) for cell in row] for row in rows])
 

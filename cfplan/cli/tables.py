@@ -12,6 +12,7 @@ from rich.text import Text
 _GAP = 2  # characters between two columns
 _EDGE = 1  # before the first
 _LEAST_TEXT = 12  # characters, to which a column of text is wrapped at most
+_LONGEST_NUMBER = 24  # characters, with its unit; what is longer is a sentence that begins with a number
 _TIE = "\N{NO-BREAK SPACE}"  # keeps a number and its unit on one line while the table is laid out
 _NUMBER = re.compile(r"[-+–(≤≥<>]?\s*\d.*|[-–]?")
 
@@ -20,11 +21,11 @@ Rows = Sequence[Sequence[str]]
 
 def print_fitting(console: Console, title: str, columns: Sequence[str], rows: Rows) -> None:
     """Print a table no wider than the console; where even wrapping cannot do that, with a column for each row."""
-    for heads, cells in _fitting(list(columns), [list(row) for row in rows], console.width):
-        with console.capture() as drawn:
-            console.print(_table(title, heads, cells))
-        console.file.write(drawn.get().replace(_TIE, " "))
-        title = ""
+    with console.capture() as drawn:
+        console.print(Text(title, "italic"))
+        for heads, cells in _fitting(list(columns), [list(row) for row in rows], console.width):
+            console.print(_table(heads, cells))
+    console.file.writelines(f"{line.rstrip()}\n" for line in drawn.get().replace(_TIE, " ").splitlines())
 
 
 def _fitting(columns: list[str], rows: list[list[str]], width: int) -> Iterator[tuple[list[str], list[list[str]]]]:
@@ -74,13 +75,11 @@ def _longest_word(text: str) -> int:
 
 
 def _is_numeric(cells: Sequence[str]) -> bool:
-    return all(_NUMBER.fullmatch(cell) for cell in cells)
+    return all(_NUMBER.fullmatch(cell) and len(cell) <= _LONGEST_NUMBER for cell in cells)
 
 
-def _table(title: str, columns: Sequence[str], rows: Rows) -> Table:
-    table = Table(
-        title=title or None, title_justify="left", header_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
+def _table(columns: Sequence[str], rows: Rows) -> Table:
+    table = Table(header_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for index, (column, least) in enumerate(zip(columns, _least_widths(columns, rows), strict=True)):
         numeric = index > 0 and _is_numeric([row[index] for row in rows])
         table.add_column(column, justify="right" if numeric else "left", min_width=least)

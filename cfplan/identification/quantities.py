@@ -139,7 +139,7 @@ def _dynamics(solution: FittedUnknowns, before: Airframe, mass: float | None) ->
     vague = "too vague, kept as before: climb and sink more sharply" if lag_doubt > _TELLS_LAG else ""
     remark = "with the mass as it is" if held else ""
     return {
-        "thrust over mass": IdentifiedQuantity("thrust over mass, of before", ratio, ratio * doubt, "", 1.0, 4),
+        "thrust over mass": IdentifiedQuantity("thrust over mass, relative", ratio, ratio * doubt, "", 1.0, 4),
         "mass": IdentifiedQuantity("mass", weight, math.nan, "g", before.mass, 2, held, scale=1e3),
         "thrust scale": IdentifiedQuantity("thrust scale", scale, scale * doubt, "", 1.0, 4, remark=remark),
         "motor lag": IdentifiedQuantity(

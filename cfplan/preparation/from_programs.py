@@ -25,7 +25,7 @@ def load_path(source: Path | str | ArrayLike) -> PathFile:
 
 
 def plan(
-    path: PathFile | Path | str,
+    path: PathFile | Path | str | ArrayLike,
     limits: Limits | Path | str,
     *,
     planner: str = AUTO,
@@ -36,7 +36,7 @@ def plan(
     """Plan a path under limits and certify it, as `cfplan plan` does; or read a plan file and certify it anew.
 
     Args:
-        path: from load_path, or a path file, or a plan file (.parquet).
+        path: from load_path, or a path file, or a plan file (.parquet), or points, (K, 3) m, as load_path takes them.
         limits: from load_limits, or a safety.yaml.
         planner: "auto", "learned", "expert", "convex", …; docs/planning.md has them.
         speed_factor: of the speed that the limits allow, above 0 and at most 1; None takes the path's own.
@@ -47,18 +47,14 @@ def plan(
         InputError: a file or an argument is wrong.
         InfeasibleError: the path leaves the space, no profile keeps the limits, or link loss takes the vehicle outside.
     """
-    if not isinstance(path, PathFile | Path | str):
-        raise InputError(
-            f"{type(path).__name__} is neither a path nor a file",
-            where="path",
-            hint="make it one with cfplan.load_path(points)",
-        )
     if not isinstance(limits, Limits):
         if not isinstance(limits, Path | str):
             raise InputError(
                 f"{type(limits).__name__} is neither limits nor a file", where="limits", hint='give "safety.yaml"'
             )
         limits = load_limits(limits)
+    if not isinstance(path, PathFile | Path | str):
+        path = path_file.path_through(path)
     source = Path(path) if isinstance(path, str) else path
     options = FlightOptions(planner=planner, speed_factor=speed_factor, budget=budget)
     return plan_flight(source, limits, options, on_step)

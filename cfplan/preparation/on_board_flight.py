@@ -123,7 +123,7 @@ def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
 
     with step(on_step, "slowing for the fall") as results:
         slowed, _ = slow_locally(planned.plan, assess)
-        results.append(slowed.describe_slowing() or "nowhere")
+        results.append(slowed.describe_slowing() or "not needed")
     return replace(planned, plan=slowed)
 
 

@@ -193,7 +193,7 @@ def give_way(
 
     with step(on_step, "slowing") as results:
         slowed, (glitches, *link_loss) = slow_locally(planned, assess, deadline)
-        results.append(slowed.describe_slowing() or "nowhere")
+        results.append(slowed.describe_slowing() or "not needed")
         for each, where in zip(link_loss, ("at any setpoint", "within sampled stops"), strict=False):
             inside = MARGIN - each.excess[each.worst]
             results.details.append(f"at least {inside:.2f} m inside the walls after link loss {where}")

@@ -45,10 +45,10 @@ def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_step
             beyond = float(moments.beyond[at])
             if not beyond <= farthest:
                 side = "beyond" if not beyond <= 0.0 else "inside"
-                farthest, worst = beyond, f"{what} {abs(beyond):.2f} m {side} {moments.name_of_wall(at, limits)}"
+                farthest, worst = beyond, f"{what} ends {abs(beyond):.2f} m {side} {moments.name_of_wall(at, limits)}"
             if not beyond <= 0.0 and not limits.link_loss.only_warn:
                 raise NotCertifiedError(f"link loss {worst}", where="link loss", hint=hint)
-        (results.append if farthest <= 0.0 else results.warn)(worst)
+        (results.append if farthest <= 0.0 else results.warn)(f"the worst {worst}")
 
 
 def _motions(mission: Mission) -> Iterator[_Motion]:

@@ -61,7 +61,8 @@ class LinkLoss:
 
     def __str__(self) -> str:
         walls = f"{self.beyond:.1f} m beyond the walls" if self.beyond > 0 else "inside the walls"
-        return f"at the worst moment, {self.moment:.1f} s, it comes down {self.distance:.1f} m on, {walls}"
+        comes_down = f"the vehicle comes down {self.distance:.1f} m farther on, {walls}"
+        return f"lost at the worst moment, {self.moment:.1f} s, {comes_down}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,12 +62,17 @@ class Recertified:
         worst = self.certificate.worst if self.certificate is not None else None
         share = f"{100 * worst.share:.1f} % of the limit on {worst.name}" if worst is not None else "a hover"
         return [
-            ("plans committed, certified again", f"{self.plans}, which use {share} at most"),
-            ("stops committed, certified again", str(self.stops)),
-            ("joints", f"{self.joints}, the motion jumps by {self.jump:.1e} at most"),
-            ("setpoints committed", f"{self.committed}, each with a certified stop"),
+            ("plans, certified again", f"{self.plans}, using {share} at most"),
+            ("stops asked for, certified again", str(self.stops)),
+            ("joints between plans", self._joints()),
+            ("setpoints committed to", f"{self.committed}, each with a certified stop"),
             ("setpoints streamed", f"{self.streamed}, each as committed{left}"),
         ]
+
+    def _joints(self) -> str:
+        if not self.joints:
+            return "none: one plan was flown"
+        return f"{self.joints}, none jumps by more than {_SAME:g} (m, m/s, m/s², m/s³)"
 
 
 def recertify(record: Record) -> Recertified:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cfplan.errors import CfplanError
 from cfplan.flight.pilot.mission import Mission, mission_of
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.preparation.export_flight import Form, fit_polynomials, plan_for_polynomials
@@ -46,6 +47,7 @@ FLIGHT_COLUMNS = (
     *_DEVIATIONS,
     Column("end", "end", meaning="of the flight on board"),
 )
+REFUSED_COLUMNS = (Column("path", "path"), Column("what", "what"), Column("reason", "why not"))
 
 
 class _Deviations(NamedTuple):
@@ -66,21 +68,31 @@ def exports(
 ) -> StudyResult:
     """Export each path and fly it on board, and the same plans streamed. An interrupt keeps what is done by then.
 
-    Raises what planning, fitting and preparing a flight on board raise.
+    What cannot be planned, fitted or prepared is a row of the table `refused`. Raises InputError where there is no
+    safety.yaml, or a mistake in it.
     """
 
-    def measure() -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    def measure() -> Iterator[tuple[str, dict[str, Any]]]:
         for done, file in enumerate(path_files):
             progress(done, len(path_files))
             limits = load_limits(find_safety_file(file))
-            yield _exported(file, limits), _flown(file, limits)
+            for name, make in (("exports", _exported), ("on-board", _flown)):
+                try:
+                    yield name, make(file, limits)
+                except CfplanError as error:
+                    yield "refused", {"path": file.stem, "what": name, "reason": str(error)}
 
     rows, interrupted = collect(measure())
-    tables = (
-        Table("exports", "Exports for the vehicle's memory, in the dry run", EXPORT_COLUMNS, tuple(r[0] for r in rows)),
-        Table("on-board", "Flights on board, in the stepped lab", FLIGHT_COLUMNS, tuple(r[1] for r in rows)),
-    )
-    return StudyResult("exports", {"paths": [file.stem for file in path_files]}, tables, interrupted=interrupted)
+    tables = [
+        Table(name, title, columns, tuple(row for table, row in rows if table == name))
+        for name, title, columns in (
+            ("exports", "Exports for the vehicle's memory, in the dry run", EXPORT_COLUMNS),
+            ("on-board", "Flights on board, in the stepped lab", FLIGHT_COLUMNS),
+            ("refused", "Neither exported nor flown on board", REFUSED_COLUMNS),
+        )
+    ]
+    tables = [table for table in tables if table.rows or table.name != "refused"]
+    return StudyResult("exports", {"paths": [file.stem for file in path_files]}, tuple(tables), interrupted=interrupted)
 
 
 def _exported(path_file: Path, limits: Limits) -> dict[str, Any]:

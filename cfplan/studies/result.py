@@ -29,6 +29,13 @@ class Column:
     goal: str = ""  # what it should not exceed
     meaning: str = ""  # where the title alone does not say it
 
+    def _plain_format(self, value: Any) -> str:
+        """Return the format, by which no number is shown as minus zero."""
+        if not isinstance(value, float) or not self.format:
+            return self.format
+        signed = self.format.startswith(("+", "-", " "))
+        return f"{self.format[:signed]}z{self.format[signed:]}"
+
     def text(self, row: Mapping[str, Any]) -> str:
         """Return the column's cell of this row."""
         value = row[self.key]
@@ -38,7 +45,7 @@ class Column:
             return f"{value}/{row[self.of]}"
         if isinstance(value, str):
             return value
-        number = f"{value * SCALE[self.unit] if self.unit in SCALE else value:{self.format}}"
+        number = f"{value * SCALE[self.unit] if self.unit in SCALE else value:{self._plain_format(value)}}"
         return number + (self.unit if self.unit == "×" else f" {self.unit}" if self.unit else "")
 
 

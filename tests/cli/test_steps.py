@@ -118,6 +118,18 @@ def test_a_long_result_goes_on_under_its_beginning(capsys, monkeypatch):
     assert lines[1].startswith(" " * 20)
 
 
+@pytest.mark.parametrize("columns", [None, "60"])
+def test_a_table_in_a_pipe_is_as_narrow_as_a_terminal(capsys, monkeypatch, columns):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    if columns is not None:
+        monkeypatch.setenv("COLUMNS", columns)
+    heads = ["name", *(f"figure {n}" for n in range(9))]
+    output.print_table("A title of many words " * 4, heads, [["a", *["1.0"] * 9]])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= int(columns or 80)
+    assert all(line == line.rstrip() for line in lines)
+
+
 @pytest.mark.parametrize(("set_to", "coloured"), [(None, True), ("", True), ("1", False)])
 def test_no_color_is_obeyed(monkeypatch, set_to, coloured):
     monkeypatch.delenv("NO_COLOR", raising=False)
@@ -139,6 +151,7 @@ WIDE = [["learned, refined", *(f"{number:.1f} ms" for number in range(15))], ["c
             [[f"{name}, refined", "801.1 ms", "2407.7 ms", "124.0×"] for name in ("learned", "expert", "convex")] * 3,
         ),
         (["limit", "worst", "allowed"], [["angular acceleration", "34.93 rad/s²", "35.00"]]),
+        (["", "value"], [["streamed", "655, each as committed, until a pose was too old, after 6.55 s"]]),
     ],
 )
 def test_tables_fit_80_columns_with_every_cell_whole(columns, rows):

@@ -26,6 +26,12 @@ def test_importing_loads_no_more_than_commands_need():
     assert found.stdout.strip() == "False"
 
 
+def test_a_list_of_points_is_planned_as_the_path_through_them(limits):
+    of_points, of_path = cfplan.plan(POINTS, limits), cfplan.plan(cfplan.load_path(POINTS), limits)
+    assert of_points.certificate.passed
+    assert of_points.duration == of_path.duration
+
+
 def test_a_saved_plan_is_the_same_flight(limits, tmp_path):
     plan = cfplan.plan(cfplan.load_path(POINTS), limits, planner="convex")
     assert isinstance(plan, cfplan.Plan)
@@ -72,7 +78,8 @@ def test_what_is_no_path_is_refused_with_place_and_hint(wrong):
 def test_other_wrong_arguments_are_refused_with_place_and_hint(limits):
     path = cfplan.load_path(POINTS)
     for call in (
-        lambda: cfplan.plan(POINTS, limits),
+        lambda: cfplan.plan(POINTS[:1], limits),
+        lambda: cfplan.plan(None, limits),
         lambda: cfplan.plan(path, None),
         lambda: cfplan.plan(path, "no-such.yaml"),
         lambda: cfplan.plan("no-such.parquet", limits),

@@ -63,6 +63,9 @@ def test_everything_committed_is_certified_again_and_was_streamed(folder):
     assert checked.plans == checked.joints == 5
     assert checked.stops == 1
     assert checked.jump < 1e-9
+    shown = dict(checked.rows())
+    assert shown["joints between plans"].startswith("5, none jumps by more than")
+    assert dict(replace(checked, joints=0).rows())["joints between plans"] == "none: one plan was flown"
     assert 0.9 < checked.certificate.worst.share <= 1.0
     assert checked.streamed > 400
     assert checked.left_after == pytest.approx(checked.streamed / 100, abs=0.03)
@@ -97,8 +100,8 @@ def test_a_plan_that_goes_on_behind_a_stop_is_recorded_and_certified_again(limit
 def test_the_command_line_says_so(folder):
     result = CliRunner().invoke(command_line, ["check", str(folder)], catch_exceptions=False)
     assert result.return_value in (0, None)
-    assert "plans committed, certified again" in result.output
-    assert "each as committed, until the plan was left" in result.output
+    assert "plans, certified again" in result.output
+    assert "each as committed, until" in result.output
 
 
 def test_a_setpoint_that_was_not_committed_is_found(folder):

@@ -15,8 +15,11 @@ pytestmark = pytest.mark.integration
 
 
 @pytest.fixture(scope="module")
-def result():
-    return exports([REPOSITORY / "flights" / "line.yaml"], lambda _: REPOSITORY / "safety.yaml")
+def result(tmp_path_factory):
+    through_the_floor = tmp_path_factory.mktemp("paths") / "through-the-floor.yaml"
+    through_the_floor.write_text("waypoints: [[0, 0, 1], [1, 0, -1]]\n")
+    paths = [through_the_floor, REPOSITORY / "flights" / "line.yaml"]
+    return exports(paths, lambda _: REPOSITORY / "safety.yaml")
 
 
 @pytest.mark.parametrize("name", ["exports", "on-board"])
@@ -41,4 +44,13 @@ def test_the_flight_lands_and_is_slower_for_the_fall(result):
 
 def test_the_result_survives_json(result):
     tables = json.loads(json.dumps(result.to_json(), allow_nan=False))["tables"]
-    assert [[row[0] for row in table["rows"]] for table in tables] == [["line"], ["line"]]
+    assert [[row[0] for row in table["rows"]] for table in tables[:2]] == [["line"], ["line"]]
+
+
+def test_a_path_that_cannot_be_exported_is_told_and_the_others_go_on(result):
+    rows = result.table("refused").rows
+    assert [(row["path"], row["what"]) for row in rows] == [
+        ("through-the-floor", "exports"),
+        ("through-the-floor", "on-board"),
+    ]
+    assert all("floor" in row["reason"] for row in rows)

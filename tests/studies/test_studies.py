@@ -13,6 +13,7 @@ from cfplan.planning import planners
 from cfplan.studies import feasibility, proposals, scaling, trials
 from cfplan.studies.bench import bench
 from cfplan.studies.machine import this_machine
+from cfplan.studies.result import Column
 from cfplan.studies.trials import quantiles, random_path
 
 pytestmark = pytest.mark.unit
@@ -151,6 +152,11 @@ def test_paths_come_in_the_length_that_was_asked_for(length):
 def test_wrong_arguments_are_input_errors(wrong):
     with pytest.raises(InputError):
         bench(**wrong)
+
+
+@pytest.mark.parametrize(("spec", "shown"), [("+.1f", "+0.0 cm"), (".1f", "0.0 cm"), ("", "-0.01 cm")])
+def test_no_cell_says_minus_zero(spec, shown):
+    assert Column("off", "off", "cm", spec).text({"off": -0.0001}) == shown
 
 
 def test_quantiles_pass_over_what_is_not_finite():
