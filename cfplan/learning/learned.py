@@ -36,7 +36,7 @@ from cfplan.learning.model_files import Model, find_model
 from cfplan.learning.smooth import Begin, smoothed
 from cfplan.learning.windows import overlapped, windows_over
 from cfplan.planners.solution import Solution, Status
-from cfplan.planners.task import PlanningTask
+from cfplan.planners.task import FREE_START, PlanningTask
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import coefficients_of, spline_profile
 from cfplan.vehicle.yaw_spline import YawSpline
@@ -62,7 +62,7 @@ class Question(NamedTuple):
     start: BoundaryState | None = None
     end: BoundaryState | None = None
     track: YawSpline | None = None  # None: yaw is the network's to choose
-    yaw_angle: float = 0.0  # rad, where it begins then
+    yaw_angle: float = 0.0  # rad, from which on it may begin then, see PlanningTask
 
 
 class _Windows(NamedTuple):
@@ -213,7 +213,9 @@ def _proposal(question: Question, asked: _Windows, answers: NDArray) -> Proposed
     turns = np.diff(turned, axis=1)
     turns -= 2.0 * math.pi * np.round(turns / (2.0 * math.pi))
     total = np.cumsum(overlapped(starts, counts * np.pad(turns, ((0, 0), (1, 0)))))
-    return ProposedProfile(coefficients, (start.yaw if start else yaw_angle) + total - total[0])
+    # In the middle of where it may begin: at a bound, refining would end at another optimum than the expert.
+    first = start.yaw if start else yaw_angle + FREE_START / 2
+    return ProposedProfile(coefficients, first + total - total[0])
 
 
 def _blend_to(coefficients: NDArray, end: BoundaryState, step: float) -> None:

@@ -18,6 +18,7 @@ from cfplan.vehicle.profile import BoundaryState
 
 LEAST_NODES = 12
 NODES_PER_PIECE = 3  # of the path, at least, where a spline is laid over the grid
+FREE_START = math.pi / 2  # rad, from the angle given on, within which yaw begins where it is FREE, as in the paper
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ class PlanningTask:
     limits: PlanLimits
     nodes: int = 100  # intervals of the grid, uniform in s
     yaw: YawMode = YawMode.FIXED
-    yaw_angle: float = 0.0  # rad: held where yaw is FIXED, else where it begins
+    yaw_angle: float = 0.0  # rad: held where yaw is FIXED; where FREE it begins within FREE_START from there on
     start: BoundaryState | None = None  # None: free within the limits (a rest end)
     end: BoundaryState | None = None
     speed_caps: SpeedCaps | None = None  # along the path, besides the limit on speed

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cfplan.geometry.yaw import YawMode
 from cfplan.learning.dataset_spec import DatasetSpec
 from cfplan.learning.features import scaled_limits
 from cfplan.learning.labels import clean_path, row_limits
@@ -41,14 +42,26 @@ def test_a_draw_outside_is_outside_of_all_and_can_hover(around, group):
         assert chosen == unseen_limits._DRAW[group](other, number, around)[0]  # by seed
 
 
-@pytest.mark.parametrize("number", [119, 719])
-def test_refining_ends_at_the_experts_optimum_where_it_crawls_there_from_a_proposal_far_off(number):
+def _drawn_as_in_training(number):
     spec = DatasetSpec(count=10_000_000, seed=unseen_limits.SEED + list(unseen_limits._DRAW).index(WITHIN))
     chosen, mode, angle = row_limits(spec, number)
-    task = PlanningTask(clean_path(spec, number), chosen.airframe, chosen.limits, unseen_limits.NODES, mode, angle)
+    return PlanningTask(clean_path(spec, number), chosen.airframe, chosen.limits, unseen_limits.NODES, mode, angle)
+
+
+@pytest.mark.parametrize("number", [119, 719])
+def test_refining_ends_at_the_experts_optimum_where_it_crawls_there_from_a_proposal_far_off(number):
+    task = _drawn_as_in_training(number)
     best = repair(task, plan_expert(task).profile).trajectory.duration
-    proposal = plan_learned(task).profile
-    refined = refine(task, proposal)
+    refined = refine(task, plan_learned(task).profile)
     assert refined.before < 0.95 * best  # far off
     assert refined.certificate.passed
     assert refined.trajectory.duration < 1.0005 * best
+
+
+def test_where_yaw_is_free_refining_ends_at_the_experts_yaw():
+    task = _drawn_as_in_training(805)
+    assert task.yaw is YawMode.FREE
+    best = repair(task, plan_expert(task).profile).trajectory
+    refined = refine(task, plan_learned(task).profile).trajectory
+    assert refined.duration < 1.0005 * best.duration  # 0.7 % more from a yaw that begins at the bound of where it may
+    assert np.abs(refined.profile.yaw - best.profile.yaw).max() < 0.05

@@ -1,6 +1,5 @@
 """The numbers of one speed-profile problem: a stretch of path and its limits at points, and how limits are lowered."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.initial_guess import guess
 from cfplan.planners.expert.intersample import CONTINUOUS, Violation, spread
 from cfplan.planners.expert.layout import Layout
+from cfplan.planners.task import FREE_START
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
 from cfplan.vehicle.airframe import Airframe
@@ -128,13 +128,13 @@ def build_problem(
     if coefficients is None:
         coefficients = guess(
             path, segment.airframe, limits, nodes, unit, ends.start, ends.end,
-            yaw_angle + math.pi / 4 if layout.shape.free_yaw else None,
+            yaw_angle + FREE_START / 2 if layout.shape.free_yaw else None,
         )  # fmt: skip
     return Problem(
         layout, ends, (nominal[0] < REST, nominal[nodes] < REST), unit, step, _point_data(segment, step),
         point_constraints.common_data(segment.airframe, limits, unit / step**2),
         np.array((penalties or point_constraints.Penalties()).weights()), lower, upper, highest,
-        (yaw_angle, yaw_angle + math.pi / 2), coefficients,
+        (yaw_angle, yaw_angle + FREE_START), coefficients,
     )  # fmt: skip
 
 
