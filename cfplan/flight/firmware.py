@@ -4,7 +4,7 @@ Setpoints, dry run and link loss rest on these figures, so preflight reads back 
 """
 
 import re
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,13 +40,12 @@ class MellingerGains:
 
     def pack(self) -> NDArray:
         """Return the gains (19,), as the compiled controller takes them."""
-        return np.array(astuple(self))
+        return np.array([getattr(self, name) for name in _GAINS])  # astuple() takes ten times as long
 
 
+_GAINS = tuple(each.name for each in fields(MellingerGains))
 # The parameter of each gain, in the order of `MellingerGains.pack`.
-GAIN_PARAMETERS = tuple(
-    "ctrlMel." + {"mass_thrust": "massThrust"}.get(each.name, each.name) for each in fields(MellingerGains)
-)
+GAIN_PARAMETERS = tuple("ctrlMel." + {"mass_thrust": "massThrust"}.get(name, name) for name in _GAINS)
 
 
 def gains_for(airframe: Airframe) -> MellingerGains:

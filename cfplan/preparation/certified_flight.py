@@ -6,13 +6,14 @@ vehicle gets there.
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.errors import InfeasibleError
+from cfplan.errors import CfplanError, InfeasibleError
 from cfplan.flight.setpoints.encoding import HOLD, RATE, EncodedFlight, check_bytes, check_setpoints, encode_trajectory
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import gains_under
@@ -21,13 +22,14 @@ from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
 from cfplan.safety.limits import Limits
-from cfplan.simulation.dry_run import dry_run, dry_run_of_setpoints
+from cfplan.simulation.dry_run import dry_run, rehearse_setpoints
 from cfplan.simulation.glitches import glitch_where_nearly_lost
 from cfplan.simulation.link_loss import LinkLossMoments, as_believed, foreseen_link_loss, link_loss_at_walls
 from cfplan.vehicle.joint import JoinedTrajectory
 
 STOP = round(DURATION * RATE)  # setpoints from the place where a stop begins to where it rests
 BEHIND = STOP + 1 + round(HOLD * RATE)  # setpoints of a beginning behind those that follow the motion
+_BESIDE = ThreadPoolExecutor(1, "checks")
 _FORESEEN = 0.05  # m beyond a wall, from which on link loss that is only foreseen counts
 
 
@@ -87,7 +89,7 @@ def certify_beginning(
     def rehearse() -> None:
         check_setpoints(begun, flown, limits.plan)
         believed = as_believed(starts, limits)
-        dry_run_of_setpoints(payloads, limits.airframe, limits.flight, snapshot=believed).require_passed()
+        rehearse_setpoints(payloads, limits.airframe, limits.flight, snapshot=believed).require_passed()
 
     stops, lost = _certified(begun, payloads, limits, starts, rehearse, encoded.motion, foresee_link_loss)
     rest = rest_behind(encoded.motion, following, RATE)
@@ -127,31 +129,33 @@ def _certified(
     and first what `foresee` raises.
     """
 
-    def stop_everywhere() -> NDArray:
+    # What is mostly compiled loops runs beside what is mostly Python: two threads of that would hinder each other.
+    foreseen = _BESIDE.submit(foresee)
+    losing = _BESIDE.submit(link_loss_at_walls, payloads, limits, starts=starts)
+    gaps = _BESIDE.submit(meet_gaps, payloads, limits, starts)
+    refused: CfplanError | None = None
+    try:
         along = encoded.motion if motion is None else motion
-        stops, passed = encode_certified_stops(
-            along, limits, RATE, encoded.gains, encoded.space, count=len(encoded.payloads)
-        )
+        count = len(encoded.payloads)
+        stops, passed = encode_certified_stops(along, limits, RATE, encoded.gains, encoded.space, count=count)
         passed.require(limits)
-        return stops
-
-    def lose_link() -> LinkLossMoments:
-        lost = link_loss_at_walls(payloads, limits, starts=starts)
-        require_inside(lost, limits)
-        if not limits.link_loss.only_warn:
-            within = assess_link_loss_of_stops(encoded, limits, lost, margin=0.0, stops=stops.result())
-            if not within.passed:
-                what = f"{within.what} from {within.time[within.worst]:.2f} s on {within.describe(within.worst)}"
-                raise EndsBadlyError(what, where="link loss", hint=OUTSIDE_HINT)
-        return lost
-
-    with ThreadPoolExecutor() as pool:  # compiled loops and most of numpy run side by side
-        stops, lost = pool.submit(stop_everywhere), pool.submit(lose_link)
-        gaps, rehearsed = pool.submit(meet_gaps, payloads, limits, starts), pool.submit(rehearse)
-        pool.submit(foresee).result()
-        gaps.result()
-        rehearsed.result()
-        return stops.result(), lost.result()
+        rehearse()
+    except CfplanError as error:
+        refused = error
+    beside: list[Future[Any]] = [foreseen, losing, gaps]
+    wait(beside)  # nothing goes on behind the caller's back
+    foreseen.result()
+    gaps.result()
+    if refused is not None:
+        raise refused
+    lost = losing.result()
+    require_inside(lost, limits)
+    if not limits.link_loss.only_warn:
+        within = assess_link_loss_of_stops(encoded, limits, lost, margin=0.0, stops=stops)
+        if not within.passed:
+            what = f"{within.what} from {within.time[within.worst]:.2f} s on {within.describe(within.worst)}"
+            raise EndsBadlyError(what, where="link loss", hint=OUTSIDE_HINT)
+    return stops, lost
 
 
 def require_inside(lost: LinkLossMoments, limits: Limits) -> None:

@@ -36,7 +36,7 @@ from cfplan.preparation.certified_flight import (
     require_inside,
 )
 from cfplan.safety.limits import Limits
-from cfplan.simulation.dry_run import dry_run_of_setpoints
+from cfplan.simulation.dry_run import rehearse_setpoints
 from cfplan.simulation.link_loss import as_believed, link_loss_at_walls
 from cfplan.vehicle.hover import hover_at
 from cfplan.vehicle.joint import JoinedTrajectory
@@ -439,7 +439,7 @@ def _rehearse_stop(payloads: NDArray, duration: float, limits: Limits, starts: N
     the other at little thrust, controlling the attitude takes what is left of a motor; then the firmware lowers the
     thrust of all, and the vehicle sinks: by 0.2 m where it came over the top of a climb.
     """
-    run = dry_run_of_setpoints(payloads, limits.airframe, limits.flight, snapshot=as_believed(starts, limits))
+    run = rehearse_setpoints(payloads, limits.airframe, limits.flight, snapshot=as_believed(starts, limits))
     run.require_passed()
     if duration < DURATION and not run.deviation <= STRAYS:
         raise NotCertifiedError(

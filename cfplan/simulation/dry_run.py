@@ -37,6 +37,24 @@ _HINT = "plan with lower limits, or check mass, thrust and motor lag of the airf
 
 
 @dataclass(frozen=True, slots=True)
+class Rehearsal:
+    """What decides whether a dry run passes."""
+
+    reason: str  # why it failed; empty when it passed
+    deviation: float  # m, worst distance from where the trajectory is at that time
+    deviation_time: float  # s, when that was
+    final_error: float  # m, from the end of the path when the simulation ends
+    speed: float  # m/s, highest that lasts for the limits' patience
+    acceleration: float  # m/s², likewise
+    angular_velocity: float  # rad/s, likewise
+
+    def require_passed(self) -> None:
+        """Raise NotCertifiedError where it failed."""
+        if self.reason:
+            raise NotCertifiedError(self.reason, where="dry run", hint=_HINT)
+
+
+@dataclass(frozen=True, slots=True)
 class DryRun:
     """The result of a dry run."""
 
@@ -127,30 +145,28 @@ def dry_run(
     )
 
 
-def dry_run_of_setpoints(
+def rehearse_setpoints(
     payloads: NDArray, airframe: Airframe, limits: FlightLimits, *, snapshot: NDArray, rate: float = RATE
-) -> DryRun:
+) -> Rehearsal:
     """Fly payloads, (N, 29) uint8 at `rate`, Hz, on from a snapshot, (31,); compare with the places in them.
 
-    As dry_run() does, of a motion that is known by its setpoints alone.
+    As dry_run() does, of a motion that is known by its setpoints alone; only what decides is looked at.
     """
     decoded, times = decode(payloads), np.arange(len(payloads)) / rate
-    moving = np.flatnonzero(decoded.velocity.any(axis=1)).max(initial=0) + 1
-    fly = partial(
-        fly_setpoints,
+    loop = fly_setpoints(
         decoded,
         times,
         airframe,
         snapshot[:MEMORY],
+        duration=times[-1] + SETTLING,
         gains=gains_for(airframe),
         floor=NO_FLOOR,
         memory=snapshot[MEMORY:THRUSTS],
     )
-
-    def wanted_at(moments: NDArray) -> NDArray:
-        return np.stack([np.interp(moments, times + LEAD, along) for along in decoded.position.T], axis=1)
-
-    return fly_and_judge(fly, times[-1] + SETTLING, wanted_at, moving / rate, limits)
+    moments = loop.time[::_STRIDE]
+    wanted = np.stack([np.interp(moments, times + LEAD, along) for along in decoded.position.T], axis=1)
+    run = _rehearsed(loop, _away(loop, wanted), limits)
+    return replace(run, reason=_fault(run, limits))
 
 
 def fly_and_judge(
@@ -172,37 +188,53 @@ def fly_and_judge(
 def _judge(loop: ClosedLoop, wanted_at: Callable[[NDArray], NDArray], duration: float, limits: FlightLimits) -> DryRun:
     times, positions = loop.time[::_STRIDE], loop.position[::_STRIDE]
     wanted = wanted_at(times)
-    error = np.linalg.norm(positions - wanted, axis=1)
-    error = np.where(np.isfinite(error), error, np.inf)
+    error = _away(loop, wanted)
     known = np.isfinite(positions).all(axis=1)
     nearest = np.where(known, _distances_to_path(np.where(known[:, None], positions, 0.0), wanted), np.inf)
     moving = times <= duration
     late = np.flatnonzero(~moving & (error > SETTLED))
     settled = times[late[-1]] - duration if len(late) else 0.0
-    speed = np.linalg.norm(loop.velocity, axis=1)
-    acceleration = np.linalg.norm(np.diff(loop.velocity, axis=0), axis=1) / TIME_STEP
-    turning = np.linalg.norm(loop.body_rate, axis=1)
     at_its_end = np.mean((loop.commands <= 0) | (loop.commands >= FULL_COMMAND), axis=0)
-    worst = int(np.argmax(error))
-    run = DryRun(
-        reason="",
-        deviation=float(error[worst]),
-        deviation_time=float(times[worst]),
+    decides = _rehearsed(loop, error, limits)
+    return DryRun(
+        reason=_fault(decides, limits),
+        deviation=decides.deviation,
+        deviation_time=decides.deviation_time,
         deviation_rms=float(np.sqrt(np.mean(error[moving] ** 2))),
         path_distance=float(nearest.max()),
-        final_error=float(error[-1]),
+        final_error=decides.final_error,
         settle_time=float(np.inf if error[-1] > SETTLED else settled),
-        speed=_lasting(speed, limits.patience),
-        acceleration=_lasting(acceleration, limits.patience),
-        angular_velocity=_lasting(turning, limits.patience),
+        speed=decides.speed,
+        acceleration=decides.acceleration,
+        angular_velocity=decides.angular_velocity,
         saturation=float(at_its_end.max()),
         real_time_factor=np.inf,
         loop=loop,
     )
-    return replace(run, reason=_fault(run, limits))
 
 
-def _fault(run: DryRun, limits: FlightLimits) -> str:
+def _away(loop: ClosedLoop, wanted: NDArray) -> NDArray:
+    """Return (K,) m: how far the vehicle is from where it is wanted, (K, 3) m, each _STRIDE; inf where not known."""
+    error = np.linalg.norm(loop.position[::_STRIDE] - wanted, axis=1)
+    return np.where(np.isfinite(error), error, np.inf)
+
+
+def _rehearsed(loop: ClosedLoop, error: NDArray, limits: FlightLimits) -> Rehearsal:
+    """Return what decides, without a reason; `error`, (K,) m, is the distance from where it is wanted."""
+    worst, patience = int(np.argmax(error)), limits.patience
+    changes = np.diff(loop.velocity, axis=0)
+    return Rehearsal(
+        reason="",
+        deviation=float(error[worst]),
+        deviation_time=float(loop.time[::_STRIDE][worst]),
+        final_error=float(error[-1]),
+        speed=_lasting(np.linalg.norm(loop.velocity, axis=1), patience),
+        acceleration=_lasting(np.linalg.norm(changes, axis=1) / TIME_STEP, patience),
+        angular_velocity=_lasting(np.linalg.norm(loop.body_rate, axis=1), patience),
+    )
+
+
+def _fault(run: Rehearsal, limits: FlightLimits) -> str:
     """Return the first reason not to fly, or nothing. A position that is not a number counts as infinitely far."""
     if not run.deviation < limits.deviation.brake:
         return (
@@ -223,11 +255,15 @@ def _lasting(values: NDArray, patience: float) -> float:
     window = min(max(1, round(patience / TIME_STEP)), len(values))
     values = np.where(np.isfinite(values), values, np.inf)
     # Repeated ends stand for what is not simulated any more.
-    padded = np.pad(values, (window // 2, window - 1 - window // 2), mode="edge")
-    return float(np.lib.stride_tricks.sliding_window_view(padded, window).min(axis=1).max())
+    first, last = np.full(window // 2, values[0]), np.full(window - 1 - window // 2, values[-1])
+    lowest, covered = np.concatenate([first, values, last]), 1
+    while covered < window:  # the lowest of so many from each place on is that of two runs, which may overlap
+        more = min(covered, window - covered)
+        lowest, covered = np.minimum(lowest[:-more], lowest[more:]), covered + more
+    return float(lowest.max())
 
 
-@njit
+@njit(nogil=True)
 def _distances_to_path(positions: NDArray, wanted: NDArray) -> NDArray:
     """Return the distance of each position, (N, 3), to the nearest of the wanted ones, (N, 3) too, in order of time.
 

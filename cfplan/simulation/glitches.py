@@ -245,11 +245,20 @@ def _follow(
                 step_control(now, now, gains, setpoints[newest], FULL_STATE, body, CONTROL_PERIOD, control, motors)
             step_vehicle(now, body, STILL_AIR, FULL_EFFICIENCY)
             away[step], lift[step] = _away(now, setpoints[newest]), _lift(now)
+    # The worst of `following` steps is the worst of what is left of one block of as many, and of what the next begins
+    # with (van Herk).
+    left_away, left_lift = away.copy(), lift.copy()
+    for step in range(len(away) - 2, -1, -1):
+        if (step + 1) % following:
+            left_away[step] = _most(left_away[step + 1], away[step])
+            left_lift[step] = _least(left_lift[step + 1], lift[step])
+    for step in range(1, len(away)):
+        if step % following:
+            away[step], lift[step] = _most(away[step - 1], away[step]), _least(lift[step - 1], lift[step])
     for newest in range(len(setpoints)):
-        farthest, least_lift = 0.0, 1.0
-        for step in range(arrivals[newest], arrivals[newest] + following):
-            farthest, least_lift = _most(farthest, away[step]), _least(least_lift, lift[step])
-        followed[newest], followed_tilt[newest] = math.sqrt(farthest), _tilt(least_lift)
+        first, last_step = arrivals[newest], arrivals[newest] + following - 1
+        followed[newest] = math.sqrt(_most(left_away[first], away[last_step]))
+        followed_tilt[newest] = _tilt(_least(left_lift[first], lift[last_step]))
 
 
 @njit(nogil=True, error_model="numpy")

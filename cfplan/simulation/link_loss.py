@@ -19,8 +19,11 @@ vehicle comes near a wall.
 """
 
 import math
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +43,9 @@ LEVEL_AFTER, OFF_AFTER = Timeouts().level_out_at_latest, Timeouts().motors_off_a
 OFF_BY_WATCHDOG = Timeouts().watchdog_at_latest  # if the emergency-stop watchdog is enabled
 WALLS = ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1))
 """(axis, low or high side) of the walls and the ceiling; on the floor is where it ends."""
+_WORTH_THREADS = 400  # setpoints, of which each motor lag has a thread
+_Body = TypeVar("_Body")
+_Found = TypeVar("_Found")
 _STEP, _COARSE_STEP = 0.004, 0.008  # s, of the simulation after the last setpoint, and where it only looks for walls
 _NEAR = 0.1  # m from a wall, within which it also matters that the accelerometer may say too much
 _COARSE_EVERY = 2  # setpoints between those that are looked at coarsely
@@ -166,9 +172,10 @@ def _begins(state: FullStateSetpoints, limits: Limits, starts: NDArray | None) -
 
 def _snapshots(state: FullStateSetpoints, limits: Limits, rate: float, begins: list[NDArray]) -> NDArray:
     """Return (L, N, 31) vehicle and controller at each setpoint, for each motor lag, where the link is not lost."""
-    with ThreadPoolExecutor() as pool:  # a motor lag each
-        bodies = (body for body, _ in _bodies(limits))
-        return np.array(list(pool.map(lambda body, begin: _flown(state, limits, rate, body, begin), bodies, begins)))
+    bodies = [body for body, _ in _bodies(limits)]
+    return np.array(
+        _of_each_lag(lambda body, begin: _flown(state, limits, rate, body, begin), bodies, begins, len(state.position))
+    )
 
 
 def _flown(state: FullStateSetpoints, limits: Limits, rate: float, body: NDArray, begin: NDArray) -> NDArray:
@@ -223,8 +230,7 @@ def _boxes(
         boxes[forks] = swept
         return boxes
 
-    with ThreadPoolExecutor() as pool:  # a motor lag each
-        return list(pool.map(one, _bodies(limits), snapshots))
+    return _of_each_lag(one, _bodies(limits), snapshots, len(rows))
 
 
 def _look_coarsely(
@@ -284,8 +290,7 @@ def link_loss_within_stops(
     if coarsely:
         boxes = [one((_bodies(limits)[middle][0], _coarse_bodies(limits)), begins[middle])]
     else:
-        with ThreadPoolExecutor() as pool:  # a motor lag each
-            boxes = list(pool.map(one, _bodies(limits), begins))
+        boxes = _of_each_lag(one, _bodies(limits), begins, len(stops))
     times, places = np.nonzero(forks)[1] / rate, rows[..., 0:3][forks]
     return _judge(times, places, boxes, limits, np.empty((len(boxes), 0, SNAPSHOT_SIZE)))
 
@@ -324,21 +329,42 @@ def _judge(time: NDArray, place: NDArray, boxes: list[NDArray], limits: Limits, 
     )
 
 
-def _bodies(limits: Limits) -> list[tuple[NDArray, NDArray]]:
+def _of_each_lag(
+    work: Callable[[_Body, NDArray], _Found], bodies: Sequence[_Body], begins: Iterable[NDArray], count: int
+) -> list[_Found]:
+    """Return what work gives for each motor lag; `count` is of the setpoints, or stops, that it looks at.
+
+    It is done side by side where that takes longer than threads take to begin.
+    """
+    if count < _WORTH_THREADS:
+        return [work(body, begin) for body, begin in zip(bodies, begins, strict=True)]
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(work, bodies, begins))
+
+
+def _bodies(limits: Limits) -> tuple[tuple[NDArray, NDArray], ...]:
     """Return for each motor lag the parameters of the body for steps before the last setpoint, (P,), and after it.
 
     The latter, (2, P), are of the vehicle that goes on alone, and of the one whose motors stop.
     """
-    airframes: list[Airframe] = [replace(limits.airframe, motor_time_constant=lag) for lag in _lags(limits)]
-    return [(pack_body(airframe), np.stack([pack_body(airframe, step=_STEP)] * 2)) for airframe in airframes]
+    return _bodies_with(limits.airframe, tuple(_lags(limits)))
+
+
+@lru_cache(maxsize=8)
+def _bodies_with(airframe: Airframe, lags: tuple[float, ...]) -> tuple[tuple[NDArray, NDArray], ...]:
+    airframes: list[Airframe] = [replace(airframe, motor_time_constant=lag) for lag in lags]
+    return tuple((pack_body(each), np.stack([pack_body(each, step=_STEP)] * 2)) for each in airframes)
 
 
 def _coarse_bodies(limits: Limits) -> NDArray:
     """Return (3, P): with the motor lag in the middle after the last setpoint, and falling with both extremes."""
     lags = _lags(limits)
-    airframes: list[Airframe] = [
-        replace(limits.airframe, motor_time_constant=lag) for lag in (lags[len(lags) // 2], lags[0], lags[-1])
-    ]
+    return _coarse_bodies_with(limits.airframe, (lags[len(lags) // 2], lags[0], lags[-1]))
+
+
+@lru_cache(maxsize=8)
+def _coarse_bodies_with(airframe: Airframe, lags: tuple[float, ...]) -> NDArray:
+    airframes: list[Airframe] = [replace(airframe, motor_time_constant=lag) for lag in lags]
     return np.stack([pack_body(each, step=_COARSE_STEP) for each in airframes])
 
 

@@ -130,9 +130,7 @@ def fly_rows(
     """
     steps = round(duration / TIME_STEP)
     arrivals = np.round((np.asarray(times) + delay) / TIME_STEP).astype(np.int64)
-    random = np.random.default_rng(estimate.seed)
-    noise = np.repeat(random.normal(size=(steps // 10 + 1, 6)), 10, axis=0)
-    noise *= np.repeat([estimate.position_noise, estimate.velocity_noise], 3)
+    noise = np.zeros((steps + 1, 6)) if estimate is PERFECT else _noise(estimate, steps)
     states = np.empty((steps + 1, STATE_SIZE))
     states[0] = start
     commands = np.empty((steps + 1, 4))
@@ -153,7 +151,15 @@ def fly_rows(
     return ClosedLoop(np.arange(steps + 1) * TIME_STEP, states, commands)
 
 
-@njit
+def _noise(estimate: EstimateErrors, steps: int) -> NDArray:
+    """Return (M, 6), M > steps: errors of position, m, and velocity, m/s, for each millisecond."""
+    random = np.random.default_rng(estimate.seed)
+    noise = np.repeat(random.normal(size=(steps // 10 + 1, 6)), 10, axis=0)
+    noise *= np.repeat([estimate.position_noise, estimate.velocity_noise], 3)
+    return noise
+
+
+@njit(nogil=True)
 def _run(
     states: NDArray,
     commands: NDArray,
