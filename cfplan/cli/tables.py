@@ -10,7 +10,6 @@ from rich.table import Table
 from rich.text import Text
 
 _GAP = 2  # characters between two columns
-_EDGE = 1  # before the first
 _LEAST_TEXT = 12  # characters, to which a column of text is wrapped at most
 _LONGEST_NUMBER = 24  # characters, with its unit; what is longer is a sentence that begins with a number
 _TIE = "\N{NO-BREAK SPACE}"  # keeps a number and its unit on one line while the table is laid out
@@ -50,7 +49,7 @@ def _turned(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[
 
 def _least_width(columns: list[str], rows: list[list[str]]) -> int:
     """Return how narrow the table may be drawn, in characters."""
-    return sum(_least_widths(columns, rows)) + _GAP * (len(columns) - 1) + 2 * _EDGE
+    return sum(_least_widths(columns, rows)) + _GAP * (len(columns) - 1)
 
 
 def _least_widths(columns: Sequence[str], rows: Rows) -> list[int]:
@@ -79,7 +78,7 @@ def _is_numeric(cells: Sequence[str]) -> bool:
 
 
 def _table(columns: Sequence[str], rows: Rows) -> Table:
-    table = Table(header_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(header_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
     for index, (column, least) in enumerate(zip(columns, _least_widths(columns, rows), strict=True)):
         numeric = index > 0 and _is_numeric([row[index] for row in rows])
         table.add_column(column, justify="right" if numeric else "left", min_width=least)

@@ -11,6 +11,7 @@ from cfplan.safety.certificate import shares
 
 ACTIVE = 0.95  # share from which a limit counts as what holds the plan back
 STEP = 0.01  # s, between the samples of the plan
+LIGHTEST = 0.55  # of a colour's luminance on white paper; lighter ones are darkened to it
 
 Colour = tuple[int, int, int]
 FREE, FREE_COLOUR = "none", (60, 66, 76)
@@ -22,7 +23,7 @@ LIMIT_COLOURS: dict[str, Colour] = {
     "tilt": (240, 228, 66),
     "motor thrust, most": (226, 74, 74),
     "motor thrust, least": (0, 114, 178),
-    "specific thrust, least": (150, 150, 210),
+    "specific thrust, least": (176, 122, 92),
 }
 
 
@@ -30,7 +31,7 @@ LIMIT_COLOURS: dict[str, Colour] = {
 class ActiveLimits:
     """Which limit holds the plan back, and where."""
 
-    time: NDArray  # (N,) s from the begin of the path
+    time: NDArray  # (N,) s from the start of the path
     position: NDArray  # (N, 3) m
     name: NDArray  # (N,) str: the limit that is used most, where that is at least ACTIVE of it, else FREE
     shares: dict[str, NDArray]  # (N,) of each limit, 1 at the limit
@@ -42,6 +43,14 @@ class ActiveLimits:
             (str(self.name[begin]), slice(int(begin), min(int(end) + 1, len(self.name))))
             for begin, end in pairwise(edges)
         ]
+
+
+def on_white(colour: Colour) -> Colour:
+    """Return the colour for white paper, darkened where it is too light."""
+    red, green, blue = colour
+    luminance = (0.2126 * red + 0.7152 * green + 0.0722 * blue) / 255
+    factor = min(1.0, LIGHTEST / luminance) if luminance > 0 else 1.0
+    return round(factor * red), round(factor * green), round(factor * blue)
 
 
 def active_limits(plan: Plan) -> ActiveLimits:

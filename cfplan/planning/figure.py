@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.files.whole import check_new_file, write_whole
-from cfplan.planning.active_limits import FREE, FREE_COLOUR, LIMIT_COLOURS, ActiveLimits, Colour, active_limits
+from cfplan.planning.active_limits import (
+    FREE,
+    FREE_COLOUR,
+    LIMIT_COLOURS,
+    ActiveLimits,
+    Colour,
+    active_limits,
+    on_white,
+)
 from cfplan.planning.plan_result import Plan
 
 if TYPE_CHECKING:
@@ -30,7 +38,7 @@ AXES = ("x", "y", "z")
 class Flown:
     """What was flown of a plan."""
 
-    time: NDArray  # (N,) s from the begin of the path
+    time: NDArray  # (N,) s from the start of the path
     position: NDArray  # (N, 3) m
     deviation: NDArray  # (N,) m, from where the vehicle should have been at that time
 
@@ -62,7 +70,7 @@ def draw_plan(plan: Plan, name: str, flown: Flown | None = None) -> "Figure":
     if flown is not None:
         rows[2].plot(flown.time, 100.0 * flown.deviation, color=_hex(FLOWN), lw=1.0)
         rows[2].set(ylabel="deviation, cm", ylim=(0.0, None))
-    rows[-1].set_xlabel("time from the begin of the path, s")
+    rows[-1].set_xlabel("time from the start of the path, s")
     for axes in (above, aside, *rows):
         axes.grid(alpha=0.25)
     said = f"{plan.path.length:.1f} m in {plan.trajectory.duration:.2f} s, {plan.airframe.name}"
@@ -100,7 +108,7 @@ def _draw_view(axes: "Axes", plan: Plan, active: ActiveLimits, flown: Flown | No
     axes.set(xlabel=f"{AXES[across]}, m", ylabel=f"{AXES[up]}, m")
     _draw_path(axes, active, across, up)
     begin, end = active.position[0], active.position[-1]
-    axes.plot(begin[across], begin[up], "o", color="black", mfc="white", ms=6, label="begin")
+    axes.plot(begin[across], begin[up], "o", color="black", mfc="white", ms=6, label="start")
     axes.plot(end[across], end[up], "s", color="black", ms=5, label="end")
     if flown is None:
         return
@@ -127,12 +135,15 @@ def _magnify(axes: "Axes", active: ActiveLimits, flown: Flown, across: int, up: 
     inset = axes.inset_axes((*free, *size), xticks=[], yticks=[])
     _draw_path(inset, active, across, up)
     inset.plot(flown.position[:, across], flown.position[:, up], color=_hex(FLOWN), lw=0.8)
+    wanted = [float(np.interp(flown.time[worst], active.time, active.position[:, axis])) for axis in (across, up)]
+    inset.plot(*zip(wanted, centre.tolist(), strict=True), color=_hex(FLOWN), lw=1.2)
+    inset.plot(*wanted, "o", color="black", mfc="white", ms=4)
+    inset.plot(*centre.tolist(), "o", color="black", ms=4)
     inset.set(xlim=centre[0] + np.array([-half, half]), ylim=centre[1] + np.array([-half, half]), aspect="equal")
     if axes.xaxis_inverted():
         inset.invert_xaxis()
-    inset.text(
-        0.5, 0.04, f"{100 * flown.deviation[worst]:.1f} cm off", transform=inset.transAxes, ha="center", fontsize=7
-    )
+    for height, told in ((0.87, f"{100 * flown.deviation[worst]:.1f} cm off"), (0.04, "○ planned  ● flown")):
+        inset.text(0.5, height, told, transform=inset.transAxes, ha="center", fontsize=6)
     axes.indicate_inset_zoom(inset, edgecolor="0.3")
 
 
@@ -159,4 +170,4 @@ def _colour(name: str) -> Any:
 
 
 def _hex(colour: Colour) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
+    return "#{:02x}{:02x}{:02x}".format(*on_white(colour))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.files.whole import check_new_file, write_whole
-from cfplan.planning.active_limits import FREE, FREE_COLOUR, LIMIT_COLOURS, Colour, active_limits
+from cfplan.planning.active_limits import FREE, FREE_COLOUR, LIMIT_COLOURS, Colour, active_limits, on_white
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
 from cfplan.recording.record import PLAN_FILE, Record
@@ -225,4 +225,4 @@ class _Scene:
 
 
 def _colour(name: str) -> Colour:
-    return FREE_COLOUR if name == FREE else LIMIT_COLOURS[name]
+    return on_white(FREE_COLOUR if name == FREE else LIMIT_COLOURS[name])

@@ -29,7 +29,7 @@ class Reference:
     """Where a vehicle should have been."""
 
     name: str
-    time: NDArray  # (M,) s from the begin of the path
+    time: NDArray  # (M,) s from the start of the path
     position: NDArray  # (M, 3) m
 
     def at(self, time: NDArray) -> NDArray:
@@ -43,7 +43,7 @@ class Trial:
     """One flight of the overlay."""
 
     name: str
-    time: NDArray  # (N,) s from the begin of the path, or of the log where there is no reference
+    time: NDArray  # (N,) s from the start of the path, or of the log where there is no reference
     position: NDArray  # (N, 3) m, NaN where it was not seen
     quaternion: NDArray  # (N, 4) body→world, x y z w, NaN where not known
     reference: Reference | None

@@ -67,7 +67,7 @@ def plots(record: Record) -> tuple[Plot, ...]:
         Plot(
             "deviation",
             (
-                _flown("in_time", off.time, off.in_time, "from the reference in time"),
+                _flown("in_time", off.time, off.in_time, "in time"),
                 Line("to_path", off.time, off.to_path, ("from the path",), ((150, 150, 150),)),
             ),
             (bounds.deviation,),

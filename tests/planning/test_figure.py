@@ -48,14 +48,16 @@ def test_curves_are_of_the_plan_and_of_the_flight(figure, made):
     assert labels["deviation, cm"].lines[0].get_ydata().max() == pytest.approx(5.0, rel=1e-3)
     assert max(np.max(line.get_ydata()) for line in labels["share of the limit, %"].lines) <= 100.0 + 1e-9
     named = {text.get_text() for legend in figure.subfigs[0].legends for text in legend.get_texts()}
-    assert {"begin", "end", "flown"} <= named
-    assert named <= {"begin", "end", "flown", "no limit", *LIMIT_COLOURS}
+    assert {"start", "end", "flown"} <= named
+    assert named <= {"start", "end", "flown", "no limit", *LIMIT_COLOURS}
 
 
 def test_the_largest_deviation_is_magnified(figure):
     above = next(axes for axes in figure.axes if axes.get_title(loc="left") == "from above")
     (inset,) = above.child_axes
     assert inset.texts[0].get_text() == "5.0 cm off"
+    planned, flown = (np.array(line.get_xydata()[0]) for line in inset.lines[-2:])
+    assert np.linalg.norm(flown - planned) == pytest.approx(0.05, rel=0.02)
 
 
 @pytest.mark.parametrize(("suffix", "begins"), [(".png", b"\x89PNG"), (".pdf", b"%PDF"), (".svg", b"<?xml")])

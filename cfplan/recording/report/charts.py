@@ -12,16 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.planning.active_limits import on_white
 from cfplan.recording.plots import FAR_LIMIT, LIMIT, Colour
 
 WIDTH, HEIGHT = 560, 250  # of a chart, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 46, 34  # around what is drawn
-LIGHTEST = 0.55  # of a colour's luminance on white paper; lighter ones are darkened to it
 TALLEST = 320.0  # of a chart of places
 NARROWEST = 1.0  # m across a chart of places, or millimetres of noise would fill it
 _SMALLEST_SPAN = 1e-9  # of the values, or of 1: smaller ones cannot be told apart
 COLUMNS = 400  # pixels across a chart, within which points cannot be distinguished
 _LETTER = 6.2  # width of one, about
+_LEGEND_ROW = 15.0  # height of each row of the legend behind the first
 _GRID, _TEXT, _BAND = "#e3e3e3", "#444", "#f3f6fb"
 
 
@@ -37,13 +38,19 @@ class Curve:
 
 
 def time_chart(
-    title: str, curves: Sequence[Curve], *, limits: Sequence[float] = (), band: tuple[float, float] | None = None
+    title: str,
+    curves: Sequence[Curve],
+    *,
+    limits: Sequence[float] = (),
+    band: tuple[float, float] | None = None,
+    span: tuple[float, float] | None = None,
 ) -> str:
     """Draw curves over time in s, the limits as level lines, the band (the time along the path) shaded.
 
-    A limit far above all measured values is named, not drawn, or nothing else could be seen.
+    The axis shows the times in `span`, or those that there are. A limit far above all measured values is named, not
+    drawn, or nothing else could be seen.
     """
-    x = _span([curve.x for curve in curves])
+    x = _span([curve.x for curve in curves]) if span is None else span
     y = _span([curve.y for curve in curves])
     reach = FAR_LIMIT * (y[1] - y[0])
     near = [limit for limit in limits if y[0] - reach <= limit <= y[1] + reach]
@@ -187,23 +194,23 @@ def thinned(x: NDArray, y: NDArray, columns: int) -> NDArray:
 def _svg(
     title: str, labels: Sequence[tuple[str, Colour, bool]], parts: Sequence[str], width: float, height: float
 ) -> str:
-    legend, x = [], float(LEFT)
-    labels = list(dict.fromkeys(labels))
-    room = (width - LEFT - RIGHT) / max(len(labels), 1) - 30
-    if sum(30 + _LETTER * len(label) for label, _, _ in labels) > width - LEFT - RIGHT:
-        labels = [(_shortened(label, int(room / _LETTER)), colour, dashed) for label, colour, dashed in labels]
-    for label, colour, dashed in labels:
+    legend, x, y = [], float(LEFT), 0.0
+    longest = int((width - LEFT - RIGHT - 30) / _LETTER)
+    for name, colour, dashed in dict.fromkeys(labels):
+        label = _shortened(name, longest)
+        if x > LEFT and x + 30 + _LETTER * len(label) > width - RIGHT:  # another row
+            x, y = float(LEFT), y + _LEGEND_ROW
         dash = ' stroke-dasharray="5 3"' if dashed else ""
         legend.append(
-            f'<line x1="{x:.0f}" x2="{x + 14:.0f}" y1="32" y2="32" stroke="{_css(colour)}" stroke-width="3"{dash}/>'
-            f'<text x="{x + 18:.0f}" y="36">{html.escape(label)}</text>'
+            f'<line x1="{x:.0f}" x2="{x + 14:.0f}" y1="{y + 32:g}" y2="{y + 32:g}" stroke="{_css(colour)}" '
+            f'stroke-width="3"{dash}/><text x="{x + 18:.0f}" y="{y + 36:g}">{html.escape(label)}</text>'
         )
         x += 30 + _LETTER * len(label)
     return (
-        f'<svg viewBox="0 0 {width:g} {height:.0f}" role="img" xmlns="http://www.w3.org/2000/svg" '
+        f'<svg viewBox="0 0 {width:g} {height + y:.0f}" role="img" xmlns="http://www.w3.org/2000/svg" '
         f'font-size="11" fill="{_TEXT}"><title>{html.escape(title)}</title>'
         f'<text x="{LEFT}" y="16" font-size="13" font-weight="600">{html.escape(title)}</text>'
-        f"{''.join(legend)}{''.join(parts)}</svg>"
+        f'{"".join(legend)}<g transform="translate(0 {y:g})">{"".join(parts)}</g></svg>'
     )
 
 
@@ -212,8 +219,4 @@ def _shortened(label: str, letters: int) -> str:
 
 
 def _css(colour: Colour) -> str:
-    """Return the colour for white paper, darkened where it is too light."""
-    red, green, blue = colour
-    luminance = (0.2126 * red + 0.7152 * green + 0.0722 * blue) / 255
-    factor = min(1.0, LIGHTEST / luminance) if luminance > 0 else 1.0
-    return "#" + "".join(f"{round(channel * factor):02x}" for channel in colour)
+    return "#{:02x}{:02x}{:02x}".format(*on_white(colour))

@@ -123,8 +123,11 @@ def _flight(flight: ReportedFlight) -> str:
     begin, end = (moment - record.start for moment in reference_span(record))
     band = (begin, end) if np.isfinite(begin) else None
     trial = trial_of_record(record, flight.name)
-    charts = _views([trial])
-    for plot in plots(record):
+    charts, drawn = _views([trial]), plots(record)
+    moments = [line.time[np.isfinite(line.time)] - record.start for plot in drawn for line in plot.lines]
+    seen = np.concatenate([each for each in moments if len(each)] or [np.array([0.0, 1.0])])
+    span = (float(seen.min()), float(max(seen.max(), seen.min() + 1.0)))
+    for plot in drawn:
         curves = [
             Curve(
                 label,
@@ -135,7 +138,7 @@ def _flight(flight: ReportedFlight) -> str:
             for line in plot.lines
             for column, (label, colour) in enumerate(zip(line.labels, line.colours, strict=True))
         ]
-        charts.append(time_chart(plot.title, curves, limits=finite_limits(plot), band=band))
+        charts.append(time_chart(plot.title, curves, limits=finite_limits(plot), band=band, span=span))
     notes = "".join(f'<p class="note">{html.escape(note)}</p>' for note in flight.notes)
     return (
         f"<h2>{html.escape(flight.name)}</h2>{notes}"

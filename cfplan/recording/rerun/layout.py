@@ -85,7 +85,7 @@ def _room(header: RecordHeader) -> rrb.Spatial3DView:
     low, high = np.array(header.fence)
     centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
     target = (*centre[:2], low[2] + 0.1 * (high - low)[2])
-    aside = (0.66, -0.17, 0.45) if high[1] - low[1] > high[0] - low[0] else (-0.17, -0.66, 0.45)
+    aside = (0.76, -0.20, 0.52) if high[1] - low[1] > high[0] - low[0] else (-0.20, -0.76, 0.52)
     ever = rrb.VisibleTimeRange(
         TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0)
     )

@@ -45,7 +45,7 @@ def show_overlay(trials: Sequence[Trial]) -> None:
 def picture_overlay(
     trials: Sequence[Trial], file: Path, *, moment: float | None = None, overwrite: bool = False
 ) -> tuple[str, ...]:
-    """Write a PNG of the view at a moment, s from the begin of the path; else half-way. Return the viewer's complaints.
+    """Write a PNG of the view at a moment, s from the start of the path; else half-way. Return the viewer's complaints.
 
     Raises InputError as write_png does.
     """

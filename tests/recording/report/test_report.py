@@ -21,7 +21,7 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import save_plan
 from cfplan.recording.record import Events
-from cfplan.recording.report.charts import Curve, place_chart, thinned, ticks, time_chart
+from cfplan.recording.report.charts import WIDTH, Curve, place_chart, thinned, ticks, time_chart
 from cfplan.recording.report.page import page, write_page
 from cfplan.recording.report.report import flight_to_dict, read_flight, rows
 from cfplan.recording.summary import reference_span, summarise
@@ -268,6 +268,28 @@ def test_places_are_drawn_to_one_scale_in_both_axes():
     angle = np.linspace(0, 2 * np.pi, 100)
     (circle,) = points(place_chart("circle", [Curve("a", 3 * np.cos(angle), 3 * np.sin(angle), (0, 0, 0))], ("x", "y")))
     assert np.ptp(circle[:, 0]) == pytest.approx(np.ptp(circle[:, 1]), abs=0.3)
+
+
+def test_a_legend_too_long_for_a_row_goes_on_in_the_next_with_every_name_whole():
+    names = [f"flight number {number} of a long name" for number in range(5)]
+    chart = place_chart("many", [Curve(name, np.arange(2.0), np.arange(2.0), (0, 0, 0)) for name in names], ("x", "y"))
+    assert all(name in chart for name in names)
+    ends = [float(x) + 6.2 * len(text) for x, text in re.findall(r'<text x="(\d+)" y="[\d.]+">(flight[^<]*)', chart)]
+    assert len(ends) == len(names)
+    assert max(ends) <= WIDTH
+
+
+def test_charts_over_the_same_span_are_of_one_time_axis():
+    axes = [
+        re.findall(
+            r'<text x="([\d.]+)" y="[\d.]+" text-anchor="middle">([^<]*)', time_chart("t", [curve], span=(0.0, 9.0))
+        )
+        for curve in (
+            Curve("a", np.array([4.0, 5.0]), np.ones(2), (0, 0, 0)),
+            Curve("b", np.arange(9.0), np.arange(9.0), (0,) * 3),
+        )
+    ]
+    assert axes[0] == axes[1] != []
 
 
 def test_a_limit_far_above_is_named_and_does_not_flatten_the_curve():
