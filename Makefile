@@ -4,18 +4,27 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --editable
 
+# pip unpacks in silence, for half a minute and more: meanwhile the number of packages is shown every few seconds.
+define install
+	@echo '$(PIP) $(1)'
+	@(while sleep 5 >/dev/null 2>&1; do \
+		set -- $(VENV)/lib/python*/site-packages/*.dist-info; \
+		if [ $$# -gt 2 ] || ! [ -t 1 ]; then echo "installing: $$# packages so far"; fi; \
+	done) & counting=$$!; trap "kill $$counting" EXIT; $(PIP) $(1)
+endef
+
 .PHONY: install fly test slow fuzz dist site pictures lint clean
 
 install: $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) .
+	$(call install,.)
 	$(BIN)/cfplan doctor --warm-up
 	touch $@
 
 $(VENV)/installed-tests: $(VENV)/installed
-	$(PIP) ".[dev]"
+	$(call install,".[dev]")
 	touch $@
 
 fly: install

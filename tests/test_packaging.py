@@ -1,11 +1,14 @@
 """What pip installs is whole: the wheel holds the models and examples, and flies from a folder of its own."""
 
 import os
+import pty
 import re
+import select
 import subprocess
 import sys
 import tomllib
 import venv
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -51,3 +54,36 @@ def test_a_wheel_in_an_empty_environment_flies_an_example(tmp_path):
     assert "by learned" in said
     (record,) = (tmp_path / "records").iterdir()
     assert f"record: records/{record.name}" in said
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("terminal", [True, False], ids=["in a terminal", "into a pipe"])
+def test_make_fly_in_a_new_clone_lands_and_is_never_silent_for_ten_seconds(tmp_path, terminal):
+    """With an environment to be made, and nothing compiled yet."""
+    subprocess.run(["git", "clone", "--quiet", REPOSITORY, tmp_path / "cfplan"], check=True)
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    environment |= {"CFPLAN_CACHE": str(tmp_path / "cache"), "TERM": "xterm", "COLUMNS": "80"}
+    read, write = pty.openpty() if terminal else os.pipe()
+    with subprocess.Popen(
+        ["make", "fly"], cwd=tmp_path / "cfplan", env=environment, stdin=subprocess.DEVNULL, stdout=write, stderr=write
+    ) as making:
+        os.close(write)
+        printed = b"".join(pieces_within(read, 10.0))
+    assert making.returncode == 0, printed.decode(errors="replace")
+    assert b"ended" in printed
+    assert b"landed" in printed
+
+
+def pieces_within(file: int, silence: float) -> Iterator[bytes]:
+    """Read to the end; fail where nothing comes for so many seconds."""
+    printed = b""
+    while True:
+        assert select.select([file], [], [], silence)[0], f"silent for {silence} s after {printed[-200:]!r}"
+        try:
+            printed = os.read(file, 65536)
+        except OSError:  # the end of a terminal
+            return
+        if not printed:
+            return
+        yield printed
