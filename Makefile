@@ -4,13 +4,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --editable
 
-# pip unpacks in silence, for half a minute and more: meanwhile the number of packages is shown every few seconds.
-define install
-	@echo '$(PIP) $(1)'
+# Runs what says nothing for half a minute, as pip does while it unpacks, and shows meanwhile how many packages there are;
+# not while pip draws bars, before it has added to its own two.
+define counting_packages
+	@echo '$(1)'
 	@(while sleep 5 >/dev/null 2>&1; do \
-		set -- $(VENV)/lib/python*/site-packages/*.dist-info; \
-		if [ $$# -gt 2 ] || ! [ -t 1 ]; then echo "installing: $$# packages so far"; fi; \
-	done) & counting=$$!; trap "kill $$counting" EXIT; $(PIP) $(1)
+		set -- $(VENV)/lib/python*/site-packages/*.dist-info; [ -e "$$1" ] || shift; \
+		if [ $$# -gt 2 ] || [ $$# -eq 0 ] || ! [ -t 1 ]; then echo "$(VENV): $$# packages so far"; fi; \
+	done) & counting=$$!; trap "kill $$counting" EXIT; $(1)
 endef
 
 .PHONY: install fly test slow fuzz dist site pictures lint clean
@@ -18,13 +19,13 @@ endef
 install: $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml
-	$(PYTHON) -m venv $(VENV)
-	$(call install,.)
+	$(call counting_packages,$(PYTHON) -m venv $(VENV))
+	$(call counting_packages,$(PIP) .)
 	$(BIN)/cfplan doctor --warm-up
 	touch $@
 
 $(VENV)/installed-tests: $(VENV)/installed
-	$(call install,".[dev]")
+	$(call counting_packages,$(PIP) ".[dev]")
 	touch $@
 
 fly: install
