@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sources import FILES, nodes
 
 from cfplan import errors
-from cfplan.learning.dataset import SchedulerError
+from cfplan.learning.workers import SchedulerError
 
 KINDS = {name for name, kind in inspect.getmembers(errors, inspect.isclass) if issubclass(kind, errors.CfplanError)} | {
     SchedulerError.__name__

@@ -13,6 +13,7 @@ from cfplan.cli.output import print_json, print_table
 from cfplan.errors import InputError
 
 if TYPE_CHECKING:
+    from cfplan.studies.items import Running
     from cfplan.studies.result import StudyResult
 
 Study = Callable[..., "StudyResult"]
@@ -29,6 +30,10 @@ JOBS = click.option("--jobs", type=click.IntRange(1), default=1, show_default=Tr
 MINUTES = click.option(
     "--minutes", type=click.FloatRange(0, min_open=True), help="Begin no flight after them.  [default: all]"
 )
+WORKERS = click.option(
+    "--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine."
+)
+SCHEDULER = click.option("--scheduler", help="Work on a Dask cluster instead: tcp://host:port.")
 EARLIER = click.option(
     "--add", "earlier_files", type=click.Path(path_type=Path), multiple=True,
     help="A result of other seeds, which the tables then count as well; may be given several times.",
@@ -96,10 +101,12 @@ def _measure(run: Study, what: str, given: dict[str, Any], output: Path | None, 
         from cfplan.geometry.yaw import YawMode
 
         chosen["yaw"] = YawMode(chosen["yaw"])
-    with _progress(what, as_json) as progress:
-        result = run(**chosen, progress=progress)
+    if "workers" in given:
+        chosen["running"] = _running(output, workers=chosen.pop("workers"), scheduler=chosen.pop("scheduler", None))
+    with shown_progress(quiet=as_json) as begin:
+        result = run(**chosen, progress=begin(what))
     if output is not None:
-        result.write(output)
+        _write(result, output)
     if as_json:
         print_json(result.to_json())
         return
@@ -107,11 +114,46 @@ def _measure(run: Study, what: str, given: dict[str, Any], output: Path | None, 
         print_table(table.title, *table.cells())
 
 
-@contextmanager
-def _progress(what: str, as_json: bool) -> Iterator[Callable[[int, int], None]]:
-    from rich.console import Console
-    from rich.progress import Progress
+def _running(output: Path | None, **how: Any) -> "Running":
+    from cfplan.studies.items import Running
 
-    with Progress(console=Console(stderr=True, quiet=as_json)) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+    return Running(**how, result=output, tell=lambda text: click.echo(text, err=True))
+
+
+def _write(result: "StudyResult", output: Path) -> None:
+    """Write the result; what is kept beside it is not needed any more, unless it was interrupted."""
+    from cfplan.studies.items import forget_unfinished
+
+    result.write(output)
+    if not result.interrupted:
+        forget_unfinished(output)
+
+
+@contextmanager
+def shown_progress(*, quiet: bool) -> Iterator[Callable[[str], Callable[[int, int], None]]]:
+    """Yield a function from a name to what is told of its progress: a bar on stderr, with the time left."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    from cfplan.studies.time_left import TimeLeft, duration_text
+
+    class Left(TextColumn):
+        def render(self, task: Any) -> Any:
+            left: TimeLeft = task.fields["left"]
+            self.text_format = "" if left.seconds is None else f"{duration_text(left.seconds)} left"
+            return super().render(task)
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Left(""))
+    with Progress(*columns, console=Console(stderr=True, quiet=quiet)) as bar:
+
+        def begin(name: str) -> Callable[[int, int], None]:
+            left = TimeLeft()
+            task = bar.add_task(name, total=None, left=left)
+
+            def show(done: int, total: int) -> None:
+                left.step(done, total)
+                bar.update(task, completed=done, total=total)
+
+            return show
+
+        yield begin

@@ -1,15 +1,20 @@
 """The studies of `cfplan study` that make the paper's tables and figures."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from cfplan.cli.measured import Study, count, measured, seed, use_one_thread
+from cfplan.cli.measured import SCHEDULER, WORKERS, Study, count, measured, seed, shown_progress, use_one_thread
 from cfplan.cli.output import print_table
+
+if TYPE_CHECKING:
+    from cfplan.studies.paper.expected_time import Expected
 
 _EPOCHS = click.option("--epochs", type=click.IntRange(1), help="Of each training.  [default: 14]")
 _QUICK = click.option("--quick", is_flag=True, help="A few paths and epochs on data of its own: does it run?")
+_SPREAD = (WORKERS, SCHEDULER)
 _NETWORKS = (
     click.option(
         "--data", type=click.Path(path_type=Path), default=Path("datasets/paper"), show_default=True,
@@ -21,6 +26,7 @@ _NETWORKS = (
     ),
     _EPOCHS,
     _QUICK,
+    *_SPREAD,
 )  # fmt: skip
 
 
@@ -57,10 +63,16 @@ def inputs() -> Study:
     click.option(
         "--draws", type=click.IntRange(1), default=10, show_default=True, help="Perturbations of each, each ε."
     ),
-    click.option("--model", "models", multiple=True, help="LSTM, LSTM-0.001, …, LSTM-0.1-solved.  [default: all]"),
+    click.option(
+        "--model", "models", multiple=True, help="LSTM, LSTM-0.001, …, LSTM-0.1-solved, shipped.  [default: all]"
+    ),
     click.option(
         "--reference", type=click.Choice(["toppquad", "expert"]), default="toppquad", show_default=True,
         help="Whose travel times are compared with, on the path and on the perturbed one.",
+    ),
+    click.option(
+        "--reference-draws", type=click.IntRange(1), help="Of each, that are compared so; it takes the most time.  "
+        "[default: all]",
     ),
     *_NETWORKS,
 )  # fmt: skip
@@ -98,7 +110,7 @@ def baselines() -> Study:
         "--data", type=click.Path(path_type=Path), default=Path("datasets/paper-hardware"), show_default=True,
         help="Where paths and networks are kept; those not there are made.",
     ),
-    _EPOCHS, _QUICK,
+    _EPOCHS, _QUICK, *_SPREAD,
 )  # fmt: skip
 def hardware() -> Study:
     """Make the paper's hardware tables on the virtual lab, without real time: TOPPQuad, networks and what ships."""
@@ -110,7 +122,7 @@ def hardware() -> Study:
 @measured(
     "planning", "cfplan study yaw-consistency -o results/yaw-consistency.json",
     click.option("--pairs", type=click.IntRange(1), default=100, show_default=True, help="Of random paths."),
-    seed(50_000),
+    seed(50_000), *_SPREAD,
 )  # fmt: skip
 def yaw_consistency() -> Study:
     """Make the paper's figure of yaw consistency: TOPPQuad on pairs of paths whose first waypoint is 0.1 m apart."""
@@ -119,33 +131,64 @@ def yaw_consistency() -> Study:
     return run
 
 
-@click.command(epilog="Example: cfplan study paper results")
+@click.command(epilog="Example: cfplan study paper results --workers 2")
 @click.argument("folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path("results"))
 @_QUICK
-def paper(folder: Path, quick: bool) -> None:
+@click.option("--dry-run", is_flag=True, help="Only say what would be made, and how long it would take.")
+@WORKERS
+@SCHEDULER
+def paper(folder: Path, quick: bool, dry_run: bool, workers: int, scheduler: str | None) -> None:
     """Make all tables of the paper: the studies above and that of long paths, a result each in DIR.
 
-    What was made by the same commit is kept, so that a run that was stopped goes on.
+    What was made by the same commit is kept, so that a run that was stopped goes on, also within a study; results of
+    another commit are stale, and are made anew.
     """
     use_one_thread()
-    from rich.console import Console
-    from rich.progress import Progress
-
+    from cfplan.studies.items import Running
     from cfplan.studies.paper.all_tables import paper_tables
+    from cfplan.studies.paper.expected_time import expected
+    from cfplan.studies.time_left import duration_text
 
-    with Progress(console=Console(stderr=True)) as bar:
-
-        def begin(name: str) -> Callable[[int, int], None]:
-            task = bar.add_task(name, total=None)
-            return lambda done, total: bar.update(task, completed=done, total=total)
-
-        made = paper_tables(folder, quick=quick, begin=begin)
+    processes = workers if scheduler is None else 1
+    _print_expected(expected(folder, quick=quick), processes, quick=quick)
+    if dry_run:
+        return
+    running = Running(workers, scheduler, tell=lambda text: click.echo(text, err=True))
+    with shown_progress(quiet=False) as begin:
+        made = paper_tables(folder, quick=quick, running=running, begin=begin)
     for each in made:
         for table in each.result.tables:
             print_table(table.title, *table.cells())
     for each in made:
-        how = "kept, of this commit" if each.kept else f"{each.seconds:.0f} s of the processor"
-        click.echo(f"{each.file}: {how}")
+        click.echo(f"{each.file}: {'kept, of this commit' if each.kept else f'made in {duration_text(each.seconds)}'}")
+    click.echo(f"all in {duration_text(sum(each.seconds for each in made))}")
+
+
+def _print_expected(studies: "Sequence[Expected]", processes: int, *, quick: bool) -> None:
+    """Print what there is of each study, and how long all of them take."""
+    import numpy as np
+
+    from cfplan.studies.time_left import duration_text
+
+    cells = [
+        [each.study, f"{each.state} {each.remark}".strip(),
+         *("–" if np.isnan(seconds) else duration_text(seconds)
+           for seconds in (each.training_seconds, each.other_seconds))]
+        for each in studies
+    ]  # fmt: skip
+    titles = ["study", "result", "training", "the rest"]
+    if quick:
+        print_table("What there is", titles[:2], [line[:2] for line in cells])
+        return
+    print_table("What there is, and how long a whole run takes the processor", titles, cells)
+    known = [each for each in studies if not np.isnan(each.other_seconds)]
+    whole = sum(each.training_seconds + each.other_seconds / processes for each in known)
+    on = "one process" if processes == 1 else f"{processes} processes"
+    click.echo(
+        f"A whole run takes {duration_text(whole)} on {on}, where a processor is as fast as that of the results."
+    )
+    if unknown := [each.study for each in studies if each not in known]:
+        click.echo(f"Not counted are those of which no result says how long they take: {', '.join(unknown)}.")
 
 
 @click.command(epilog="Example: cfplan study figures results docs/images")

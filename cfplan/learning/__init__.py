@@ -13,4 +13,5 @@ __all__ = [
     "paper",
     "training",
     "training_set",
+    "workers",
 ]

@@ -5,28 +5,25 @@ no two runs repeat, and which is therefore kept apart from the rows that every r
 """
 
 import io
-import socket
 from collections import Counter
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cfplan.errors import CfplanError, ExitCode, InputError
+from cfplan.errors import InputError
 from cfplan.files.whole import whole
 from cfplan.learning.dataset_spec import SPEC_FILE, DatasetSpec, load_spec, require_same
 from cfplan.learning.labels import SCHEMA, TIMING_SCHEMA, make_rows
+from cfplan.learning.workers import pool
 from cfplan.planners.solution import Status
 
 SHARDS, TIMING = "shards", "timing"
-SCHEDULER_PATIENCE = 10  # s
 PERCENTILES = (0, 10, 50, 90, 99, 100)
 DISTRIBUTIONS = {
     "length": "m",
@@ -36,12 +33,6 @@ DISTRIBUTIONS = {
     "iterations": "",
     "solve_seconds": "s",
 }
-
-
-class SchedulerError(CfplanError):
-    """The scheduler of a cluster cannot be used."""
-
-    exit_code = ExitCode.USAGE
 
 
 def make_dataset(
@@ -61,8 +52,8 @@ def make_dataset(
     _prepare(folder, spec)
     missing = [number for number in range(spec.shards) if not _shard(folder, SHARDS, number).exists()]
     on_rows(spec.rows - sum(len(spec.shard(number)) for number in missing))
-    with _pool(workers, scheduler) as labelled:
-        for number, rows, timing in labelled(spec, missing):
+    with pool(workers, scheduler) as work:
+        for number, rows, timing in work(partial(label_shard, spec), missing):
             try:
                 for part, content in ((TIMING, timing), (SHARDS, rows)):
                     with whole(_shard(folder, part, number)) as unfinished:
@@ -135,73 +126,6 @@ def _prepare(folder: Path, spec: DatasetSpec) -> None:
         raise InputError(
             f"cannot be used for a dataset: {error.strerror}", where=str(folder), hint="give another folder"
         ) from None
-
-
-Labelled = Iterator[tuple[int, bytes, bytes]]
-
-
-@contextmanager
-def _pool(workers: int, scheduler: str | None) -> Iterator[Callable[[DatasetSpec, list[int]], Labelled]]:
-    """Yield a function that labels shards on this machine or on a cluster, and yields them as they are done."""
-    from joblib import Parallel, delayed, parallel_config
-
-    def run(spec: DatasetSpec, numbers: list[int]) -> Labelled:
-        tasks = (delayed(label_shard)(spec, number) for number in numbers)
-        yield from Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(
-            tasks
-        )
-
-    if scheduler is None:
-        n_jobs = workers
-        with parallel_config(backend="loky", inner_max_num_threads=1):
-            yield run
-        return
-    n_jobs = -1
-    with _client(scheduler) as client, parallel_config(backend="dask", client=client, wait_for_workers_timeout=30):
-        yield run
-
-
-@contextmanager
-def _client(scheduler: str) -> Iterator[object]:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise SchedulerError(
-            "Dask is not installed", where=scheduler, hint="pip install 'cfplan[cluster]', here and on the workers"
-        ) from None
-    _require_listening(scheduler)
-    try:
-        client = Client(scheduler, timeout=SCHEDULER_PATIENCE)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise SchedulerError(
-            f"no Dask scheduler answers there ({error})", where=scheduler, hint="start one with `dask scheduler`"
-        ) from None
-    try:
-        yield client
-    finally:
-        client.close()
-
-
-def _require_listening(scheduler: str) -> None:
-    """Check that something listens there: Dask would try for long and log much."""
-    parts = urlsplit(scheduler)
-    try:
-        if parts.scheme != "tcp" or parts.hostname is None or parts.port is None:
-            raise ValueError("an address has the form tcp://host:port")
-        # In a thread, because looking up a name has no timeout.
-        lookup = ThreadPoolExecutor(1)
-        lookup.submit(_touch, parts.hostname, parts.port).result(timeout=SCHEDULER_PATIENCE)
-        lookup.shutdown(wait=False)
-    except (OSError, ValueError) as error:  # TimeoutError is an OSError
-        raise SchedulerError(
-            f"no Dask scheduler can be reached there ({error or 'no answer'})",
-            where=scheduler,
-            hint="start one with `dask scheduler`, and workers with `dask worker`",
-        ) from None
-
-
-def _touch(host: str, port: int) -> None:
-    socket.create_connection((host, port), timeout=SCHEDULER_PATIENCE / 2).close()
 
 
 def _shard(folder: Path, part: str, number: int) -> Path:

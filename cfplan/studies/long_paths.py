@@ -28,6 +28,7 @@ from cfplan.planning.repair import Repaired, repair
 from cfplan.safety.limit_sets import LimitSet
 from cfplan.safety.limits import FlightLimits, Ladder
 from cfplan.simulation.dry_run import dry_run
+from cfplan.studies.items import work_table
 from cfplan.studies.machine import process_memory
 from cfplan.studies.result import Column, StudyResult, Table, detail_table
 from cfplan.studies.scaling import path_of_length
@@ -165,7 +166,7 @@ def long_paths(
         )
     find_box(box)
     chosen, seeds = find_limit_set(limits), range(first_seed, first_seed + paths)
-    total, made, interrupted = len(lengths) * paths * repeats, 0, False
+    total, made, interrupted, begun = len(lengths) * paths * repeats, 0, False, time.process_time()
     done: list[list[LongPlan]] = []
     try:
         warm = path_of_length(lengths[0], box, first_seed)
@@ -189,7 +190,8 @@ def long_paths(
         "quick": max(lengths) < LENGTHS[-1],
     }  # fmt: skip
     detail = detail_table("plans", [plan for plans in done for plan in plans])
-    return StudyResult("long", settings, (lengths_table(done, box, limits), beside_table(done)), (detail,), interrupted)
+    details = (detail, work_table({"plan": (made, time.process_time() - begun)}))
+    return StudyResult("long", settings, (lengths_table(done, box, limits), beside_table(done)), details, interrupted)
 
 
 def lengths_table(done: Sequence[Sequence[LongPlan]], box: str, limits: str) -> Table:

@@ -1,11 +1,13 @@
 """Where a measurement comes from: the command, the date, the commit of cfplan and the machine."""
 
+import hashlib
 import shlex
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from cfplan import version
@@ -40,3 +42,20 @@ def provenance() -> Provenance:
         modified=bool(version.git("status", "--porcelain", "--", *DECIDES)),
         machine=this_machine(),
     )
+
+
+@cache
+def sources_digest() -> str:
+    """Return a digest of all that a study's figures depend on, as it was at the first call: of code that is changed
+    but not committed too, and where there is no repository.
+    """
+    digest = hashlib.sha256()
+    for top in DECIDES:
+        for file in sorted(_files(version.REPOSITORY / top)):
+            digest.update(f"{file.relative_to(version.REPOSITORY)}\n".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def _files(top: Path) -> list[Path]:
+    found = [top] if top.is_file() else top.rglob("*")
+    return [file for file in found if file.is_file() and "__pycache__" not in file.parts]

@@ -15,9 +15,10 @@ from cfplan.geometry.path import Path as Curve
 from cfplan.geometry.path_families import Family
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import dataset
-from cfplan.learning.dataset import SchedulerError, describe, label_shard, make_dataset, read_dataset, read_timing
+from cfplan.learning.dataset import describe, label_shard, make_dataset, read_dataset, read_timing
 from cfplan.learning.dataset_spec import DatasetSpec, Labeller, Relabel, load_spec
 from cfplan.learning.labels import row_limits, row_path
+from cfplan.learning.workers import SchedulerError
 from cfplan.safety.feasibility import infeasible_limit
 from cfplan.vehicle.airframes import AIRFRAMES
 

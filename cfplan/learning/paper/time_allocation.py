@@ -4,7 +4,7 @@ AllocNet learns through its quadratic program, without labels. Here each corrido
 its segments for which the motion keeps SPEED and ACCELERATION in the least time (see planners/baselines/corridors.py).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -70,28 +70,25 @@ def fastest_times(corridor: Corridor) -> NDArray:
     return least_time(min_jerk(corridor, times), times) * times
 
 
+def time_label(corridor: Corridor) -> NDArray | None:
+    """Return the logarithms of its fastest times, (B,); None where no motion stays in its boxes."""
+    try:
+        return np.log(fastest_times(corridor))
+    except InfeasibleError:
+        return None
+
+
 def train_times(
-    corridors: Sequence[Corridor],
-    *,
-    epochs: int = EPOCHS,
-    seed: int = 0,
-    on_label: Callable[[int], None] = lambda _: None,
+    corridors: Sequence[Corridor], labels: Sequence[NDArray | None], *, epochs: int = EPOCHS, seed: int = 0
 ) -> TimeNetwork:
-    """Label the corridors and train a network on them; `on_label` is told how many are labelled. Raises InputError."""
-    seen, wanted = [], []
-    for count, corridor in enumerate(corridors):
-        try:
-            wanted.append(np.log(fastest_times(corridor)))
-            seen.append(box_features(corridor))
-        except InfeasibleError:
-            continue
-        finally:
-            on_label(count + 1)
+    """Train a network on the corridors that have a label. Raises InputError where fewer than two have one."""
+    seen = [box_features(each) for each, label in zip(corridors, labels, strict=True) if label is not None]
+    wanted = [label for label in labels if label is not None]
     if len(seen) < 2:
         raise InputError("too few corridors can be flown through", where="corridors", hint="give more")
     torch.manual_seed(seed)
     network, random = TimeNetwork(), np.random.default_rng(seed)
-    inputs, labels = torch.from_numpy(np.array(seen)), torch.from_numpy(np.array(wanted, dtype=np.float32))
+    inputs, answers = torch.from_numpy(np.array(seen)), torch.from_numpy(np.array(wanted, dtype=np.float32))
     network.mean.copy_(inputs.mean((0, 1)))
     network.scale.copy_(inputs.std((0, 1)).clamp_min(1e-6))
     steps = epochs * -(-len(inputs) // BATCH)
@@ -99,7 +96,7 @@ def train_times(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for _ in range(epochs):
         for chosen in torch.split(torch.from_numpy(random.permutation(len(inputs))), BATCH):
-            loss = (network(inputs[chosen]) - labels[chosen]).square().mean()
+            loss = (network(inputs[chosen]) - answers[chosen]).square().mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

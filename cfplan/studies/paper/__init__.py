@@ -4,6 +4,7 @@ __all__ = [
     "all_tables",
     "architectures",
     "baselines",
+    "expected_time",
     "figures",
     "hardware",
     "inputs",

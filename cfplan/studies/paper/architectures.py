@@ -4,8 +4,9 @@ Beside it the planner that ships, on a vehicle as it is: certified for motors th
 bytes, flown in the dry run.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -25,13 +26,16 @@ from cfplan.safety.limit_sets import LIMIT_SETS, PAPER
 from cfplan.safety.limits import FlightLimits, Ladder
 from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.geometric_flight import LOST, thrust_violation
+from cfplan.studies.items import HERE, Progress, Running, work_table, work_through
 from cfplan.studies.paper.networks import (
     DATA,
     NETWORKS,
     PaperData,
-    Progress,
+    PaperItem,
     TrainedNetwork,
+    identities,
     paper_data,
+    paper_items,
     trained_networks,
 )
 from cfplan.studies.paper.printed import ARCHITECTURES
@@ -40,14 +44,13 @@ from cfplan.studies.paper.trials import (
     SAMPLE,
     TOPPQUAD,
     PaperTrial,
-    Plan,
-    measured,
+    path_trials,
     planner_columns,
     planner_row,
     planners,
     profile_of,
 )
-from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
+from cfplan.studies.result import Column, StudyResult, Table, detail_table
 from cfplan.vehicle.trajectory import Trajectory
 
 SHIPPED_LIMITS = LIMIT_SETS["simulation"]
@@ -87,6 +90,7 @@ def architectures(
     networks: FilePath = NETWORKS,
     epochs: int | None = None,
     quick: bool = False,
+    running: Running = HERE,
     progress: Progress = lambda done, total: None,
 ) -> StudyResult:
     """Compare the architectures on `paths` paths for training and for testing each; networks are trained if need be.
@@ -99,44 +103,25 @@ def architectures(
             raise InputError(f"unknown architecture {name!r}", where="kinds", hint=f"known: {', '.join(Kind)}")
     wanted = [SequenceOptions(kind=Kind(name)) for name in kinds]
     with paper_data(data, networks, paths, epochs=epochs, quick=quick) as material:
-        more = 2 * (len(wanted) + 3)
-        trained = trained_networks(material, wanted, progress, more)
-        steps = TrialSteps(progress, sum(each.options.epochs for each in trained), more)
-        found = planners(trained)
-        trials, interrupted = collect(all_trials(found, material, steps))
-        flights = [] if interrupted else shipped_flights(material)
+        trained = trained_networks(material, wanted, progress)
+        settings = settings_of(material, quick)
+        work = work_through(
+            "architectures", settings | {"networks": identities(trained)}, partial(_trials_of, trained),
+            paper_items(material), running, progress,
+        )  # fmt: skip
+    trials = [PaperTrial(**trial) for value in work.values for trial in value["trials"]]
+    flights = [ShippedFlight(**value["shipped"]) for value in work.values]
     tables = (
-        *planner_tables(trials, list(found), "architectures", "network", ARCHITECTURES), *shipped_tables(flights),
-        training_table(trained, material),
+        *planner_tables(trials, list(planners(trained)), "architectures", "network", ARCHITECTURES),
+        *shipped_tables(flights), training_table(trained, material),
     )  # fmt: skip
-    details = (detail_table("trials", trials), detail_table("shipped-flights", flights))
-    return StudyResult("architectures", settings_of(material, quick), tables, details, interrupted)
+    steps = training_steps(trained, settings["learned_from"]) | {"path": (len(work.values), work.seconds)}
+    details = (detail_table("trials", trials), detail_table("shipped-flights", flights), work_table(steps))
+    return StudyResult("architectures", settings, tables, details, work.interrupted)
 
 
-@dataclass(slots=True)
-class TrialSteps:
-    """The progress after training: one step a planner and part."""
-
-    progress: Progress
-    done: int
-    more: int
-
-    def __post_init__(self) -> None:
-        self.more += self.done
-
-    def step(self) -> None:
-        """Show that one more is done."""
-        self.done += 1
-        self.progress(self.done, self.more)
-
-
-def all_trials(found: dict[str, Plan], data: PaperData, steps: TrialSteps) -> Iterator[PaperTrial]:
-    """Plan and fly every path by every planner."""
-    for name, plan in found.items():
-        for part, sequences in data.parts.items():
-            for both in measured(name, plan, part, sequences):
-                yield from both
-            steps.step()
+def _trials_of(networks: Sequence[TrainedNetwork], item: PaperItem) -> dict[str, Any]:
+    return {"trials": path_trials(planners(networks), *item), "shipped": _shipped(*item)}
 
 
 def settings_of(data: PaperData, quick: bool) -> dict[str, Any]:
@@ -176,6 +161,16 @@ def planner_tables(
     )
 
 
+def training_steps(
+    trained: Sequence[TrainedNetwork], learned_from: int, where: str = ""
+) -> dict[str, tuple[int, float]]:
+    """Return what each training took: how many paths went through the network, and the seconds of all."""
+    return {
+        f"path through {where}{each.name}": (each.options.epochs * learned_from, each.training_seconds)
+        for each in trained
+    }
+
+
 def training_table(trained: Sequence[TrainedNetwork], data: PaperData) -> Table:
     """Return the size and the training of each network."""
     columns = (
@@ -195,16 +190,7 @@ def training_table(trained: Sequence[TrainedNetwork], data: PaperData) -> Table:
     return Table("training", "Networks and their training", columns, tuple(rows))
 
 
-def shipped_flights(data: PaperData) -> list[ShippedFlight]:
-    """Fly every path by the planner that ships."""
-    return [
-        _shipped(path, part, int(row))
-        for part, sequences in data.parts.items()
-        for row, path in zip(sequences.rows, sequences.paths, strict=True)
-    ]
-
-
-def _shipped(path: Path, part: str, row: int) -> ShippedFlight:
+def _shipped(part: str, row: int, path: Path) -> ShippedFlight:
     airframe, limits = SHIPPED_LIMITS.airframe, SHIPPED_LIMITS.limits
     known: dict[str, Any] = {"part": part, "row": row}
     try:

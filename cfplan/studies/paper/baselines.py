@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.learning.paper.bayesian_times import Budget, require_library
 from cfplan.learning.paper.sequences import MAX_LENGTH
-from cfplan.learning.paper.time_allocation import TimeNetwork, allotted_times, train_times
+from cfplan.learning.paper.time_allocation import TimeNetwork, allotted_times, time_label, train_times
 from cfplan.learning.paper.training import SequenceOptions
 from cfplan.planners.baselines.convex import plan_convex
 from cfplan.planners.baselines.corridors import (
@@ -37,7 +38,17 @@ from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import LOST, fly_geometric, thrust_violation
-from cfplan.studies.paper.networks import DATA, NETWORKS, WAYPOINTS, Progress, paper_data, trained_networks
+from cfplan.studies.items import HERE, Progress, Running, work_table, work_through
+from cfplan.studies.paper.architectures import training_steps
+from cfplan.studies.paper.networks import (
+    DATA,
+    NETWORKS,
+    WAYPOINTS,
+    TrainedNetwork,
+    identities,
+    paper_data,
+    trained_networks,
+)
 from cfplan.studies.paper.printed import BASELINES
 from cfplan.studies.paper.segment_times import QUICK_BUDGET, bayesian_motion, timed_trajectory
 from cfplan.studies.paper.trials import (
@@ -53,7 +64,7 @@ from cfplan.studies.paper.trials import (
     shipped_profile,
     trajectory_by,
 )
-from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
+from cfplan.studies.result import Column, StudyResult, Table, detail_table
 from cfplan.vehicle.trajectory import Trajectory
 
 BOX = np.array([10.0, 10.0, 5.0])  # m, where waypoints are drawn
@@ -72,6 +83,7 @@ class Course(NamedTuple):
     seed: int
 
 
+_WARM: set[str] = set()  # planners that this process has asked before
 Ask = Callable[[Course], Trajectory]  # raises CfplanError where there is none
 
 
@@ -106,6 +118,7 @@ def baselines(
     networks: FilePath = NETWORKS,
     epochs: int | None = None,
     quick: bool = False,
+    running: Running = HERE,
     progress: Progress = lambda done, total: None,
 ) -> StudyResult:
     """Plan and fly `paths` random paths by each planner; networks are trained if need be.
@@ -121,31 +134,53 @@ def baselines(
     wanted = [SequenceOptions(epsilon=epsilon) for epsilon in NOISES]
     budget = QUICK_BUDGET if quick else Budget()
     corridors = QUICK_CORRIDORS if quick else corridors
-    with paper_data(data, networks, 1, epochs=epochs, quick=quick) as material:
-        more = corridors + paths
-        trained = trained_networks(material, wanted, progress, more)
-        done = sum(each.options.epochs for each in trained)
-        begun = time.process_time()
-        allocation = _time_network(corridors, first_seed, lambda count: progress(done + count, done + more))
-        training = time.process_time() - begun
-        plans = {each.name: network_plan(each) for each in trained}
-        asked, warm_up = (_planners(plans, allocation, each) for each in (budget, QUICK_BUDGET))
-        retraining = {each.name: each.training_seconds for each in trained} | {ALLOCATION: training}
-
-        def show(count: int) -> None:
-            progress(done + corridors + count, done + more)
-
-        seeds = range(first_seed, first_seed + paths)
-        trials, interrupted = collect(_trials(asked, warm_up, seeds, show))
     settings = {
         "paths": paths, "first_seed": first_seed, "corridors": corridors, "motor_lag": PAPER_LAG, "quick": quick,
     }  # fmt: skip
-    table = baselines_table([trial for trial, _ in trials], list(asked), retraining)
-    details = (
-        detail_table("trials", [trial for trial, _ in trials]),
-        detail_table("drawn", _drawn(trials, first_seed)),
-    )
-    return StudyResult("baselines", settings, (table,), details, interrupted)
+    with paper_data(data, networks, 1, epochs=epochs, quick=quick) as material:
+        trained = trained_networks(material, wanted, progress)
+        labels = work_through(
+            "baselines, corridors", settings, _label, {str(k): 10 * first_seed + k for k in range(corridors)},
+            running.beside("corridors"), progress,
+        )  # fmt: skip
+        begun = time.process_time()
+        allocation = _time_network(10 * first_seed, labels.values)
+        training = labels.seconds + time.process_time() - begun
+        asked = Asked(tuple(trained), allocation, budget)
+        seeds = {str(seed): seed for seed in range(first_seed, first_seed + paths)}
+        known = settings | {"networks": identities(trained)}
+        work = work_through("baselines", known, partial(_flown_on, asked, first_seed), seeds, running, progress)
+    retraining = {each.name: each.training_seconds for each in trained} | {ALLOCATION: training}
+    trials = [BaselineTrial(**trial) for value in work.values for trial in value["trials"]]
+    drawn = [row for value in work.values for row in value["drawn"]]
+    table = baselines_table(trials, list(asked.planners()), retraining)
+    steps = training_steps(trained, len(material.learned_from.rows)) | {
+        "corridor": (corridors, training), "path": (len(work.values), work.seconds),
+    }  # fmt: skip
+    details = (detail_table("trials", trials), detail_table("drawn", drawn), work_table(steps))
+    return StudyResult("baselines", settings, (table,), details, work.interrupted)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What the planners of the table are made of."""
+
+    networks: tuple[TrainedNetwork, ...]
+    allocation: TimeNetwork
+    budget: Budget
+
+    def planners(self) -> dict[str, Ask]:
+        """Return the planners by name, in the order of the table."""
+        on_the_path = {
+            TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert),
+            **{each.name: network_plan(each) for each in self.networks}, SHIPPED: shipped_profile,
+        }  # fmt: skip
+        return {name: _on_the_path(plan) for name, plan in on_the_path.items()} | {
+            ALLOCATION: lambda course: _allotted(course.path, self.allocation),
+            BAYESIAN: lambda course: bayesian_motion(course.waypoints, budget=self.budget, seed=course.seed),
+            CONVEX: _on_the_path(profile_by(plan_convex)),
+            MIN_SNAP: _on_the_path(profile_by(plan_min_snap)),
+        }
 
 
 def random_course(seed: int) -> Course:
@@ -162,22 +197,15 @@ def random_course(seed: int) -> Course:
         attempt += 1
 
 
-def _time_network(count: int, first_seed: int, on_label: Callable[[int], None]) -> TimeNetwork:
-    """Train a time allocation on paths that are none of the study's."""
-    corridors = [corridor_about(random_course(10 * first_seed + k).path) for k in range(count)]
-    return train_times(corridors, on_label=on_label)
+def _label(seed: int) -> list[float] | None:
+    """Return the label of the corridor about a path, which is none of those that are flown."""
+    label = time_label(corridor_about(random_course(seed).path))
+    return None if label is None else label.tolist()
 
 
-def _planners(networks: Mapping[str, Plan], allocation: TimeNetwork, budget: Budget) -> dict[str, Ask]:
-    on_the_path = {
-        TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert), **networks, SHIPPED: shipped_profile,
-    }  # fmt: skip
-    return {name: _on_the_path(plan) for name, plan in on_the_path.items()} | {
-        ALLOCATION: lambda course: _allotted(course.path, allocation),
-        BAYESIAN: lambda course: bayesian_motion(course.waypoints, budget=budget, seed=course.seed),
-        CONVEX: _on_the_path(profile_by(plan_convex)),
-        MIN_SNAP: _on_the_path(profile_by(plan_min_snap)),
-    }
+def _time_network(first: int, labels: Sequence[list[float] | None]) -> TimeNetwork:
+    corridors = [corridor_about(random_course(first + k).path) for k in range(len(labels))]
+    return train_times(corridors, [None if label is None else np.array(label) for label in labels])
 
 
 def _on_the_path(plan: Plan) -> Ask:
@@ -194,18 +222,18 @@ def _allotted(path: Path, network: TimeNetwork) -> Trajectory:
 Flown = tuple[BaselineTrial, Trajectory | None]
 
 
-def _trials(
-    asked: Mapping[str, Ask], warm_up: Mapping[str, Ask], seeds: range, show: Callable[[int], None]
-) -> Iterator[Flown]:
-    warm = random_course(seeds.start)
-    for ask in warm_up.values():
-        with suppress(CfplanError):
-            ask(warm)  # loads and compiles
-    for done, seed in enumerate(seeds):
-        course = random_course(seed)
-        for name, ask in asked.items():
-            yield _flown(ask, course, BaselineTrial(name, seed))
-        show(done + 1)
+def _flown_on(asked: Asked, first_seed: int, seed: int) -> dict[str, Any]:
+    """Plan and fly one path by each planner; of the first paths, keep what the figure shows."""
+    course, flown = random_course(seed), []
+    for name, ask in asked.planners().items():
+        if name not in _WARM:
+            quickly = replace(asked, budget=QUICK_BUDGET).planners()[name]
+            with suppress(CfplanError):
+                quickly(course)  # loads and compiles
+            _WARM.add(name)
+        flown.append(_flown(ask, course, BaselineTrial(name, seed)))
+    drawn = list(_drawn(flown, course)) if seed < first_seed + DRAWN_PATHS else []
+    return {"trials": [trial for trial, _ in flown], "drawn": drawn}
 
 
 def _flown(ask: Ask, course: Course, trial: BaselineTrial) -> Flown:
@@ -232,22 +260,20 @@ def _judged(trajectory: Trajectory, trial: BaselineTrial) -> BaselineTrial:
     )
 
 
-def _drawn(trials: Sequence[Flown], first_seed: int) -> Iterator[dict[str, Any]]:
-    """Yield what the figure shows of the first paths: the motions of DRAWN, and AllocNet's boxes by their corners."""
-    for seed in range(first_seed, first_seed + DRAWN_PATHS):
-        own = {trial.planner: trajectory for trial, trajectory in trials if trial.seed == seed and not trial.failed}
-        if not own:
-            continue
-        course = random_course(seed)
-        yield {"seed": seed, "what": "waypoints", "points": _millimetres(course.waypoints)}
-        for name in DRAWN:
-            trajectory = own.get(name)
-            if trajectory is not None:
-                path = trajectory.path
-                points = _millimetres(path(np.linspace(0.0, path.end, DRAWN_POINTS)))
-                yield {"seed": seed, "what": name, "points": points}
-        for corners in box_corners(corridor_about(course.path)):
-            yield {"seed": seed, "what": "box", "points": _millimetres(corners)}
+def _drawn(trials: Sequence[Flown], course: Course) -> Iterator[dict[str, Any]]:
+    """Yield what the figure shows of a path: the motions of DRAWN, and AllocNet's boxes by their corners."""
+    own = {trial.planner: trajectory for trial, trajectory in trials if not trial.failed}
+    if not own:
+        return
+    yield {"seed": course.seed, "what": "waypoints", "points": _millimetres(course.waypoints)}
+    for name in DRAWN:
+        trajectory = own.get(name)
+        if trajectory is not None:
+            path = trajectory.path
+            points = _millimetres(path(np.linspace(0.0, path.end, DRAWN_POINTS)))
+            yield {"seed": course.seed, "what": name, "points": points}
+    for corners in box_corners(corridor_about(course.path)):
+        yield {"seed": course.seed, "what": "box", "points": _millimetres(corners)}
 
 
 def _millimetres(points: NDArray) -> list[list[float]]:

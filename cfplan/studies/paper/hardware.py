@@ -9,9 +9,10 @@ limits are those that `cfplan init` writes. Of the first set the poses are kept,
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,10 +46,19 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.studies.fault_scenarios import FOR_GOOD, Scenario
 from cfplan.studies.faults import fly_stepped
 from cfplan.studies.giving_way import random_paths
-from cfplan.studies.paper.networks import NODES, WAYPOINTS, Progress, labelled_data, trained_networks
+from cfplan.studies.items import HERE, Progress, Running, work_table, work_through
+from cfplan.studies.paper.architectures import training_steps
+from cfplan.studies.paper.networks import (
+    NODES,
+    WAYPOINTS,
+    TrainedNetwork,
+    identities,
+    labelled_data,
+    trained_networks,
+)
 from cfplan.studies.paper.printed import HARDWARE
 from cfplan.studies.paper.trials import TOPPQUAD, Plan, finite_mean, network_plan, profile_of
-from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
+from cfplan.studies.result import Column, StudyResult, Table, detail_table
 from cfplan.vehicle.trajectory import Trajectory
 
 DATA = FilePath("datasets/paper-hardware")  # a folder for each set of limits, with its dataset and its networks
@@ -135,6 +145,7 @@ def hardware(
     data: FilePath = DATA,
     epochs: int | None = None,
     quick: bool = False,
+    running: Running = HERE,
     progress: Progress = lambda done, total: None,
 ) -> StudyResult:
     """Fly `paths` paths and the long one by each planner; paths are labelled and networks trained if need be.
@@ -150,23 +161,33 @@ def hardware(
     names = list(LIMITS)[:1] if quick else list(LIMITS)
     flown_paths = hardware_paths(usual, paths) | ({} if quick else {LONG: long_path(usual)})
     wanted = [SequenceOptions(epsilon=epsilon) for epsilon in (NOISES[:1] if quick else NOISES)]
-    planners: dict[str, list[FlownPlanner]] = {}
+    networks: dict[str, list[TrainedNetwork]] = {}
     training: list[dict[str, Any]] = []
+    steps: dict[str, tuple[int, float]] = {}
     for name in names:
         spec = hardware_spec(paper_limits(usual, name), learned_from)
-        with labelled_data(data / name, spec, progress, epochs=epochs, quick=quick) as material:
-            trained = trained_networks(material, wanted, progress, 1)
-            planners[name] = flown_planners({each.name: network_plan(each) for each in trained})
+        with labelled_data(data / name, spec, progress, running=running, epochs=epochs, quick=quick) as material:
+            networks[name] = trained_networks(material, wanted, progress)
+            steps |= training_steps(networks[name], len(material.learned_from.rows), f"{name} ")
             training += [
                 {"limits": name, "network": each.name, "learned_from": len(material.learned_from.rows),
-                 "epochs": each.options.epochs, "seconds": each.training_seconds} for each in trained
+                 "epochs": each.options.epochs, "seconds": each.training_seconds} for each in networks[name]
             ]  # fmt: skip
-    flown, interrupted = collect(_all_flights(usual, planners, flown_paths, 1 if quick else None, progress))
+    planners = {name: flown_planners({each.name: network_plan(each) for each in own}) for name, own in networks.items()}
+    settings = {"paths": paths, "learned_from": learned_from, "radio_loss": LOSS, "quick": quick}
+    work = work_through(
+        "hardware", settings | {"networks": {name: identities(own) for name, own in networks.items()}},
+        partial(_flights, planners, flown_paths, 1 if quick else None), _flown_together(planners, flown_paths), running,
+        progress,
+    )  # fmt: skip
+    flown = [(HardwareFlight(**flight), points) for value in work.values for flight, points in value]
     flights = [flight for flight, _ in flown]
-    settings = {"paths": paths, "radio_loss": LOSS, "quick": quick}
     tables = (*hardware_tables(flights), Table("training", "Networks", TRAINING_COLUMNS, tuple(training)))
-    details = (detail_table("flights", flights), detail_table("tracks", _tracks(flown_paths, flown)))
-    return StudyResult("hardware", settings, tables, details, interrupted)
+    details = (
+        detail_table("flights", flights), detail_table("tracks", _tracks(flown_paths, flown)),
+        work_table(steps | {"plan": (len(work.values), work.seconds)}),
+    )  # fmt: skip
+    return StudyResult("hardware", settings, tables, details, work.interrupted)
 
 
 def paper_limits(usual: Limits, name: str) -> Limits:
@@ -259,33 +280,41 @@ def _task(path: Path, limits: Limits) -> PlanningTask:
     return PlanningTask(path, limits.airframe, limits.plan, max(NODES, default_nodes(path)), YawMode.FREE)
 
 
-def _all_flights(
-    usual: Limits, planners: Mapping[str, Sequence[FlownPlanner]], paths: Mapping[str, Path], most: int | None,
-    progress: Progress,
-) -> Iterator[tuple[HardwareFlight, list[list[int]]]]:  # fmt: skip
-    wanted = [
-        (name, way, planner, path)
+class FlownGroup(NamedTuple):
+    """Flights of one plan."""
+
+    limits: str
+    way: str
+    planner: int  # its place among those of the limits
+    path: str
+
+
+def _flown_together(planners: Mapping[str, Sequence[FlownPlanner]], paths: Iterable[str]) -> dict[str, FlownGroup]:
+    groups = [
+        FlownGroup(name, way, place, path)
         for name, own in planners.items()
         for way in (RAW, CERTIFIED)
-        for planner in own
+        for place, planner in enumerate(own)
         for path in paths
         if (way == CERTIFIED or planner.raw) and (path != LONG or planner.any_length)
     ]
-    for done, (name, way, planner, path) in enumerate(wanted):
-        progress(done, len(wanted))
-        limits = paper_limits(usual, name)
-        flights = planner.flights if most is None else min(most, planner.flights)
-        begun = [HardwareFlight(name, way, planner.name, path, trial) for trial in range(flights)]
-        try:
-            mission, duration = _mission(way, planner, paths[path], limits)
-        except CfplanError as error:
-            yield from ((replace(flight, reason=str(error)), []) for flight in begun)
-            continue
-        place = list(paths).index(path)
-        yield from (
-            _flown(replace(flight, travel_time=duration), mission, 10 * place + flight.trial) for flight in begun
-        )
-    progress(len(wanted), len(wanted))
+    return {" ".join(map(str, group)): group for group in groups}
+
+
+def _flights(
+    planners: Mapping[str, Sequence[FlownPlanner]], paths: Mapping[str, Path], most: int | None, group: FlownGroup
+) -> list[tuple[HardwareFlight, list[list[int]]]]:
+    """Plan once, and fly that as often as the paper; return with each flight where it was, mm."""
+    name, way, place, path = group
+    planner, limits = planners[name][place], paper_limits(load_limits(DEFAULTS), name)
+    flights = planner.flights if most is None else min(most, planner.flights)
+    begun = [HardwareFlight(name, way, planner.name, path, trial) for trial in range(flights)]
+    try:
+        mission, duration = _mission(way, planner, paths[path], limits)
+    except CfplanError as error:
+        return [(replace(flight, reason=str(error)), []) for flight in begun]
+    seed = 10 * list(paths).index(path)
+    return [_flown(replace(flight, travel_time=duration), mission, seed + flight.trial) for flight in begun]
 
 
 def _mission(way: str, planner: FlownPlanner, path: Path, limits: Limits) -> tuple[Mission, float]:

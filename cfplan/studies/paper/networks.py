@@ -1,12 +1,15 @@
 """The networks of the paper's studies: read where they are trained, else trained first, resumed if need be."""
 
+import hashlib
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from cfplan.errors import InputError
+from cfplan.geometry.path import Path as PathOfMotion
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.checkpoints import Epoch
 from cfplan.learning.dataset import make_dataset
@@ -15,6 +18,7 @@ from cfplan.learning.paper.networks import SequenceNetwork
 from cfplan.learning.paper.sequences import Sequences, read_sequences
 from cfplan.learning.paper.training import SequenceOptions, load_network, train_network
 from cfplan.safety.limit_sets import BOXES, PAPER
+from cfplan.studies.items import HERE, Progress, Running
 from cfplan.studies.paper.printed import TEST, TRAIN
 
 DATA, NETWORKS = Path("datasets/paper"), Path("datasets/paper-networks")
@@ -26,7 +30,6 @@ DATA_COMMAND = (
     "--nodes 99 --yaw free"
 )
 QUICK_PATHS, QUICK_EPOCHS = 40, 2
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +73,9 @@ def paper_data(
 
 @contextmanager
 def labelled_data(
-    folder: Path, spec: DatasetSpec, progress: Progress, *, epochs: int | None = None, quick: bool = False
-) -> Iterator[PaperData]:
+    folder: Path, spec: DatasetSpec, progress: Progress, *, running: Running = HERE, epochs: int | None = None,
+    quick: bool = False,
+) -> Iterator[PaperData]:  # fmt: skip
     """Yield the dataset of `spec` to learn from, labelled first where it is not there; networks are kept beside it.
 
     `quick`: a few paths, in a folder that goes away. Raises InputError where the folder holds another dataset.
@@ -79,7 +83,7 @@ def labelled_data(
     if quick:
         with tempfile.TemporaryDirectory() as passing:
             few = replace(spec, count=QUICK_PATHS // 2)
-            with labelled_data(Path(passing), few, progress, epochs=QUICK_EPOCHS) as material:
+            with labelled_data(Path(passing), few, progress, running=running, epochs=QUICK_EPOCHS) as material:
                 yield material
         return
     done = 0
@@ -90,8 +94,25 @@ def labelled_data(
         progress(done, spec.rows)
 
     data = folder / "data"
-    make_dataset(data, spec, on_rows=show)
+    make_dataset(data, spec, workers=running.workers, scheduler=running.scheduler, on_rows=show)
     yield PaperData({}, read_sequences(data).learned_from(0), folder, epochs)
+
+
+class PaperItem(NamedTuple):
+    """One path of the dataset, with which a study works."""
+
+    part: str
+    row: int
+    path: PathOfMotion
+
+
+def paper_items(data: PaperData) -> dict[str, PaperItem]:
+    """Return the paths for training and for testing, by a name."""
+    return {
+        f"{part} {row}": PaperItem(part, int(row), path)
+        for part, sequences in data.parts.items()
+        for row, path in zip(sequences.rows, sequences.paths, strict=True)
+    }
 
 
 def quick_spec() -> DatasetSpec:
@@ -114,12 +135,10 @@ def _parts(read: Sequences, folder: Path, paths: int, tested: int, epochs: int |
     return PaperData(parts, known, folder, epochs)
 
 
-def trained_networks(
-    data: PaperData, wanted: Sequence[SequenceOptions], progress: Progress, more: int
-) -> list[TrainedNetwork]:
-    """Return the networks, those not trained yet after training; `more` steps of progress follow after these."""
+def trained_networks(data: PaperData, wanted: Sequence[SequenceOptions], progress: Progress) -> list[TrainedNetwork]:
+    """Return the networks, those not trained yet after training; `progress` is told of their epochs."""
     options = [replace(each, epochs=data.epochs) if data.epochs else each for each in wanted]
-    total, done = sum(each.epochs for each in options) + more, 0
+    total, done = sum(each.epochs for each in options), 0
     found = []
     for each in options:
 
@@ -136,3 +155,13 @@ def trained_networks(
         progress(done, total)
         found.append(TrainedNetwork(each.name, each, *loaded))
     return found
+
+
+def identities(trained: Sequence[TrainedNetwork]) -> dict[str, Any]:
+    """Return what tells networks of the same names from others: their options, and a digest of their weights."""
+    return {each.name: {**asdict(each.options), "weights": _digest(each.network)} for each in trained}
+
+
+def _digest(network: SequenceNetwork) -> str:
+    weights = b"".join(tensor.numpy().tobytes() for tensor in network.state_dict().values())
+    return hashlib.sha256(weights).hexdigest()

@@ -5,8 +5,9 @@ motor lag. Beside the networks, as they are, the planner that ships, certified. 
 learns from perturbed paths with labels of their own, where the paper keeps the clean path's.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path as FilePath
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -19,25 +20,28 @@ from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import perturbed
 from cfplan.learning.dataset_spec import Relabel
 from cfplan.learning.paper.recovery import recover_profile
-from cfplan.learning.paper.sequences import Sequences, path_inputs
+from cfplan.learning.paper.sequences import path_inputs
 from cfplan.learning.paper.training import SequenceOptions, answer
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import Planner
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import LOST, fly_geometric, nearest_states
-from cfplan.studies.paper.architectures import settings_of, training_table
+from cfplan.studies.items import HERE, Progress, Running, work_table, work_through
+from cfplan.studies.paper.architectures import settings_of, training_steps, training_table
 from cfplan.studies.paper.networks import (
     DATA,
     NETWORKS,
-    Progress,
+    PaperItem,
     TrainedNetwork,
+    identities,
     paper_data,
+    paper_items,
     trained_networks,
 )
 from cfplan.studies.paper.printed import ROBUSTNESS, TEST
 from cfplan.studies.paper.trials import FLOWN, NODES, PAPER_LAG, finite_mean, profile_by, shipped_profile, trajectory_by
-from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
+from cfplan.studies.result import Column, StudyResult, Table, detail_table
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -51,7 +55,7 @@ MODELS = MappingProxyType(
         )
     }
 )
-SHIPPED = "the shipped planner, certified"
+SHIPPED, SHIPPED_NAME = "the shipped planner, certified", "shipped"  # in tables, and where it is asked for
 REFERENCES: Mapping[str, Planner] = MappingProxyType({"toppquad": plan_toppquad, "expert": plan_expert})
 TOLERANCES = ((0.02, 0.1), (0.05, 0.25), (0.1, 0.5))  # m and m/s, within which a planned state counts as reached
 
@@ -93,58 +97,89 @@ def robustness(
     *,
     paths: int = 100,
     draws: int = 10,
-    models: Sequence[str] = tuple(MODELS),
+    models: Sequence[str] = (*MODELS, SHIPPED_NAME),
     reference: str = "toppquad",
+    reference_draws: int | None = None,
     data: FilePath = DATA,
     networks: FilePath = NETWORKS,
     epochs: int | None = None,
     quick: bool = False,
+    running: Running = HERE,
     progress: Progress = lambda done, total: None,
 ) -> StudyResult:
     """Perturb `paths` paths for testing, `draws` times each; networks are trained if need be.
 
-    `reference` says whose travel times are compared with, toppquad or expert.
+    `reference` says whose travel times are compared with, toppquad or expert; `reference_draws`, of how many draws,
+    of all where it is None.
 
     Raises:
         InputError: an unknown model, no such dataset, or fewer paths in it.
     """
     for name in models:
-        if name not in MODELS:
-            raise InputError(f"unknown model {name!r}", where="models", hint=f"known: {', '.join(MODELS)}")
+        if name not in (*MODELS, SHIPPED_NAME):
+            known = ", ".join((*MODELS, SHIPPED_NAME))
+            raise InputError(f"unknown model {name!r}", where="models", hint=f"known: {known}")
     if draws < 1:
         raise InputError("draws must be at least 1", where="draws", hint="give --draws 10, as is usual")
-    wanted = [MODELS[name] for name in models]
+    wanted = [MODELS[name] for name in models if name != SHIPPED_NAME]
     with paper_data(data, networks, paths, epochs=epochs, quick=quick) as material:
-        more = len(material.parts[TEST].rows)
-        trained = trained_networks(material, wanted, progress, more)
-        begun = sum(each.options.epochs for each in trained)
-        asked = {each.name: _network(each) for each in trained} | {SHIPPED: _shipped}
+        trained = trained_networks(material, wanted, progress)
+        settings = settings_of(material, quick) | {
+            "draws": draws, "models": list(models), "reference": reference,
+            "reference_draws": draws if reference_draws is None else reference_draws,
+        }  # fmt: skip
+        unseen = replace(material, parts={TEST: material.parts[TEST]})
+        asked = Questions(tuple(trained), SHIPPED_NAME in models, draws, reference, settings["reference_draws"])
+        work = work_through(
+            "robustness", settings | {"networks": identities(trained)}, partial(_trials_of, asked),
+            paper_items(unseen), running, progress,
+        )  # fmt: skip
+    trials = [RobustnessTrial(**trial) for value in work.values for trial in value]
+    tables = (robustness_table(trials, list(asked.models()), reference), training_table(trained, material))
+    steps = training_steps(trained, settings["learned_from"])
+    steps |= {"perturbed path": (perturbed_paths(len(work.values), draws), work.seconds)}
+    details = (detail_table("trials", trials), work_table(steps))
+    return StudyResult("robustness", settings, tables, details, work.interrupted)
 
-        def show(done: int) -> None:
-            progress(begun + done, begun + more)
 
-        trials, interrupted = collect(_trials(asked, material.parts[TEST], draws, REFERENCES[reference], show))
-    settings = settings_of(material, quick) | {"draws": draws, "reference": reference}
-    tables = (robustness_table(trials, list(asked), reference), training_table(trained, material))
-    return StudyResult("robustness", settings, tables, (detail_table("trials", trials),), interrupted)
+def perturbed_paths(paths: int, draws: int) -> int:
+    """Return how many paths are asked about: each as it is, and its draws of each other scale."""
+    return paths * (1 + draws * (len(SCALES) - 1))
 
 
-def _trials(
-    asked: Mapping[str, Callable[[Path], Answered]], sequences: Sequences, draws: int, reference: Planner,
-    progress: Callable[[int], None],
-) -> Iterator[RobustnessTrial]:  # fmt: skip
-    for done, (row, path) in enumerate(zip(sequences.rows, sequences.paths, strict=True)):
-        clean = {name: _answered(ask, path) for name, ask in asked.items()}
-        clean_time = _time(reference, path)
-        for epsilon in SCALES:
-            for draw in range(draws if epsilon else 1):
-                seed = np.random.SeedSequence(int(row), spawn_key=(SCALES.index(epsilon), draw))
-                moved = perturbed(path, epsilon, seed) if epsilon else path
-                own_time = _time(reference, moved) if epsilon else clean_time
-                for name, ask in asked.items():
-                    begun = RobustnessTrial(name, epsilon, int(row), draw, own_time=own_time, clean_time=clean_time)
-                    yield _flown(begun, moved, _answered(ask, moved), clean[name])
-        progress(done + 1)
+@dataclass(frozen=True, slots=True)
+class Questions:
+    """What is asked about each path."""
+
+    networks: tuple[TrainedNetwork, ...]
+    shipped: bool  # whether the planner that ships is asked too
+    draws: int
+    reference: str
+    reference_draws: int
+
+    def models(self) -> dict[str, Callable[[Path], Answered]]:
+        """Return those that are asked, by name."""
+        return {each.name: _network(each) for each in self.networks} | ({SHIPPED: _shipped} if self.shipped else {})
+
+
+def _trials_of(questions: Questions, item: PaperItem) -> list[RobustnessTrial]:
+    """Ask each model about the path and about each of its perturbations."""
+    _, row, path = item
+    asked, reference = questions.models(), REFERENCES[questions.reference]
+    clean = {name: _answered(ask, path) for name, ask in asked.items()}
+    clean_time = _time(reference, path)
+    trials = []
+    for epsilon in SCALES:
+        for draw in range(questions.draws if epsilon else 1):
+            seed = np.random.SeedSequence(row, spawn_key=(SCALES.index(epsilon), draw))
+            moved = perturbed(path, epsilon, seed) if epsilon else path
+            own_time = against = np.nan
+            if draw < questions.reference_draws:
+                own_time, against = _time(reference, moved) if epsilon else clean_time, clean_time
+            for name, ask in asked.items():
+                begun = RobustnessTrial(name, epsilon, row, draw, own_time=own_time, clean_time=against)
+                trials.append(_flown(begun, moved, _answered(ask, moved), clean[name]))
+    return trials
 
 
 def _flown(begun: RobustnessTrial, path: Path, found: Answered | str, clean: Answered | str) -> RobustnessTrial:

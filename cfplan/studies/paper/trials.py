@@ -5,7 +5,7 @@ planned and as asked by the controller, speed above the limit, travel time, and 
 """
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +17,7 @@ from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.learned import plan_learned
 from cfplan.learning.paper.recovery import recover_profile
-from cfplan.learning.paper.sequences import Sequences, path_inputs
+from cfplan.learning.paper.sequences import path_inputs
 from cfplan.learning.paper.training import answer
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
@@ -35,6 +35,7 @@ PAPER_LAG = 0.005  # s, time constant of the motors in RotorPy of the paper's da
 FLOWN = replace(PAPER.airframe, motor_time_constant=PAPER_LAG)
 TOPPQUAD, EXPERT, SHIPPED = "TOPPQuad", "expert", "the shipped network"
 SAMPLE = 0.002  # s between the moments at which planned thrust and speed are looked at
+_WARM: set[str] = set()  # planners that this process has asked before
 Plan = Callable[[Path], SpeedProfile]  # raises CfplanError where there is none
 Ask = Callable[[Path], Trajectory]  # likewise
 
@@ -110,15 +111,19 @@ def network_plan(trained: TrainedNetwork) -> Plan:
     return plan
 
 
-def measured(name: str, plan: Plan, part: str, sequences: Sequences) -> Iterable[tuple[PaperTrial, PaperTrial]]:
-    """Yield for each path what was planned, flown as it is and flown after repair."""
-    with suppress(CfplanError):
-        plan(sequences.paths[0])  # loads and compiles
-    for row, path in zip(sequences.rows, sequences.paths, strict=True):
-        yield _both(name, plan, path, {"planner": name, "part": part, "row": int(row)})
+def path_trials(plans: Mapping[str, Plan], part: str, row: int, path: Path) -> list[PaperTrial]:
+    """Return what each planner planned, flown as it is and flown after repair."""
+    trials: list[PaperTrial] = []
+    for name, plan in plans.items():
+        if name not in _WARM:
+            with suppress(CfplanError):
+                plan(path)  # loads and compiles
+            _WARM.add(name)
+        trials += _both(plan, path, {"planner": name, "part": part, "row": row})
+    return trials
 
 
-def _both(name: str, plan: Plan, path: Path, known: dict[str, Any]) -> tuple[PaperTrial, PaperTrial]:
+def _both(plan: Plan, path: Path, known: dict[str, Any]) -> tuple[PaperTrial, PaperTrial]:
     begun = time.process_time()
     try:
         profile = plan(path)

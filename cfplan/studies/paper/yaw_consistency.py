@@ -4,7 +4,7 @@ Without the penalty on angular acceleration many yaws are as good as each other 
 small change of the path may choose another.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -21,9 +21,10 @@ from cfplan.planners.baselines.toppquad_nlp import PENALTY
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import Planner
 from cfplan.safety.limit_sets import BOXES, PAPER
+from cfplan.studies.items import HERE, Progress, Running, work_table, work_through
 from cfplan.studies.paper.networks import WAYPOINTS
 from cfplan.studies.paper.trials import profile_by
-from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
+from cfplan.studies.result import Column, StudyResult, Table, detail_table
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import duration_of
 
@@ -53,7 +54,11 @@ class Pair:
 
 
 def yaw_consistency(
-    *, pairs: int = PAPERS, first_seed: int = 50_000, progress: Callable[[int, int], None] = lambda done, total: None
+    *,
+    pairs: int = PAPERS,
+    first_seed: int = 50_000,
+    running: Running = HERE,
+    progress: Progress = lambda done, total: None,
 ) -> StudyResult:
     """Solve `pairs` pairs of paths in each way.
 
@@ -62,20 +67,21 @@ def yaw_consistency(
     """
     if pairs < 1:
         raise InputError("pairs must be at least 1", where="pairs", hint="give --pairs 100, as in the paper")
-    found, interrupted = collect(_pairs(range(first_seed, first_seed + pairs), progress))
     settings = {"pairs": pairs, "first_seed": first_seed, "moved": MOVED, "quick": pairs < PAPERS}
+    seeds = {str(seed): seed for seed in range(first_seed, first_seed + pairs)}
+    work = work_through("yaw-consistency", settings, _pairs, seeds, running, progress)
+    found = [Pair(**pair) for value in work.values for pair in value]
     tables = (differences_table(found), histogram_table(found))
-    return StudyResult("yaw-consistency", settings, tables, (detail_table("pairs", found),), interrupted)
+    details = (detail_table("pairs", found), work_table({"pair": (len(work.values), work.seconds)}))
+    return StudyResult("yaw-consistency", settings, tables, details, work.interrupted)
 
 
-def _pairs(seeds: range, progress: Callable[[int, int], None]) -> Iterator[Pair]:
-    for count, seed in enumerate(seeds):
-        half = np.array(BOXES["10x10x10"]) / 2
-        waypoints = random_waypoints(seed, np.array([-half, half]), (WAYPOINTS, WAYPOINTS))
-        moved = waypoints + np.array([MOVED] + [(0.0, 0.0, 0.0)] * (WAYPOINTS - 1))
-        for name, planner in WAYS.items():
-            yield _pair(name, seed, planner, min_snap(waypoints), min_snap(moved))
-        progress(count + 1, len(seeds))
+def _pairs(seed: int) -> list[Pair]:
+    """Return the pair of paths of that seed, planned in each way."""
+    half = np.array(BOXES["10x10x10"]) / 2
+    waypoints = random_waypoints(seed, np.array([-half, half]), (WAYPOINTS, WAYPOINTS))
+    moved = waypoints + np.array([MOVED] + [(0.0, 0.0, 0.0)] * (WAYPOINTS - 1))
+    return [_pair(name, seed, planner, min_snap(waypoints), min_snap(moved)) for name, planner in WAYS.items()]
 
 
 def _pair(name: str, seed: int, planner: Planner, path: Path, moved: Path) -> Pair:

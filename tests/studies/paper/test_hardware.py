@@ -1,5 +1,6 @@
 """The paper's hardware tables on the virtual lab: what is flown, under which limits, and who crashes."""
 
+import cloudpickle
 import numpy as np
 import pytest
 
@@ -109,10 +110,20 @@ def test_a_planner_without_a_plan_fails_every_flight_of_that_path(monkeypatch):
 
     planner = study.FlownPlanner("none", none, none, 3)
     paths = {LONG: long_path(USUAL), **hardware_paths(USUAL, 1)}
-    flown = study._all_flights(USUAL, {"text": [planner]}, paths, None, lambda done, total: None)
+    planners = {"text": [planner]}
+    groups = study._flown_together(planners, paths).values()
+    flown = [each for group in groups for each in study._flights(planners, paths, None, group)]
     assert [(flight.path, flight.way, flight.failed) for flight, _ in flown] == 3 * [("1", RAW, True)] + 3 * [
         ("1", CERTIFIED, True)
     ]
+
+
+def test_what_is_flown_can_be_sent_to_other_processes():
+    networks = {"LSTM": lambda path: None}
+    planners = {"text": study.flown_planners(networks)}
+    sent = cloudpickle.loads(cloudpickle.dumps((planners, hardware_paths(USUAL, 2))))
+    assert [planner.name for planner in sent[0]["text"]] == [TOPPQUAD, "LSTM", SHIPPED]
+    assert sent[1]["2"].length == hardware_paths(USUAL, 2)["2"].length
 
 
 def test_no_path_is_refused():

@@ -19,7 +19,7 @@ REPOSITORY = Path(__file__).parents[3]
 
 @pytest.fixture(scope="module")
 def quick():
-    return robustness(paths=1, draws=2, models=["LSTM"], reference="expert", quick=True)
+    return robustness(paths=1, draws=2, models=["LSTM", "shipped"], reference="expert", quick=True)
 
 
 def test_the_quick_run_asks_each_model_about_each_scale(quick):

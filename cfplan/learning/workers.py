@@ -1,0 +1,92 @@
+"""Work through a list of items by processes on this machine, or by the workers of a Dask cluster."""
+
+import socket
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
+
+from cfplan.errors import CfplanError, ExitCode
+
+SCHEDULER_PATIENCE = 10  # s
+Item = TypeVar("Item")
+Done = TypeVar("Done")
+Work = Callable[[Callable[[Any], Done], Iterable[Any]], Iterator[Done]]
+
+
+class SchedulerError(CfplanError):
+    """The scheduler of a cluster cannot be used."""
+
+    exit_code = ExitCode.USAGE
+
+
+@contextmanager
+def pool(workers: int = 1, scheduler: str | None = None) -> Iterator[Work[Any]]:
+    """Yield a function that calls another on each item, and yields what that returns as it is done, in any order.
+
+    One worker without a scheduler works in this process. A worker of a cluster that dies costs only the items that it
+    had; they are done again by others.
+
+    Raises:
+        SchedulerError: Dask is not installed, or the scheduler does not answer within SCHEDULER_PATIENCE.
+    """
+    from joblib import Parallel, delayed, parallel_config
+
+    def run(function: Callable[[Item], Done], items: Iterable[Item]) -> Iterator[Done]:
+        tasks = (delayed(function)(item) for item in items)
+        yield from Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(
+            tasks
+        )
+
+    if scheduler is None:
+        n_jobs = workers
+        with parallel_config(backend="loky", inner_max_num_threads=1):
+            yield run
+        return
+    n_jobs = -1
+    with _client(scheduler) as client, parallel_config(backend="dask", client=client, wait_for_workers_timeout=30):
+        yield run
+
+
+@contextmanager
+def _client(scheduler: str) -> Iterator[object]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise SchedulerError(
+            "Dask is not installed", where=scheduler, hint="pip install 'cfplan[cluster]', here and on the workers"
+        ) from None
+    _require_listening(scheduler)
+    try:
+        client = Client(scheduler, timeout=SCHEDULER_PATIENCE)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise SchedulerError(
+            f"no Dask scheduler answers there ({error})", where=scheduler, hint="start one with `dask scheduler`"
+        ) from None
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def _require_listening(scheduler: str) -> None:
+    """Check that something listens there: Dask would try for long and log much."""
+    parts = urlsplit(scheduler)
+    try:
+        if parts.scheme != "tcp" or parts.hostname is None or parts.port is None:
+            raise ValueError("an address has the form tcp://host:port")
+        # In a thread, because looking up a name has no timeout.
+        lookup = ThreadPoolExecutor(1)
+        lookup.submit(_touch, parts.hostname, parts.port).result(timeout=SCHEDULER_PATIENCE)
+        lookup.shutdown(wait=False)
+    except (OSError, ValueError) as error:  # TimeoutError is an OSError
+        raise SchedulerError(
+            f"no Dask scheduler can be reached there ({error or 'no answer'})",
+            where=scheduler,
+            hint="start one with `dask scheduler`, and workers with `dask worker`",
+        ) from None
+
+
+def _touch(host: str, port: int) -> None:
+    socket.create_connection((host, port), timeout=SCHEDULER_PATIENCE / 2).close()
