@@ -29,7 +29,7 @@ def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **plannin
     and that what was streamed is what was committed. Exit code 4 where a limit is exceeded, or that is not so.
     """
     steps = Steps(as_json=as_json)
-    if (path_or_plan / "flight.mcap").is_file():
+    if path_or_plan.is_dir():
         return _check_record(path_or_plan, steps)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
     with steps.waiting("loading planners"):

@@ -150,7 +150,9 @@ def _progress(as_json: bool) -> "Progress":
     return Progress(*columns, console=Console(stderr=True, quiet=as_json))
 
 
-@dataset.command(epilog="Example: cfplan dataset info datasets/hardware")
+@dataset.command(
+    short_help="Show counts, failures and distributions.", epilog="Example: cfplan dataset info datasets/hardware"
+)
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @options.as_json
 def info(folder: Path, as_json: bool) -> None:

@@ -1,5 +1,6 @@
 """`cfplan doctor`: checks that everything that a flight needs is installed."""
 
+import logging
 import os
 import platform
 import sys
@@ -127,6 +128,7 @@ def _vehicle(uri: str, safety_file: Path | None) -> list[dict[str, str]]:
     from cfplan.safety.limits_file import load_limits
 
     check_vehicle_uri(uri)
+    logging.getLogger("cflib").setLevel(logging.CRITICAL)  # its tracebacks would stand above the one line that says it
     limits = load_limits(options.find_safety_file(safety_file, Path.cwd()))
     with ExitStack() as opened:
         drivers: list[type] = []

@@ -73,6 +73,16 @@ def _remember_verbose(context: click.Context, _: click.Parameter, verbose: bool)
     context.meta[VERBOSE] = verbose
 
 
+class _SpeedFactor(click.FloatRange):
+    """A share of the allowed speed, which is often taken for m/s."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(f"{value} is no share of the allowed speed, above 0 and at most 1; it is not in m/s.", param, ctx)
+
+
 _PLANNING = (
     click.option(
         "--safety",
@@ -100,7 +110,7 @@ _PLANNING = (
     click.option(
         "--speed",
         "speed_factor",
-        type=click.FloatRange(0, 1, min_open=True),
+        type=_SpeedFactor(0, 1, min_open=True),
         help="Factor on the allowed speed; else the path file's, else 1.",
     ),
     click.option(

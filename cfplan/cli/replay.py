@@ -104,6 +104,11 @@ class Files:
         """Raise InputError where they do not go together, or a figure could not be written."""
         if self.moment is not None and (self.png is None or not abs(self.moment) < 1e6):
             raise InputError("--at says when a picture is taken, in s", hint="add --png flight.png")
+        from cfplan.files.whole import check_new_file
+
+        for file, suffix in ((self.save, ".rrd"), (self.png, ".png")):
+            if file is not None:
+                check_new_file(file, suffix, overwrite=self.force)
         if self.figure is not None:
             from cfplan.planning.figure import check_figure_file
 

@@ -1,5 +1,6 @@
 """`cfplan study`: measurements, each one command and one JSON file, and the tables of docs/ made from those."""
 
+from difflib import get_close_matches
 from pathlib import Path
 
 import click
@@ -9,22 +10,31 @@ from cfplan.errors import InputError
 
 
 class _Studies(click.Group):
-    """Names all studies where an unknown one is asked for."""
+    """Says of each study what it measures, and names all where an unknown one is asked for."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the studies, each with its whole first sentence."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, each.get_short_help_str(200)) for name, each in sorted(self.commands.items())])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         name = args[0]
         if not name.startswith("-") and self.get_command(ctx, name) is None:
+            near = get_close_matches(name, self.commands, n=1)
+            meant = f"did you mean {near[0]}? " if near else ""
             raise InputError(
-                f"there is no study {name!r}", where="cfplan study", hint=f"one of {', '.join(sorted(self.commands))}"
+                f"there is no study {name!r}",
+                where="cfplan study",
+                hint=f"{meant}known: {', '.join(sorted(self.commands))}",
             )
         return super().resolve_command(ctx, args)
 
 
 @click.group(short_help="Measurements for docs/results.", cls=_Studies)
 def study() -> None:
-    """Measure one thing, with tables for docs/results."""
+    """Measure one thing, with tables for docs/results. To fly, nobody needs these."""
 
 
 @study.command(short_help="Write the tables of docs/ from results/.")

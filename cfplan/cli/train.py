@@ -60,7 +60,8 @@ def train(dataset: Path, folder: Path, device: str, as_json: bool, **what: Any) 
         def show(epoch: Epoch) -> None:
             progress.update(task, completed=epoch.epoch, description=_line(epoch))
             if not progress.console.is_terminal:
-                progress.console.print(f"epoch {epoch.epoch} of {chosen.epochs}: {_line(epoch)}, {epoch.seconds:.1f} s")
+                more = f"loss {epoch.loss:.2e}, {epoch.seconds:.1f} s"
+                progress.console.print(f"epoch {epoch.epoch} of {chosen.epochs}: {_line(epoch)}, {more}")
 
         card = train(dataset, folder, chosen, device=device, command=_command(), on_epoch=show)
     if card is None:
@@ -71,7 +72,8 @@ def train(dataset: Path, folder: Path, device: str, as_json: bool, **what: Any) 
         scores = card.scores
         click.echo(
             f"{folder}: travel time of unseen paths off by {scores['time_error_mean']:.2%} in the mean, "
-            f"{scores['time_error_p95']:.2%} at the 95th percentile"
+            f"{scores['time_error_p95']:.2%} at the 95th percentile\n"
+            f"plan with it: cfplan plan PATH --model {folder}"
         )
 
 
@@ -88,14 +90,14 @@ def _progress(as_json: bool) -> "Progress":
     )
 
     columns = (
-        TextColumn("epochs"), BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}"),
+        TextColumn("epochs"), BarColumn(10), MofNCompleteColumn(), TextColumn("{task.description}"),
         TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(elapsed_when_finished=False),
     )  # fmt: skip
     return Progress(*columns, console=Console(stderr=True, quiet=as_json), speed_estimate_period=600)
 
 
 def _line(epoch: Any) -> str:
-    return f"loss {epoch.loss:.2e}, time off by {epoch.time_error_mean:.2%}, p95 {epoch.time_error_p95:.2%}"
+    return f"time off by {epoch.time_error_mean:.2%}, p95 {epoch.time_error_p95:.2%}"
 
 
 def _command() -> str:

@@ -34,7 +34,11 @@ def identify(records: Sequence[Record], *, mass: float | None = None) -> Identif
     if not records:
         raise InputError("no record", hint="name at least one")
     if mass is not None and not (math.isfinite(mass) and 0.001 <= mass <= 10.0):
-        raise InputError(f"a mass of {mass:g} kg", hint="give the vehicle's mass with its battery in kg, as 0.0331")
+        raise InputError(
+            f"{mass:g} kg is no vehicle's mass",
+            where="--mass",
+            hint="weigh it with its battery, and write kilograms, as 0.0331",
+        )
     flights = [read_signals(record) for record in records]
     _check_same_vehicle(records)
     voltage = float(np.mean(np.concatenate([slow_voltage(flight) for flight in flights])))

@@ -95,7 +95,7 @@ class Certificate:
                 margin.shown(margin.limit).split()[0],
                 f"{100 * margin.share:.1f} %",
                 f"{margin.time:.2f} s",
-                "{:.2f} {:.2f} {:.2f}".format(*margin.position),
+                "{:z.2f} {:z.2f} {:z.2f}".format(*margin.position),
             )
             for margin in self.margins
         ]

@@ -1,6 +1,8 @@
 """`cfplan doctor --uri` reads what preflight rests on, changes nothing, and says what would be refused."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -54,6 +56,14 @@ def test_firmware_that_is_too_old_is_refused(look):
     checks, code = look(firmware="2025.02", protocol=9)
     assert checks["firmware"]["verdict"] == "refused"
     assert code == 5
+
+
+def test_a_radio_that_is_not_there_is_told_without_a_traceback():
+    words = [sys.executable, "-m", "cfplan", "doctor", "--uri", "radio://9/80/2M/E7E7E7E7E7"]
+    told = subprocess.run(words, capture_output=True, text=True, check=False, cwd=SAFETY_FILE.parent)
+    assert told.returncode != 0
+    assert told.stderr.splitlines()[-1].startswith("error: radio://9/80/2M/E7E7E7E7E7: ")
+    assert "Traceback" not in told.stdout + told.stderr
 
 
 def test_what_is_no_uri_is_an_error():

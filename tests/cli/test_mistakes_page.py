@@ -20,6 +20,9 @@ COMMANDS = {
     "another body than the virtual one": ("fly", "path.yaml", "--mocap", "vicon://lab/cf2"),
     "a plan that is no Parquet file": ("plan", "path.yaml", "-o", "line.csv"),
     "a folder that is no record": ("replay", "."),
+    "a picture that is no PNG": ("replay", ".", "--png", "flight.jpg"),
+    "a folder of records, to be checked": ("check", "."),
+    "a mistyped study": ("study", "fault"),
     "speed in m/s on the command line": ("plan", "path.yaml", "--speed", "2"),
 }
 

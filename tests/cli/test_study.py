@@ -15,6 +15,11 @@ def test_an_unknown_study_is_refused_with_all_that_there_are():
         assert name in result.exception.hint.replace(",", " ").split()
 
 
+def test_help_says_of_each_study_what_it_measures():
+    lines = CliRunner().invoke(cfplan, ["study", "--help"]).output.split("Commands:")[1]
+    assert "..." not in lines
+
+
 @pytest.mark.parametrize("words", [["--help"], ["paper", "--help"]])
 def test_help_is_shown(words):
     result = CliRunner().invoke(cfplan, ["study", *words])
