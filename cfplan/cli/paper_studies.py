@@ -131,6 +131,17 @@ def yaw_consistency() -> Study:
     return run
 
 
+@measured(
+    "training and simulating", "cfplan study simulators -o results/simulators.json",
+    count(8, "Of each kind of table."), *_NETWORKS,
+)  # fmt: skip
+def simulators() -> Study:
+    """Fly bytes of the paper's tables on bodies of RotorPy, with two motor lags, and of drone-models."""
+    from cfplan.studies.paper.simulators import simulators as run
+
+    return run
+
+
 @click.command(epilog="Example: cfplan study paper results --workers 2")
 @click.argument("folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path("results"))
 @_QUICK
@@ -202,4 +213,4 @@ def figures(results: Path, images: Path) -> None:
         click.echo(f"{file}: left out: {reason}" if reason else file)
 
 
-COMMANDS = (architectures, inputs, robustness, baselines, hardware, yaw_consistency, paper, figures)
+COMMANDS = (architectures, inputs, robustness, baselines, hardware, yaw_consistency, simulators, paper, figures)

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.simulation.dynamics.body import POSITION, TIME_STEP, VELOCITY, hovering
-from cfplan.simulation.dynamics.geometric import CONTROL_STEPS, GeometricFlight, follow, reference_rows
+from cfplan.simulation.dynamics.geometric import (
+    CONTROL_STEPS,
+    BodyStep,
+    GeometricFlight,
+    follow,
+    follow_by,
+    reference_rows,
+)
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -40,14 +47,29 @@ class FollowedFlight:
 
 def fly_geometric(trajectory: Trajectory, airframe: Airframe) -> FollowedFlight:
     """Follow the trajectory from a hover at its start, on `airframe`, for SETTLING longer than it lasts."""
-    times = np.arange(0.0, trajectory.duration + SETTLING, CONTROL_STEPS * TIME_STEP)
-    wanted = trajectory.at(times)
+    wanted = trajectory.at(control_times(trajectory))
     flight = follow(reference_rows(wanted), airframe, hovering(airframe, wanted.position[0], float(wanted.yaw[0])))
     away = np.linalg.norm(flight.states[:-1:CONTROL_STEPS, POSITION] - wanted.position, axis=1)
     lost = np.flatnonzero(~(away < LOST))
     last = int(lost[0]) if len(lost) else len(away)
     asked = flight.asked[: max(CONTROL_STEPS * last, 1)]
     return FollowedFlight(LOST if len(lost) else float(away.max()), thrust_violation(asked, airframe), flight)
+
+
+def control_times(trajectory: Trajectory) -> NDArray:
+    """Return when the controller is asked, (K,) s from the start of the motion to SETTLING after its end."""
+    return np.arange(0.0, trajectory.duration + SETTLING, CONTROL_STEPS * TIME_STEP)
+
+
+def positions_by_both(step: BodyStep, trajectory: Trajectory, airframe: Airframe) -> tuple[NDArray, NDArray, NDArray]:
+    """Return where the trajectory, another body and cfplan's with `airframe` are at `control_times`, (K, 3) m each.
+
+    The same geometric controller flies both, from a hover at the start.
+    """
+    wanted = trajectory.at(control_times(trajectory))
+    reference, start = reference_rows(wanted), hovering(airframe, wanted.position[0], float(wanted.yaw[0]))
+    own = follow(reference, airframe, start).states[:-1:CONTROL_STEPS, POSITION]
+    return wanted.position, follow_by(step, reference, airframe, start), own
 
 
 def thrust_violation(thrust: NDArray, airframe: Airframe) -> float:

@@ -14,13 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
+from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
+from cfplan.safety.limits import FlightLimits
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.other_bodies import BodyStep, fly_on, identified_body, rotorpy_body
 from cfplan.studies.result import Column, StudyResult, Table, collect, detail_table
 from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.trajectory import Trajectory
 
 PAPER_LAG, REALISTIC_LAG = 0.005, 0.072  # s, of the motors: RotorPy's of the paper's day, and its today
 
@@ -79,21 +82,29 @@ def physics(
 def _compared(path_file: Path, safety_file: Path, missing: list[str]) -> Iterator[ComparedFlight]:
     limits = load_limits(safety_file)
     planned = plan_flight(path_file, limits)
-    encoded, trajectory = encode_flight(planned), planned.plan.trajectory
-    for other in _bodies(limits.airframe, missing):
-        times, theirs = fly_on(other.step, encoded, trajectory, limits.airframe)
-        loop = dry_run(encoded, trajectory, other.airframe, limits.flight, believed=limits.airframe).loop
-        own = loop.position[np.searchsorted(loop.time, times - 1e-9)]
-        wanted, apart = trajectory.at(times).position, np.linalg.norm(theirs - own, axis=1)
-        yield ComparedFlight(
-            path_file.stem, other.name, other.airframe.motor_time_constant, trajectory.duration,
-            deviation=_largest(theirs - wanted), own_deviation=_largest(own - wanted),
-            apart=float(apart.max()), apart_time=float(times[np.argmax(apart)]),
-            apart_rms=float(np.sqrt(np.mean(apart**2))),
-        )  # fmt: skip
+    encoded, trajectory, airframe = encode_flight(planned), planned.plan.trajectory, limits.airframe
+    for other in bodies_for(airframe, missing):
+        yield compared(path_file.stem, encoded, trajectory, other, airframe, limits.flight)
 
 
-def _bodies(airframe: Airframe, missing: list[str]) -> list[OtherBody]:
+def compared(
+    path: str, encoded: EncodedFlight, trajectory: Trajectory, other: OtherBody, airframe: Airframe,
+    limits: FlightLimits,
+) -> ComparedFlight:  # fmt: skip
+    """Return how the bytes are followed by a body and by cfplan's; the controller believes in `airframe`."""
+    times, theirs = fly_on(other.step, encoded, trajectory, airframe)
+    loop = dry_run(encoded, trajectory, other.airframe, limits, believed=airframe).loop
+    own = loop.position[np.minimum(np.searchsorted(loop.time, times - 1e-9), len(loop.time) - 1)]
+    wanted, apart = trajectory.at(times).position, np.linalg.norm(theirs - own, axis=1)
+    return ComparedFlight(
+        path, other.name, other.airframe.motor_time_constant, trajectory.duration,
+        deviation=_largest(theirs - wanted), own_deviation=_largest(own - wanted),
+        apart=float(apart.max()), apart_time=float(times[np.argmax(apart)]),
+        apart_rms=float(np.sqrt(np.mean(apart**2))),
+    )  # fmt: skip
+
+
+def bodies_for(airframe: Airframe, missing: list[str]) -> list[OtherBody]:
     """Return the bodies that can be had, and append to `missing` why others cannot."""
     makers: list[tuple[str, Callable[[], BodyStep], Airframe]] = [
         ("drone-models", partial(identified_body, airframe), airframe),

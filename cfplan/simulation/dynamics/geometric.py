@@ -5,13 +5,14 @@ fibration (Watterson and Kumar, 2019) and the gains of TOPPQuad's Table III. Bod
 reference are fed forward. It knows the true state, and the motors' range binds only what they give, not what it asks.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
-from cfplan.simulation.dynamics.body import STATE_SIZE, TIME_STEP, pack_body, step_body
+from cfplan.simulation.dynamics.body import POSITION, STATE_SIZE, TIME_STEP, pack_body, step_body
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.rotations import axes_of, hopf_quaternion
 from cfplan.vehicle.trajectory import FullState
@@ -24,6 +25,7 @@ POSITION_GAINS = (8.0, 8.0, 19.0)  # 1/s²
 VELOCITY_GAINS = (5.5, 5.5, 8.7)  # 1/s
 ATTITUDE_GAINS = (2812.0, 2812.0, 163.0)  # 1/s²
 RATE_GAINS = (128.0, 128.0, 73.0)  # 1/s
+BodyStep = Callable[[NDArray, NDArray, float], NDArray]  # as in `other_bodies`
 _GAINS = np.array([POSITION_GAINS, VELOCITY_GAINS, ATTITUDE_GAINS, RATE_GAINS])
 
 
@@ -55,6 +57,20 @@ def follow(reference: NDArray, airframe: Airframe, start: NDArray) -> GeometricF
     states[0] = start
     _follow(states, asked, reference, *_packed(airframe))
     return GeometricFlight(np.arange(steps + 1) * TIME_STEP, states, asked)
+
+
+def follow_by(step: BodyStep, reference: NDArray, airframe: Airframe, start: NDArray) -> NDArray:
+    """Return positions, (K, 3) m, of another body that the controller flies along the reference, as `follow` does."""
+    state, command, positions = start.copy(), np.zeros(4), np.empty((len(reference), 3))
+    _, inertia, thrusts, mass = _packed(airframe)
+    for row, wanted in enumerate(reference):
+        positions[row] = state[POSITION]
+        if not np.isfinite(state).all():
+            positions[row:] = np.nan
+            break
+        _control(command, wanted, state, inertia, thrusts, mass)
+        state = step(state, command, CONTROL_STEPS * TIME_STEP)
+    return positions
 
 
 def _packed(airframe: Airframe) -> tuple[NDArray, NDArray, NDArray, float]:

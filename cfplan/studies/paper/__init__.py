@@ -12,6 +12,7 @@ __all__ = [
     "printed",
     "robustness",
     "segment_times",
+    "simulators",
     "trials",
     "yaw_consistency",
 ]

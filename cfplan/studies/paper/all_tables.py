@@ -18,6 +18,7 @@ from cfplan.studies.paper.baselines import baselines
 from cfplan.studies.paper.hardware import hardware
 from cfplan.studies.paper.inputs import inputs_study
 from cfplan.studies.paper.robustness import robustness
+from cfplan.studies.paper.simulators import simulators
 from cfplan.studies.paper.yaw_consistency import yaw_consistency
 from cfplan.studies.provenance import provenance
 from cfplan.studies.result import StudyResult, read_result
@@ -25,13 +26,15 @@ from cfplan.version import UNKNOWN
 
 TABLES: MappingProxyType[str, Callable[..., StudyResult]] = MappingProxyType({
     "architectures": architectures, "inputs": inputs_study, "robustness": robustness,
-    "yaw-consistency": yaw_consistency, "baselines": baselines, "hardware": hardware, "long": long_paths,
+    "yaw-consistency": yaw_consistency, "baselines": baselines, "hardware": hardware, "simulators": simulators,
+    "long": long_paths,
 })  # fmt: skip
 AT_ONCE = ("long",)  # compares times on one computer, so it is made in one process
 QUICK: MappingProxyType[str, dict[str, Any]] = MappingProxyType({
     "architectures": {"paths": 2, "quick": True}, "inputs": {"paths": 2, "quick": True},
     "robustness": {"paths": 1, "draws": 1, "quick": True}, "yaw-consistency": {"pairs": 2},
     "baselines": {"paths": 1, "quick": True}, "hardware": {"paths": 1, "quick": True},
+    "simulators": {"paths": 1, "quick": True},
     "long": {"paths": 1, "repeats": 1, "lengths": (20.0, 40.0)},
 })  # fmt: skip
 

@@ -200,7 +200,7 @@ def _shipped(part: str, row: int, path: Path) -> ShippedFlight:
         known |= {"travel_time": trajectory.duration, "violation": _planned_violation(trajectory)}
         encoded = encode_trajectory(trajectory)
         check_bytes(encoded, trajectory, limits)
-        run = dry_run(encoded, trajectory, airframe, _lost_alone())
+        run = dry_run(encoded, trajectory, airframe, lost_alone())
         return ShippedFlight(**known, reason=run.reason, deviation=run.deviation)
     except CfplanError as error:
         return ShippedFlight(**known, reason=str(error))
@@ -211,7 +211,8 @@ def _planned_violation(trajectory: Trajectory) -> float:
     return thrust_violation(state.motor_thrust, trajectory.airframe)
 
 
-def _lost_alone() -> FlightLimits:
+def lost_alone() -> FlightLimits:
+    """Return limits by which a flight is over when it is LOST, and by nothing else."""
     never = Ladder(np.inf, np.inf, np.inf)
     return FlightLimits(
         deviation=Ladder(LOST, LOST, LOST), fence=never, speed=never, acceleration=never, angular_velocity=never,

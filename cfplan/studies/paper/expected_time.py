@@ -23,6 +23,7 @@ _EPOCHS = SequenceOptions().epochs
 WHOLE = MappingProxyType({
     "architectures": {"path": 200}, "inputs": {"path": 200}, "robustness": {"perturbed path": perturbed_paths(100, 10)},
     "yaw-consistency": {"pair": 100}, "baselines": {"path": 50, "corridor": 2000}, "hardware": {"plan": 136},
+    "simulators": {"flight": 64},
     "long": {"plan": 63},
 })  # fmt: skip
 SEEN = MappingProxyType({"hardware": LEARNED_FROM})  # paths of an epoch, where they are not USUALLY_SEEN

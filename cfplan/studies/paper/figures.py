@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InputError
 from cfplan.planning.figure import save_figure
+from cfplan.simulation.geometric_flight import LOST
 from cfplan.studies.paper.baselines import ALLOCATION, BAYESIAN, DRAWN, SHIPPED
-from cfplan.studies.paper.hardware import CERTIFIED, LONG, RAW
+from cfplan.studies.paper.hardware import CERTIFIED, LONG, RAW, TRACKED
 from cfplan.studies.paper.trials import TOPPQUAD
 from cfplan.studies.paper.yaw_consistency import WAYS
 from cfplan.studies.result import StudyResult, read_result
@@ -24,6 +25,9 @@ COLOURS = MappingProxyType({SHIPPED: "#7b3fa0", BAYESIAN: "#c04a2b", ALLOCATION:
 DIFFERENCES = (("h", "largest Δh"), ("time", "Δtime, s"), ("yaw", "largest Δyaw, rad"))  # of the paper's histograms
 BINS = 20
 NETWORKS = MappingProxyType({"LSTM-0.001": "#7b3fa0", "LSTM-0.01": "#1f7a4d", "LSTM-0.1": "#c0282b"})  # as in the paper
+LONG_STYLES = MappingProxyType({
+    "": {"color": "black", "ls": "--", "zorder": 3}, TOPPQUAD: {"color": "#2b5fc0", "ls": "--", "zorder": 2},
+})  # fmt: skip
 PANELS = 4  # of tracks, in a line
 EDGES = tuple((corner, corner | 1 << axis) for corner in range(8) for axis in range(3) if not corner & 1 << axis)
 Row = Mapping[str, Any]
@@ -67,12 +71,13 @@ def write_figures(results: Path, images: Path) -> list[Written]:
 def draw_baselines(result: StudyResult) -> "Figure":
     """Draw the paths of a row of planners through the same waypoints, and the boxes that AllocNet's kind is given."""
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     rows = result.table("drawn").rows
     seeds = list(dict.fromkeys(row["seed"] for row in rows))
     if not seeds:
         raise InputError("no path was flown by any planner", where="drawn", hint="run cfplan study baselines anew")
-    figure = Figure(figsize=(3.2 * len(DRAWN), 2.6 * len(seeds)), layout="constrained")
+    figure = Figure(figsize=(3.2 * len(DRAWN), 2.6 * len(seeds)), layout=ConstrainedLayoutEngine(rect=(0, 0, 0.97, 1)))
     for line, seed in enumerate(seeds):
         own = [row for row in rows if row["seed"] == seed]
         for column, name in enumerate(DRAWN):
@@ -147,11 +152,38 @@ def draw_tracks(result: StudyResult, network: str) -> "Figure":
                     style = {"color": NETWORKS[network]} if own else {"color": "#2b5fc0", "ls": "--", "zorder": 2}
                     track = np.array(row["points"]) / 1000.0
                     axes.plot(track[:, 0], track[:, 1], lw=0.9, **style)
-            axes.set_title(f"path {name}", fontsize=8)
+            axes.set_title(f"path {name}{_failures(result, name, way, network)}", fontsize=8)
             axes.set_aspect("equal")
             axes.tick_params(labelsize=6)
         for axes in grid[len(paths) :]:
             axes.set_visible(False)
+    return figure
+
+
+def _failures(result: StudyResult, path: str, way: str, network: str) -> str:
+    flown = [
+        row for row in result.table("flights").rows
+        if (row["limits"], row["path"], row["way"], row["planner"]) == (TRACKED, path, way, network)
+    ]  # fmt: skip
+    failed = sum(bool(row["reason"]) or row["deviation"] is None or row["deviation"] >= LOST for row in flown)
+    return f": {failed} of {len(flown)} failed" if failed else ""
+
+
+def draw_long(result: StudyResult) -> "Figure":
+    """Draw the flights over the long path, certified, from above and from the side: the planner's that ships."""
+    from matplotlib.figure import Figure
+
+    rows = [row for row in result.table("tracks").rows if row["path"] == LONG and row["way"] in ("", CERTIFIED)]
+    if not any(row["planner"] for row in rows):
+        raise InputError("no flight over the long path", where="tracks", hint="run cfplan study hardware anew")
+    figure = Figure(figsize=(9.6, 5.4), layout="constrained")
+    for axes, (first, second) in zip(figure.subplots(1, 2), ((0, 1), (1, 2)), strict=True):
+        for row in rows:
+            points = np.array(row["points"]) / 1000.0
+            style = LONG_STYLES.get(row["planner"], {"color": COLOURS[SHIPPED]})
+            axes.plot(points[:, first], points[:, second], lw=0.9, **style)
+        axes.set(xlabel=f"{'xyz'[first]}, m", ylabel=f"{'xyz'[second]}, m")
+        axes.set_aspect("equal")
     return figure
 
 
@@ -163,4 +195,5 @@ FIGURES: MappingProxyType[str, Drawing] = MappingProxyType({
     "paper-baselines": Drawing("baselines", draw_baselines),
     "paper-yaw": Drawing("yaw-consistency", draw_yaw_consistency),
     **{f"paper-{name}": Drawing("hardware", partial(draw_tracks, network=name)) for name in NETWORKS},
+    "paper-long": Drawing("hardware", draw_long),
 })  # fmt: skip

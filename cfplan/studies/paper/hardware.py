@@ -345,11 +345,14 @@ def _flown(flight: HardwareFlight, mission: Mission, seed: int) -> tuple[Hardwar
 
 
 def _tracks(paths: Mapping[str, Path], flown: Sequence[tuple[HardwareFlight, list[list[int]]]]) -> Iterator[Track]:
-    """Yield what the paper draws: each path, and the flights of TOPPQuad and of the networks, under TRACKED."""
+    """Yield what the paper draws: each path, and the flights of TOPPQuad and of the networks, under TRACKED.
+
+    On the long path the planner that ships is in their place.
+    """
     for name, path in paths.items():
         yield Track(name, [_millimetres(point) for point in path(np.linspace(0.0, path.end, TRACK_POINTS))])
     for flight, points in flown:
-        if flight.limits == TRACKED and flight.planner != SHIPPED and points:
+        if flight.limits == TRACKED and points and (flight.planner != SHIPPED or flight.path == LONG):
             yield Track(flight.path, points, flight.way, flight.planner, flight.trial)
 
 

@@ -10,11 +10,12 @@ from cfplan.studies.paper.figures import (
     EDGES,
     NETWORKS,
     draw_baselines,
+    draw_long,
     draw_tracks,
     draw_yaw_consistency,
     write_figures,
 )
-from cfplan.studies.paper.hardware import CERTIFIED, LONG, RAW
+from cfplan.studies.paper.hardware import CERTIFIED, LONG, RAW, SHIPPED, TRACKED
 from cfplan.studies.paper.trials import TOPPQUAD
 from cfplan.studies.paper.yaw_consistency import WAYS, yaw_consistency
 from cfplan.studies.result import StudyResult, detail_table
@@ -48,17 +49,35 @@ def hardware():
             {"path": path, "planner": planner, "way": way, "points": [[0, 0, 0], [900, 880, 0]]}
             for way in (RAW, CERTIFIED) for planner in (TOPPQUAD, *NETWORKS) for _ in range(2)
         ]  # fmt: skip
-    return StudyResult("hardware", {}, (), (detail_table("tracks", rows),))
+        rows += [{"path": path, "planner": SHIPPED, "way": CERTIFIED, "points": [[0, 0, 500], [900, 890, 500]]}] * (
+            path == LONG
+        )
+    flights = [
+        {"limits": TRACKED, "way": RAW, "planner": "LSTM-0.01", "path": "2", "reason": reason, "deviation": deviation}
+        for reason, deviation in (("crash", None), ("", 0.1), ("", 1.2))
+    ]
+    return StudyResult("hardware", {}, (), (detail_table("tracks", rows), detail_table("flights", flights)))
 
 
 def test_tracks_of_one_network_and_toppquad_stand_over_each_path_as_planned_and_certified(hardware):
     panels = [panel for panel in draw_tracks(hardware, "LSTM-0.01").axes if panel.get_visible()]
-    assert [panel.get_title() for panel in panels] == 2 * ["path 1", "path 2"]
+    assert [panel.get_title() for panel in panels] == ["path 1", "path 2: 2 of 3 failed", "path 1", "path 2"]
     for panel in panels:
         colours = [line.get_color() for line in panel.lines]
         assert len(colours) == 5
         assert colours.count(NETWORKS["LSTM-0.01"]) == 2
         np.testing.assert_allclose(panel.lines[0].get_xdata(), [0.0, 0.9])
+
+
+def test_the_long_path_is_drawn_from_above_and_from_the_side_with_all_that_was_flown_certified(hardware):
+    above, side = draw_long(hardware).axes
+    assert len(above.lines) == len(side.lines) == 1 + 2 * (1 + len(NETWORKS)) + 1
+    assert (above.get_xlabel(), side.get_ylabel()) == ("x, m", "z, m")
+    np.testing.assert_allclose(above.lines[-1].get_ydata(), [0.0, 0.89])
+    np.testing.assert_allclose(side.lines[-1].get_ydata(), [0.5, 0.5])
+    without = StudyResult("hardware", {}, (), (detail_table("tracks", hardware.table("tracks").rows[:1]),))
+    with pytest.raises(InputError, match="long path"):
+        draw_long(without)
 
 
 def test_each_planner_has_a_panel_for_each_path_and_allocnets_has_its_boxes(baselines):
@@ -96,7 +115,12 @@ def test_figures_are_written_and_those_without_a_result_are_left_out_with_the_re
     hardware.write(tmp_path / "hardware.json")
     written = dict(write_figures(tmp_path, tmp_path))
     assert not any(written.values())
-    assert {file.stem for file in written} == {"paper-baselines", "paper-yaw", *(f"paper-{name}" for name in NETWORKS)}
+    assert {file.stem for file in written} == {
+        "paper-baselines",
+        "paper-yaw",
+        "paper-long",
+        *(f"paper-{name}" for name in NETWORKS),
+    }
     assert all(file.stat().st_size > 10_000 for file in written)
 
 

@@ -1,0 +1,59 @@
+"""The paper's tables by bodies of other simulators: the same controller, and who counts as lost."""
+
+import numpy as np
+import pytest
+
+from cfplan.geometry.min_snap import min_snap
+from cfplan.planners.expert.expert import plan_expert
+from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STILL_AIR, TIME_STEP, pack_body, step_body
+from cfplan.simulation.geometric_flight import fly_geometric, positions_by_both
+from cfplan.studies.paper.simulators import HARDWARE, PLANNED, BodyFlight, bodies_table
+from cfplan.studies.paper.trials import FLOWN, PAPER_LAG, TOPPQUAD, profile_by, trajectory_by
+from cfplan.studies.physics import bodies_for
+
+LAGS = [f"RotorPy, {lag:g} s" for lag in (0.072, 0.005)]
+
+
+@pytest.fixture(scope="module")
+def trajectory():
+    return trajectory_by(profile_by(plan_expert))(min_snap([[0, 0, 1], [0.5, 0.3, 1.2], [0.9, 0.0, 1.1]]))
+
+
+def own_step(state, asked, seconds):
+    state, body = state.copy(), pack_body(FLOWN, floor=-np.inf)
+    for _ in range(round(seconds / TIME_STEP)):
+        step_body(state, np.asarray(asked), body, STILL_AIR, FULL_EFFICIENCY)
+    return state
+
+
+def test_with_cfplans_own_body_it_is_the_flight_of_the_tables(trajectory):
+    wanted, theirs, own = positions_by_both(own_step, trajectory, FLOWN)
+    np.testing.assert_array_equal(theirs, own)
+    assert np.linalg.norm(own - wanted, axis=1).max() == fly_geometric(trajectory, FLOWN).deviation
+
+
+def test_rotorpy_with_the_papers_motor_lag_follows_as_cfplan_does(trajectory):
+    pytest.importorskip("rotorpy")
+    (body,) = (each for each in bodies_for(FLOWN, []) if each.airframe.motor_time_constant == PAPER_LAG)
+    wanted, theirs, own = positions_by_both(body.step, trajectory, body.airframe)
+    assert np.linalg.norm(theirs - own, axis=1).max() < 0.03
+    assert np.linalg.norm(theirs - wanted, axis=1).max() < 0.05
+
+
+def test_the_lost_count_as_a_metre_and_are_left_out_of_how_far_bodies_are_apart():
+    def flight(path, **given):
+        return BodyFlight(PLANNED, TOPPQUAD, path, **{"body": LAGS[1], **given})
+
+    flights = [
+        flight("1", deviation=0.2, own_deviation=0.1, apart=0.15),
+        flight("2", deviation=9.0, own_deviation=0.3, apart=9.1),
+        flight("3", deviation=float("nan"), own_deviation=float("nan"), apart=float("nan")),
+        flight("4", body="", reason="no plan"),
+        BodyFlight(HARDWARE, TOPPQUAD, "1", LAGS[0], "", 0.02, 0.01, 0.015),
+    ]
+    planned, hardware = bodies_table(flights).rows
+    assert (planned["paths"], planned["failed"], planned["own_failed"]) == (4, 3, 2)
+    assert planned["deviation"] == pytest.approx((0.2 + 3.0) / 4)
+    assert planned["own_deviation"] == pytest.approx((0.1 + 0.3 + 2.0) / 4)
+    assert planned["apart"] == planned["apart_most"] == 0.15
+    assert (hardware["body"], hardware["apart"]) == (LAGS[0], 0.015)
