@@ -12,8 +12,10 @@ smoothly across. This is the yaw of the Hopf fibration; heading differs from it 
 from dataclasses import dataclass
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.geometry import banded
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.machine_code import njit
@@ -23,6 +25,8 @@ SMOOTHING_LENGTH = 0.15  # s of nominal time, over which a sudden turn is spread
 SETTLING_LENGTH, TURN = 1.0, 0.3  # s of nominal time, at least, and rad a second of it, to turn from a boundary state
 SAMPLES = 16  # an interval, where the direction of flight is followed
 LEVEL = 0.1  # horizontal share of the direction of flight below which it says nothing about yaw
+_LEAST_WEIGHT = 1e-9  # of each coefficient's own target
+_REST = 1e-9  # |γ'| below which a path rests
 KERNEL_WIDTH = 3.0  # nodes, standard deviation of the Gaussian that smooths given angles
 KERNEL_REACH = 12  # nodes on each side, where that Gaussian ends
 # ψ, ψ'Δs, ψ''Δs² where an interval begins, from its three coefficients.
@@ -78,10 +82,10 @@ class YawSpline:
         heading = np.unwrap(np.arctan2(tangent[seen, 1], tangent[seen, 0]))
         if start is not None:  # the turn of 2π that is nearest
             heading += 2 * np.pi * np.round((start.yaw - heading[0]) / (2 * np.pi))
-        wanted = np.interp(s, s[seen], heading)
-        weight = np.where(seen, share**2, 0.0)
         every = SAMPLES // 2
-        return _fit(path, nodes, wanted[::every], np.maximum(weight[::every], 1e-6), start, end)
+        wanted = np.interp(s[::every], s[seen], heading)
+        weight = np.where(seen[::every], share[::every] ** 2, 0.0)
+        return _fit(path, nodes, wanted, np.maximum(weight, 1e-6), start, end)
 
     @classmethod
     def smoothed(cls, yaw: NDArray, step: float, start: BoundaryState | None, end: BoundaryState | None) -> "YawSpline":
@@ -159,35 +163,57 @@ def _fit(
     end: BoundaryState | None,
 ) -> YawSpline:
     """Fit to a target at nodes and midpoints, (2 nodes + 1,)."""
-    from scipy.sparse import bmat, csr_matrix, diags  # slow to import
-    from scipy.sparse.linalg import spsolve
-
-    step = path.end / nodes
+    step, size = path.end / nodes, nodes + 2
     if start is not None:
         target = target + _turn_from(start, target, step / 2, path.end)
-    size = nodes + 2
-    ones = np.ones(size)
-    at_nodes = diags([ones[:-1] / 2, ones[:-1] / 2], [0, 1], shape=(nodes + 1, size))
-    at_middles = diags([ones / 8, 6 * ones / 8, ones / 8], [0, 1, 2], shape=(nodes, size))
-    bend = diags([ones, -2 * ones, ones], [0, 1, 2], shape=(nodes, size))
-    fit = at_nodes.T @ diags(weight[::2]) @ at_nodes + at_middles.T @ diags(weight[1::2]) @ at_middles
-    matrix = fit + (SMOOTHING_LENGTH / step) ** 4 * (bend.T @ bend) + 1e-9 * diags(ones)
-    right = at_nodes.T @ (weight[::2] * target[::2]) + at_middles.T @ (weight[1::2] * target[1::2])
-    right += 1e-9 * target[np.minimum(2 * np.arange(size), 2 * nodes)]
-
-    rows, values = [], []
-    for boundary, s, first in ((start, 0.0, 0), (end, path.end, size - 2)):
-        value, slope = np.zeros(size), np.zeros(size)
-        value[first : first + 2] = AT_NODE[0, :2]
-        slope[first : first + 2] = AT_NODE[1, :2]
+    first, last, known = np.arange(2), np.arange(size - 2, size), np.full(size, np.nan)
+    own = np.ones(size, dtype=np.int64)
+    for boundary, s, at in ((start, 0.0, first), (end, path.end, last)):
         if boundary is not None:
-            rows += [value, slope]
-            values += [boundary.yaw, boundary.dyaw * step]
-        elif np.linalg.norm(path(s, 1)) < 1e-9:  # at rest nothing turns
-            rows.append(slope)
-            values.append(0.0)
-    if rows:
-        held = csr_matrix(np.array(rows))
-        matrix = bmat([[matrix, held.T], [held, None]])
-        right = np.concatenate([right, values])
-    return YawSpline.from_coefficients(spsolve(matrix.tocsc(), right)[:size], step)
+            known[at], own[at] = end_coefficients(boundary.yaw, boundary.dyaw * step), 0
+        elif np.linalg.norm(path(s, 1)) < _REST:  # nothing turns there: both have one value
+            own[at[1]] = 0
+    coefficients = _fitted(target, weight, (SMOOTHING_LENGTH / step) ** 4, own.cumsum() - 1, known)
+    return YawSpline.from_coefficients(coefficients, step)
+
+
+@njit(error_model="numpy")
+def _fitted(target: NDArray, weight: NDArray, smoothing: float, slots: NDArray, known: NDArray) -> NDArray:
+    """Return the (N+2,) coefficients of the least squares fit to a target at nodes and midpoints, (2N+1,).
+
+    `slots`, (N+2,), is which unknown each coefficient is, unless it is `known`, where that is not NaN.
+    """
+    nodes = (len(target) - 1) // 2
+    matrix, right = np.zeros((slots[-1] + 1, 3)), np.zeros(slots[-1] + 1)
+    for k in range(nodes + 2):
+        if np.isnan(known[k]):  # so that some value is the best where nothing has a weight
+            matrix[slots[k], 0] += _LEAST_WEIGHT
+            right[slots[k]] += _LEAST_WEIGHT * target[min(2 * k, 2 * nodes)]
+    for k in range(nodes):
+        _add_row(matrix, right, slots, known, k, (1 / 2, 1 / 2, 0.0), weight[2 * k], target[2 * k])
+        _add_row(matrix, right, slots, known, k, (1 / 8, 6 / 8, 1 / 8), weight[2 * k + 1], target[2 * k + 1])
+        _add_row(matrix, right, slots, known, k, (1.0, -2.0, 1.0), smoothing, 0.0)
+    _add_row(matrix, right, slots, known, nodes - 1, (0.0, 1 / 2, 1 / 2), weight[-1], target[-1])
+    factor, _ = banded.factorise(matrix, 0.0, 0.0)
+    unknown = banded.solve(factor, right)
+    coefficients = known.copy()
+    for k in range(nodes + 2):
+        if np.isnan(known[k]):
+            coefficients[k] = unknown[slots[k]]
+    return coefficients
+
+
+@register_jitable
+def _add_row(matrix, right, slots, known, first, values, weight, target):
+    """Add to the normal equations that these three coefficients times `values` should be the target."""
+    for a in range(3):
+        if not np.isnan(known[first + a]):
+            target -= values[a] * known[first + a]
+    for a in range(3):
+        if np.isnan(known[first + a]):
+            i = slots[first + a]
+            right[i] += weight * values[a] * target
+            for b in range(3):
+                j = slots[first + b]
+                if np.isnan(known[first + b]) and j <= i:
+                    matrix[i, i - j] += weight * values[a] * values[b]
