@@ -50,6 +50,9 @@ WARM_START = (
 # less than a tenth of the gradient. Before limits are tightened ROUGHLY as many times that may remain.
 EARLY_STOP, EARLY_FEASIBILITY, EARLY_GRADIENT, EARLY_LEFT_BY_STEP = 0.15, 2e-4, 0.05, 0.2
 ROUGHLY = 10.0
+# Times that barrier: with which refining begins. From a profile far off, a search that begins with the last one crawls
+# along its bounds.
+FIRST_BARRIER = 3.0
 # Times the last barrier: what multipliers are at first, which are far larger where limits are used to the full.
 EARLY_MULTIPLIERS = 10.0
 
@@ -63,8 +66,8 @@ def refining_starts(interval: float, *, capped: bool = False) -> Sequence[Start]
     if capped:
         return _early(EARLIER * EARLY_STOP * interval, push=1e-2, iterations=40, roughly=ROUGHLY), *COLD_START
     return (
-        _early(EARLY_STOP * interval, push=1e-2, iterations=40, roughly=ROUGHLY),
-        _early(EARLIER * EARLY_STOP * interval, push=1e-2, iterations=40, roughly=ROUGHLY),
+        _early(EARLY_STOP * interval, push=1e-2, iterations=40, roughly=ROUGHLY, first=FIRST_BARRIER),
+        _early(EARLIER * EARLY_STOP * interval, push=1e-2, iterations=40, roughly=ROUGHLY, first=FIRST_BARRIER),
         *COLD_START,
     )
 
@@ -76,10 +79,11 @@ def refining_restarts(interval: float, *, capped: bool = False) -> Sequence[Star
     return start._replace(goes_on=True), start, *WARM_START
 
 
-def _early(barrier: float, push: float, iterations: int, roughly: float = 1.0) -> Start:
+def _early(barrier: float, push: float, iterations: int, roughly: float = 1.0, first: float = 1.0) -> Start:
     return Start(Search(
-        barrier=barrier, last_barrier=barrier, push=push, multipliers=EARLY_MULTIPLIERS, iterations=iterations,
-        feasibility=roughly * EARLY_FEASIBILITY, gradient=roughly * EARLY_GRADIENT, left_by_step=EARLY_LEFT_BY_STEP,
+        barrier=first * barrier, last_barrier=barrier, multipliers=EARLY_MULTIPLIERS / first, push=push,
+        iterations=iterations, feasibility=roughly * EARLY_FEASIBILITY, gradient=roughly * EARLY_GRADIENT,
+        left_by_step=EARLY_LEFT_BY_STEP,
     ))  # fmt: skip
 
 
