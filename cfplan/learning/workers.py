@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from cfplan.errors import CfplanError, ExitCode
 
-SCHEDULER_PATIENCE = 10  # s
+SCHEDULER_PATIENCE, WORKER_PATIENCE = 10, 30  # s
 Item = TypeVar("Item")
 Done = TypeVar("Done")
 Work = Callable[[Callable[[Any], Done], Iterable[Any]], Iterator[Done]]
@@ -29,7 +29,8 @@ def pool(workers: int = 1, scheduler: str | None = None) -> Iterator[Work[Any]]:
     had; they are done again by others.
 
     Raises:
-        SchedulerError: Dask is not installed, or the scheduler does not answer within SCHEDULER_PATIENCE.
+        SchedulerError: Dask is not installed, the scheduler does not answer within SCHEDULER_PATIENCE, no worker comes
+            within WORKER_PATIENCE, or one works at several items at a time.
     """
     from joblib import Parallel, delayed, parallel_config
 
@@ -45,7 +46,7 @@ def pool(workers: int = 1, scheduler: str | None = None) -> Iterator[Work[Any]]:
             yield run
         return
     n_jobs = -1
-    with _client(scheduler) as client, parallel_config(backend="dask", client=client, wait_for_workers_timeout=30):
+    with _client(scheduler) as client, parallel_config(backend="dask", client=client):
         yield run
 
 
@@ -65,9 +66,28 @@ def _client(scheduler: str) -> Iterator[object]:
             f"no Dask scheduler answers there ({error})", where=scheduler, hint="start one with `dask scheduler`"
         ) from None
     try:
+        _require_workers(client, scheduler)
         yield client
     finally:
         client.close()
+
+
+def _require_workers(client: Any, scheduler: str) -> None:
+    """Check that somebody works there, and one item at a time: what is measured of an item is its process's time."""
+    command = f"`dask worker --nworkers -1 --nthreads 1 {scheduler}`"
+    try:
+        client.wait_for_workers(1, timeout=WORKER_PATIENCE)
+    except TimeoutError:
+        raise SchedulerError(
+            f"the scheduler has no worker, after {WORKER_PATIENCE:g} s",
+            where=scheduler,
+            hint=f"start one for each processor: {command}",
+        ) from None
+    threads = max(client.nthreads().values())
+    if threads > 1:
+        raise SchedulerError(
+            f"a worker there has {threads} threads", where=scheduler, hint=f"start one for each processor: {command}"
+        )
 
 
 def _require_listening(scheduler: str) -> None:
