@@ -152,7 +152,7 @@ def path_through(points: ArrayLike, name: str = "points") -> PathFile:
 
 def read_points(file: pathlib.Path) -> tuple[NDArray, list[int]]:
     """Read points, (K, 3) m, from rows of x, y, z, and the line number of each."""
-    return read_table(file, 3, "x, y, z")
+    return read_table(file, 3, "x, y, z; write `samples:` for rows of t, x, y, z")
 
 
 def _source(content: _Content, places: Places) -> str:

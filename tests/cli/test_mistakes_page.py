@@ -22,7 +22,6 @@ COMMANDS = {
     "a folder that is no record": ("replay", "."),
     "a picture that is no PNG": ("replay", ".", "--png", "flight.jpg"),
     "a folder of records, to be checked": ("check", "."),
-    "a mistyped study": ("study", "fault"),
     "speed in m/s on the command line": ("plan", "path.yaml", "--speed", "2"),
 }
 

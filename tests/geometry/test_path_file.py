@@ -122,7 +122,10 @@ def test_hundreds_of_points_keep_their_shape(load):
         ("waypoints: [[0,0,1],[1,0,1]]\nyaws: free\n", ":2:1: unknown key 'yaws' (hint: did you mean 'yaw'?"),
         ("points: gone.csv\n", "gone.csv: no such file"),
         ("polynomials: .\n", "a folder, not a file"),
-        ("points: short.csv\n", "short.csv:2: the row has 2 numbers, not 3 (hint: each row is x, y, z)"),
+        (
+            "points: short.csv\n",
+            "short.csv:2: the row has 2 numbers, not 3 (hint: each row is x, y, z; write `samples:`",
+        ),
         ("points: one.csv\n", "one.csv: a path needs at least two points, not 1"),
         ("points: twice.csv\n", "twice.csv:4: waypoints 2 and 3 are 0.0000 m apart"),
         ("points: words.csv\n", "words.csv: no rows of numbers"),
