@@ -1,15 +1,28 @@
-"""Commands that README and docs/ show end well as they stand there, in a new folder, with records where they are shown.
+"""Every command that README and docs/ show is one that cfplan takes, and is run by a test: these, and those it names.
 
-Those that fly in real time, train, measure for long, or need a window, a lab or a dataset have tests of their own; that
-every option exists holds tests/test_docs.py.
+Here commands run as they stand, in a new folder, with records where they are shown. Flights go by the stepped clock,
+those on hardware by another URI alone: that of the virtual lab. No window is opened.
 """
 
+import io
+import os
 import re
 import shlex
 import shutil
+import socket
+import subprocess
+import sys
+import threading
+from functools import partial
+from glob import glob
 from pathlib import Path
 
+import click
+import pages
 import pytest
+import rerun as rr
+from pages import AS_SHOWN, BY_CI, COMPLETED, FLOWN, STEERED
+from scipy.spatial.transform import Rotation
 from stepped_flight import fly_stepped
 
 from cfplan.cli import cfplan as command_line
@@ -18,37 +31,68 @@ from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.prepare_flight import prepare_flight
 from cfplan.recording.header import header_of_plan
 from cfplan.recording.reader import read_record
+from cfplan.recording.rerun.live import LiveView
 from cfplan.recording.summary import summarise
 from cfplan.recording.writer import RecordWriter, write_summary
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.steering import connect
+from tests.recording.importers.test_import_vicon import write as write_vicon_csv
 
 REPOSITORY = Path(__file__).parents[2]
-PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
-SHOWN = re.compile(r"(?:^ {4}(?:\$ )?|`)(cfplan [^`#\n]*)", re.MULTILINE)
-LINES = sorted({" ".join(line.split()) for page in PAGES for line in SHOWN.findall(page.read_text(encoding="utf-8"))})
-PLANNING = ("init", "plan", "check", "sim", "export")
-OF_RECORDS = ("replay", "report", "identify")
-RECORD = re.compile(r"records/[\w-]+")
-ELSEWHERE = ("…", "<", "models/mine", "PATH", "vicon.csv", "--png")  # not files; a log; a driver for graphics
-SLOW = ("/scan.yaml", "/circle.yaml --to", "--gif", "replay records/20261122-212927-figure-eight --figure")
+RECORD = re.compile(r"records/[\w<>-]+")
+ON_HARDWARE = (("radio://0/80/2M/E7E7E7E7E7", "sim://0"), ("vicon://192.168.1.2/cf1", "vicon://lab/cf1"))
+SLOW = (
+    "/scan.yaml", "/circle.yaml --to", "--gif", "--png", "replay records/20261122-212927-figure-eight --figure",
+    "--on-board", "fly flights/identify.yaml", "--warm-up",
+)  # fmt: skip
+DRIVERS = [*Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"), *Path("/etc/vulkan/icd.d").glob("lvp_icd*.json")]
+no_driver = pytest.mark.skipif(not DRIVERS, reason="no software Vulkan driver (Debian: mesa-vulkan-drivers)")
 
 
-def runs(line: str) -> bool:
-    """Return whether a line is a whole command that needs no hardware, window, dataset or time."""
-    words = line.split()
-    if any(part in line for part in ELSEWHERE) or len(words) < 3:
-        return False
-    if "--help" in words:
-        return True
-    if words[1] in PLANNING:
-        return len(words) > 3 or "/" in line
-    if words[1] == "replay":  # alone it opens a window
-        return words[2] == "records" or ("records/" in line and len(words) > 3)
-    return words[1] in OF_RECORDS and "records/" in line
+def parameters(lines):
+    """Return the lines to run, of which some are slow, and some need a driver."""
+    for line in lines:
+        slow = [pytest.mark.slow] * any(part in line for part in SLOW)
+        yield pytest.param(line, marks=[*slow, *[no_driver] * ("--png" in line)])
 
 
-RUN = [line for line in LINES if runs(line)]
+@pytest.mark.parametrize("page", pages.PAGES, ids=lambda page: page.relative_to(REPOSITORY).as_posix())
+def test_every_command_of_a_page_is_run_by_a_test(page):
+    for _, line, _ in [shown for shown in pages.shown_commands() if REPOSITORY / shown.page == page]:
+        test = pages.run_by(line)
+        assert test is not None, f"no test runs {line!r}: write one, and name it in tests/pages.py"
+        file, _, name = test.partition("::")
+        text = (REPOSITORY / file).read_text()
+        if test == BY_CI:
+            assert all(f"make {goal}\n" in text for goal in line.split()[1:])
+        else:
+            assert f"def {name}(" in text
+
+
+@pytest.mark.parametrize("line", sorted({shown.line for shown in pages.shown_commands() if shown.whole}))
+def test_a_whole_command_is_one_that_cfplan_takes(folder, monkeypatch, line):
+    """Its arguments are there, known, of their type and in their range; nothing is run."""
+    if not line.startswith("cfplan ") or "--help" in line:
+        return
+    monkeypatch.chdir(folder)
+    (folder / "records" / "<flight>").mkdir(parents=True, exist_ok=True)
+    command: click.Command = command_line
+    words = [word for part in shlex.split(line)[1:] for word in sorted(glob(part)) or [part]]
+    while isinstance(command, click.Group):
+        found = command.get_command(click.Context(command), words.pop(0))
+        assert found is not None
+        command = found
+    command.make_context(line, words)
+
+
+@pytest.mark.parametrize("page", pages.PAGES, ids=lambda page: page.name)
+def test_goals_of_make_and_tests_that_a_page_names_are_there(page):
+    text, makefile = page.read_text(), (REPOSITORY / "Makefile").read_text()
+    goals = {goal for span in re.findall(r"(?:`| {4})make ([a-z ]+?)(?=`|  |$)", text, re.M) for goal in span.split()}
+    assert all(re.search(rf"^{goal}:", makefile, re.M) for goal in goals), goals
+    for span in re.findall(r"`(?:[\w./]*python -m )?pytest ([^`]+)`", text):
+        assert all((REPOSITORY / word).exists() for word in span.split() if word.startswith("tests"))
 
 
 @pytest.fixture(scope="module")
@@ -69,33 +113,157 @@ def record(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A new folder with what the repository brings."""
+    """A new folder with what the repository brings, a path and a plan of one's own, and a model."""
     folder = tmp_path_factory.mktemp("shown")
-    shutil.copytree(REPOSITORY / "flights", folder / "flights")
+    for name in ("flights", "results"):
+        shutil.copytree(REPOSITORY / name, folder / name)
     shutil.copy(REPOSITORY / "safety.yaml", folder)
+    for name in ("path.yaml", "first.yaml"):
+        shutil.copy(REPOSITORY / "flights" / "line.yaml", folder / name)
+    shutil.copytree(REPOSITORY / "models" / "any", folder / "models" / "mine")
     return folder
 
 
-@pytest.mark.parametrize(
-    "line", [pytest.param(line, marks=[pytest.mark.slow] * any(part in line for part in SLOW)) for line in RUN]
-)
-def test_a_command_ends_well_as_it_is_shown(cfplan, folder, tmp_path, monkeypatch, request, line):
+def prepare(line, folder, request):
+    """Lay in the folder what a command reads beside paths and limits."""
+    run = request.getfixturevalue("cfplan")
+    if "mylab/first.yaml" in line and not (folder / "mylab").is_dir():
+        assert run("init", "mylab", "--room", "4x6x2.5").code == 0
+    if "mine.parquet" in line:
+        assert run("plan", "path.yaml", "-o", "mine.parquet").code == 0
+    for name in RECORD.findall(line) or ["records/20261122-094221-figure8"] * (line == "cfplan replay records"):
+        if not (folder / name / "flight.mcap").is_file():
+            shutil.copytree(request.getfixturevalue("record"), folder / name, dirs_exist_ok=True)
+    if "vicon.csv" in line:
+        poses = read_record(request.getfixturevalue("record")).poses
+        seen = [True] * len(poses.time)
+        motion = (poses.position, Rotation.from_quat(poses.quaternion), seen)
+        write_vicon_csv(folder / "vicon.csv", {"cf1": ("quaternion", motion)}, rate=100.0, length="mm")
+
+
+@pytest.fixture
+def no_window(monkeypatch):
+    """Send what a viewer's window would show into memory."""
+    for module in ("viewer", "live"):
+        monkeypatch.setattr(f"cfplan.recording.rerun.{module}.require_screen", lambda hint: None)
+    monkeypatch.setattr("rerun.spawn", lambda *, recording, **_: recording.memory_recording())
+
+    def open_live(header, folder):
+        stream = rr.RecordingStream("cfplan")
+        stream.memory_recording()
+        return LiveView(stream, header, folder)
+
+    monkeypatch.setattr("cfplan.recording.rerun.live.open_live", open_live)
+
+
+@pytest.mark.parametrize("line", list(parameters(pages.lines_for(AS_SHOWN))))
+def test_a_command_ends_well_as_it_is_shown(cfplan, folder, tmp_path, monkeypatch, request, no_window, line):
+    monkeypatch.chdir(tmp_path if " init" in line else folder)
+    prepare(line, folder, request)
+    if line.startswith("python"):
+        words = [sys.executable, *shlex.split(line.replace("…", "--help"))[1:]]
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+        assert b"Usage" in subprocess.run(words, capture_output=True, check=True, env=environment).stdout
+        return
     words = shlex.split(line)[1:]
-    monkeypatch.chdir(tmp_path if words[0] == "init" else folder)
-    if "mylab/first.yaml" in words and not (folder / "mylab").is_dir():
-        assert cfplan("init", "mylab", "--room", "4x6x2.5").code == 0
-    for name in RECORD.findall(line) or ["records/20261122-094221-figure8"] * ("records" in words):
-        if not (folder / name).is_dir():
-            shutil.copytree(request.getfixturevalue("record"), folder / name)
-    if {"-o", "--figure", "--gif", "--save"} & set(words):
+    if {"-o", "--figure", "--gif", "--png", "--save"} & set(words) or words[0] == "report":
         words.append("--force")
     ended = cfplan(*words)
     assert ended.code == 0, ended.err
 
 
+class SteppedVehicle:
+    """In place of the processes of pilot and lab."""
+
+    def __init__(self, uri, mocap_uri, limits):
+        assert uri == "sim://0"
+        self.uri, self.pilot = uri, None
+
+    def poses(self, steps):
+        return None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+
+def fly_in_the_stepped_lab(mission, *, on_telemetry, more_orders, **_):
+    return fly_stepped(mission, on_telemetry, more_orders=more_orders).outcome
+
+
+@pytest.mark.parametrize("line", list(parameters(pages.lines_for(FLOWN))))
+def test_a_flight_lands_as_it_is_shown(cfplan, folder, tmp_path, monkeypatch, request, no_window, line):
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("cfplan.steering.starting_vehicle.StartingVehicle", SteppedVehicle)
+    monkeypatch.setattr("cfplan.cli.recorded_flight.fly", fly_in_the_stepped_lab)
+    prepare(line, folder, request)
+    for shown, virtual in ON_HARDWARE:
+        line = line.replace(shown, virtual)
+    ended = cfplan(*shlex.split(line)[1:], "--records", tmp_path)
+    assert ended.code == 0, ended.err
+    assert re.search(r"ended +landed", ended.out)
+    (flight,) = tmp_path.iterdir()
+    assert f"replay: cfplan replay {flight}" in ended.out
+
+
+@pytest.mark.parametrize("line", pages.lines_for(STEERED))
+def test_waypoints_are_flown_as_it_is_shown(cfplan, folder, tmp_path, monkeypatch, no_window, line):
+    monkeypatch.chdir(folder)
+    by_clock = partial(connect.connect, stepped=True)
+    monkeypatch.setattr(connect, "connect", by_clock)
+    asked = b"1 0 1\n0 1 1.2\nland\n"
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(asked)))
+    if "127.0.0.1:7777" in line:
+        threading.Thread(target=ask_by_the_port, args=(7777, asked), daemon=True).start()
+    ended = cfplan(*shlex.split(line)[1:], "--records", tmp_path)
+    assert ended.code in (0, 6), ended.err
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def ask_by_the_port(port, lines):
+    while True:
+        try:
+            client = socket.create_connection(("127.0.0.1", port), timeout=60)
+        except ConnectionRefusedError:
+            continue
+        with client:
+            client.sendall(lines)
+            client.shutdown(socket.SHUT_WR)
+            while client.recv(4096):
+                pass
+        return
+
+
+@pytest.mark.parametrize("line", pages.lines_for(COMPLETED))
+def test_completion_is_set_up_as_it_is_shown(tmp_path, line):
+    """In the shell that it is for where that is here; else the script is made at least."""
+    wanted = re.search(r"_CFPLAN_COMPLETE=(\w+)_source", line)[1]
+    shell = shutil.which(wanted)
+    program = tmp_path / "bin" / "cfplan"
+    program.parent.mkdir()
+    program.write_text(f"#!{sys.executable}\nfrom cfplan.cli import main\nmain()\n")
+    program.chmod(0o755)
+    (tmp_path / ".config" / "fish" / "completions").mkdir(parents=True)
+    environment = {**os.environ, "HOME": str(tmp_path), "PATH": f"{program.parent}:{os.environ['PATH']}"}
+    environment["PYTHONPATH"] = str(REPOSITORY)
+    if shell is None:
+        line = re.sub(r'^eval "\$\((.*)\)"$', r"\1", line)
+    done = subprocess.run(
+        [shell or "bash", "-c", line], env=environment, capture_output=True, text=True, check=False
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    scripts = list((tmp_path / ".config").rglob("*.fish"))
+    if shell is None or scripts:
+        assert "_CFPLAN_COMPLETE" in "".join(script.read_text() for script in scripts) or done.stdout
+
+
 def test_the_commands_of_the_first_hour_and_after_a_flight_are_among_them():
-    assert {*PLANNING, *OF_RECORDS} <= {line.split()[1] for line in RUN}
-    assert len(RUN) > 20
+    commands = {"init", "plan", "check", "sim", "export", "replay", "report", "identify", "doctor"}
+    assert commands <= {line.split()[1] for line in pages.lines_for(AS_SHOWN)}
+    assert len(pages.lines_for(AS_SHOWN)) > 30
+    assert len(pages.lines_for(FLOWN)) > 10
 
 
 @pytest.mark.parametrize(
