@@ -12,7 +12,7 @@ from cfplan.learning.paper.training import SequenceOptions
 from cfplan.studies.items import SHORT, count_unfinished
 from cfplan.studies.paper.all_tables import TABLES, is_current
 from cfplan.studies.paper.hardware import LEARNED_FROM
-from cfplan.studies.paper.robustness import perturbed_paths
+from cfplan.studies.paper.robustness import ASKING, COMPARING, MODELS, SHIPPED, perturbed_paths
 from cfplan.studies.result import StudyResult, read_result
 from cfplan.version import REPOSITORY
 
@@ -21,7 +21,9 @@ _EPOCHS = SequenceOptions().epochs
 # How many steps of each kind a whole run of a study has, by the names in the detail `work` of its result; what a
 # training sees is counted apart.
 WHOLE = MappingProxyType({
-    "architectures": {"path": 200}, "inputs": {"path": 200}, "robustness": {"perturbed path": perturbed_paths(100, 10)},
+    "architectures": {"path": 200}, "inputs": {"path": 200}, "robustness": dict.fromkeys(
+        [COMPARING, *(f"{ASKING}{model}" for model in (*MODELS, SHIPPED))], perturbed_paths(100, 10)
+    ),
     "yaw-consistency": {"pair": 100}, "baselines": {"path": 50, "corridor": 2000}, "hardware": {"plan": 136},
     "simulators": {"flight": 64},
     "long": {"plan": 63},
@@ -78,8 +80,8 @@ def _expected(name: str, file: Path, trained: set[str], *, quick: bool) -> Expec
 
 def _seconds(name: str, made: StudyResult | None, trained: set[str]) -> tuple[float, float]:
     """Return what a whole run takes for training and for the rest; `trained` are the networks that are trained then."""
-    steps = next((found for found in (_work(made), _work(_shipped(name))) if found), None)
-    if steps is None:
+    steps = _known(name) | _work(made)
+    if not steps:
         return np.nan, np.nan
     training = 0.0
     for step, seconds in steps.items():
@@ -97,6 +99,7 @@ def _work(result: StudyResult | None) -> dict[str, float]:
     return {row["step"]: row["seconds"] / row["count"] for table in tables for row in table.rows if row["count"]}
 
 
-def _shipped(name: str) -> StudyResult | None:
-    file = SHIPPED_RESULTS / f"{name}.json"
-    return read_result(file) if file.is_file() else None
+def _known(name: str) -> dict[str, float]:
+    """Return the same of the results that come with cfplan, of which a study may have several: NAME-PART.json."""
+    files = [SHIPPED_RESULTS / f"{name}.json", *sorted(SHIPPED_RESULTS.glob(f"{name}-*.json"))]
+    return {step: each for file in files if file.is_file() for step, each in _work(read_result(file)).items()}

@@ -5,6 +5,7 @@ motor lag. Beside the networks, as they are, the planner that ships, certified. 
 learns from perturbed paths with labels of their own, where the paper keeps the clean path's.
 """
 
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -57,6 +58,7 @@ MODELS = MappingProxyType(
 )
 SHIPPED, SHIPPED_NAME = "the shipped planner, certified", "shipped"  # in tables, and where it is asked for
 REFERENCES: Mapping[str, Planner] = MappingProxyType({"toppquad": plan_toppquad, "expert": plan_expert})
+COMPARING, ASKING = "perturbed path, compared", "perturbed path, "  # steps of the work; behind the second, a model
 TOLERANCES = ((0.02, 0.1), (0.05, 0.25), (0.1, 0.5))  # m and m/s, within which a planned state counts as reached
 
 
@@ -80,6 +82,7 @@ class RobustnessTrial:
     travel_time: float = np.nan  # s
     own_time: float = np.nan  # s, of the reference on the same perturbed path
     clean_time: float = np.nan  # s, of the reference on the clean path
+    seconds: float = np.nan  # of the processor, to plan, fly and compare
     deviation: float = np.nan  # m, LOST where it failed
     h_variation: float = np.nan  # largest difference of h from that on the clean path
     h_relative: float = np.nan  # the same, relative
@@ -134,10 +137,15 @@ def robustness(
             "robustness", settings | {"networks": identities(trained)}, partial(_trials_of, asked),
             paper_items(unseen), running, progress,
         )  # fmt: skip
-    trials = [RobustnessTrial(**trial) for value in work.values for trial in value]
+    trials = [RobustnessTrial(**trial) for value in work.values for trial in value["trials"]]
     tables = (robustness_table(trials, list(asked.models()), reference), training_table(trained, material))
-    steps = training_steps(trained, settings["learned_from"])
-    steps |= {"perturbed path": (perturbed_paths(len(work.values), draws), work.seconds)}
+    compared = sum(value["compared"] for value in work.values)
+    steps = training_steps(trained, settings["learned_from"]) | {
+        COMPARING: (compared, sum(value["comparing_seconds"] for value in work.values))
+    }
+    for name in asked.models():
+        own = [trial.seconds for trial in trials if trial.model == name]
+        steps[f"{ASKING}{name}"] = (len(own), sum(own))
     details = (detail_table("trials", trials), work_table(steps))
     return StudyResult("robustness", settings, tables, details, work.interrupted)
 
@@ -162,24 +170,28 @@ class Questions:
         return {each.name: _network(each) for each in self.networks} | ({SHIPPED: _shipped} if self.shipped else {})
 
 
-def _trials_of(questions: Questions, item: PaperItem) -> list[RobustnessTrial]:
+def _trials_of(questions: Questions, item: PaperItem) -> dict[str, Any]:
     """Ask each model about the path and about each of its perturbations."""
     _, row, path = item
     asked, reference = questions.models(), REFERENCES[questions.reference]
     clean = {name: _answered(ask, path) for name, ask in asked.items()}
-    clean_time = _time(reference, path)
-    trials = []
+    trials, times, comparing = [], [], 0.0
     for epsilon in SCALES:
         for draw in range(questions.draws if epsilon else 1):
             seed = np.random.SeedSequence(row, spawn_key=(SCALES.index(epsilon), draw))
             moved = perturbed(path, epsilon, seed) if epsilon else path
             own_time = against = np.nan
             if draw < questions.reference_draws:
-                own_time, against = _time(reference, moved) if epsilon else clean_time, clean_time
+                begun = time.process_time()
+                times.append(_time(reference, moved))
+                comparing += time.process_time() - begun
+                own_time, against = times[-1], times[0]
             for name, ask in asked.items():
-                begun = RobustnessTrial(name, epsilon, row, draw, own_time=own_time, clean_time=against)
-                trials.append(_flown(begun, moved, _answered(ask, moved), clean[name]))
-    return trials
+                begun = time.process_time()
+                trial = RobustnessTrial(name, epsilon, row, draw, own_time=own_time, clean_time=against)
+                trial = _flown(trial, moved, _answered(ask, moved), clean[name])
+                trials.append(replace(trial, seconds=time.process_time() - begun))
+    return {"trials": trials, "compared": len(times), "comparing_seconds": comparing}
 
 
 def _flown(begun: RobustnessTrial, path: Path, found: Answered | str, clean: Answered | str) -> RobustnessTrial:
