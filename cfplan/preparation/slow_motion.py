@@ -38,7 +38,7 @@ def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_step
     Raises NotCertifiedError where the vehicle comes down outside the walls, unless safety.yaml says only to warn.
     """
     limits, farthest, worst = mission.limits, -np.inf, ""
-    with step(on_step, "link loss of take-off and landing") as results:
+    with step(on_step, "slow phases") as results:
         for what, hint, payloads in _motions(mission):
             moments = link_loss_of_slow_motion(payloads, limits, mission.rate)
             at = int(np.argmax(np.where(np.isnan(moments.beyond), np.inf, moments.beyond)))
@@ -48,7 +48,7 @@ def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_step
                 farthest, worst = beyond, f"{what} ends {abs(beyond):.2f} m {side} {moments.name_of_wall(at, limits)}"
             if not beyond <= 0.0 and not limits.link_loss.only_warn:
                 raise NotCertifiedError(f"link loss {worst}", where="link loss", hint=hint)
-        (results.append if farthest <= 0.0 else results.warn)(f"the worst {worst}")
+        (results.append if farthest <= 0.0 else results.warn)(f"link loss {worst}, at worst")
 
 
 def _motions(mission: Mission) -> Iterator[_Motion]:

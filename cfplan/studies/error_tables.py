@@ -68,7 +68,7 @@ def rows_of(module: str, meanings: Meanings) -> Iterator[ErrorRow]:
 
 
 def _row(text: ErrorText, told: Sequence[Meaning]) -> ErrorRow:
-    means = " ".join(meaning.means for meaning in told if meaning.means)
+    means = " ".join(dict.fromkeys(meaning.means for meaning in told if meaning.means))
     printed = tuple(message for meaning in told for message in meaning.printed)
     cures = tuple(dict.fromkeys(meaning.cure for meaning in told if meaning.cure))
     return ErrorRow(

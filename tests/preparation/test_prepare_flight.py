@@ -20,7 +20,7 @@ from cfplan.simulation.link_loss import LinkLoss, simulate_link_loss
 
 REPOSITORY = Path(__file__).parents[2]
 LINE = REPOSITORY / "flights" / "line.yaml"
-AFTER_PLANNING = ["certificate", "bytes", "dry run", "link loss", "stops", "link loss of take-off and landing"]
+AFTER_PLANNING = ["certificate", "bytes", "dry run", "link loss", "stops", "slow phases"]
 
 ENDED_WELL = (StepState.FINISHED, StepState.WARNED)
 

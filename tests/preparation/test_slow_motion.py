@@ -56,7 +56,7 @@ def test_a_flight_is_prepared_with_it():
         load_limits(REPOSITORY / "safety.yaml"),
         on_step=lambda name, state, _: steps.append((name, state)),
     )
-    assert ("link loss of take-off and landing", StepState.FINISHED) in steps
+    assert ("slow phases", StepState.FINISHED) in steps
 
 
 FAST = {"go_to_speed": 2.0}

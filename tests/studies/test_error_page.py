@@ -90,3 +90,9 @@ def test_constants_of_other_modules_stand_as_they_are_printed():
     messages = [message for text in all_errors() for message in text.messages]
     assert "'…' is not a channel: 0 to 125" in messages
     assert "coordinates must be numbers within 100000 m of the origin, not …" in messages
+
+
+def test_no_meaning_is_said_twice():
+    for line in PAGE.splitlines():
+        sentences = [sentence for sentence in line.split(". ") if len(sentence) > 40]
+        assert len(sentences) == len(set(sentences)), line[:100]
