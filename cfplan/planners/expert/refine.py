@@ -22,6 +22,7 @@ from cfplan.planners.expert.search import (
     COLD_START,
     Attempt,
     Start,
+    refining_again,
     refining_restarts,
     refining_starts,
     rejection_reason,
@@ -131,7 +132,7 @@ def _search(problem: Problem, interval: float, capped: bool, deadline: Deadline)
     attempt = solve(problem, problem.coefficients, (first,), deadline)
     steps = attempt.iterations
     if attempt.solved and steps >= CRAWLED and not capped:
-        again = solve(problem, attempt.coefficients, (first._replace(lowered=SLOWER),), deadline)
+        again = solve(problem, attempt.coefficients, (refining_again(interval, SLOWER),), deadline)
         return (again if again.solved else attempt)._replace(iterations=steps + again.iterations)
     if attempt.solved or deadline.passed:
         return attempt

@@ -72,6 +72,11 @@ def refining_starts(interval: float, *, capped: bool = False) -> Sequence[Start]
     )
 
 
+def refining_again(interval: float, lowered: float) -> Start:
+    """Return the search that goes on where one of these crawled: from that share below it, at the last barrier."""
+    return _early(EARLY_STOP * interval, push=1e-2, iterations=40, roughly=ROUGHLY)._replace(lowered=lowered)
+
+
 def refining_restarts(interval: float, *, capped: bool = False) -> Sequence[Start]:
     """Return the same from the solution of a problem almost the same."""
     stop = EARLIER * EARLY_STOP if capped else EARLY_STOP
