@@ -10,6 +10,7 @@ from mkdocs.structure.files import File, Files
 REPOSITORY = Path(__file__).parent.parent
 PAGES = {"README.md": "begin.md", "CHANGELOG.md": "changes.md"}  # and what they are called on the site
 LINK = re.compile(r"(?<=\]\()(?!\w+:)[^)#\s]+")
+COMMANDS = re.compile(r"(?<=\n\n)(?: {4}(?:\$ )?(?:cfplan|make|python|git) .*\n(?: {4} .*\n)*)+(?=\n)")
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -26,9 +27,15 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Lead the links of docs/ that leave it to what on_files added."""
+    """Lead the links of docs/ that leave it to what on_files added, and show commands as a shell's."""
     uri = page.file.src_uri
-    return markdown if uri in PAGES.values() else _with_links_led(markdown, f"docs/{uri}", uri)
+    text = markdown if uri in PAGES.values() else _with_links_led(markdown, f"docs/{uri}", uri)
+    return COMMANDS.sub(_as_shell, text + "\n")
+
+
+def _as_shell(block: re.Match[str]) -> str:
+    """Return a block of commands by its language: comments in grey, and long lines go on in the next one (site.css)."""
+    return "```sh\n" + re.sub(r"^ {4}", "", block[0], flags=re.MULTILINE) + "```\n"
 
 
 def _with_links_led(text: str, name: str, page: str) -> str:
