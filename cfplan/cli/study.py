@@ -34,7 +34,7 @@ class _Studies(click.Group):
 
 @click.group(short_help="Measurements for docs/results.", cls=_Studies)
 def study() -> None:
-    """Measure one thing, with tables for docs/results. To fly, nobody needs these."""
+    """Measure one thing, with tables for docs/results. Users who only fly need none of these."""
 
 
 @study.command(short_help="Write the tables of docs/ from results/.")
