@@ -121,7 +121,7 @@ def architectures(
 
 
 def _trials_of(networks: Sequence[TrainedNetwork], item: PaperItem) -> dict[str, Any]:
-    return {"trials": path_trials(planners(networks), *item), "shipped": _shipped(*item)}
+    return {"trials": path_trials(planners(networks), *item), "shipped": _shipped(item.part, item.row, amid(item.path))}
 
 
 def settings_of(data: PaperData, quick: bool) -> dict[str, Any]:
@@ -188,6 +188,12 @@ def training_table(trained: Sequence[TrainedNetwork], data: PaperData) -> Table:
         for each in trained
     ]
     return Table("training", "Networks and their training", columns, tuple(rows))
+
+
+def amid(path: Path) -> Path:
+    """Return the path in the middle of its room: a packet holds no place farther than 32.8 m from the room's origin."""
+    places = path(np.linspace(0.0, path.end, 1000))
+    return path.placed(-0.5 * (places.min(axis=0) + places.max(axis=0)))
 
 
 def _shipped(part: str, row: int, path: Path) -> ShippedFlight:

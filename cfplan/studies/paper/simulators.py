@@ -32,7 +32,7 @@ from cfplan.safety.limit_sets import PAPER
 from cfplan.safety.limits_file import DEFAULTS, load_limits
 from cfplan.simulation.geometric_flight import LOST, positions_by_both
 from cfplan.studies.items import HERE, Progress, Running, work_table, work_through
-from cfplan.studies.paper.architectures import SHIPPED_LIMITS, SHIPPED_NODES, lost_alone
+from cfplan.studies.paper.architectures import SHIPPED_LIMITS, SHIPPED_NODES, amid, lost_alone
 from cfplan.studies.paper.hardware import TRACKED, hardware_paths, paper_limits
 from cfplan.studies.paper.networks import (
     DATA,
@@ -181,6 +181,7 @@ def _planned(network: TrainedNetwork, planner: str, path: Path) -> Trajectory:
 
 
 def _shipped(_: str, path: Path) -> Sent:
+    path = amid(path)
     task = PlanningTask(path, SHIPPED_LIMITS.airframe, SHIPPED_LIMITS.limits, SHIPPED_NODES, YawMode.FIXED)
     trajectory = refine(task, profile_of(plan_learned, task)).trajectory
     return Sent(encode_trajectory(trajectory), trajectory, SHIPPED_LIMITS.airframe)

@@ -2,13 +2,15 @@
 
 import json
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from cfplan.cli import cfplan
 from cfplan.errors import InputError
+from cfplan.geometry.min_snap import min_snap
 from cfplan.studies import machine
-from cfplan.studies.paper.architectures import architectures
+from cfplan.studies.paper.architectures import amid, architectures
 from cfplan.studies.paper.printed import ABOVE_IN_TEXT, ARCHITECTURES, INPUTS
 from cfplan.studies.paper.trials import PaperTrial, planner_row
 
@@ -64,6 +66,14 @@ def test_the_quick_run_makes_all_tables(name, rows, tmp_path, monkeypatch):
     if name == "architectures":
         (shipped,) = (table for table in document["tables"] if table["name"] == "shipped")
         assert len(shipped["rows"]) == 2
+
+
+def test_a_path_far_from_the_origin_is_flown_in_the_middle_of_its_room():
+    path = min_snap([[-33.0, 20.0, 1.0], [5.0, 21.0, 2.0], [27.0, -4.0, 9.0]])
+    moved = amid(path)
+    places = moved(np.linspace(0.0, moved.end, 500))
+    assert np.abs(places.min(axis=0) + places.max(axis=0)).max() < 1e-2
+    np.testing.assert_allclose(moved(3.0) - moved(1.0), path(3.0) - path(1.0), atol=1e-9)
 
 
 def test_unknown_architectures_are_named():
