@@ -45,7 +45,7 @@ def with_tables(page: str, folder: Path) -> str:
     def block(match: re.Match[str]) -> str:
         result = read_result(folder / match["file"])
         if match["kind"] == "measured":
-            text = _measured(result.provenance)
+            text = _measured(result.provenance, interrupted=result.interrupted)
         else:
             write = _cells if match["kind"] == "table" else _meanings
             text = write(result.table(match["name"] or ""))
@@ -125,10 +125,11 @@ def _meanings(table: Table) -> str:
     return "\n".join(f"- *{column.title}*: {column.meaning}" for column in explained)
 
 
-def _measured(made: Provenance) -> str:
+def _measured(made: Provenance, *, interrupted: bool) -> str:
     commit = f"commit {made.commit[:12]}{' with changes' if made.modified else ''}"
     machine = f"{made.machine.processor}, {made.machine.cores} cores, Python {made.machine.python}"
-    return f"    {made.command}\n\nMeasured on {made.date[:10]} at {commit}; {machine}."
+    until_then = " It was interrupted: these are the figures until then." if interrupted else ""
+    return f"    {made.command}\n\nMeasured on {made.date[:10]} at {commit}; {machine}.{until_then}"
 
 
 def _parameters() -> tuple[list[str], list[list[str]]]:

@@ -1,5 +1,6 @@
 """The tables in docs/ are what `cfplan study docs` makes of results/, and a result survives its file."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -34,7 +35,7 @@ def test_the_tables_of_a_page_are_those_of_the_results(page):
 def test_every_result_has_its_tables_on_a_page():
     pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     for file in (REPOSITORY / "results").glob("*.json"):
-        for table in read_result(file).tables:
+        for table in (table for table in read_result(file).tables if table.rows):
             assert f"<!-- table: results/{file.name}#{table.name} -->" in pages
 
 
@@ -78,6 +79,12 @@ def test_meanings_and_provenance_have_blocks_too(tmp_path):
     assert "- *landed*: at the end of its plan" in text
     assert f"    {provenance().command}" in text
     assert provenance().commit[:12] in text
+
+
+def test_a_result_that_was_interrupted_says_so(tmp_path):
+    replace(result(), interrupted=True).write(tmp_path / "flights.json")
+    text = with_tables("<!-- measured: flights.json -->\n<!-- end -->\n", tmp_path)
+    assert text.count("It was interrupted") == 1
 
 
 def test_what_was_not_measured_is_a_dash():

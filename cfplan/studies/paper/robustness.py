@@ -138,7 +138,10 @@ def robustness(
             paper_items(unseen), running, progress,
         )  # fmt: skip
     trials = [RobustnessTrial(**trial) for value in work.values for trial in value["trials"]]
-    tables = (robustness_table(trials, list(asked.models()), reference), training_table(trained, material))
+    tables = (
+        robustness_table(trials, list(asked.models()), reference),
+        *([training_table(trained, material)] if trained else []),
+    )
     compared = sum(value["compared"] for value in work.values)
     steps = training_steps(trained, settings["learned_from"]) | {
         COMPARING: (compared, sum(value["comparing_seconds"] for value in work.values))
