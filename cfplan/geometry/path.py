@@ -143,12 +143,7 @@ class Path:
 
     def _slowest(self, low: NDArray, high: NDArray) -> NDArray:
         """Return the s of the least |γ'| in each interval [low, high], by golden-section search."""
-        ratio = (math.sqrt(5) - 1) / 2
-        for _ in range(45):
-            left, right = high - ratio * (high - low), low + ratio * (high - low)
-            rising = np.linalg.norm(self(left, 1), axis=-1) < np.linalg.norm(self(right, 1), axis=-1)
-            low, high = np.where(rising, low, left), np.where(rising, right, high)
-        return (low + high) / 2
+        return _slowest_within(self.breaks, self.origins, self._tables[1], low, high)
 
     def _refuse(self, what: str, s: float, where: str) -> None:
         x, y, z = self(s)
@@ -185,6 +180,51 @@ def derivatives_of(coefficients: NDArray, x: NDArray) -> NDArray:
     for term in coefficients.transpose(1, 2, 0)[::-1]:
         p = step(x, term, p)
     return np.stack([factor * each for factor, each in zip((1.0, 1.0, 2.0, 6.0, 24.0), p, strict=True)])
+
+
+_GOLDEN = (math.sqrt(5) - 1) / 2
+_GOLDEN_STEPS = 45
+
+
+def _slowest_interpreted(breaks: NDArray, origins: NDArray, table: NDArray, low: NDArray, high: NDArray) -> NDArray:
+    def speed(s: NDArray) -> NDArray:
+        return np.asarray(np.linalg.norm(_values(breaks, origins, table, s), axis=-1))
+
+    for _ in range(_GOLDEN_STEPS):
+        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        rising = speed(left) < speed(right)
+        low, high = np.where(rising, low, left), np.where(rising, right, high)
+    return (low + high) / 2
+
+
+@njit(interpreted=_slowest_interpreted)
+def _slowest_within(breaks: NDArray, origins: NDArray, table: NDArray, low: NDArray, high: NDArray) -> NDArray:
+    """Return the s, (N,), of the least |γ'| between `low` and `high`; `table`, (M, D, 3), is that of γ'."""
+    out = np.empty(len(low))
+    for n in range(len(low)):
+        a, b = low[n], high[n]
+        for _ in range(_GOLDEN_STEPS):
+            left, right = b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)
+            if _squared_speed(breaks, origins, table, left) < _squared_speed(breaks, origins, table, right):
+                b = right
+            else:
+                a = left
+        out[n] = (a + b) / 2
+    return out
+
+
+@register_jitable
+def _squared_speed(breaks: NDArray, origins: NDArray, table: NDArray, s: float) -> float:
+    """Return |γ'|² at s."""
+    s = min(max(s, 0.0), breaks[-1])
+    piece = _piece_at(breaks, s)
+    x, total = s - origins[piece], 0.0
+    for axis in range(3):
+        value = 0.0
+        for k in range(table.shape[1] - 1, -1, -1):
+            value = value * x + table[piece, k, axis]
+        total += value * value
+    return total
 
 
 def _trace_interpreted(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray, out: NDArray) -> None:

@@ -1,5 +1,6 @@
 """Polynomial arithmetic on many pieces at a time, coefficients in ascending powers."""
 
+from functools import lru_cache
 from math import comb, factorial
 
 import numpy as np
@@ -8,10 +9,15 @@ from numpy.typing import NDArray
 
 def shifted(table: NDArray, offset: NDArray) -> NDArray:
     """Return the same polynomials (M, D, 3), each in powers of x - offset[i], with offset (M,)."""
-    count = table.shape[1]
-    binomials = np.array([[comb(k, j) if k >= j else 0 for k in range(count)] for j in range(count)], dtype=float)
-    exponents = np.maximum(np.arange(count) - np.arange(count)[:, None], 0)
+    binomials, exponents = _shift(table.shape[1])
     return (binomials * offset[:, None, None] ** exponents) @ table
+
+
+@lru_cache(maxsize=16)
+def _shift(count: int) -> tuple[NDArray, NDArray]:
+    """Return the binomials, and the exponents of the offset, (count, count) each, by which polynomials are shifted."""
+    binomials = np.array([[comb(k, j) if k >= j else 0 for k in range(count)] for j in range(count)], dtype=float)
+    return binomials, np.maximum(np.arange(count) - np.arange(count)[:, None], 0)
 
 
 def reversed_pieces(durations: NDArray, table: NDArray) -> tuple[NDArray, NDArray]:
@@ -29,7 +35,9 @@ def end_values(durations: NDArray, table: NDArray, orders: int = 5) -> tuple[NDA
 
 def padded(table: NDArray, count: int) -> NDArray:
     """Return the same polynomials with `count` coefficients each, (M, count, 3)."""
-    return np.pad(table, ((0, 0), (0, count - table.shape[1]), (0, 0)))
+    wider = np.zeros((len(table), count, 3))
+    wider[:, : table.shape[1]] = table
+    return wider
 
 
 def composed(outer: NDArray, inner: NDArray, count: int) -> NDArray:

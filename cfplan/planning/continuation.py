@@ -25,11 +25,13 @@ from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.features import REFERENCE, ScaledLimits, node_features, scaled_limits
+from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.expert.search import COLD_START
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import check_endurance
 from cfplan.planning.plan_result import Plan
-from cfplan.planning.planners import default_nodes, find_planner
+from cfplan.planning.planners import default_nodes
 from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.safety.space import check_space
@@ -54,6 +56,7 @@ STOPPING = 0.6  # s of the way left, on which a vehicle that stops comes to rest
 OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
 ROOM = 0.005  # share of each limit that plans leave to whoever continues them
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
+NODES_ROUND = 8  # of which intervals on a grid are a multiple
 _NODES = 60  # where a path's time is estimated
 
 
@@ -101,7 +104,7 @@ def continue_plan(
     ways = (first, _ways_guided(joint, trajectory, points), _ways_later(joint, trajectory, points))
     for way in islice(chain.from_iterable(_sound(each, limits, known) for each in ways), MOST_TRIES):
         task = PlanningTask(
-            way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,
+            way.path, limits.airframe, limits.plan, _nodes(way.path), yaw, yaw_angle, start=way.start,
             speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,
         )  # fmt: skip
         found = _solve(task, limits)
@@ -216,9 +219,14 @@ def _unsound(path: Path, limits: Limits) -> str:
     return ""
 
 
+def _nodes(path: Path) -> int:
+    """Return the intervals of a path's grid: a round number, of which the layout is known from other paths."""
+    return NODES_ROUND * math.ceil(default_nodes(path, PLANNER) / NODES_ROUND)
+
+
 def _slowing_to(speed: float, way: _Way) -> SpeedCaps:
     """Return caps of speed along a path, that fall from what the vehicle has at its start."""
-    s = np.linspace(0.0, way.path.end, 4 * default_nodes(way.path, PLANNER) + 1)
+    s = np.linspace(0.0, way.path.end, 4 * _nodes(way.path) + 1)
     moving = np.linalg.norm(way.path(s, 1), axis=1)
     length = np.append(0.0, np.cumsum((moving[1:] + moving[:-1]) / 2.0 * np.diff(s)))
     first = moving[0] * way.start.h**0.5
@@ -266,7 +274,7 @@ def _solve(task: PlanningTask, limits: Limits) -> _Found | str:
     solution = Solution(Status.BAD_BOUNDARY, None)
     for allowed in (with_room(task.limits, task.airframe), task.limits):
         if solution.status is Status.BAD_BOUNDARY:
-            solution = find_planner(PLANNER)(replace(task, limits=allowed))
+            solution = plan_expert(replace(task, limits=allowed), starts=COLD_START[:1])  # others never help here
     if solution.profile is None:
         return f"{solution.status} ({' '.join(solution.reason.split())})" if solution.reason else str(solution.status)
     trajectory = Trajectory(task.path, solution.profile, task.airframe)

@@ -72,17 +72,19 @@ def certify_beginning(
     As certify_whole(). With `foresee`, an estimate of link loss in all of the flight counts besides: what it says to
     end outside by far is refused before any of it is flown.
     """
-    encoded = encode_trajectory(flown, gains=gains_under(limits), space=limits.space)
     if following + STOP >= flown.duration * RATE:
         return certify_whole(flown, limits, starts)
+    gains, space = gains_under(limits), limits.space
+    encoded = encode_trajectory(flown, gains=gains, space=space, count=following + STOP)  # stops lead half as far on
     last = np.array([following])
-    stop = encode_stops(encoded.motion, RATE, rows=last, gains=encoded.gains, space=encoded.space)[0]
+    stop = encode_stops(encoded.motion, RATE, rows=last, gains=gains, space=space)[0]
     payloads = np.concatenate([encoded.payloads[:following], stop, np.repeat(stop[-1:], BEHIND - len(stop), axis=0)])
     begun = _first_rows(encoded, following + 1)
 
     def foresee_link_loss() -> None:
         if foresee and not limits.link_loss.only_warn:
-            foreseen = foreseen_link_loss(encoded.payloads, limits, starts=starts).worst
+            payloads = encode_trajectory(flown, gains=gains, space=space).payloads
+            foreseen = foreseen_link_loss(payloads, limits, starts=starts).worst
             if foreseen.beyond > _FORESEEN:
                 raise EndsBadlyError(str(foreseen), where="link loss", hint=OUTSIDE_HINT)
 

@@ -21,6 +21,7 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.machine_code import njit
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 
+_STILL = 1e-6  # rad, and rad by nominal time, that yaw is off or turns at most where it stays as it is
 SMOOTHING_LENGTH = 0.15  # s of nominal time, over which a sudden turn is spread
 SETTLING_LENGTH, TURN = 1.0, 0.3  # s of nominal time, at least, and rad a second of it, to turn from a boundary state
 SAMPLES = 16  # an interval, where the direction of flight is followed
@@ -62,6 +63,8 @@ class YawSpline:
         if start is None and end is None:
             return cls(np.full(nodes + 1, angle), np.zeros(nodes + 1), np.zeros(nodes))
         if start is not None and end is None:  # the turn of 2π that is nearest
+            if abs(start.yaw - angle) < _STILL and abs(start.dyaw) < _STILL:  # it stays as it is
+                return cls(np.full(nodes + 1, start.yaw), np.zeros(nodes + 1), np.zeros(nodes))
             angle += 2 * np.pi * np.round((start.yaw - angle) / (2 * np.pi))
         target = np.full(2 * nodes + 1, angle)
         return _fit(path, nodes, target, np.ones_like(target), start, end)

@@ -124,11 +124,12 @@ def encode_trajectory(
     thrust_lead: float = THRUST_LEAD,
     gains: AttitudeGains = FIRMWARE_GAINS,
     space: Space | None = None,
+    count: int | None = None,
 ) -> EncodedFlight:
     """Encode a flight: full states at `rate`, Hz, then hover at the end for at least `hold`, s.
 
     `lead`, s, samples the trajectory that much ahead of the clock. `space` has the walls that a vehicle whose setpoints
-    stop is to keep away from. Raises NotCertifiedError with the setpoint where a value is not finite or does not fit
+    stop is to keep away from. With `count`, so many setpoints are made at most, the first ones. Raises NotCertifiedError with the setpoint where a value is not finite or does not fit
     its 16 bits.
     """
     if not (np.isfinite([trajectory.duration, lead, rate_lead, thrust_lead]).all() and rate > 0 and hold >= 0):
@@ -138,7 +139,8 @@ def encode_trajectory(
             hint="give finite times, a rate above 0 and a hold of at least 0",
         )
     moving = int(np.ceil(trajectory.duration * rate)) + 1
-    times = np.arange(moving + int(np.ceil(hold * rate))) / rate
+    whole = moving + int(np.ceil(hold * rate))
+    times = np.arange(whole if count is None else min(whole, count)) / rate
     payloads = []
     for rows in _batches(len(times)):
         moments = times[rows] + lead

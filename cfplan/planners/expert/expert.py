@@ -15,6 +15,7 @@ alone, an optimiser lets it run away or stop short. There h stays constant over 
 
 import math
 import time
+from collections.abc import Sequence
 
 from numpy.typing import NDArray
 
@@ -23,7 +24,7 @@ from cfplan.planners.expert.initial_guess import guess_spline
 from cfplan.planners.expert.layout import Shape, layout_of
 from cfplan.planners.expert.point_constraints import Penalties
 from cfplan.planners.expert.problem import Ends, Segment, build_problem, slowness_of
-from cfplan.planners.expert.search import COLD_START, rejection_reason, solve
+from cfplan.planners.expert.search import COLD_START, Start, rejection_reason, solve
 from cfplan.planners.expert.tightening import Tightened, tighten_until_feasible
 from cfplan.planners.expert.windows import WindowSize, by_windows, failed_status, solution_of
 from cfplan.planners.solution import Solution
@@ -33,14 +34,21 @@ from cfplan.vehicle.yaw_spline import YawSpline
 WINDOW = WindowSize(kept=96, ahead=24)  # longer windows take more iterations
 
 
-def plan_expert(task: PlanningTask, *, penalties: Penalties | None = None, window: WindowSize = WINDOW) -> Solution:
+def plan_expert(
+    task: PlanningTask,
+    *,
+    penalties: Penalties | None = None,
+    window: WindowSize = WINDOW,
+    starts: Sequence[Start] = COLD_START,
+) -> Solution:
     """Plan the fastest profile that keeps every limit of the task.
 
     Yaw is that of the Hopf fibration. FIXED holds the yaw angle, TANGENT follows the horizontal direction of flight;
     both are laid out before the speed (see YawSpline), which then respects what turning takes. FREE leaves yaw to the
     optimiser, from a first yaw between that angle and a quarter turn more, as the paper has it. A start or end state
-    brings its own yaw in every mode. A path longer than `window` is planned window by window. At the task's deadline
-    there is no profile, unless only limits between points were still exceeded.
+    brings its own yaw in every mode. A path longer than `window` is planned window by window. The search begins as the
+    first of `starts` that succeeds. At the task's deadline there is no profile, unless only limits between points were
+    still exceeded.
 
     Raises:
         InputError: fewer nodes than the path needs.
@@ -59,7 +67,7 @@ def plan_expert(task: PlanningTask, *, penalties: Penalties | None = None, windo
 
     def search(segment: Segment, _near: NDArray) -> Tightened | str:
         problem = build_problem(segment, task.yaw_angle, penalties)
-        attempt = solve(problem, problem.coefficients, COLD_START, task.deadline)
+        attempt = solve(problem, problem.coefficients, starts, task.deadline)
         return rejection_reason(attempt, segment) or tighten_until_feasible(
             attempt, problem, segment, deadline=task.deadline
         )

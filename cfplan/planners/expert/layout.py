@@ -59,7 +59,7 @@ class Layout:
         return self.speed_interval + self.speed_place
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=128)
 def layout_of(shape: Shape) -> Layout:
     """Return the layout of a shape, made once a process."""
     all_rows = np.ones(point_constraints.ROWS, dtype=bool)
@@ -111,7 +111,7 @@ class Variables:
     sparsity: Sparsity
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=128)
 def variables_of(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, bool]) -> Variables:
     """Return the variables, where each end is held by a boundary state or not, and at rest or not."""
     nodes, free_yaw = layout.shape.nodes, layout.shape.free_yaw
