@@ -61,6 +61,7 @@ with machine_code.without_compiling():
     from cfplan.safety.limits_file import load_limits
     limits = load_limits(Path("safety.yaml"))
     path = min_snap([[0.0, 0.0, 1.0], [0.6, 0.5, 1.2], [0.0, 0.9, 0.8]])
+    path.check()
     plan(path, limits.airframe, limits, planner="learned")
     plan(path, limits.airframe, limits, planner="expert", nodes=12, yaw=YawMode.FREE)
 print(json.dumps([sorted(with_another_way), sorted(called)]))

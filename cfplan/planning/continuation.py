@@ -10,9 +10,10 @@ Several paths are tried, first the one that looks fastest by a cheap estimate.
 
 import math
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from itertools import chain, islice
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -56,12 +57,23 @@ STOPPING = 0.6  # s of the way left, on which a vehicle that stops comes to rest
 OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
 ROOM = 0.005  # share of each limit that plans leave to whoever continues them
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
-NODES_ROUND = 8  # of which intervals on a grid are a multiple
 _NODES = 60  # where a path's time is estimated
 
 
 class NoWayError(InfeasibleError):
     """No path that was tried leads from the state of a joint through the waypoints; from a later one it may."""
+
+
+class TooLateError(CfplanError):
+    """What is planned cannot be flown from its joint any more; from a later one it may."""
+
+
+@dataclass(slots=True)
+class Ways:
+    """Which kinds of path led on, and which did not, from a joint a little before; written as paths are tried."""
+
+    found: tuple[int, int] | None = None
+    failed: set[tuple[int, int]] = field(default_factory=set)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,37 +94,46 @@ def continue_plan(
     yaw: YawMode = YawMode.FIXED,
     yaw_angle: float = 0.0,
     speed: float = math.inf,
+    ways: Ways | None = None,
+    too_late: Callable[[], bool] = lambda: False,
 ) -> Continuation:
     """Return a certified plan that leaves a trajectory at `leave`, s, and goes through waypoints, (K, 3) m, to rest.
 
     `times`, (K,) s, are the nominal times of the segments that end in each, where waypoints of the path left stay: what
     is left of it. In mode FIXED yaw turns to `yaw_angle`, rad, along the path. `speed`, m/s, is not to be exceeded once
-    the vehicle has slowed down to it, gently.
+    the vehicle has slowed down to it, gently. With what is known of `ways` from another joint the one found there is
+    tried first, and those that failed are not tried.
 
     Raises:
         InputError: the waypoints are no waypoints, or the trajectory does not move then.
         InfeasibleError: a waypoint lies outside the space, or none of the paths tried can be flown from this state.
+        TooLateError: a path did not lead on, and by then it was `too_late` to try others.
     """
-    begun = time.perf_counter()
+    begun, ways = time.perf_counter(), Ways() if ways is None else ways
     joint = joint_at(trajectory, leave)
     points = np.asarray(waypoints, dtype=float)
     continued_min_snap(joint.derivatives, points)  # refuses what are no waypoints
     check_waypoints(points, limits)
     known = scaled_limits(limits.airframe, limits.plan)
     failure = ""
-    first = _ways(joint, trajectory, points, times)
-    ways = (first, _ways_guided(joint, trajectory, points), _ways_later(joint, trajectory, points))
-    for way in islice(chain.from_iterable(_sound(each, limits, known) for each in ways), MOST_TRIES):
+    straight = _ways(joint, points, times, trajectory)
+    kinds = (lambda: straight, lambda: _ways_guided(joint, trajectory, points),
+             lambda: _ways_later(joint, trajectory, points))  # fmt: skip
+    for number, way in islice(_sound(kinds, limits, known, ways), MOST_TRIES):
+        if ways.failed and too_late():
+            raise TooLateError("no way has been found in time", where="request", hint="it is planned farther ahead")
         task = PlanningTask(
-            way.path, limits.airframe, limits.plan, _nodes(way.path), yaw, yaw_angle, start=way.start,
+            way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,
             speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,
         )  # fmt: skip
         found = _solve(task, limits)
         if not isinstance(found, str):
+            ways.found = number
             check_endurance(found.trajectory.duration, limits)
             return Continuation(_plan(found, task, limits, time.perf_counter() - begun), way.reached)
+        ways.failed.add(number)
         failure = found
-    failure = failure or _unsound(next(_ways(joint, trajectory, points, times)).path, limits)
+    failure = failure or _unsound(straight[0]().path, limits)
     speed = float(np.linalg.norm(trajectory.at(leave).velocity))
     away = float(np.linalg.norm(points[0] - joint.derivatives[0]))
     raise NoWayError(
@@ -164,18 +185,25 @@ class _Way(NamedTuple):
     reached: tuple[float, ...]
 
 
-def _ways(joint: Joint, trajectory: Trajectory, points: NDArray, times: ArrayLike | None) -> Iterator[_Way]:
-    """Yield the paths that are worth a try."""
+_Maker = Callable[[], _Way]
+
+
+def _ways(joint: Joint, points: NDArray, times: ArrayLike | None, trajectory: Trajectory) -> list[_Maker]:
+    """Return what makes the paths that are worth a try."""
     straight = centripetal_times(np.concatenate([joint.derivatives[:1], points]))
+    made: list[_Maker] = []
     if times is not None:
-        yield _way(joint, points, np.asarray(times, dtype=float))
+        made.append(partial(_way, joint, points, np.asarray(times, dtype=float)))
     for begin, factors in ((joint, FIRST_TIMES), (joint.timed(trajectory, RATE), FIRST_TIMES_TIMED)):
-        for factor in factors:
-            yield _way(begin, points, np.concatenate([[factor * straight[0]], straight[1:]]))
+        made += [
+            partial(_way, begin, points, np.concatenate([[factor * straight[0]], straight[1:]])) for factor in factors
+        ]
+    return made
 
 
-def _ways_later(joint: Joint, trajectory: Trajectory, points: NDArray) -> Iterator[_Way]:
-    """Yield paths that go on a little as the one left would, before they turn off."""
+def _ways_later(joint: Joint, trajectory: Trajectory, points: NDArray) -> list[_Maker]:
+    """Return what makes paths that go on a little as the one left would, before they turn off."""
+    made: list[_Maker] = []
     for later in VIA:
         s = float(trajectory.s_at(min(joint.time + later, trajectory.duration)))
         via = trajectory.path(s)
@@ -183,30 +211,45 @@ def _ways_later(joint: Joint, trajectory: Trajectory, points: NDArray) -> Iterat
             onwards = centripetal_times(np.concatenate([via[None], points]))
             for factor in FIRST_TIMES_VIA:
                 ahead = np.concatenate([[s - joint.s, factor * onwards[0]], onwards[1:]])
-                way = _way(joint, np.concatenate([via[None], points]), ahead)
-                yield way._replace(reached=way.reached[1:])
+                made.append(partial(_way, joint, np.concatenate([via[None], points]), ahead, range(1, len(ahead))))
+    return made
 
 
-def _ways_guided(joint: Joint, trajectory: Trajectory, points: NDArray) -> Iterator[_Way]:
-    """Yield paths that keep near the straight lines between the waypoints."""
+def _ways_guided(joint: Joint, trajectory: Trajectory, points: NDArray) -> list[_Maker]:
+    """Return what makes paths that keep near the straight lines between the waypoints."""
+    made: list[_Maker] = []
     for away in GUIDES_IN_MOTION:
         guided, rows = with_guides(np.concatenate([joint.derivatives[:1], points]), away, first_too=False)
         onwards = centripetal_times(guided)
         for begin in (joint, joint.timed(trajectory, RATE)):
             for factor in FIRST_TIMES_GUIDED:
-                way = _way(begin, guided[1:], np.concatenate([[factor * onwards[0]], onwards[1:]]))
-                yield way._replace(reached=tuple(way.reached[row - 1] for row in rows[1:]))
+                ahead = np.concatenate([[factor * onwards[0]], onwards[1:]])
+                made.append(partial(_way, begin, guided[1:], ahead, [row - 1 for row in rows[1:]]))
+    return made
 
 
-def _way(joint: Joint, points: NDArray, times: NDArray) -> _Way:
-    path = continued_min_snap(joint.derivatives, points, times)
-    return _Way(path, joint.state, tuple(np.cumsum(times).tolist()))
+def _way(joint: Joint, points: NDArray, times: NDArray, rows: Sequence[int] | None = None) -> _Way:
+    """Return the path through points, of which those of the `rows`, or all, are waypoints."""
+    path, reached = continued_min_snap(joint.derivatives, points, times), np.cumsum(times).tolist()
+    return _Way(path, joint.state, tuple(reached if rows is None else (reached[row] for row in rows)))
 
 
-def _sound(ways: Iterable[_Way], limits: Limits, known: ScaledLimits) -> Iterator[_Way]:
-    """Yield ways inside the space that can be planned, TRIES at most, first the one that looks fastest."""
-    fastest_first = sorted(ways, key=lambda way: _least_time(way.path, known))
-    return islice((way for way in fastest_first if not _unsound(way.path, limits)), TRIES)
+def _sound(
+    kinds: Sequence[Callable[[], list[_Maker]]], limits: Limits, known: ScaledLimits, ways: Ways
+) -> Iterator[tuple[tuple[int, int], _Way]]:
+    """Yield ways inside the space that can be planned, TRIES of a kind at most, first the one that looks fastest.
+
+    Each has a number. The one that was found elsewhere comes before all, and those that failed do not come.
+    """
+    first = ways.found
+    if first is not None:
+        makers = kinds[first[0]]()
+        if first[1] < len(makers) and not _unsound((way := makers[first[1]]()).path, limits):
+            yield first, way
+    for kind, make in enumerate(kinds):
+        made = [((kind, k), maker()) for k, maker in enumerate(make()) if (kind, k) not in (first, *ways.failed)]
+        fastest_first = sorted(made, key=lambda each: _least_time(each[1].path, known))
+        yield from islice((each for each in fastest_first if not _unsound(each[1].path, limits)), TRIES)
 
 
 def _unsound(path: Path, limits: Limits) -> str:
@@ -219,14 +262,9 @@ def _unsound(path: Path, limits: Limits) -> str:
     return ""
 
 
-def _nodes(path: Path) -> int:
-    """Return the intervals of a path's grid: a round number, of which the layout is known from other paths."""
-    return NODES_ROUND * math.ceil(default_nodes(path, PLANNER) / NODES_ROUND)
-
-
 def _slowing_to(speed: float, way: _Way) -> SpeedCaps:
     """Return caps of speed along a path, that fall from what the vehicle has at its start."""
-    s = np.linspace(0.0, way.path.end, 4 * _nodes(way.path) + 1)
+    s = np.linspace(0.0, way.path.end, 4 * default_nodes(way.path, PLANNER) + 1)
     moving = np.linalg.norm(way.path(s, 1), axis=1)
     length = np.append(0.0, np.cumsum((moving[1:] + moving[:-1]) / 2.0 * np.diff(s)))
     first = moving[0] * way.start.h**0.5

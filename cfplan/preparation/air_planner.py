@@ -17,6 +17,7 @@ from cfplan.planning.plan_result import Plan
 from cfplan.preparation.certified_flight import EndsBadlyError
 from cfplan.preparation.replan import (
     PACE,
+    Attempt,
     HeldFlight,
     Replanned,
     at_pace,
@@ -30,7 +31,7 @@ from cfplan.safety.limits import Limits
 
 FIRST_PART, NEXT_PART = 0.5, 0.8  # s of a plan committed at once, at least: its beginning, and more of it
 PART = 4.0  # likewise, for each s that planning looks ahead
-SLACK = 0.02  # s more than that, for the way to the pilot, which looks every 10 ms
+SLACK = 0.003  # s more than that
 FARTHEST = 3000  # setpoints ahead of which no more of a plan is committed, until the vehicle comes nearer
 
 
@@ -114,11 +115,17 @@ def presses(held: HeldFlight, first: int, ahead: float) -> bool:
 
 
 def plan_request(
-    held: HeldFlight, request: PathRequest, first: int, limits: Limits, part: int | None = None
+    held: HeldFlight,
+    request: PathRequest,
+    first: int,
+    limits: Limits,
+    part: int | None = None,
+    attempt: Attempt | None = None,
 ) -> Replanned | HeldFlight:
     """Return the proposal from setpoint `first` on that does what is asked for, of so many setpoints as `part` says.
 
-    Where nothing need be proposed, what is held from now on. Raises a CfplanError where no plan does it.
+    Where nothing need be proposed, what is held from now on. Raises a CfplanError where no plan does it, TooLateError
+    where the `attempt` says so.
     """
     yaw = float(held.flown.at(held.ends).yaw)
     match request.wish:
@@ -127,9 +134,10 @@ def plan_request(
         case Wish.SLOWER | Wish.FASTER:
             now = min(held.speed, limits.plan.speed)
             speed = now * PACE if request.wish is Wish.SLOWER else now / PACE
-            return pace(held, first, speed, limits, yaw_angle=yaw, part=part) or at_pace(held, speed)
+            paced = pace(held, first, speed, limits, yaw_angle=yaw, part=part, attempt=attempt)
+            return paced or at_pace(held, speed)
     keep = request.wish is Wish.EXTEND
-    return replan(held, first, request.waypoints, limits, keep=keep, yaw_angle=yaw, part=part)
+    return replan(held, first, request.waypoints, limits, keep=keep, yaw_angle=yaw, part=part, attempt=attempt)
 
 
 def plan_behind_stop(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import CfplanError, InfeasibleError
+from cfplan.flight.setpoints.commitment import left_of
 from cfplan.flight.setpoints.encoding import HOLD, RATE, EncodedFlight, check_bytes, check_setpoints, encode_trajectory
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import gains_under
@@ -95,13 +96,8 @@ def certify_beginning(
 
     stops, lost = _certified(begun, payloads, limits, starts, rehearse, encoded.motion, foresee_link_loss)
     rest = rest_behind(encoded.motion, following, RATE)
-    return CertifiedFlight(payloads, np.concatenate([stops[:-1], left_of(stop)]), lost.snapshots, following, rest)
-
-
-def left_of(stop: NDArray) -> NDArray:
-    """Return (BEHIND, M, 29) uint8: the stops from within a stop, (M, 29), and the hover behind it, are its rest."""
-    rows = np.arange(BEHIND)[:, None] + np.arange(len(stop))
-    return np.asarray(stop[np.minimum(rows, len(stop) - 1)])
+    behind = left_of(stop, BEHIND - 1)
+    return CertifiedFlight(payloads, np.concatenate([stops, behind]), lost.snapshots, following, rest)
 
 
 def _first_rows(encoded: EncodedFlight, count: int) -> EncodedFlight:

@@ -10,6 +10,7 @@ import math
 import multiprocessing
 import os
 import signal
+import sys
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from cfplan.flight.pilot.proposals import PilotAnswer, read_answer
 from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, splice
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
+from cfplan.planning.continuation import TooLateError, Ways
 from cfplan.preparation.air_planner import (
     NEXT_PART,
     SLACK,
@@ -43,15 +45,28 @@ from cfplan.preparation.air_planner import (
     presses,
     wants_more,
 )
-from cfplan.preparation.replan import HeldFlight, Replanned, accepted, after_failure, following, go_on, halt, replan
+from cfplan.preparation.replan import (
+    Attempt,
+    HeldFlight,
+    Replanned,
+    accepted,
+    after_failure,
+    following,
+    go_on,
+    halt,
+    replan,
+)
 from cfplan.safety.limits import Limits
 
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 LEARNED_FROM = 10  # plans, by which one knows how long the next may take
-IN_TIME = 0.8  # share of them for which what is taken to be needed was enough: one that comes late is planned again
+IN_TIME = 0.7  # share of them for which what is taken to be needed was enough: one that comes late is planned again
 AGAIN = 1.2  # by how much longer than the first the next one is taken to need then, at least
-TRIES = 3  # of a request whose proposal comes late
+TRIES = 4  # of a request whose proposal comes late
+ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
+_GARBAGE = 100_000  # objects, after which it is looked through in any case
+_SWITCH_INTERVAL = 0.0002  # s; a thread with loops gets the interpreter back after at most this
 PRIORITY = -10  # niceness of the planner where that is allowed: behind the pilot, before all else
 _LOOK_AGAIN = 1.0  # s, until the planner sees whether it has
 _ANSWER_WITHIN = 1.0  # s in which a pilot answers; what comes later counts as well
@@ -153,6 +168,7 @@ class _Worker:
         self._held, self._limits, self._requests, self._pilot = held, limits, requests, pilot
         self._begun: float | None = None  # s, when setpoint 0 was due
         self._plans, self._stops, self._parts = _Lead(FIRST_TIME), _Lead(FIRST_STOP), _Lead(FIRST_STOP)
+        self._checks: deque[float] = deque([0.0], maxlen=LEARNED_FROM)  # s from a plan to its proposal
         self._waiting: tuple[PathRequest, float] | None = None
         self._proposed: _Proposed | None = None
         self._accepted = 0  # number of the request whose plan is flown
@@ -191,6 +207,7 @@ class _Worker:
     def _serve_next(self) -> PathAnswer | None:
         """Wait for something to do, and do it; return what there is to tell."""
         if self._waiting is None and not self._wants_more():
+            gc.collect()
             wait([self._requests, self._pilot], _LOOK_AGAIN if self._held.unfinished else None)
         self._read(0.0)
         if self._wants_more() and (self._waiting is None or presses(self._held, *self._next(self._plans))):
@@ -236,22 +253,29 @@ class _Worker:
         """Plan what is asked for, and propose it; it was `received` at that time, s."""
         if self._begun is None:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
-        reason, took = "", 0.0
+        reason, took, attempt = "", 0.0, Attempt(self._too_late, Ways())
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for _ in range(TRIES):
             begun, (first, ahead) = REAL_CLOCK.now(), self._next(lead, AGAIN * took)
             try:
-                made = self._planned(request, first, part_within(ahead))
+                made = self._planned(request, first, part_within(ahead), attempt)
+            except TooLateError as error:
+                # Known ways need less time than it took to find them.
+                took = 0.0 if attempt.ways.failed else REAL_CLOCK.now() - begun + self._checking
+                lead.note(REAL_CLOCK.now() - begun + self._checking)
+                reason = str(error)
+                continue
             except CfplanError as error:
                 return PathAnswer(request.number, PathVerdict.REFUSED, str(error))
             except Exception as error:  # a fault here must not leave the rest of the flight without a planner
                 return PathAnswer(request.number, PathVerdict.REFUSED, f"fault in the planner: {error!r}")
             proposed = REAL_CLOCK.now()
             took = proposed - begun
-            lead.note(took)
             if isinstance(made, HeldFlight):
                 self._held = made
                 return answer_held(request, made)
+            if made.plan is not None:
+                self._checks.append(took - made.plan.seconds)
             stop, answer = made.stop, None
             if stop is not None:
                 answer = self._propose(_Proposed(stop, request))
@@ -260,6 +284,7 @@ class _Worker:
                 answer = self._propose(_Proposed(made, request))
             if answer is None:
                 return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER)
+            lead.note(max(answer.came, proposed) - begun)
             if answer.commitment is not None:
                 self._accepted = request.number
                 accepted_made = answer_accepted(request.number, made, 0 if stop is None else stop.proposal.checksum)
@@ -270,10 +295,23 @@ class _Worker:
                 return PathAnswer(request.number, PathVerdict.REFUSED, reason)
         return PathAnswer(request.number, PathVerdict.LATE, reason)
 
-    def _planned(self, request: PathRequest, first: int, part: int) -> Replanned | HeldFlight:
+    def _too_late(self, splice: int) -> bool:
+        """Return whether what is planned from a setpoint on, and must be checked still, comes to the pilot too late."""
+        assert self._begun is not None
+        due = self._begun + (splice - LEAST_AHEAD) / RATE
+        return REAL_CLOCK.now() + self._checking + ON_THE_WAY > due
+
+    @property
+    def _checking(self) -> float:
+        """Return how long the checks of a plan take, s."""
+        return float(np.median(self._checks))
+
+    def _planned(self, request: PathRequest, first: int, part: int, attempt: Attempt) -> Replanned | HeldFlight:
         """Return what is to be proposed, from rest where no plan leads there from the motion."""
         try:
-            return plan_request(self._held, request, first, self._limits, part)
+            return plan_request(self._held, request, first, self._limits, part, attempt)
+        except TooLateError:
+            raise
         except CfplanError as error:
             later, _ = self._next(self._plans)
             return plan_behind_stop(self._held, request, later, self._limits, part, error)
@@ -352,10 +390,12 @@ def _run(held: HeldFlight, limits: Limits, requests: Connection, pilot: Connecti
         os.setsid()  # the terminal's signals are for the main process
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
         signal.signal(number, signal.SIG_IGN)
+    sys.setswitchinterval(_SWITCH_INTERVAL)
     worker = _Worker(held, limits, requests, pilot)
     worker.warm_up()
     gc.collect()
     gc.freeze()  # what was imported is not looked through again in flight
+    gc.set_threshold(_GARBAGE)  # the worker looks when nothing is asked for
     with contextlib.suppress(OSError, AttributeError):  # not everybody may; other systems have other ways
         os.nice(PRIORITY)
     with contextlib.suppress(EOFError, OSError):

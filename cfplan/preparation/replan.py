@@ -9,6 +9,7 @@ go_on(), one part after another before the vehicle comes to the stop. A planner 
 """
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -23,7 +24,14 @@ from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times
-from cfplan.planning.continuation import NoWayError, check_waypoints, continue_plan, path_from_rest
+from cfplan.planning.continuation import (
+    NoWayError,
+    TooLateError,
+    Ways,
+    check_waypoints,
+    continue_plan,
+    path_from_rest,
+)
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.certified_flight import (
@@ -101,6 +109,14 @@ class Replanned:
     stop: "Replanned | None" = None  # to be proposed before it, where it begins from the rest behind that
 
 
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One try to answer a request; another is made where it comes too late, with the ways that are known by then."""
+
+    too_late: Callable[[int], bool]  # whether a plan from a setpoint on, not certified yet, will come too late for it
+    ways: Ways
+
+
 def hold(planned: Plan, waypoints: ArrayLike) -> HeldFlight:
     """Return what is held of a plan that begins at rest, through waypoints (K, 3) m with centripetal times.
 
@@ -142,6 +158,7 @@ def replan(
     keep: bool = False,
     yaw_angle: float = 0.0,
     part: int | None = None,
+    attempt: Attempt | None = None,
 ) -> Replanned:
     """Return the proposal to leave what is held at setpoint `splice` and to go through waypoints, (K, 3) m, to rest.
 
@@ -155,16 +172,24 @@ def replan(
         InputError: what is given are no waypoints.
         InfeasibleError: no plan leads through them from there, or link loss would end outside the walls.
         NotCertifiedError: the plan, its bytes, a stop, a gap or the dry run does not pass.
+        TooLateError: as the `attempt` says, where there is one.
     """
     points = np.asarray(waypoints, dtype=float)
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
         raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint="give rows of x, y, z in metres")
     check_waypoints(points, limits)
-    return _replan_within(held, splice, points, limits, keep, yaw_angle, part)
+    return _replan_within(held, splice, points, limits, keep, yaw_angle, part, attempt)
 
 
 def pace(
-    held: HeldFlight, splice: int, speed: float, limits: Limits, *, yaw_angle: float = 0.0, part: int | None = None
+    held: HeldFlight,
+    splice: int,
+    speed: float,
+    limits: Limits,
+    *,
+    yaw_angle: float = 0.0,
+    part: int | None = None,
+    attempt: Attempt | None = None,
 ) -> Replanned | None:
     """Return the proposal to fly what is ahead at setpoint `splice` at a speed, m/s, at most; None where it rests.
 
@@ -173,7 +198,7 @@ def pace(
     nothing_ahead = held.exact_from > 0 and not len(held.left)  # but to come to rest
     if nothing_ahead or (splice + SPLICE_AHEAD) / RATE >= held.ends:
         return None
-    return _replan_within(at_pace(held, speed), splice, np.empty((0, 3)), limits, True, yaw_angle, part)
+    return _replan_within(at_pace(held, speed), splice, np.empty((0, 3)), limits, True, yaw_angle, part, attempt)
 
 
 def go_on(
@@ -240,7 +265,14 @@ def at_pace(held: HeldFlight, speed: float) -> HeldFlight:
 
 
 def _replan_within(
-    held: HeldFlight, splice: int, points: NDArray, limits: Limits, keep: bool, yaw_angle: float, part: int | None
+    held: HeldFlight,
+    splice: int,
+    points: NDArray,
+    limits: Limits,
+    keep: bool,
+    yaw_angle: float,
+    part: int | None,
+    attempt: Attempt | None = None,
 ) -> Replanned:
     """Return what replan() does, at the speed that is asked for, or slower where it must be."""
     fastest = min(held.speed, limits.plan.speed)
@@ -250,7 +282,8 @@ def _replan_within(
             if later and held.stops_from is not None and splice + later >= held.stops_from:
                 break
             try:
-                return _replan_at(speed, held, splice + later, points, limits, keep, yaw_angle, part)
+                at_once = attempt if speed == fastest and not later else None  # ways are known of that alone
+                return _replan_at(speed, held, splice + later, points, limits, keep, yaw_angle, part, at_once)
             except EndsBadlyError as error:
                 refused = error
                 break  # slower
@@ -273,12 +306,17 @@ def _replan_at(
     keep: bool,
     yaw_angle: float,
     part: int | None,
+    attempt: Attempt | None,
 ) -> Replanned:
     """Return what replan() does, at that speed, m/s, or less."""
     held = at_rest_from(held, splice, limits)
     splice, left = _leaving(held, splice, keep)
     joint = (splice + SPLICE_AHEAD) / RATE
     leave, trajectory = joint - held.flown.starts[left], held.flown.trajectories[left]
+
+    def too_late() -> bool:
+        return attempt is not None and attempt.too_late(splice)
+
     if leave >= trajectory.duration:
         place = held.flown.at(joint)
         points = np.concatenate([place.position[None], held.left, points] if keep else [place.position[None], points])
@@ -303,8 +341,13 @@ def _replan_at(
                     where="request",
                     hint="ask for waypoints instead; they are flown so",
                 )
-        made = continue_plan(trajectory, leave, points, limits, times=times, yaw_angle=yaw_angle, speed=speed)
+        made = continue_plan(
+            trajectory, leave, points, limits, times=times, yaw_angle=yaw_angle, speed=speed,
+            ways=None if attempt is None else attempt.ways, too_late=too_late,
+        )  # fmt: skip
         planned, reached = made.plan, made.reached
+    if too_late():
+        raise TooLateError("the plan was not made in time", where="request", hint="it is planned farther ahead")
     flown = held.flown.continued(joint, planned.trajectory)
     since, starts = flown.since(splice / RATE), snapshots_at(held, splice)
     passed = certify_whole(since, limits, starts) if part is None else certify_beginning(since, part, limits, starts)
@@ -313,7 +356,8 @@ def _replan_at(
 
 def _proposed(held: HeldFlight, splice: int, made: CertifiedFlight, planned: Plan | None, joint: float) -> Replanned:
     """Return the proposal of what was certified; `held` has the trajectories and waypoints behind it."""
-    proposal = propose(held.commitment, splice, made.payloads, made.stops)
+    ending = 0 if made.following is None else len(made.payloads) - made.following - 1
+    proposal = propose(held.commitment, splice, made.payloads, made.stops, ending)
     return Replanned(proposal, held_with(held, splice, made), planned, joint)
 
 
@@ -429,7 +473,8 @@ def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration:
     meet_gaps(payloads, limits, starts)
     resting = _resting(held, rest_behind(motion, 1, RATE, duration), splice + 1, splice + len(rows), limits)
     later = replace(resting, begin=splice, snapshots=lost.snapshots)
-    return Replanned(propose(held.commitment, splice, payloads, stops), later, None, splice / RATE)
+    proposal = propose(held.commitment, splice, payloads, stops, len(stops) - 2)
+    return Replanned(proposal, later, None, splice / RATE)
 
 
 def _rehearse_stop(payloads: NDArray, duration: float, limits: Limits, starts: NDArray) -> None:

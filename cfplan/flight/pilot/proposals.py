@@ -9,10 +9,12 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import Protocol
 
+from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal
 
 LONGEST_MESSAGE = 1 << 26  # bytes, of a proposal: five minutes of flight
-_ANSWER = struct.Struct("<8sIId")  # kind, checksum of the proposal, of the commitment, time
+# kind, checksum of the proposal, of the commitment, and when setpoint 0 is due, or the proposal came, s
+_ANSWER = struct.Struct("<8sIId")
 _BEGUN, _ACCEPTED, _REFUSED = b"begun   ", b"accepted", b"refused "
 
 
@@ -77,6 +79,7 @@ class ReceivedProposals(HeldProposals):
         super().__init__(self._answer)
         self._connection = connection
         self._answers: SimpleQueue[bytes] = SimpleQueue()
+        self._came = (0, 0.0)  # checksum of the proposal that came last, and when, s
         threading.Thread(target=self._read, name="proposals", daemon=True).start()
         threading.Thread(target=self._write, name="answers", daemon=True).start()
 
@@ -84,15 +87,18 @@ class ReceivedProposals(HeldProposals):
         self._answers.put(_ANSWER.pack(_BEGUN, 0, 0, start))
 
     def _answer(self, proposal: Proposal, answer: Commitment | Refusal) -> None:
+        checksum, came = self._came
+        came = came if checksum == proposal.checksum else 0.0
         if isinstance(answer, Commitment):
-            self._answers.put(_ANSWER.pack(_ACCEPTED, proposal.checksum, answer.checksum, 0.0))
+            self._answers.put(_ANSWER.pack(_ACCEPTED, proposal.checksum, answer.checksum, came))
         else:
-            self._answers.put(_ANSWER.pack(_REFUSED, proposal.checksum, 0, 0.0) + str(answer).encode())
+            self._answers.put(_ANSWER.pack(_REFUSED, proposal.checksum, 0, came) + str(answer).encode())
 
     def _read(self) -> None:
         with contextlib.suppress(EOFError, OSError, TypeError):  # TypeError: it was closed here while it was read
             while True:
                 if proposal := Proposal.of_bytes(self._connection.recv_bytes(LONGEST_MESSAGE)):
+                    self._came = proposal.checksum, REAL_CLOCK.now()
                     self.give(proposal)
 
     def _write(self) -> None:
@@ -108,6 +114,7 @@ class PilotAnswer:
     begun: float | None = None  # s, when setpoint 0 is due, where that is told
     proposal: int = 0  # checksum of the proposal that is answered
     commitment: int | None = None  # checksum of what is committed with it; None where it was refused
+    came: float = 0.0  # s, when the pilot had the proposal; 0 where another came meanwhile
     reason: str = ""  # why it was refused
 
 
@@ -120,7 +127,7 @@ def read_answer(message: bytes) -> PilotAnswer:
         case b"begun   ":
             return PilotAnswer(begun=time)
         case b"accepted":
-            return PilotAnswer(proposal=proposal, commitment=commitment)
+            return PilotAnswer(proposal=proposal, commitment=commitment, came=time)
         case b"refused ":
-            return PilotAnswer(proposal=proposal, reason=message[_ANSWER.size :].decode())
+            return PilotAnswer(proposal=proposal, came=time, reason=message[_ANSWER.size :].decode())
     raise ValueError(f"an answer of the kind {kind!r}")

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
@@ -31,8 +32,9 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import rotations_of
 
 SPLICE_AHEAD = math.ceil((LEAD + BRAKE_LEAD) * RATE)  # setpoints from a splice to its joint: so far ahead one looks
-LEAST_AHEAD = 2  # setpoints from the clock to a splice, at least, in time for it
+LEAST_AHEAD = 0  # setpoints from the one just sent to a splice, at least: the first that is another comes behind that
 FARTHEST_AHEAD = 6000  # setpoints from the clock to a splice, at most: a minute
+LONGEST_ENDING = 1000  # stops of a proposal that are not sent, at most, so that a message cannot ask for any memory
 KEPT_BEHIND = 100  # setpoints before the one due that are kept, for a vehicle that fell behind
 QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
 LEVEL = 0.01  # rad of tilt, below which a vehicle hovers: twice what bytes round an attitude by
@@ -40,7 +42,8 @@ LARGEST_JERK = 400.0  # m/s³, beyond which velocities do not belong together: t
 _ROUNDING = 1e-9
 _MAGIC = b"proposal"
 _CHAIN = struct.Struct("<II")  # checksums of a commitment and of the proposal that continues it
-_HEAD = struct.Struct("<8sIIQII")  # magic, what it follows, checksum, splice, setpoints, setpoints of a stop
+# magic, what it follows, checksum, splice, setpoints, setpoints of a stop, stops that are sent
+_HEAD = struct.Struct("<8sIIQIII")
 
 
 class Fault(StrEnum):
@@ -111,28 +114,43 @@ class Proposal:
     payloads: NDArray  # (K, 29) uint8
     stops: NDArray  # (K, M, 29) uint8
     checksum: int  # of splice, payloads and stops
+    ending: int = 0  # how many of the stops, the last ones, are what is left of the stop before them: see left_of()
 
     def to_bytes(self) -> bytes:
-        """Return the proposal as it goes from process to process."""
-        shape = self.stops.shape[:2]
-        head = _HEAD.pack(_MAGIC, self.follows, self.checksum, self.splice, *shape)
-        return b"".join((head, self.payloads.tobytes(), self.stops.tobytes()))
+        """Return the proposal as it goes from process to process, where memory that is copied costs milliseconds."""
+        sent = len(self.stops) - self.ending
+        head = _HEAD.pack(_MAGIC, self.follows, self.checksum, self.splice, *self.stops.shape[:2], sent)
+        return b"".join((head, self.payloads.tobytes(), self.stops[:sent].tobytes()))
 
     @classmethod
     def of_bytes(cls, message: bytes) -> "Proposal | None":
         """Return the proposal of a message, None where it is none. What it proposes may still be anything."""
         if len(message) < _HEAD.size or message[: len(_MAGIC)] != _MAGIC:
             return None
-        _, follows, checksum, first, count, length = _HEAD.unpack_from(message)
-        if not count or not length or len(message) != _HEAD.size + count * (1 + length) * PAYLOAD_SIZE:
+        _, follows, checksum, first, count, length, sent = _HEAD.unpack_from(message)
+        if not length or not 0 < sent <= count or count - sent > LONGEST_ENDING:
+            return None
+        if len(message) != _HEAD.size + (count + sent * length) * PAYLOAD_SIZE:
             return None
         rows = np.frombuffer(message, np.uint8, offset=_HEAD.size).reshape(-1, PAYLOAD_SIZE)
-        return cls(follows, first, rows[:count], rows[count:].reshape(count, length, PAYLOAD_SIZE), checksum)
+        stops, ending = rows[count:].reshape(sent, length, PAYLOAD_SIZE), count - sent
+        if ending:
+            stops = np.concatenate([stops, left_of(stops[-1], ending)])
+        return cls(follows, first, rows[:count], stops, checksum, ending)
 
 
-def propose(commitment: Commitment, splice: int, payloads: NDArray, stops: NDArray) -> Proposal:
-    """Return the proposal of setpoints and stops that were certified to continue the commitment from `splice` on."""
-    return Proposal(commitment.checksum, splice, payloads, stops, checksum_of(splice, payloads, stops))
+def propose(commitment: Commitment, splice: int, payloads: NDArray, stops: NDArray, ending: int = 0) -> Proposal:
+    """Return the proposal of setpoints and stops that were certified to continue the commitment from `splice` on.
+
+    `ending` is how many of the stops, the last ones, are what is left of the stop before them.
+    """
+    return Proposal(commitment.checksum, splice, payloads, stops, checksum_of(splice, payloads, stops), ending)
+
+
+def left_of(stop: NDArray, count: int) -> NDArray:
+    """Return (count, M, 29) uint8: the stops from within a stop, (M, 29), and the hover behind it, are its rest."""
+    padded = np.concatenate([stop[1:], np.repeat(stop[-1:], count, axis=0)])
+    return np.asarray(sliding_window_view(padded, len(stop), axis=0)[:count].swapaxes(1, 2))
 
 
 def checksum_of(first: int, payloads: NDArray, stops: NDArray) -> int:

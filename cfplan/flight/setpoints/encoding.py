@@ -129,8 +129,8 @@ def encode_trajectory(
     """Encode a flight: full states at `rate`, Hz, then hover at the end for at least `hold`, s.
 
     `lead`, s, samples the trajectory that much ahead of the clock. `space` has the walls that a vehicle whose setpoints
-    stop is to keep away from. With `count`, so many setpoints are made at most, the first ones. Raises NotCertifiedError with the setpoint where a value is not finite or does not fit
-    its 16 bits.
+    stop is to keep away from. With `count`, so many setpoints are made at most, the first ones. Raises
+    NotCertifiedError with the setpoint where a value is not finite or does not fit its 16 bits.
     """
     if not (np.isfinite([trajectory.duration, lead, rate_lead, thrust_lead]).all() and rate > 0 and hold >= 0):
         raise NotCertifiedError(

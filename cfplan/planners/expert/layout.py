@@ -65,18 +65,23 @@ def layout_of(shape: Shape) -> Layout:
     all_rows = np.ones(point_constraints.ROWS, dtype=bool)
     all_rows[measures.ANGULAR_ACCELERATION] = shape.turning_limited
     jumping = all_rows & point_constraints.JUMPS
-    points: list[tuple[int, int, float, NDArray]] = []  # order in the interval, interval, place, rows
-    for k in range(shape.nodes):
-        at_end = k < shape.end_intervals[0] or k >= shape.nodes - shape.end_intervals[1]
-        places = (0.0, *(shape.end_places if at_end else shape.middle_places), 1.0)
-        right = all_rows if k == shape.nodes - 1 else jumping  # the rest holds at the next interval's left end
-        points += [(j, k, place, right if place == 1.0 else all_rows) for j, place in enumerate(places)]
-    points.sort(key=lambda point: point[:2])
-    padding = -len(points) % point_constraints.LANES
-    interval, place = (np.array([point[i] for point in points + points[-1:] * padding]) for i in (1, 2))
-    bounded = np.stack([point[3] for point in points] + [np.zeros_like(all_rows)] * padding, axis=1)
+    k = np.arange(shape.nodes)
+    at_end = (k < shape.end_intervals[0]) | (k >= shape.nodes - shape.end_intervals[1])
+    of_end, of_middle = (0.0, *shape.end_places, 1.0), (0.0, *shape.middle_places, 1.0)
+    intervals, places = [], []
+    for j in range(max(len(of_end), len(of_middle))):
+        here = np.where(at_end, j < len(of_end), j < len(of_middle))
+        intervals.append(k[here])
+        places.append(np.where(at_end, (of_end + (1.0,) * j)[j], (of_middle + (1.0,) * j)[j])[here])
+    interval, place = np.concatenate(intervals), np.concatenate(places)
+    count, padding = len(interval), -len(interval) % point_constraints.LANES
+    interval, place = (np.append(each, np.repeat(each[-1:], padding)) for each in (interval, place))
+    # At an interval's right end the rest holds as it does at the next one's left end.
+    inner_right = (place == 1.0) & (interval < shape.nodes - 1)
+    bounded = np.where(inner_right, jumping[:, None], all_rows[:, None])
+    bounded[:, count:] = False
     weight = np.where(place == 0.0, 1.0, 0.0)  # penalties count once an interval
-    weight[len(points) :] = 0.0
+    weight[count:] = 0.0
     node = np.arange(shape.nodes + 1)
     speed_interval = np.concatenate([np.minimum(node, shape.nodes - 1), np.tile(node[:-1], len(shape.speed_places))])
     speed_place = np.concatenate([(node == shape.nodes) * 1.0, np.repeat(np.array(shape.speed_places), shape.nodes)])
