@@ -56,6 +56,7 @@ SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², and s before that, with which the vehicl
 STOPPING = 0.6  # s of the way left, on which a vehicle that stops comes to rest
 OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
 ROOM = 0.005  # share of each limit that plans leave to whoever continues them
+LATE_HINT = "ask again; a computer with less to do answers sooner"
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
 _NODES = 60  # where a path's time is estimated
 
@@ -121,7 +122,7 @@ def continue_plan(
              lambda: _ways_later(joint, trajectory, points))  # fmt: skip
     for number, way in islice(_sound(kinds, limits, known, ways), MOST_TRIES):
         if ways.failed and too_late():
-            raise TooLateError("no way has been found in time", where="request", hint="it is planned farther ahead")
+            raise TooLateError("no way has been found in time", where="request", hint=LATE_HINT)
         task = PlanningTask(
             way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,
             speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,

@@ -17,7 +17,7 @@ from cfplan.planning.plan_result import Plan
 from cfplan.preparation.certified_flight import EndsBadlyError
 from cfplan.preparation.replan import (
     PACE,
-    Attempt,
+    AnswerAttempt,
     HeldFlight,
     Replanned,
     at_pace,
@@ -120,7 +120,7 @@ def plan_request(
     first: int,
     limits: Limits,
     part: int | None = None,
-    attempt: Attempt | None = None,
+    attempt: AnswerAttempt | None = None,
 ) -> Replanned | HeldFlight:
     """Return the proposal from setpoint `first` on that does what is asked for, of so many setpoints as `part` says.
 

@@ -46,7 +46,7 @@ from cfplan.preparation.air_planner import (
     wants_more,
 )
 from cfplan.preparation.replan import (
-    Attempt,
+    AnswerAttempt,
     HeldFlight,
     Replanned,
     accepted,
@@ -159,6 +159,10 @@ class _Proposed:
 
     made: Replanned
     request: PathRequest | None  # None where it is the next part of the plan that is flown
+    received: float = math.nan  # s, when that came
+    begun: float = math.nan  # s, when it was begun to be planned
+    proposed: float = math.nan  # s, when it was sent
+    before: HeldFlight | None = None  # what is held where it is refused, where another is planned on it meanwhile
 
 
 class _Worker:
@@ -200,7 +204,8 @@ class _Worker:
     def serve(self) -> None:
         """Plan until the main process or the pilot has ended."""
         while True:
-            answer = self._settle() if self._proposed is not None else self._serve_next()
+            meanwhile = self._proposed is None or (self._proposed.before is not None and self._waiting is not None)
+            answer = self._serve_next() if meanwhile else self._settle()
             if answer is not None:
                 self._requests.send(answer)
 
@@ -211,11 +216,12 @@ class _Worker:
             wait([self._requests, self._pilot], _LOOK_AGAIN if self._held.unfinished else None)
         self._read(0.0)
         if self._wants_more() and (self._waiting is None or presses(self._held, *self._next(self._plans))):
-            return self._go_on()
+            return self._go_on() if self._proposed is None else self._settle()
         if self._waiting is None:
             return None
         (request, since), self._waiting = self._waiting, None
-        return replace(self._answer(request, since), seconds=REAL_CLOCK.now() - since)
+        answer = self._answer(request, since)
+        return None if answer is None else replace(answer, seconds=REAL_CLOCK.now() - since)
 
     def _wants_more(self) -> bool:
         return self._held.unfinished and wants_more(self._held, self._next(self._parts)[0])
@@ -249,14 +255,19 @@ class _Worker:
                 self._waiting = request, REAL_CLOCK.now()
         return found
 
-    def _answer(self, request: PathRequest, received: float) -> PathAnswer:
-        """Plan what is asked for, and propose it; it was `received` at that time, s."""
+    def _answer(self, request: PathRequest, received: float) -> PathAnswer | None:
+        """Plan what is asked for, and propose it; it was `received` at that time, s.
+
+        Where another request waits by then, the pilot's answer is not waited for, but taken to be good, and there is
+        nothing to tell yet. Before the next proposal is sent, the answer has come.
+        """
         if self._begun is None:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
-        reason, took, attempt = "", 0.0, Attempt(self._too_late, Ways())
+        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways())
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for _ in range(TRIES):
-            begun, (first, ahead) = REAL_CLOCK.now(), self._next(lead, AGAIN * took)
+            begun, (first, ahead), held = REAL_CLOCK.now(), self._next(lead, AGAIN * took), self._held
+            made: Replanned | HeldFlight | None
             try:
                 made = self._planned(request, first, part_within(ahead), attempt)
             except TooLateError as error:
@@ -266,9 +277,15 @@ class _Worker:
                 reason = str(error)
                 continue
             except CfplanError as error:
-                return PathAnswer(request.number, PathVerdict.REFUSED, str(error))
+                made, reason = None, str(error)
             except Exception as error:  # a fault here must not leave the rest of the flight without a planner
-                return PathAnswer(request.number, PathVerdict.REFUSED, f"fault in the planner: {error!r}")
+                made, reason = None, f"fault in the planner: {error!r}"
+            if not self._as_foreseen(held):
+                if self._proposed is None:
+                    continue
+                made, reason = None, NO_ANSWER
+            if made is None:
+                return PathAnswer(request.number, PathVerdict.REFUSED, reason)
             proposed = REAL_CLOCK.now()
             took = proposed - begun
             if isinstance(made, HeldFlight):
@@ -276,37 +293,66 @@ class _Worker:
                 return answer_held(request, made)
             if made.plan is not None:
                 self._checks.append(took - made.plan.seconds)
-            stop, answer = made.stop, None
-            if stop is not None:
-                answer = self._propose(_Proposed(stop, request))
-                made = following(made, self._held.commitment)
-            if stop is None or (answer is not None and answer.commitment is not None):
-                answer = self._propose(_Proposed(made, request))
+            sent = _Proposed(made, request, received, begun, proposed)
+            if made.stop is not None:
+                answer = self._propose(replace(sent, made=made.stop))
+                if answer is not None and answer.commitment is not None:
+                    answer = self._propose(replace(sent, made=following(made, self._held.commitment)))
+            elif self._late_by(made.proposal.splice) > 0.0:
+                reason = Fault.LATE.value
+                lead.note(took)
+                continue
+            elif made.plan is not None and self._another_waits():
+                self._send(replace(sent, before=self._held))
+                return None
+            else:
+                answer = self._propose(sent)
             if answer is None:
                 return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER)
             lead.note(max(answer.came, proposed) - begun)
-            if answer.commitment is not None:
-                self._accepted = request.number
-                accepted_made = answer_accepted(request.number, made, 0 if stop is None else stop.proposal.checksum)
-                seconds = 0.0 if made.plan is None else made.plan.seconds
-                return replace(accepted_made, times=AnswerTimes(received, begun, seconds, proposed, REAL_CLOCK.now()))
             reason = answer.reason
             if not reason.startswith(Fault.LATE):
-                return PathAnswer(request.number, PathVerdict.REFUSED, reason)
+                return self._outcome(sent, answer)
         return PathAnswer(request.number, PathVerdict.LATE, reason)
+
+    def _outcome(self, sent: _Proposed, answer: PilotAnswer) -> PathAnswer:
+        """Return the answer to a request by the pilot's to its proposal."""
+        request, made = sent.request, sent.made
+        assert request is not None
+        if answer.commitment is None:
+            late = answer.reason.startswith(Fault.LATE)
+            return PathAnswer(request.number, PathVerdict.LATE if late else PathVerdict.REFUSED, answer.reason)
+        self._accepted = request.number
+        seconds = 0.0 if made.plan is None else made.plan.seconds
+        times = AnswerTimes(sent.received, sent.begun, seconds, sent.proposed, REAL_CLOCK.now())
+        stop = 0 if made.stop is None else made.stop.proposal.checksum
+        return replace(answer_accepted(request.number, made, stop), times=times)
+
+    def _another_waits(self) -> bool:
+        self._read(0.0)
+        return self._waiting is not None
+
+    def _as_foreseen(self, held: HeldFlight) -> bool:
+        """Return whether the pilot is bound to what something was planned on; wait for its answer if need be."""
+        if self._proposed is not None and (told := self._settle()) is not None:
+            self._requests.send(told)
+        return self._held is held
 
     def _too_late(self, splice: int) -> bool:
         """Return whether what is planned from a setpoint on, and must be checked still, comes to the pilot too late."""
+        return self._late_by(splice) + self._checking > 0.0
+
+    def _late_by(self, splice: int) -> float:
+        """Return how much too late, s, what is sent now comes to the pilot, where it begins at a setpoint."""
         assert self._begun is not None
-        due = self._begun + (splice - LEAST_AHEAD) / RATE
-        return REAL_CLOCK.now() + self._checking + ON_THE_WAY > due
+        return REAL_CLOCK.now() + ON_THE_WAY - (self._begun + (splice - LEAST_AHEAD) / RATE)
 
     @property
     def _checking(self) -> float:
         """Return how long the checks of a plan take, s."""
         return float(np.median(self._checks))
 
-    def _planned(self, request: PathRequest, first: int, part: int, attempt: Attempt) -> Replanned | HeldFlight:
+    def _planned(self, request: PathRequest, first: int, part: int, attempt: AnswerAttempt) -> Replanned | HeldFlight:
         """Return what is to be proposed, from rest where no plan leads there from the motion."""
         try:
             return plan_request(self._held, request, first, self._limits, part, attempt)
@@ -346,18 +392,29 @@ class _Worker:
 
     def _propose(self, proposed: _Proposed) -> PilotAnswer | None:
         """Send a proposal and wait for the pilot's answer; None where that does not come soon."""
-        self._pilot.send_bytes(proposed.made.proposal.to_bytes())
-        self._proposed = proposed
+        self._send(proposed)
         return self._read(_ANSWER_WITHIN)
 
-    def _settle(self) -> PathAnswer | None:
-        """Wait for the answer to a proposal that the pilot did not answer soon; return what there is to tell.
+    def _send(self, proposed: _Proposed) -> None:
+        self._pilot.send_bytes(proposed.made.proposal.to_bytes())
+        self._proposed = proposed
+        if proposed.before is not None:
+            self._held = self._committed_to(proposed.made)
 
-        Until it has come nothing can be planned: nobody knows what the pilot is bound to.
+    def _settle(self) -> PathAnswer | None:
+        """Wait for the answer to a proposal that was not waited for, or not long enough; return what there is to tell.
+
+        Until it has come nothing can be proposed: nobody knows what the pilot is bound to.
         """
         proposed = self._proposed
         assert proposed is not None
         answer = self._read(_ANSWER_WITHIN)
+        if proposed.before is not None:
+            if answer is not None:
+                return None  # as was told when it came
+            self._held, self._proposed = proposed.before, replace(proposed, before=None)
+            assert proposed.request is not None
+            return PathAnswer(proposed.request.number, PathVerdict.REFUSED, NO_ANSWER)
         if answer is None:
             if self._waiting is None:
                 return None
@@ -372,16 +429,26 @@ class _Worker:
 
     def _hold(self, made: Replanned, answer: PilotAnswer) -> None:
         """Take the pilot's answer to a proposal."""
-        self._proposed = None
-        if answer.commitment is None:
-            return
+        proposed, self._proposed = self._proposed, None
+        assert proposed is not None
+        if proposed.before is not None:  # nobody waits for it
+            self._plans.note(max(answer.came, proposed.proposed) - proposed.begun)
+            told = self._outcome(proposed, answer)
+            self._requests.send(replace(told, seconds=REAL_CLOCK.now() - proposed.received))
+            if answer.commitment is None:
+                self._held = proposed.before
+        elif answer.commitment is not None:
+            self._held = self._committed_to(made)
+        assert answer.commitment in (None, self._held.commitment.checksum)
+
+    def _committed_to(self, made: Replanned) -> HeldFlight:
+        """Return what is held once the pilot has accepted a proposal."""
         assert self._begun is not None
         due = math.floor((REAL_CLOCK.now() - self._begun) * RATE)  # the pilot looked a little earlier
         now = min(due, made.proposal.splice - LEAST_AHEAD)
         committed = splice(self._held.commitment, made.proposal, now, self._limits.space)
         assert isinstance(committed, Commitment)
-        assert committed.checksum == answer.commitment
-        self._held = accepted(made, committed)
+        return accepted(made, committed)
 
 
 def _run(held: HeldFlight, limits: Limits, requests: Connection, pilot: Connection) -> None:
@@ -397,7 +464,8 @@ def _run(held: HeldFlight, limits: Limits, requests: Connection, pilot: Connecti
     gc.freeze()  # what was imported is not looked through again in flight
     gc.set_threshold(_GARBAGE)  # the worker looks when nothing is asked for
     with contextlib.suppress(OSError, AttributeError):  # not everybody may; other systems have other ways
-        os.nice(PRIORITY)
+        for thread in map(int, os.listdir("/proc/self/task")):
+            os.setpriority(os.PRIO_PROCESS, thread, PRIORITY)
     with contextlib.suppress(EOFError, OSError):
         requests.send("ready")
         worker.serve()

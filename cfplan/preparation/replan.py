@@ -25,6 +25,7 @@ from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times
 from cfplan.planning.continuation import (
+    LATE_HINT,
     NoWayError,
     TooLateError,
     Ways,
@@ -110,7 +111,7 @@ class Replanned:
 
 
 @dataclass(frozen=True, slots=True)
-class Attempt:
+class AnswerAttempt:
     """One try to answer a request; another is made where it comes too late, with the ways that are known by then."""
 
     too_late: Callable[[int], bool]  # whether a plan from a setpoint on, not certified yet, will come too late for it
@@ -158,7 +159,7 @@ def replan(
     keep: bool = False,
     yaw_angle: float = 0.0,
     part: int | None = None,
-    attempt: Attempt | None = None,
+    attempt: AnswerAttempt | None = None,
 ) -> Replanned:
     """Return the proposal to leave what is held at setpoint `splice` and to go through waypoints, (K, 3) m, to rest.
 
@@ -189,7 +190,7 @@ def pace(
     *,
     yaw_angle: float = 0.0,
     part: int | None = None,
-    attempt: Attempt | None = None,
+    attempt: AnswerAttempt | None = None,
 ) -> Replanned | None:
     """Return the proposal to fly what is ahead at setpoint `splice` at a speed, m/s, at most; None where it rests.
 
@@ -272,7 +273,7 @@ def _replan_within(
     keep: bool,
     yaw_angle: float,
     part: int | None,
-    attempt: Attempt | None = None,
+    attempt: AnswerAttempt | None = None,
 ) -> Replanned:
     """Return what replan() does, at the speed that is asked for, or slower where it must be."""
     fastest = min(held.speed, limits.plan.speed)
@@ -306,7 +307,7 @@ def _replan_at(
     keep: bool,
     yaw_angle: float,
     part: int | None,
-    attempt: Attempt | None,
+    attempt: AnswerAttempt | None,
 ) -> Replanned:
     """Return what replan() does, at that speed, m/s, or less."""
     held = at_rest_from(held, splice, limits)
@@ -347,7 +348,7 @@ def _replan_at(
         )  # fmt: skip
         planned, reached = made.plan, made.reached
     if too_late():
-        raise TooLateError("the plan was not made in time", where="request", hint="it is planned farther ahead")
+        raise TooLateError("the plan was not made in time", where="request", hint=LATE_HINT)
     flown = held.flown.continued(joint, planned.trajectory)
     since, starts = flown.since(splice / RATE), snapshots_at(held, splice)
     passed = certify_whole(since, limits, starts) if part is None else certify_beginning(since, part, limits, starts)

@@ -47,7 +47,7 @@ class PlannerFault(Enum):
 
     KILLED = "killed"  # it plans and answers nothing any more
     STOPPED = "stopped"  # each proposal comes STOPPED s later than it should
-    LATE = "late"  # each proposal comes as its first setpoint is due
+    LATE = "late"  # each proposal comes a setpoint later than it may
     GARBAGE = "garbage"  # proposals hold other bytes than were certified
     OTHER_JOINT = "other joint"  # proposals begin three setpoints away from where they were made for
 
@@ -185,7 +185,7 @@ class SteppedPlanner:
         if self.fault is PlannerFault.STOPPED:
             proposal.due += STOPPED
         elif self.fault is PlannerFault.LATE:
-            proposal.due = self._begun + proposal.made.proposal.splice / RATE
+            proposal.due = self._begun + (proposal.made.proposal.splice - LEAST_AHEAD + 1) / RATE
         self._in_hand = proposal
 
     def _spoilt(self, proposal: Proposal) -> Proposal:

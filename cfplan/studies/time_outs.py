@@ -216,7 +216,8 @@ def _planner() -> list[TimeOut]:
     )  # fmt: skip
     return [
         TimeOut(
-            "a plan, so late that less than this is left until it begins", _read(commitment, "LEAST_AHEAD") / 100.0,
+            "a plan, so late that less than this is left until its first setpoint that is another",
+            (_read(commitment, "LEAST_AHEAD") + 1) / 100.0,
             "it is refused as late and planned again, farther ahead; the vehicle flies what was committed before",
             "the pilot", commitment,
         ),
