@@ -358,7 +358,7 @@ def _replan_at(
 def _proposed(held: HeldFlight, splice: int, made: CertifiedFlight, planned: Plan | None, joint: float) -> Replanned:
     """Return the proposal of what was certified; `held` has the trajectories and waypoints behind it."""
     ending = 0 if made.following is None else len(made.payloads) - made.following - 1
-    proposal = propose(held.commitment, splice, made.payloads, made.stops, ending)
+    proposal = propose(held.commitment, splice, made.payloads, made.stops, ending, goes_on=planned is None)
     return Replanned(proposal, held_with(held, splice, made), planned, joint)
 
 

@@ -1,8 +1,11 @@
 """The planner's process: what it proposes verifies, and whatever happens to it the pilot has what is committed."""
 
+import contextlib
 import multiprocessing
 import os
 import signal
+import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,7 +29,7 @@ from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
 from cfplan.preparation.air_planner import PathAnswer, PathRequest, PathVerdict, Wish
 from cfplan.preparation.planner_process import AirPlanner, _Worker
-from cfplan.preparation.replan import hold
+from cfplan.preparation.replan import hold, replan
 
 LATE = 1.5  # s, longer than a planner waits for an answer
 NOT_FLOWN = "the plan is not flown yet"
@@ -206,6 +209,61 @@ def test_what_is_no_proposal_is_none(held):
     np.testing.assert_array_equal(read.stops, good.stops)
     for broken in (b"", b"proposal", message[:-1], message + b"x", b"text " * 1000, bytes(len(message))):
         assert Proposal.of_bytes(broken) is None
+
+
+def test_of_the_stops_within_a_stop_only_that_is_sent(held, limits):
+    good = replan(held, 100, [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0]], limits, part=50).proposal
+    message = good.to_bytes()
+    read = Proposal.of_bytes(message)
+    np.testing.assert_array_equal(read.payloads, good.payloads)
+    np.testing.assert_array_equal(read.stops, good.stops)
+    assert len(message) < 0.3 * good.stops.nbytes
+    assert isinstance(splice(held.commitment, read, 90, limits.space), Commitment)
+    stops = np.broadcast_to(good.stops[0], (20_000, *good.stops.shape[1:]))
+    payloads = np.repeat(good.payloads[-1:], len(stops), axis=0)
+    few = replace(good, payloads=payloads, stops=stops, ending=len(stops) - 1).to_bytes()
+    assert Proposal.of_bytes(few) is None  # it would ask for any memory
+
+
+@pytest.mark.parametrize("accepted", [True, False])
+def test_another_request_is_planned_while_the_pilot_looks_at_the_last_proposal(held, limits, accepted):
+    (main, requests), (theirs, ours) = multiprocessing.Pipe(), multiprocessing.Pipe()
+    worker, pilot = _Worker(held, limits, requests, ours), PilotSide(held.commitment, limits, theirs)
+    pilot.begin()
+    assert until(lambda: worker._read(0.1) is None and worker._begun is not None)
+    main.send(PathRequest(2, Wish.REPLACE, ((0.0, 0.5, 1.0),)))
+    assert worker._answer(PathRequest(1, Wish.REPLACE, ((0.5, 0.9, 1.0),)), REAL_CLOCK.now()) is None
+    assert worker._held is not held  # but what it will be, if that is accepted
+    if not accepted:
+        assert until(lambda: (proposal := pilot.proposals.newest()) is not None and refused(pilot, proposal))
+
+    def serve() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            worker.serve()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    answers: list[PathAnswer] = []
+
+    def both_are_answered() -> bool:
+        pilot.tick()
+        while main.poll():
+            answers.append(main.recv())
+        return len(answers) == 2
+
+    assert until(both_are_answered)
+    main.close()
+    theirs.close()
+    thread.join()
+    first, second = answers
+    assert (first.number, first.verdict) == (1, PathVerdict.ACCEPTED if accepted else PathVerdict.REFUSED), first
+    assert (second.number, second.verdict) == (2, PathVerdict.ACCEPTED), second
+    assert worker._held.commitment.checksum == pilot.commitment.checksum
+
+
+def refused(pilot: PilotSide, proposal: Proposal) -> bool:
+    pilot.proposals.answer(proposal, Refusal(Fault.MOTION, ""))
+    return True
 
 
 def test_a_fault_in_planning_is_an_answer_and_what_is_held_stays(held, limits):

@@ -56,6 +56,7 @@ def test_the_readmes_example_flies_and_is_recorded(connect, limits):
     assert record.requests.wish.tolist() == ["replace", "extend", "replace"]
     assert record.answers.verdict.tolist() == ["accepted"] * 3
     assert len(record.commitments.splice) > 4  # the hover, and each plan in parts
+    assert sum("a new plan is flown" in text for text in record.events.text) == 3  # said once of each
     assert len(list(vehicle.record.glob("plan-*.parquet"))) == 3
     assert vehicle.summary["max_deviation"] < 0.1
     assert vehicle.summary["peak_speed"] > 1.0

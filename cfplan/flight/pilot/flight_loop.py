@@ -190,7 +190,8 @@ class FlightLoop:
             self.history.report(committed(now, proposal.splice, proposal.checksum, proposal.payloads))
             self.commitment = answer
             self.plan = self.stream = self._begun[-1] = stream_of(answer, self.mission.rate, self.plan.start)
-            self.history.say(Level.INFO, f"a new plan is flown from setpoint {answer.splices[-1]} on")
+            if not proposal.goes_on:
+                self.history.say(Level.INFO, f"a new plan is flown from setpoint {answer.splices[-1]} on")
         else:
             self.history.say(Level.WARNING, f"a new plan is refused: {answer}")
         self._proposals.answer(proposal, answer)

@@ -42,8 +42,8 @@ LARGEST_JERK = 400.0  # m/s³, beyond which velocities do not belong together: t
 _ROUNDING = 1e-9
 _MAGIC = b"proposal"
 _CHAIN = struct.Struct("<II")  # checksums of a commitment and of the proposal that continues it
-# magic, what it follows, checksum, splice, setpoints, setpoints of a stop, stops that are sent
-_HEAD = struct.Struct("<8sIIQIII")
+# magic, what it follows, checksum, splice, setpoints, setpoints of a stop, stops that are sent, whether it goes on
+_HEAD = struct.Struct("<8sIIQIII?")
 
 
 class Fault(StrEnum):
@@ -115,11 +115,12 @@ class Proposal:
     stops: NDArray  # (K, M, 29) uint8
     checksum: int  # of splice, payloads and stops
     ending: int = 0  # how many of the stops, the last ones, are what is left of the stop before them: see left_of()
+    goes_on: bool = False  # whether it is the next part of the plan that is flown, of which nothing need be said
 
     def to_bytes(self) -> bytes:
         """Return the proposal as it goes from process to process, where memory that is copied costs milliseconds."""
         sent = len(self.stops) - self.ending
-        head = _HEAD.pack(_MAGIC, self.follows, self.checksum, self.splice, *self.stops.shape[:2], sent)
+        head = _HEAD.pack(_MAGIC, self.follows, self.checksum, self.splice, *self.stops.shape[:2], sent, self.goes_on)
         return b"".join((head, self.payloads.tobytes(), self.stops[:sent].tobytes()))
 
     @classmethod
@@ -127,7 +128,7 @@ class Proposal:
         """Return the proposal of a message, None where it is none. What it proposes may still be anything."""
         if len(message) < _HEAD.size or message[: len(_MAGIC)] != _MAGIC:
             return None
-        _, follows, checksum, first, count, length, sent = _HEAD.unpack_from(message)
+        _, follows, checksum, first, count, length, sent, goes_on = _HEAD.unpack_from(message)
         if not length or not 0 < sent <= count or count - sent > LONGEST_ENDING:
             return None
         if len(message) != _HEAD.size + (count + sent * length) * PAYLOAD_SIZE:
@@ -136,15 +137,25 @@ class Proposal:
         stops, ending = rows[count:].reshape(sent, length, PAYLOAD_SIZE), count - sent
         if ending:
             stops = np.concatenate([stops, left_of(stops[-1], ending)])
-        return cls(follows, first, rows[:count], stops, checksum, ending)
+        return cls(follows, first, rows[:count], stops, checksum, ending, goes_on)
 
 
-def propose(commitment: Commitment, splice: int, payloads: NDArray, stops: NDArray, ending: int = 0) -> Proposal:
+def propose(
+    commitment: Commitment,
+    splice: int,
+    payloads: NDArray,
+    stops: NDArray,
+    ending: int = 0,
+    *,
+    goes_on: bool = False,
+) -> Proposal:
     """Return the proposal of setpoints and stops that were certified to continue the commitment from `splice` on.
 
-    `ending` is how many of the stops, the last ones, are what is left of the stop before them.
+    `ending` is how many of the stops, the last ones, are what is left of the stop before them. What `goes_on` is the
+    next part of the plan that is flown.
     """
-    return Proposal(commitment.checksum, splice, payloads, stops, checksum_of(splice, payloads, stops), ending)
+    checksum = checksum_of(splice, payloads, stops)
+    return Proposal(commitment.checksum, splice, payloads, stops, checksum, ending, goes_on)
 
 
 def left_of(stop: NDArray, count: int) -> NDArray:
