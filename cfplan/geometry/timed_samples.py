@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from cfplan.errors import InputError
 from cfplan.geometry.path import Path
@@ -69,6 +68,8 @@ class TimedSamples:
         if gap > _LONGEST_GAP:
             told.append(f"nothing is known for {gap:.1f} s before {self.time[1 + np.argmax(np.diff(self.time))]:.1f} s")
         dense = path(np.linspace(0.0, path.end, max(2, int(path.length / 0.005))))
+        from scipy.spatial import KDTree  # slow to import
+
         off = KDTree(dense).query(self.position)[0]
         told.append(
             f"samples lie up to {1000 * off.max():.0f} mm from the path, {1000 * np.median(off):.1f} mm in median"

@@ -158,10 +158,14 @@ def _sample(
 
 def _about(near: NDArray, every: int, each: int) -> NDArray:
     """Return, (N, M), what lies about what is `near`, (N, M), not farther than the next samples."""
-    from scipy.ndimage import maximum_filter1d  # slow to import
+    return _closer_than(every, _closer_than(each, near.T).T)
 
-    rows = maximum_filter1d(near.view(np.uint8), 2 * each - 1, axis=1, mode="constant")
-    return maximum_filter1d(rows, 2 * every - 1, axis=0, mode="constant").astype(bool)
+
+def _closer_than(distance: int, near: NDArray) -> NDArray:
+    """Return, (N, M), whether any row less than `distance` away is `near`, (N, M)."""
+    before = np.cumsum(np.pad(near, ((1, 0), (0, 0))), axis=0)
+    row = np.arange(len(near))
+    return before[np.minimum(row + distance, len(near))] > before[np.maximum(row - distance + 1, 0)]
 
 
 def _every(count: int, step: int) -> NDArray:
