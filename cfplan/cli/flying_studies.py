@@ -161,6 +161,20 @@ def latency() -> Study:
 
 
 @measured(
+    "simulating", "cfplan study stops -o results/stops.json",
+    click.option(
+        "--duration", "durations", type=click.FloatRange(0.1, 1.2), multiple=True,
+        help="Of a stop, s; may be given several times.  [default: those that are tried in flight, and shorter ones]",
+    ),
+)  # fmt: skip
+def stops() -> Study:
+    """Stop from full speed, straight on, within several times: what that asks of the vehicle, and what refuses it."""
+    from cfplan.studies.stops import stops as run
+
+    return partial(run, safety_file_of(Path()))
+
+
+@measured(
     "simulating", "cfplan study link-loss flights/line.yaml flights/helix.yaml -o results/link-loss.json",
     PATHS,
     click.option(
@@ -232,6 +246,6 @@ def giving_way() -> Study:
 
 
 COMMANDS = (
-    flights, lateness, faults, random_faults, steering, latency, link_loss, dry_runs, exports, physics,
+    flights, lateness, faults, random_faults, steering, latency, stops, link_loss, dry_runs, exports, physics,
     identification, giving_way,
 )  # fmt: skip

@@ -39,6 +39,7 @@ __all__ = [
     "result",
     "scaling",
     "steering",
+    "stops",
     "time_left",
     "unseen_limits",
 ]

@@ -51,6 +51,7 @@ SMALL = {  # of a command, by its beginning: what is appended
     "study robustness": QUICK,
     "study scaling": "--repeats 1",
     "study steering": "--flights 1 --requests 5 --seconds 10",
+    "study stops": "",
     "study unseen-limits": "--paths 1",
     "study yaw-consistency": "--pairs 1",
 }

@@ -1,0 +1,103 @@
+"""Stops of several durations from full speed, straight on: what each asks of the vehicle, and what refuses it.
+
+The vehicle flies along the longest side of the room, and stops where it flies at a constant speed. From there every
+duration is tried that a request to stop tries, and shorter ones.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import CfplanError
+from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
+from cfplan.flight.setpoints.packets import FullStateSetpoints
+from cfplan.flight.setpoints.rate_trade import gains_under
+from cfplan.flight.setpoints.stop_certificate import certify_stops
+from cfplan.flight.setpoints.stops import encode_stops, stop_motion
+from cfplan.geometry.min_snap import centripetal_times, min_snap
+from cfplan.planning.plan import plan
+from cfplan.preparation.replan import STOPS, HeldFlight, hold, stop_within
+from cfplan.safety.limits import Limits
+from cfplan.safety.limits_file import load_limits
+from cfplan.studies.result import Column, StudyResult, Table
+
+SHORTER = (0.36, 0.4, 0.42, 0.43, 0.44)  # s, besides those that a request tries
+LONGEST = 0.6  # s
+_FROM_WALLS = 0.5  # m beyond the margin
+_NEXT = np.array([1])  # row of a motion
+
+COLUMNS = (
+    Column("duration", "within", "s", ".2f"),
+    Column("distance", "way to rest", "m", ".2f", meaning="of the setpoints, from full speed"),
+    Column("acceleration", "acceleration", "m/s²", ".1f"),
+    Column("tilt", "tilt", "°", ".1f"),
+    Column("turning", "angular acceleration", "rad/s²", ".0f", meaning="that the setpoints ask for"),
+    Column("refused", "refused, as"),
+)
+
+
+def stops(
+    safety_file: Path,
+    *,
+    durations: Sequence[float] = (),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> StudyResult:
+    """Stop within each of the durations, s, from full speed. Raises a CfplanError where no flight can be planned."""
+    limits = load_limits(safety_file)
+    tried = durations or sorted({*SHORTER, *(each for each in STOPS if each <= LONGEST)})
+    held = _straight_flight(limits)
+    number = _at_full_speed(held)
+    since = held.flown.since(number / RATE)
+    motion = encode_trajectory(since, gains=gains_under(limits), space=limits.space).motion
+    rows = []
+    for done, duration in enumerate(tried):
+        progress(done, len(tried))
+        rows.append(_row(held, number, motion, duration, limits))
+    speed, tilt = float(np.linalg.norm(motion.velocity[0])), np.degrees(limits.flight.stop_tilt)
+    title = f"Stops from {speed:.2f} m/s, straight on, at a tilt of {tilt:.0f}° at most"
+    return StudyResult("stops", {"durations": list(tried)}, (Table("stops", title, COLUMNS, tuple(rows)),))
+
+
+def _straight_flight(limits: Limits) -> HeldFlight:
+    """Return a flight along the longest side of the room, through its middle, from rest to rest."""
+    space = limits.space
+    low, high = np.array(space.low), np.array(space.high)
+    along = int(np.argmax((high - low)[:2]))
+    ends = np.repeat([(low + high) / 2.0], 2, axis=0)
+    ends[:, along] = low[along] + space.margin + _FROM_WALLS, high[along] - space.margin - _FROM_WALLS
+    path = min_snap(ends, times=centripetal_times(ends))
+    return hold(plan(path, limits.airframe, limits, planner="expert"), ends)
+
+
+def _at_full_speed(held: HeldFlight) -> int:
+    """Return the number of the setpoint where the vehicle is fastest and its speed changes least."""
+    state = held.flown.at(np.arange(0.0, held.ends, 1.0 / RATE))
+    speed, acceleration = np.linalg.norm(state.velocity, axis=1), np.linalg.norm(state.acceleration, axis=1)
+    return int(np.argmin(np.where(speed >= 0.99 * speed.max(), acceleration, np.inf)))
+
+
+def _row(held: HeldFlight, number: int, motion: FullStateSetpoints, duration: float, limits: Limits) -> dict[str, Any]:
+    gains, space = gains_under(limits), limits.space
+    payloads = encode_stops(motion, RATE, duration, _NEXT, gains, space)
+    reached = certify_stops(payloads, motion, limits, RATE, _NEXT, gains, space).worst
+    made, _ = stop_motion(motion, _NEXT, RATE, duration)
+    refused = ""
+    try:
+        stop_within(held, number, duration, limits)
+    except CfplanError as error:
+        refused = error.what
+    return {
+        "duration": duration,
+        "distance": _way(made.position),
+        "acceleration": reached["acceleration"],
+        "tilt": float(np.degrees(reached["tilt"])),
+        "turning": float(np.linalg.norm(np.diff(made.body_rate, axis=0), axis=1).max() * RATE),
+        "refused": refused,
+    }
+
+
+def _way(places: NDArray) -> float:
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
