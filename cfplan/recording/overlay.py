@@ -11,6 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import oaconvolve
 
 from cfplan.errors import InputError
+from cfplan.recording.header import Triple
 from cfplan.recording.importers.mocap_log import LoggedSubject
 from cfplan.recording.record import Record
 from cfplan.recording.summary import reference_span, reference_times
@@ -47,6 +48,7 @@ class Trial:
     position: NDArray  # (N, 3) m, NaN where it was not seen
     quaternion: NDArray  # (N, 4) body→world, x y z w, NaN where not known
     reference: Reference | None
+    room: tuple[Triple, Triple] | None = None  # m, lower and upper corner; a log knows of none
 
     @property
     def deviation(self) -> NDArray:
@@ -105,11 +107,11 @@ def trial_of_record(record: Record, name: str) -> Trial:
     begin, end = reference_span(record)
     poses = record.poses
     if math.isnan(begin):
-        return Trial(name, poses.time - record.start, poses.position, poses.quaternion, None)
+        return Trial(name, poses.time - record.start, poses.position, poses.quaternion, None, record.header.fence)
     wanted = reference_times(record.setpoints)
     along = (wanted >= begin) & (wanted <= end)
     reference = Reference(record.header.name, wanted[along] - begin, record.setpoints.position[along])
-    return Trial(name, poses.time - begin, poses.position, poses.quaternion, reference)
+    return Trial(name, poses.time - begin, poses.position, poses.quaternion, reference, record.header.fence)
 
 
 def subject_of_record(record: Record, name: str) -> LoggedSubject:
@@ -226,10 +228,16 @@ def _near(moments: NDArray, time: NDArray) -> NDArray:
     return (moments >= time[0]) & (moments <= time[-1]) & (time[after] - time[after - 1] <= gap)
 
 
+def rooms(trials: Sequence[Trial]) -> list[tuple[Triple, Triple]]:
+    """Return each room in which a trial was flown, once."""
+    return list(dict.fromkeys(trial.room for trial in trials if trial.room is not None))
+
+
 def extent(trials: Sequence[Trial]) -> tuple[NDArray, NDArray]:
     """Return the lower and upper corner of all that is drawn, (3,) m each."""
     points = [trial.position[np.isfinite(trial.position).all(axis=1)] for trial in trials]
     points += [trial.reference.position for trial in trials if trial.reference is not None]
+    points += [np.array(room) for room in rooms(trials)]
     everything = np.concatenate([*points, np.zeros((0, 3))])
     if len(everything) == 0:
         return np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.0])

@@ -23,7 +23,7 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import save_plan
 from cfplan.recording.importers.mocap_log import LoggedSubject
-from cfplan.recording.overlay import Reference, align, extent, short_name, trial_of_record, trial_of_subject
+from cfplan.recording.overlay import Reference, align, extent, rooms, short_name, trial_of_record, trial_of_subject
 from cfplan.recording.reader import is_record
 from cfplan.recording.rerun import layout
 from cfplan.recording.rerun.overlay_view import DASH, dashes, references, stretches, write_overlay
@@ -129,6 +129,14 @@ def test_the_speed_of_a_trial_is_that_of_its_path_and_unknown_at_gaps():
 def test_a_record_as_a_trial_deviates_as_its_summary_says(flight):
     trial = trial_of_record(flight.record, "made up")
     assert np.nanmax(trial.deviation) == pytest.approx(summarise(flight.record).max_deviation, rel=1e-9)
+
+
+def test_the_room_of_a_record_is_around_all_that_is_drawn(flight):
+    trial = trial_of_record(flight.record, "flight")
+    assert rooms([trial, trial]) == [flight.record.header.fence]
+    low, high = extent([trial])
+    assert (low <= flight.record.header.fence[0]).all()
+    assert (high >= flight.record.header.fence[1]).all()
 
 
 def test_trials_of_one_plan_share_their_reference(flight):

@@ -34,6 +34,8 @@ EVENTS = "events"
 SUMMARY = "summary"
 
 TAIL_SECONDS = 2.0
+LONG_IN_Y, LONG_IN_X = (0.76, -0.20, 0.52), (-0.20, -0.76, 0.52)
+"""From where a room is looked at, from its centre and in lengths of its diagonal, so that all of it is in sight."""
 PlayState = Literal["paused", "playing", "following"]
 _STATES = "Phases, limit that holds the plan back, supervisor"
 
@@ -85,7 +87,7 @@ def _room(header: RecordHeader) -> rrb.Spatial3DView:
     low, high = np.array(header.fence)
     centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
     target = (*centre[:2], low[2] + 0.1 * (high - low)[2])
-    aside = (0.76, -0.20, 0.52) if high[1] - low[1] > high[0] - low[0] else (-0.20, -0.76, 0.52)
+    aside = LONG_IN_Y if high[1] - low[1] > high[0] - low[0] else LONG_IN_X
     ever = rrb.VisibleTimeRange(
         TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.0)
     )

@@ -9,11 +9,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from cfplan.recording.overlay import Reference, Trial, extent, short_name
+from cfplan.recording.overlay import Reference, Trial, extent, rooms, short_name
 from cfplan.recording.plots import FOUR, WANTED, Colour
+from cfplan.recording.rerun import layout
 from cfplan.recording.rerun.layout import PLOTS, TIMELINE, WORLD, tail_range, time_plot
 from cfplan.recording.rerun.picture import write_png
 from cfplan.recording.rerun.record_view import (
+    FENCE_COLOUR,
     FLOOR_COLOUR,
     PATH_COLOUR,
     TRACK_RADIUS,
@@ -30,6 +32,7 @@ MOST_DASHES = 20_000
 DRAWN_RATE = 100.0  # Hz: more poses than that are not drawn in 3-D, as they could not be distinguished
 _REFERENCE, _TRIAL = f"{WORLD}/reference", f"{WORLD}/trial"
 _AXES = "xyz"
+_HIGHER = 1.25  # times as far as in the view of one record, which is less high for its width
 
 
 def write_overlay(trials: Sequence[Trial], file: Path, *, overwrite: bool = False) -> None:
@@ -76,15 +79,13 @@ def blueprint(trials: Sequence[Trial]) -> rrb.Blueprint:
 def _room(trials: Sequence[Trial]) -> rrb.Spatial3DView:
     low, high = extent(trials)
     centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 1.0)
-    aside = (0.9, -0.35, 0.6) if high[1] - low[1] > high[0] - low[0] else (-0.35, -0.9, 0.6)
+    aside = _HIGHER * np.array(layout.LONG_IN_Y if high[1] - low[1] > high[0] - low[0] else layout.LONG_IN_X)
     return rrb.Spatial3DView(
         origin=WORLD,
         name="Trials",
         overrides={f"{_TRIAL}/{i}/tail": [tail_range()] for i in range(len(trials))},
         line_grid=False,
-        eye_controls=rrb.EyeControls3D(
-            position=centre + size * np.array(aside), look_target=centre, eye_up=(0.0, 0.0, 1.0)
-        ),
+        eye_controls=rrb.EyeControls3D(position=centre + size * aside, look_target=centre, eye_up=(0.0, 0.0, 1.0)),
     )
 
 
@@ -113,6 +114,10 @@ def log_trials(stream: rr.RecordingStream, trials: Sequence[Trial]) -> None:
     stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     lines = rr.LineStrips3D(floor_lines(*extent(trials)), colors=[FLOOR_COLOUR], radii=rr.Radius.ui_points(0.5))
     stream.log(f"{WORLD}/floor", lines, static=True)
+    if flown_in := rooms(trials):
+        low, high = np.array(flown_in).transpose(1, 0, 2)
+        box = rr.Boxes3D(mins=low, sizes=high - low, colors=[FENCE_COLOUR], fill_mode="MajorWireframe")
+        stream.log(layout.FENCE, box, static=True)
     for index, reference in enumerate(references(trials)):
         dashed = rr.LineStrips3D(dashes(reference.position), colors=[PATH_COLOUR], radii=TRACK_RADIUS)
         stream.log(f"{_REFERENCE}/{index}", dashed, static=True)
