@@ -128,8 +128,11 @@ def sample_source(airframe: Airframe, path: Path, profile: SpeedProfile) -> Samp
 def _whole_blocks(coefficients: NDArray) -> NDArray:
     """Return a path's coefficients, (M, D, 3), with D a multiple of _BLOCK."""
     if missing := -coefficients.shape[1] % _BLOCK:
-        coefficients = np.pad(coefficients, ((0, 0), (0, missing), (0, 0)))
-        coefficients.setflags(write=False)  # as a path's are: one type for the compiler
+        pieces, degrees, axes = coefficients.shape
+        whole = np.zeros((pieces, degrees + missing, axes))
+        whole[:, :degrees] = coefficients
+        whole.setflags(write=False)  # as a path's are: one type for the compiler
+        return whole
     return coefficients
 
 
@@ -165,7 +168,7 @@ def _at_points(
                 out[row, begin + n] = panel[(_RESULT + row) * WIDTH + n]
 
 
-@njit(error_model="numpy", fastmath=ROUNDING)
+@njit(error_model="numpy", fastmath=ROUNDING, nogil=True)
 def _states(
     out: NDArray, part: int, body: Body, breaks: NDArray, origins: NDArray, coefficients: NDArray, nodes: NDArray,
     s: NDArray, given: NDArray,

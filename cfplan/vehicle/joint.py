@@ -115,6 +115,8 @@ class JoinedTrajectory:
     def _on_legs(self, times: NDArray, ask: Callable[[Trajectory, NDArray], _Answer]) -> tuple[NDArray, list[_Answer]]:
         """Ask each trajectory about the times at which it is flown; return their order, and the answers."""
         leg = np.clip(np.searchsorted(self.starts, times, side="right") - 1, 0, len(self.starts) - 1)
+        if len(leg) and leg.min() == leg.max():
+            return np.arange(len(leg)), [ask(self.trajectories[leg[0]], times - self.starts[leg[0]])]
         flown = [np.flatnonzero(leg == each) for each in np.unique(leg)]
         answers = [ask(self.trajectories[leg[rows[0]]], times[rows] - self.starts[leg[rows[0]]]) for rows in flown]
         return np.argsort(np.concatenate(flown), kind="stable"), answers

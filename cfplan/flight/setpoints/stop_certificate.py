@@ -16,13 +16,13 @@ from cfplan.flight.setpoints.encoding import check_motion, encode_motion
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains
 from cfplan.flight.setpoints.stops import DURATION, chunks, stop_motion
+from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
 from cfplan.safety.quantities import AT_MOST, PACKET_ROUNDING, QUANTITIES
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.flatness import motor_thrusts
-from cfplan.vehicle.measures import measures_of
-from cfplan.vehicle.rotations import norms
+from cfplan.vehicle.flatness import ROUNDING, Body, Flat, compiled_body, motor_thrusts
+from cfplan.vehicle.measures import MEASURES, measures
 
 BOUND = tuple(quantity for quantity in QUANTITIES if quantity.in_stop)
 _SPAN = 2  # setpoints on each side, over which body rates are differentiated, as packets round them to a millirad/s
@@ -148,35 +148,58 @@ def _certificate(worst: NDArray, limits: Limits) -> StopCertificate:
 
 def _worst(flown: FullStateSetpoints, length: int, airframe: Airframe, rate: float) -> NDArray:
     """Return (len(BOUND), N): the worst value of each quantity in each of N stops of `length` rows."""
-    velocity, sent, body_rate = (
-        values.reshape(-1, length, 3) for values in (flown.velocity, flown.acceleration, flown.body_rate)
-    )
-    force = sent + np.array([0.0, 0.0, GRAVITY])
-    thrust = norms(force)
-    turning = _differentiated(body_rate, rate)
-    measured = measures_of(
-        velocity=velocity,
-        acceleration=sent - airframe.drag[0] / airframe.mass * velocity,  # what is sent makes up for drag besides
-        body_rate=body_rate,
-        thrust_axis=force / thrust[..., None],
-        specific_thrust=thrust,
-        angular_acceleration=turning,
-        motor_thrust=_motors(airframe, thrust, body_rate, turning),
-    )
-    worst = [quantity.worst(measured) for quantity in BOUND]
-    return np.stack([q.side * (q.side * values).max(axis=1) for q, values in zip(BOUND, worst, strict=True)])
+    known = (flown.velocity, flown.acceleration, flown.body_rate)
+    velocity, sent, body_rate = (np.array(each, dtype=float, order="C").reshape(-1, length, 3) for each in known)
+    low, high = _extremes(velocity, sent, body_rate, compiled_body(airframe), rate)
+    # Values grow with measures, so the worst value is that of the worst measure.
+    return np.stack([quantity.worst(high if quantity.side == AT_MOST else low) for quantity in BOUND])
 
 
-def _differentiated(body_rate: NDArray, rate: float) -> NDArray:
-    """Return (N, M, 3) rad/s²: the change of body rates from _SPAN setpoints before to as many after."""
-    place = np.arange(body_rate.shape[1])
-    ahead, behind = np.minimum(place + _SPAN, place[-1]), np.maximum(place - _SPAN, 0)
-    return (body_rate[:, ahead] - body_rate[:, behind]) * (rate / np.maximum(ahead - behind, 1))[:, None]
+@njit(error_model="numpy", fastmath=ROUNDING)
+def _extremes(velocity: NDArray, sent: NDArray, body_rate: NDArray, body: Body, rate: float) -> tuple[NDArray, NDArray]:
+    """Return the least and the largest of each measure in each of N stops, (MEASURES, N); NaN where one is NaN.
 
-
-def _motors(airframe: Airframe, specific_thrust: NDArray, body_rate: NDArray, turning: NDArray) -> NDArray:
-    """Return (N, M, 4) N: the thrust of each motor, torque counted."""
-    inertia = np.array(airframe.inertia)
-    torque = inertia * turning + np.cross(body_rate, inertia * body_rate)
-    parts = torque[..., 0], torque[..., 1], torque[..., 2]
-    return np.stack(motor_thrusts(airframe, airframe.mass * specific_thrust, parts), axis=-1)
+    Velocity, acceleration as sent and body rate are (N, M, 3); body rates are differentiated from _SPAN setpoints
+    before to as many after.
+    """
+    count, length, nan = len(velocity), velocity.shape[1], np.nan
+    low, high = np.full((MEASURES, count), np.inf), np.full((MEASURES, count), -np.inf)
+    drag = body.drag[0] / body.mass  # what is sent makes up for drag besides
+    for k in range(count):
+        for m in range(length):
+            ahead, behind = min(m + _SPAN, length - 1), max(m - _SPAN, 0)
+            over = rate / max(ahead - behind, 1)
+            wx, wy, wz = body_rate[k, m, 0], body_rate[k, m, 1], body_rate[k, m, 2]
+            ax = (body_rate[k, ahead, 0] - body_rate[k, behind, 0]) * over
+            ay = (body_rate[k, ahead, 1] - body_rate[k, behind, 1]) * over
+            az = (body_rate[k, ahead, 2] - body_rate[k, behind, 2]) * over
+            jx, jy, jz = body.inertia
+            torque = (
+                jx * ax + wy * (jz * wz) - wz * (jy * wy),
+                jy * ay + wz * (jx * wx) - wx * (jz * wz),
+                jz * az + wx * (jy * wy) - wy * (jx * wx),
+            )
+            x, y, z = sent[k, m, 0], sent[k, m, 1], sent[k, m, 2] + GRAVITY
+            vx, vy, vz = velocity[k, m, 0], velocity[k, m, 1], velocity[k, m, 2]
+            thrust = math.sqrt(x * x + y * y + z * z)
+            values = measures(
+                Flat(
+                    (vx, vy, vz),
+                    (sent[k, m, 0] - drag * vx, sent[k, m, 1] - drag * vy, sent[k, m, 2] - drag * vz),
+                    (nan, nan, nan),
+                    (nan, nan, nan),
+                    thrust,
+                    (x / thrust, y / thrust, z / thrust),
+                    (wx, wy, wz),
+                    (ax, ay, az),
+                    torque,
+                    motor_thrusts(body, body.mass * thrust, torque),
+                )
+            )
+            for row in range(MEASURES):
+                value = values[row]
+                if not value >= low[row, k] and low[row, k] == low[row, k]:
+                    low[row, k] = value
+                if not value <= high[row, k] and high[row, k] == high[row, k]:
+                    high[row, k] = value
+    return low, high
