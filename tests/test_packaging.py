@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
 from cfplan.errors import InputError
 from cfplan.files.shipped import example, shipped_folder
@@ -34,6 +35,25 @@ def test_examples_are_found_by_name_and_listed_where_there_is_none():
         example("figure9")
 
 
+def test_what_runs_on_github_is_what_every_change_must_pass():
+    """The same script; what it installs as root for the tests that look at pictures is installed before."""
+    folder = REPOSITORY / ".github" / "workflows"
+    (checks,) = yaml.safe_load((folder / "checks.yml").read_text())["jobs"].values()
+    ran = [step["run"] for step in checks["steps"] if "run" in step]
+    assert ran[-1] == ".ci/run"
+    script = (REPOSITORY / ".ci" / "run").read_text()
+    for package in re.search(r"--no-install-recommends (.*) >", script)[1].split():
+        assert package in ran[0] or package == "chromium"  # its machines have that
+    (slow,) = yaml.safe_load((folder / "slow.yml").read_text())["jobs"].values()
+    assert {"make slow", "make fuzz", ran[0]} <= {step.get("run") for step in slow["steps"]}
+
+
+def test_who_reports_something_wrong_is_asked_for_what_doctor_prints():
+    form = yaml.safe_load((REPOSITORY / ".github" / "ISSUE_TEMPLATE" / "something-is-wrong.yml").read_text())
+    (asked,) = [each for each in form["body"] if "cfplan doctor" in each["attributes"]["label"]]
+    assert asked["validations"]["required"]
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1200)  # it downloads and installs what flying needs
 def test_a_wheel_in_an_empty_environment_flies_an_example(tmp_path):
@@ -48,7 +68,9 @@ def test_a_wheel_in_an_empty_environment_flies_an_example(tmp_path):
     run(sys.executable, "-m", "build", "--outdir", tmp_path, REPOSITORY)
     venv.create(tmp_path / "env", with_pip=True)
     tools = tmp_path / "env" / "bin"
-    run(tools / "python", "-m", "pip", "install", "--quiet", *tmp_path.glob("cfplan-*.whl"))
+    (wheel,) = tmp_path.glob("cfplan-*.whl")
+    assert f"{wheel.stat().st_size / 1e6:.1f} MB" in (REPOSITORY / "README.md").read_text()
+    run(tools / "python", "-m", "pip", "install", "--quiet", wheel)
     assert re.match(r"cfplan \S+, commit [0-9a-f]{12}; models: any \(", run(tools / "cfplan", "--version"))
     said = run(tools / "cfplan", "fly", "--example", "line")
     assert "by learned" in said

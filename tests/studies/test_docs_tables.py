@@ -1,5 +1,6 @@
 """The tables in docs/ are what `cfplan study docs` makes of results/, and a result survives its file."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from cfplan.studies.result import Column, StudyResult, Table, collect, read_resu
 pytestmark = pytest.mark.unit
 REPOSITORY = Path(__file__).parents[2]
 PAGES = pages_of(REPOSITORY)
+OF_WORDS = {"| | the paper says | measured here | the difference |", "| | the paper | here |"}
 COLUMNS = (
     Column("path", "path"),
     Column("landed", "landed", of="flights", meaning="at the end of its plan"),
@@ -37,6 +39,14 @@ def test_every_result_has_its_tables_on_a_page():
     for file in (REPOSITORY / "results").glob("*.json"):
         for table in (table for table in read_result(file).tables if table.rows):
             assert f"<!-- table: results/{file.name}#{table.name} -->" in pages
+
+
+def test_tables_of_results_are_made_by_commands():
+    """All but two of words: what the paper claims beside what was found, and on which terms it is repeated here."""
+    for page in (REPOSITORY / "docs" / "results").glob("*.md"):
+        text = re.sub(r"<!-- \w[\w-]*: .*?<!-- end -->", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        heads = re.findall(r"^(\|.*)\n\|[-| ]+\|$", text, re.MULTILINE)
+        assert set(heads) <= (OF_WORDS if page.name == "paper.md" else set()), page.name
 
 
 def test_every_result_says_of_which_commit_it_is():
