@@ -174,8 +174,12 @@ def draw_long(result: StudyResult) -> "Figure":
     from matplotlib.figure import Figure
 
     rows = [row for row in result.table("tracks").rows if row["path"] == LONG and row["way"] in ("", CERTIFIED)]
-    if not any(row["planner"] for row in rows):
-        raise InputError("no flight over the long path", where="tracks", hint="run cfplan study hardware anew")
+    if not any(row["planner"] == SHIPPED for row in rows):
+        raise InputError(
+            "no flight of the planner that ships over the long path",
+            where="tracks",
+            hint="run cfplan study hardware anew",
+        )
     figure = Figure(figsize=(9.6, 5.4), layout="constrained")
     for axes, (first, second) in zip(figure.subplots(1, 2), ((0, 1), (1, 2)), strict=True):
         for row in rows:
