@@ -34,6 +34,7 @@ GENTLE = 0.57  # of the limit on angular acceleration: polynomials cannot follow
 COLUMNS = ["t", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "yaw", "wx", "wy", "wz", "qx", "qy", "qz", "qw"]
 _DIGITS = 6
 _ROUNDING = 0.5 * 10.0**-_DIGITS
+COARSE = 0.01  # m from the plan: raw pieces that stray farther are compared with compressed ones
 _STRIDE = 10  # ms between the moments of a dry run from which a correction is learned
 
 
@@ -101,20 +102,18 @@ def fit_polynomials(
 ) -> ExportedFlight:
     """Fit certified polynomials to a plan, and fly them in the simulator.
 
-    The form MEMORY is compressed, in at most `room` bytes, where `most` pieces are too few. Raises NotCertifiedError
-    where no polynomials keep the limits near the plan, or the dry run fails.
+    The form MEMORY is compressed, in at most `room` bytes, where `most` pieces are too few, or follow the plan coarsely
+    and compressed ones do not. Raises NotCertifiedError where no polynomials keep the limits near the plan, or the dry
+    run fails.
     """
     trajectory, limits = planned.plan.trajectory, planned.limits
     with step(on_step, "polynomials") as results:
         if form is Form.COMPRESSED:
             made = certified_compressed(trajectory, limits, leads=leads, room=room)
+        elif form is Form.MEMORY:
+            made = _raw_or_compressed(trajectory, limits, leads, most, room)
         else:
-            try:
-                made = certified_pieces(trajectory, limits, leads=leads, most=most)
-            except NotCertifiedError:
-                if form is not Form.MEMORY:
-                    raise
-                made = certified_compressed(trajectory, limits, leads=leads, room=room)
+            made = certified_pieces(trajectory, limits, leads=leads, most=most)
         results.append(_describe(made, planned))
     compile_from_here()
     with step(on_step, "dry run") as results:
@@ -124,6 +123,21 @@ def fit_polynomials(
         made, run = _corrected(made, run, planned, most, room, on_step)
     run.require_passed()
     return ExportedFlight(planned, made, run)
+
+
+def _raw_or_compressed(trajectory: Trajectory, limits: Limits, leads: bool, most: int, room: int) -> OnBoardTrajectory:
+    """Return raw pieces, or compressed ones where raw ones are too few or coarse: of those what is nearer the plan."""
+    try:
+        raw = certified_pieces(trajectory, limits, leads=leads, most=most)
+    except NotCertifiedError:
+        return certified_compressed(trajectory, limits, leads=leads, room=room)
+    if raw.error <= COARSE:
+        return raw
+    try:
+        compressed = certified_compressed(trajectory, limits, leads=leads, room=room)
+    except NotCertifiedError:
+        return raw
+    return compressed if compressed.error < raw.error else raw
 
 
 def _corrected(

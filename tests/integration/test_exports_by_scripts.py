@@ -25,7 +25,7 @@ from waiting import PATIENCE
 
 from cfplan.errors import CfplanError
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory
-from cfplan.preparation.export_flight import Form, fit_polynomials, plan_for_polynomials, write_polynomials
+from cfplan.preparation.export_flight import COARSE, Form, fit_polynomials, plan_for_polynomials, write_polynomials
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits_file import load_limits
@@ -243,3 +243,12 @@ def test_an_export_flies_by_the_script_of_the_page(tmp_path, monkeypatch, name, 
 def test_what_is_too_long_for_crazyswarm_is_refused(name):
     with pytest.raises(CfplanError, match="within 31 pieces"):
         fit_polynomials(planned(name), Form.CRAZYSWARM)
+
+
+@pytest.mark.slow
+def test_what_raw_pieces_follow_coarsely_is_compressed_for_the_memory():
+    raw, chosen = (fit_polynomials(planned("identify"), form) for form in (Form.CRAZYSWARM, Form.MEMORY))
+    assert raw.on_board.error > COARSE
+    assert chosen.on_board.compressed
+    assert chosen.on_board.error < raw.on_board.error
+    assert chosen.dry_run.deviation < raw.dry_run.deviation
