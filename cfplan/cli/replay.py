@@ -68,7 +68,7 @@ def replay(
     """Replay a FLIGHT in rerun, or several as trials in one view.
 
     Each is a record (its folder, or its flight.mcap) or a log of motion capture: Vicon CSV, a Crazyflie's microSD log,
-    crazyswarm2 CSV, a ROS bag, or a MAVLink .tlog. The flights in a folder of records are listed.
+    CSV of t, x, y, z, a ROS bag, or a MAVLink .tlog. The flights in a folder of records are listed.
     """
     from cfplan.cli.flights_list import flights_in, print_flights
     from cfplan.recording.reader import is_record

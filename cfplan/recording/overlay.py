@@ -84,7 +84,7 @@ class Alignment:
     def __str__(self) -> str:
         x, y, z = (round(100 * value, 1) + 0.0 for value in self.aside)  # no -0.0
         return (
-            f"offset {self.offset:.3f} s, {100 * self.covered:.0f} % of the plan seen, deviation "
+            f"offset {self.offset:z.3f} s, {100 * self.covered:.0f} % of the plan seen, deviation "
             f"{100 * self.rms_deviation:.1f} cm rms, {100 * self.max_deviation:.1f} cm max, "
             f"in the mean ({x:.1f}, {y:.1f}, {z:.1f}) cm aside"
         )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cfplan.errors import InputError
-from cfplan.recording.importers import crazyswarm_csv, ros_bag, tlog, usd_log, vicon_csv
+from cfplan.recording.importers import named_csv, ros_bag, tlog, usd_log, vicon_csv
 from cfplan.recording.importers.mocap_log import MocapLog
 from cfplan.recording.importers.vicon_csv import Rotations
 from cfplan.recording.plausible import check_places, check_times
@@ -26,7 +26,7 @@ IMPORTERS = (
     Importer("Crazyflie microSD log", usd_log.recognises, usd_log.read),
     Importer("ROS bag", ros_bag.recognises, ros_bag.read),
     Importer("MAVLink .tlog", tlog.recognises, tlog.read),
-    Importer("crazyswarm2 CSV", crazyswarm_csv.recognises, crazyswarm_csv.read),
+    Importer(named_csv.FORMAT, named_csv.recognises, named_csv.read),
     Importer("Vicon CSV", vicon_csv.recognises, vicon_csv.read),
 )
 

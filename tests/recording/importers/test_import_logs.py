@@ -217,6 +217,18 @@ def test_what_is_wrong_with_a_file_of_crazyswarm_is_named(tmp_path, change, mess
         read_log(file)
 
 
+@pytest.mark.parametrize("time", ["t", "time", "timestamp"])
+def test_a_csv_with_other_columns_too_and_without_attitudes_is_places_over_time(tmp_path, time):
+    position, _ = poses()
+    rows = [f"{x:.9f},{t:.9f},{y:.9f},7,{z:.9f}" for t, (x, y, z) in zip(TIMES, position, strict=True)]
+    file = tmp_path / "log.csv"
+    file.write_text("\n".join([f"x,{time},y,battery,z", *rows]) + "\n")
+    (subject,) = read_log(file).subjects
+    assert subject.time == pytest.approx(TIMES, abs=1e-9)
+    assert subject.position == pytest.approx(position, abs=1e-8)
+    assert np.isnan(subject.quaternion).all()
+
+
 def test_a_file_of_crazyswarm_may_be_cut(tmp_path):
     file = tmp_path / "cf.csv"
     file.write_text(swarm()[:-30])
@@ -478,7 +490,7 @@ def test_the_format_is_told_by_content_whatever_the_name(tmp_path):
     file = tmp_path / "log.csv"
     for content, name in (
         (usd(ESTIMATE, estimate_rows()[0]), "Crazyflie microSD log"),
-        (swarm().encode(), "crazyswarm2 CSV"),
+        (swarm().encode(), "CSV of t, x, y, z"),
         (tlog(local), "MAVLink .tlog"),
         (b"\r\nObjects\r\n100\r\n", "Vicon CSV"),
         (b"SQLite format 3\0", "ROS bag"),
