@@ -177,29 +177,27 @@ def paper(folder: Path, quick: bool, dry_run: bool, workers: int, scheduler: str
 
 def _print_expected(studies: "Sequence[Expected]", processes: int, *, quick: bool) -> None:
     """Print what there is of each study, and how long all of them take."""
-    import numpy as np
-
     from cfplan.studies.time_left import duration_text
 
-    cells = [
-        [each.study, f"{each.state} {each.remark}".strip(),
-         *("–" if np.isnan(seconds) else duration_text(seconds)
-           for seconds in (each.training_seconds, each.other_seconds))]
-        for each in studies
-    ]  # fmt: skip
-    titles = ["study", "result", "training", "the rest"]
+    there = [[each.study, f"{each.state} {each.remark}".strip()] for each in studies]
     if quick:
-        print_table("What there is", titles[:2], [line[:2] for line in cells])
+        print_table("What there is", ["study", "result"], there)
         return
+    times = [[duration_text(each.training_seconds), duration_text(each.other_seconds)] for each in studies]
+    cells = [line + taken + [_without(each.unknown)] for line, taken, each in zip(there, times, studies, strict=True)]
+    titles = ["study", "result", "training", "the rest", "without"]
     print_table("What there is, and how long a whole run takes the processor", titles, cells)
-    known = [each for each in studies if not np.isnan(each.other_seconds)]
-    whole = sum(each.training_seconds + each.other_seconds / processes for each in known)
+    whole = sum(each.training_seconds + each.other_seconds / processes for each in studies)
     on = "one process" if processes == 1 else f"{processes} processes"
     click.echo(
         f"A whole run takes {duration_text(whole)} on {on}, where a processor is as fast as that of the results."
     )
-    if unknown := [each.study for each in studies if each not in known]:
-        click.echo(f"Not counted are those of which no result says how long they take: {', '.join(unknown)}.")
+    if any(each.unknown for each in studies):
+        click.echo("No result says how long those steps take that it is without.")
+
+
+def _without(steps: "Sequence[str]") -> str:
+    return f"{steps[0]}, {len(steps) - 1} more" if len(steps) > 1 else "".join(steps)
 
 
 @click.command(epilog="Example: cfplan study figures results docs/images")

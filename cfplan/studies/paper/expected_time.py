@@ -1,11 +1,11 @@
 """How long all of the paper's tables take, from what their last results took, and what of them is there already."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from types import MappingProxyType
-
-import numpy as np
+from typing import Any
 
 from cfplan.errors import InputError
 from cfplan.learning.paper.training import SequenceOptions
@@ -49,8 +49,9 @@ class Expected:
     study: str
     state: ResultState
     remark: str  # of which commit a stale one is, or how much of it is done
-    training_seconds: float  # of the processor, of networks that no study before it trains; NaN where not known
+    training_seconds: float  # of the processor, of networks that no study before it trains
     other_seconds: float  # likewise, which several processes share
+    unknown: tuple[str, ...]  # steps of which no result says how long they take; they are not counted
 
 
 def expected(folder: Path, *, quick: bool = False) -> list[Expected]:
@@ -73,30 +74,47 @@ def _expected(name: str, file: Path, trained: set[str], *, quick: bool) -> Expec
     elif begun:
         state, remark = ResultState.BEGUN, f"{begun} items done"
     elif made is not None:
-        state, remark = ResultState.STALE, f"of commit {made.provenance.commit[:SHORT]}"
-    seconds = (np.nan, np.nan) if quick else _seconds(name, made, trained)
+        state, remark = ResultState.STALE, f"of {made.provenance.commit[:SHORT]}"
+    seconds = (0.0, 0.0, tuple(WHOLE[name])) if quick else _seconds(name, made, trained)
     return Expected(name, state, remark, *seconds)
 
 
-def _seconds(name: str, made: StudyResult | None, trained: set[str]) -> tuple[float, float]:
-    """Return what a whole run takes for training and for the rest; `trained` are the networks that are trained then."""
+def _seconds(name: str, made: StudyResult | None, trained: set[str]) -> tuple[float, float, tuple[str, ...]]:
+    """Return what a whole run takes for training and for the rest, and which steps of that are not known.
+
+    `trained` are the networks that are trained by then.
+    """
     steps = _known(name) | _work(made)
-    if not steps:
-        return np.nan, np.nan
     training = 0.0
     for step, seconds in steps.items():
         network = step.removeprefix(TRAINING)
         if network != step and network not in trained:
             trained.add(network)
             training += seconds * _EPOCHS * SEEN.get(name, USUALLY_SEEN)
-    other = sum(steps.get(step, np.nan) * count for step, count in WHOLE[name].items())
-    return training, float(other)
+    whole = WHOLE[name]
+    other = sum(steps[step] * count for step, count in whole.items() if step in steps)
+    return training, other, tuple(step for step in whole if step not in steps)
 
 
 def _work(result: StudyResult | None) -> dict[str, float]:
-    """Return the seconds of one step of each kind."""
-    tables = [table for table in result.details if table.name == "work"] if result else []
-    return {row["step"]: row["seconds"] / row["count"] for table in tables for row in table.rows if row["count"]}
+    """Return the seconds of one step of each kind; of older results, what their trainings and plans took."""
+    if result is None:
+        return {}
+    tables = {table.name: table.rows for table in (*result.tables, *result.details)}
+    training = {
+        f"{TRAINING}{' '.join(row[key] for key in ('limits', 'network') if key in row)}": row["seconds"]
+        / (row["epochs"] * row["learned_from"])
+        for row in tables.get("training", ())
+    }
+    steps = {row["step"]: row["seconds"] / row["count"] for row in tables.get("work", ()) if row["count"]}
+    return training | _planning(tables.get("trials", ())) | steps
+
+
+def _planning(trials: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return what planning took for a path, by all planners."""
+    paths = {(row.get("part"), row.get("row", row.get("seed"))) for row in trials}
+    taken = [row["seconds"] for row in trials if row.get("seconds") is not None and not row.get("repaired")]
+    return {"path": sum(taken) / len(paths)} if taken else {}
 
 
 def _known(name: str) -> dict[str, float]:

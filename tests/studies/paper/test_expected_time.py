@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -14,7 +13,7 @@ from cfplan.studies.paper import expected_time
 from cfplan.studies.paper.all_tables import TABLES
 from cfplan.studies.paper.expected_time import USUALLY_SEEN, WHOLE, ResultState, expected
 from cfplan.studies.provenance import provenance
-from cfplan.studies.result import StudyResult
+from cfplan.studies.result import Column, StudyResult, Table, detail_table
 
 EARLIER = replace(provenance(), commit="b" * 40)
 
@@ -45,10 +44,25 @@ def test_a_whole_run_takes_as_long_a_step_as_the_results_did(folder):
     assert found["architectures"].training_seconds == pytest.approx(14 * USUALLY_SEEN * 0.01)
     assert found["inputs"].other_seconds == pytest.approx(200 * 2.0)
     assert found["inputs"].training_seconds == pytest.approx(14 * USUALLY_SEEN * 0.005)  # the LSTM is trained by then
-    assert all(np.isnan(found[name].other_seconds) for name in ("baselines", "hardware", "long"))
+    assert found["baselines"].other_seconds == pytest.approx(50 * 40.0)
+    assert found["baselines"].unknown == ("corridor",)
+    assert found["hardware"].unknown == ("plan",)
+    assert found["hardware"].other_seconds == 0.0
     assert found["architectures"].state is ResultState.STALE
-    assert found["architectures"].remark == "of commit bbbbbbbbbbbb"
+    assert found["architectures"].remark == "of bbbbbbbbbbbb"
     assert found["hardware"].state is ResultState.MISSING
+
+
+def test_older_results_say_what_their_trainings_and_plans_took(folder):
+    training = Table("training", "", tuple(map(Column, ("network", "epochs", "learned_from", "seconds"))),
+                     ({"network": "LSTM", "epochs": 5, "learned_from": 100, "seconds": 2.0},))  # fmt: skip
+    trials = [{"seed": seed, "repaired": repaired, "seconds": 3.0} for seed in (1, 2) for repaired in (False, True)]
+    StudyResult("baselines", {}, (training,), (detail_table("trials", trials),), provenance=EARLIER).write(
+        folder / "baselines.json"
+    )
+    (found,) = (each for each in expected(folder) if each.study == "baselines")
+    assert found.training_seconds == pytest.approx(14 * USUALLY_SEEN * 0.004)
+    assert found.other_seconds == pytest.approx(50 * 3.0)
 
 
 def test_what_is_done_of_a_study_is_counted(folder):
@@ -65,7 +79,7 @@ def test_the_command_prints_it_and_makes_nothing(folder, monkeypatch):
     done = CliRunner().invoke(cfplan, ["study", "paper", str(folder), "--dry-run", "--workers", "2"])
     assert done.exit_code == 0, done.output
     assert "A whole run takes 60 min on 2 processes" in done.output
-    assert "stale of commit bbbbbbbbbbbb" in done.output
+    assert "bbbbbbbbbbbb" in done.output
     assert [file.name for file in folder.iterdir()] == ["yaw-consistency.json"]
 
 
