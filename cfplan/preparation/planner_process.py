@@ -61,7 +61,7 @@ from cfplan.safety.limits import Limits
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 LEARNED_FROM = 10  # plans, by which one knows how long the next may take
-IN_TIME = 0.7  # share of them for which what is taken to be needed was enough: one that comes late is planned again
+IN_TIME = 0.6  # share of them for which what is taken to be needed was enough: one that comes late is planned again
 AGAIN = 1.2  # by how much longer than the first the next one is taken to need then, at least
 TRIES = 4  # of a request whose proposal comes late
 ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
