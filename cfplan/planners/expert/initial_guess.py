@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
+from cfplan.machine_code import njit
 from cfplan.safety.feasibility import spare_thrust, spare_turning
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
@@ -20,6 +21,10 @@ H_BLEND, YAW_BLEND = 5.0, 4.0
 # time to pass, after as many as take LOWERED_TIME, s.
 LOWERED_FROM, LOWERED_TO = 3, 10
 LOWERED_TIME = 0.15
+
+_REACH = int(4.0 * WIDTH + 0.5)  # intervals
+_GAUSSIAN = np.exp(-0.5 / WIDTH**2 * np.arange(-_REACH, _REACH + 1) ** 2)
+_WEIGHTS = _GAUSSIAN / _GAUSSIAN.sum()
 
 
 def guess(
@@ -116,7 +121,25 @@ def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int)
         (0.7 * SHARE * limits.angular_velocity * GRAVITY / third) ** (2 / 3),
         (0.7 * SHARE * turning * GRAVITY / fourth) ** 0.5,
     ])  # fmt: skip
-    from scipy.ndimage import gaussian_filter1d, minimum_filter1d  # slow to import
+    return np.exp(_smoothed_below(np.log(h), _WEIGHTS))
 
-    logarithm = minimum_filter1d(np.log(h), int(2 * WIDTH) + 1, mode="nearest")
-    return np.exp(gaussian_filter1d(logarithm, WIDTH, mode="nearest"))
+
+@njit
+def _smoothed_below(values: NDArray, weights: NDArray) -> NDArray:
+    """Return the weighted mean of the least of neighbours; the first and last count as if they went on.
+
+    In scipy.ndimage's order, to the last bit as that, which is slow to import.
+    """
+    last, near, reach = len(values) - 1, int(WIDTH), len(weights) // 2
+    least = np.empty(len(values))
+    for n in range(len(values)):
+        least[n] = values[max(n - near, 0)]
+        for k in range(n - near + 1, n + near + 1):
+            least[n] = min(least[n], values[min(max(k, 0), last)])
+    smooth = np.empty(len(values))
+    for n in range(len(values)):
+        total = least[n] * weights[reach]
+        for k in range(reach, 0, -1):
+            total += (least[max(n - k, 0)] + least[min(n + k, last)]) * weights[reach - k]
+        smooth[n] = total
+    return smooth
