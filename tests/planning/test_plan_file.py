@@ -3,7 +3,9 @@
 import json
 import math
 import os
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow
@@ -128,6 +130,12 @@ def test_any_parquet_reader_sees_the_flight_and_its_provenance(made, saved):
     positions = np.column_stack([table[f"position_{axis}"] for axis in "xyz"])
     np.testing.assert_array_equal(positions, made.trajectory.at(table["time"].to_numpy()).position)
     assert {"quaternion_w", "motor_thrust_4", "specific_thrust"} <= set(table.column_names)
+
+
+def test_the_page_for_programs_has_every_column(saved):
+    page = (Path(__file__).parents[2] / "docs" / "python.md").read_text()
+    for column in pyarrow.parquet.read_schema(saved).names:
+        assert re.search(rf"`{re.sub('_(x|y|z|w|[1-4])$', '_', column)}", page), column
 
 
 def test_a_plan_is_certified_anew_and_not_taken_at_its_word(saved, tmp_path):
