@@ -233,7 +233,7 @@ def fly_steered(seed: int, limits: Limits, *, requests: int = REQUESTS, seconds:
         late=answers[PathVerdict.LATE],
         superseded=answers[PathVerdict.SUPERSEDED],
         invalid=invalid,
-        unanswered=sum(flight.answered[number] != 1 for number in asked[:-_IN_HAND]),
+        unanswered=max(sum(flight.answered[number] != 1 for number in asked) - _IN_HAND, 0),
         stops=sum(0 < each.stop_from <= each.splice for each in flight.commitments),
         ended=ended,
         end=failure or (outcome.reason if outcome is not None else "no outcome"),
