@@ -96,6 +96,13 @@ class SteppedPlanner:
         self._waiting = PathRequest(self._number, wish, tuple(waypoints)), self._clock.now()
         return self._number
 
+    @property
+    def pending(self) -> frozenset[int]:
+        """Return the numbers of the requests without an answer so far: of one at the pilot, and of one that waits."""
+        at_pilot = None if self._in_hand is None else self._in_hand.request
+        waiting = None if self._waiting is None else self._waiting[0]
+        return frozenset(each.number for each in (at_pilot, waiting) if each is not None)
+
     # What the pilot calls.
 
     def begin(self, start: float) -> None:

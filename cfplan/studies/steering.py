@@ -53,7 +53,6 @@ _GARBAGE: tuple[Any, ...] = (
 _TEXTS = ("1 2", "replace", "stop now", "\x00\xff", "fly 1 2 3", "nan nan", "1,2,3,4", "stop 1 2 3", "1.0 0.0 one")
 _RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)
 _ENDS = ("flown", "landed", "stopped and landed")  # how a flight is ended: at its end, in motion, after a stop
-_IN_HAND = 2  # requests that may be unanswered as a flight ends: one at the pilot, one that waits
 _BAD_SHOWN = 20
 _STANDING = 1e-9  # m/s, up to which a motion stands still
 
@@ -220,6 +219,7 @@ def fly_steered(seed: int, limits: Limits, *, requests: int = REQUESTS, seconds:
     except CfplanError as error:
         failure = str(error)
     answers = Counter(answer.verdict for answer in vehicle.answers())
+    pending = frozenset() if flight.planner is None else flight.planner.pending  # as the flight ends
     verdict = judge_sequence(flight.sent, flight.commitments, limits)
     outcome = vehicle.outcome
     well = outcome is not None and outcome.exit_code in (ExitCode.OK, ExitCode.ENDED_BY_OPERATOR)
@@ -233,7 +233,7 @@ def fly_steered(seed: int, limits: Limits, *, requests: int = REQUESTS, seconds:
         late=answers[PathVerdict.LATE],
         superseded=answers[PathVerdict.SUPERSEDED],
         invalid=invalid,
-        unanswered=max(sum(flight.answered[number] != 1 for number in asked) - _IN_HAND, 0),
+        unanswered=sum(flight.answered[number] != (number not in pending) for number in asked),
         stops=sum(0 < each.stop_from <= each.splice for each in flight.commitments),
         ended=ended,
         end=failure or (outcome.reason if outcome is not None else "no outcome"),
