@@ -3,7 +3,8 @@
 <!-- table: results/bench.json#time-4.5x8x2-hardware -->     its title and its cells
 <!-- columns: results/bench.json#time-4.5x8x2-hardware -->   what its columns mean
 <!-- measured: results/bench.json -->                        command, date, commit and machine
-<!-- figure: results/bench.json#TABLE/ROW/COLUMN -->        one cell, within a line; ROW is what its first column says
+<!-- figure: results/bench.json#TABLE/ROW/COLUMN -->        one cell, within a line; ROW is what its first column shows,
+                                                             or its first columns, joined by ` / `, until it is one row
 <!-- preflight: parameters -->                               what preflight requires on board; also signs, unknowable,
                                                              time-outs
 <!-- errors: geometry/path_file.py geometry/path.py -->   what these modules can say is wrong
@@ -12,6 +13,7 @@
 """
 
 import re
+from itertools import accumulate
 from pathlib import Path
 
 from cfplan.errors import InputError
@@ -28,7 +30,7 @@ _BLOCK = re.compile(
     re.DOTALL,
 )
 _FIGURE = re.compile(
-    r"(?P<begin><!-- figure: (?P<file>[^#\s]+)#(?P<table>[^/]+)/(?P<row>.+?)/(?P<column>\w+) -->)"
+    r"(?P<begin><!-- figure: (?P<file>[^#\s]+)#(?P<table>[^/]+)/(?P<row>.+?)/(?P<column>[^/]+?) -->)"
     r".*?(?P<end><!-- end -->)"
 )
 _RULES = re.compile(
@@ -98,12 +100,17 @@ def pages_of(folder: Path) -> list[Path]:
 
 
 def _cell(table: Table, name: str, key: str) -> str:
-    """Return one cell as it is shown. Raises InputError where there is none."""
-    first = table.columns[0].key
-    rows = [row for row in table.rows if str(row[first]) == name]
+    """Return one cell as it is shown. Raises InputError where there is none, or where the name is of several rows."""
+    shown = [column for column in table.columns if column.title]
+    rows = [row for row in table.rows if name in accumulate((column.text(row) for column in shown), "{} / {}".format)]
     columns = [column for column in table.columns if column.key == key]
-    if len(rows) != 1 or not columns:
+    if not rows or not columns:
         raise InputError(f"the table {table.name!r} has no cell {name}/{key}", hint="see the table's JSON")
+    if len(rows) > 1:
+        raise InputError(
+            f"the table {table.name!r} has {len(rows)} rows {name}",
+            hint="name the row by more columns, joined by ' / '",
+        )
     return columns[0].text(rows[0])
 
 

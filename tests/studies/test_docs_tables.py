@@ -70,6 +70,27 @@ def test_a_figure_within_a_line_is_that_of_its_cell(tmp_path):
         with_tables(line.replace("/line/", "/circle/"), tmp_path)
 
 
+def test_a_figure_is_of_the_row_that_its_first_columns_name(tmp_path):
+    columns = (Column("model", "model"), Column("hidden"), Column("epsilon", "ε", "m", "g"), Column("0 to 0.5", "few"))
+    rows = [("pos/vel", 0.01, 2), ("pos/vel", 0.1, 3), ("pos", 0.1, 5)]
+    table = Table(
+        "all", "", columns, tuple({"model": m, "hidden": 1, "epsilon": e, "0 to 0.5": few} for m, e, few in rows)
+    )
+    StudyResult("robustness", {}, (table,)).write(tmp_path / "robustness.json")
+
+    def figure(row):
+        marker = f"<!-- figure: robustness.json#all/{row}/0 to 0.5 -->"
+        return with_tables(f"{marker}?<!-- end -->", tmp_path).removeprefix(marker)
+
+    assert figure("pos/vel / 0.01 m") == "2<!-- end -->"
+    assert figure("pos/vel / 0.1 m") == "3<!-- end -->"
+    assert figure("pos") == "5<!-- end -->"
+    with pytest.raises(InputError, match="'all' has 2 rows pos/vel"):
+        figure("pos/vel")
+    with pytest.raises(InputError, match="no cell pos/vel / 1 m"):
+        figure("pos/vel / 1 m")
+
+
 def test_a_block_is_replaced_by_title_and_cells_and_nothing_else_changes(tmp_path):
     result().write(tmp_path / "flights.json")
     page = "before\n<!-- table: flights.json#all -->\nold\n<!-- end -->\nafter\n"
