@@ -51,6 +51,7 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         middle = (np.array(limits.space.low) + limits.space.high) / 2
         places = np.array([[-1.0, -1.0, -0.5], [1.0, 0.0, 0.0], [1.0, 1.0, 0.5]])  # three, so that something is solved
         path = min_snap(middle + 0.2 * places)
+        path.check()
         with suppress(CfplanError):  # there may be no model for this vehicle
             plan(path, limits.airframe, limits, planner="learned", nodes=NODES)
         planned = plan(path, limits.airframe, limits, planner="expert", nodes=NODES)  # exceeds limits between nodes
