@@ -7,7 +7,7 @@ the true state. Its motion is compared with the limits at which the pilot would 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 
 import numpy as np
@@ -48,6 +48,11 @@ class Rehearsal:
     acceleration: float  # m/s², likewise
     angular_velocity: float  # rad/s, likewise
 
+    @property
+    def passed(self) -> bool:
+        """Return whether the bytes may fly."""
+        return not self.reason
+
     def require_passed(self) -> None:
         """Raise NotCertifiedError where it failed."""
         if self.reason:
@@ -55,19 +60,12 @@ class Rehearsal:
 
 
 @dataclass(frozen=True, slots=True)
-class DryRun:
+class DryRun(Rehearsal):
     """The result of a dry run."""
 
-    reason: str  # why it failed; empty when it passed
-    deviation: float  # m, worst distance from where the trajectory is at that time
-    deviation_time: float  # s, when that was
     deviation_rms: float  # m, while it moves
     path_distance: float  # m, worst distance from the path, whenever it is there
-    final_error: float  # m, from the end of the path when the simulation ends
     settle_time: float  # s, from the end of the motion until it stays within SETTLED; inf when it never does
-    speed: float  # m/s, highest that lasts for the limits' patience
-    acceleration: float  # m/s², likewise
-    angular_velocity: float  # rad/s, likewise
     saturation: float  # share of the time for which the motor that fares worst is at either end of its range
     real_time_factor: float  # simulated seconds a second
     loop: ClosedLoop  # the whole flight
@@ -75,11 +73,6 @@ class DryRun:
     def __repr__(self) -> str:
         off = f"{100 * self.deviation:.1f} cm beside its place at most, {100 * self.deviation_rms:.1f} cm rms"
         return f"<DryRun: {self.reason or 'passed'}, {off}>"
-
-    @property
-    def passed(self) -> bool:
-        """Return whether the bytes may fly."""
-        return not self.reason
 
     def summary(self) -> dict[str, bool | float | str | None]:
         """Return everything but the flight itself, for a file; a value that is not finite is None, as in JSON."""
@@ -102,11 +95,6 @@ class DryRun:
             ("time at a motor's limit", f"{100 * self.saturation:.1f} %"),
             ("faster than real time", f"{self.real_time_factor:.0f} times"),
         ]
-
-    def require_passed(self) -> None:
-        """Raise NotCertifiedError where it failed."""
-        if self.reason:
-            raise NotCertifiedError(self.reason, where="dry run", hint=_HINT)
 
 
 def dry_run(
@@ -165,8 +153,7 @@ def rehearse_setpoints(
     )
     moments = loop.time[::_STRIDE]
     wanted = np.stack([np.interp(moments, times + LEAD, along) for along in decoded.position.T], axis=1)
-    run = _rehearsed(loop, _away(loop, wanted), limits)
-    return replace(run, reason=_fault(run, limits))
+    return _rehearsed(loop, _away(loop, wanted), limits)
 
 
 def fly_and_judge(
@@ -195,18 +182,11 @@ def _judge(loop: ClosedLoop, wanted_at: Callable[[NDArray], NDArray], duration: 
     late = np.flatnonzero(~moving & (error > SETTLED))
     settled = times[late[-1]] - duration if len(late) else 0.0
     at_its_end = np.mean((loop.commands <= 0) | (loop.commands >= FULL_COMMAND), axis=0)
-    decides = _rehearsed(loop, error, limits)
     return DryRun(
-        reason=_fault(decides, limits),
-        deviation=decides.deviation,
-        deviation_time=decides.deviation_time,
+        **asdict(_rehearsed(loop, error, limits)),
         deviation_rms=float(np.sqrt(np.mean(error[moving] ** 2))),
         path_distance=float(nearest.max()),
-        final_error=decides.final_error,
         settle_time=float(np.inf if error[-1] > SETTLED else settled),
-        speed=decides.speed,
-        acceleration=decides.acceleration,
-        angular_velocity=decides.angular_velocity,
         saturation=float(at_its_end.max()),
         real_time_factor=np.inf,
         loop=loop,
@@ -220,10 +200,10 @@ def _away(loop: ClosedLoop, wanted: NDArray) -> NDArray:
 
 
 def _rehearsed(loop: ClosedLoop, error: NDArray, limits: FlightLimits) -> Rehearsal:
-    """Return what decides, without a reason; `error`, (K,) m, is the distance from where it is wanted."""
+    """Return what decides; `error`, (K,) m, is the distance from where it is wanted."""
     worst, patience = int(np.argmax(error)), limits.patience
     changes = np.diff(loop.velocity, axis=0)
-    return Rehearsal(
+    run = Rehearsal(
         reason="",
         deviation=float(error[worst]),
         deviation_time=float(loop.time[::_STRIDE][worst]),
@@ -232,6 +212,7 @@ def _rehearsed(loop: ClosedLoop, error: NDArray, limits: FlightLimits) -> Rehear
         acceleration=_lasting(np.linalg.norm(changes, axis=1) / TIME_STEP, patience),
         angular_velocity=_lasting(np.linalg.norm(loop.body_rate, axis=1), patience),
     )
+    return replace(run, reason=_fault(run, limits))
 
 
 def _fault(run: Rehearsal, limits: FlightLimits) -> str:
