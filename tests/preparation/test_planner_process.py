@@ -48,6 +48,7 @@ class PilotSide:
         self.begun = 0.0
         self.given: list[Commitment | Refusal] = []
         self.silent_for: float | None = None  # s, for which the next answer is kept back
+        self.told: list[PathAnswer] = []  # by the planner, and not looked at yet
 
     def begin(self) -> None:
         self.begun = REAL_CLOCK.now()
@@ -84,15 +85,15 @@ def both(held, limits):
 
 
 def answer_to(number: int, planner: AirPlanner, pilot: PilotSide) -> PathAnswer:
-    found: list[PathAnswer] = []
+    """Return the first answer to a request that was not looked at yet; there may be two at once."""
 
     def answered() -> bool:
         pilot.tick()
-        found.extend(planner.answers())
-        return any(answer.number == number for answer in found)
+        pilot.told.extend(planner.answers())
+        return any(answer.number == number for answer in pilot.told)
 
     assert until(answered)
-    return next(answer for answer in found if answer.number == number)
+    return pilot.told.pop([answer.number for answer in pilot.told].index(number))
 
 
 def begin(planner: AirPlanner, pilot: PilotSide) -> None:
