@@ -64,7 +64,8 @@ def inputs() -> Study:
         "--draws", type=click.IntRange(1), default=10, show_default=True, help="Perturbations of each, each ε."
     ),
     click.option(
-        "--model", "models", multiple=True, help="LSTM, LSTM-0.001, …, LSTM-0.1-solved, shipped.  [default: all]"
+        "--model", "models", multiple=True, help="LSTM, LSTM-0.001, …, LSTM-0.1-solved; shipped, with free yaw, "
+        "shipped-fixed, shipped-tangent; expert, toppquad.  [default: all but toppquad]",
     ),
     click.option(
         "--reference", type=click.Choice(["toppquad", "expert"]), default="toppquad", show_default=True,

@@ -12,7 +12,7 @@ from cfplan.learning.paper.training import SequenceOptions
 from cfplan.studies.items import SHORT, count_unfinished
 from cfplan.studies.paper.all_tables import TABLES, is_current
 from cfplan.studies.paper.hardware import LEARNED_FROM
-from cfplan.studies.paper.robustness import ASKING, COMPARING, MODELS, SHIPPED, perturbed_paths
+from cfplan.studies.paper.robustness import perturbed_paths, step_names
 from cfplan.studies.result import StudyResult, read_result
 from cfplan.version import REPOSITORY
 
@@ -22,7 +22,7 @@ _EPOCHS = SequenceOptions().epochs
 # training sees is counted apart.
 WHOLE = MappingProxyType({
     "architectures": {"path": 200}, "inputs": {"path": 200}, "robustness": dict.fromkeys(
-        [COMPARING, *(f"{ASKING}{model}" for model in (*MODELS, SHIPPED))], perturbed_paths(100, 10)
+        step_names(), perturbed_paths(100, 10)
     ),
     "yaw-consistency": {"pair": 100}, "baselines": {"path": 50, "corridor": 2000}, "hardware": {"plan": 136},
     "simulators": {"flight": 64},

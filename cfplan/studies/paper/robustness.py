@@ -1,12 +1,13 @@
 """The paper's Table 2: networks trained on clean and on perturbed paths, asked about perturbed ones.
 
 For each path and each of its perturbations by at most ε: the plan is flown by the geometric controller with the paper's
-motor lag. Beside the networks, as they are, the planner that ships, certified. One network is not in the paper: it
-learns from perturbed paths with labels of their own, where the paper keeps the clean path's.
+motor lag. Beside the networks, as they are: the planner that ships, certified, in each mode of yaw, the expert and
+TOPPQuad. One network is not in the paper: it learns from perturbed paths with labels of their own, where the paper
+keeps the clean path's.
 """
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path as FilePath
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import perturbed
+from cfplan.geometry.yaw import YawMode
 from cfplan.learning.dataset_spec import Relabel
 from cfplan.learning.paper.recovery import recover_profile
 from cfplan.learning.paper.sequences import path_inputs
@@ -27,7 +29,7 @@ from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import Planner
 from cfplan.safety.limit_sets import PAPER
-from cfplan.simulation.geometric_flight import LOST, fly_geometric, nearest_states
+from cfplan.simulation.geometric_flight import fly_geometric, nearest_states
 from cfplan.studies.items import HERE, Progress, Running, work_table, work_through
 from cfplan.studies.paper.architectures import settings_of, training_steps, training_table
 from cfplan.studies.paper.networks import (
@@ -40,13 +42,31 @@ from cfplan.studies.paper.networks import (
     paper_items,
     trained_networks,
 )
-from cfplan.studies.paper.printed import ROBUSTNESS, TEST
-from cfplan.studies.paper.trials import FLOWN, NODES, PAPER_LAG, finite_mean, profile_by, shipped_profile, trajectory_by
-from cfplan.studies.result import Column, StudyResult, Table, detail_table
+from cfplan.studies.paper.printed import TEST
+from cfplan.studies.paper.robustness_tables import (
+    SCALES,
+    SHIPPED,
+    SHIPPED_FIXED,
+    SHIPPED_TANGENT,
+    TOLERANCES,
+    RobustnessTrial,
+    robustness_table,
+    variation_table,
+)
+from cfplan.studies.paper.trials import (
+    EXPERT,
+    FLOWN,
+    NODES,
+    TOPPQUAD,
+    Plan,
+    profile_by,
+    shipped_profile,
+    trajectory_by,
+)
+from cfplan.studies.result import StudyResult, detail_table
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 
-SCALES = (0.0, 0.001, 0.01, 0.1)  # m
 MODELS = MappingProxyType(
     {
         each.name: each
@@ -56,10 +76,8 @@ MODELS = MappingProxyType(
         )
     }
 )
-SHIPPED, SHIPPED_NAME = "the shipped planner, certified", "shipped"  # in tables, and where it is asked for
 REFERENCES: Mapping[str, Planner] = MappingProxyType({"toppquad": plan_toppquad, "expert": plan_expert})
 COMPARING, ASKING = "perturbed path, compared", "perturbed path, "  # steps of the work; behind the second, a model
-TOLERANCES = ((0.02, 0.1), (0.05, 0.25), (0.1, 0.5))  # m and m/s, within which a planned state counts as reached
 
 
 class Answered(NamedTuple):
@@ -68,39 +86,42 @@ class Answered(NamedTuple):
     profile: SpeedProfile
     h: NDArray  # (N,)
     cosine: NDArray  # (N,)
+    speed: NDArray  # (N,) m/s, along the path that it was asked about
 
 
-@dataclass(frozen=True, slots=True)
-class RobustnessTrial:
-    """One path, perturbed once, planned by one model. NaN where there was nothing to measure."""
+Ask = Callable[[Path], Answered]  # raises CfplanError where there is no answer
 
-    model: str
-    epsilon: float  # m
-    row: int  # of the dataset
-    draw: int
-    reason: str = ""  # why there is no flight
-    travel_time: float = np.nan  # s
-    own_time: float = np.nan  # s, of the reference on the same perturbed path
-    clean_time: float = np.nan  # s, of the reference on the clean path
-    seconds: float = np.nan  # of the processor, to plan, fly and compare
-    deviation: float = np.nan  # m, LOST where it failed
-    h_variation: float = np.nan  # largest difference of h from that on the clean path
-    h_relative: float = np.nan  # the same, relative
-    cosine_variation: float = np.nan  # largest difference of cos ψ
-    reached: tuple[float, ...] = (np.nan,) * len(TOLERANCES)
-    """Share of planned states that are reached in the time before them, by tolerance."""
 
-    @property
-    def failed(self) -> bool:
-        """Return whether there was no flight, or one that crashed or was LOST."""
-        return not self.deviation < LOST
+def _planner(plan: Plan) -> Ask:
+    def ask(path: Path) -> Answered:
+        profile = plan(path)
+        return _answer(profile, path, profile.h, np.cos(profile.yaw))
+
+    return ask
+
+
+def _answer(profile: SpeedProfile, path: Path, h: NDArray, cosine: NDArray) -> Answered:
+    places = np.linspace(0.0, path.end, len(h))
+    return Answered(profile, h, cosine, np.linalg.norm(path(places, 1), axis=1) * np.sqrt(h))
+
+
+PLANNERS: Mapping[str, tuple[str, Ask]] = MappingProxyType(  # besides the networks: their names in tables
+    {
+        "shipped": (SHIPPED, _planner(shipped_profile)),
+        "shipped-fixed": (SHIPPED_FIXED, _planner(partial(shipped_profile, yaw=YawMode.FIXED))),
+        "shipped-tangent": (SHIPPED_TANGENT, _planner(partial(shipped_profile, yaw=YawMode.TANGENT))),
+        "expert": (EXPERT, _planner(profile_by(plan_expert))),
+        "toppquad": (TOPPQUAD, _planner(profile_by(plan_toppquad))),
+    }
+)
+USUAL = (*MODELS, *(name for name in PLANNERS if name != "toppquad"))  # that takes 18 s a path, all others 10
 
 
 def robustness(
     *,
     paths: int = 100,
     draws: int = 10,
-    models: Sequence[str] = (*MODELS, SHIPPED_NAME),
+    models: Sequence[str] = USUAL,
     reference: str = "toppquad",
     reference_draws: int | None = None,
     data: FilePath = DATA,
@@ -119,12 +140,13 @@ def robustness(
         InputError: an unknown model, no such dataset, or fewer paths in it.
     """
     for name in models:
-        if name not in (*MODELS, SHIPPED_NAME):
-            known = ", ".join((*MODELS, SHIPPED_NAME))
+        if name not in (*MODELS, *PLANNERS):
+            known = ", ".join((*MODELS, *PLANNERS))
             raise InputError(f"unknown model {name!r}", where="models", hint=f"known: {known}")
     if draws < 1:
         raise InputError("draws must be at least 1", where="draws", hint="give --draws 10, as is usual")
-    wanted = [MODELS[name] for name in models if name != SHIPPED_NAME]
+    wanted = [MODELS[name] for name in models if name in MODELS]
+    planners = tuple(name for name in models if name in PLANNERS)
     with paper_data(data, networks, paths, epochs=epochs, quick=quick) as material:
         trained = trained_networks(material, wanted, progress)
         settings = settings_of(material, quick) | {
@@ -132,7 +154,7 @@ def robustness(
             "reference_draws": draws if reference_draws is None else reference_draws,
         }  # fmt: skip
         unseen = replace(material, parts={TEST: material.parts[TEST]})
-        asked = Questions(tuple(trained), SHIPPED_NAME in models, draws, reference, settings["reference_draws"])
+        asked = Questions(tuple(trained), planners, draws, reference, settings["reference_draws"])
         work = work_through(
             "robustness", settings | {"networks": identities(trained)}, partial(_trials_of, asked),
             paper_items(unseen), running, progress,
@@ -140,6 +162,7 @@ def robustness(
     trials = [RobustnessTrial(**trial) for value in work.values for trial in value["trials"]]
     tables = (
         robustness_table(trials, list(asked.models()), reference),
+        variation_table(trials, list(asked.models())),
         *([training_table(trained, material)] if trained else []),
     )
     compared = sum(value["compared"] for value in work.values)
@@ -153,6 +176,11 @@ def robustness(
     return StudyResult("robustness", settings, tables, details, work.interrupted)
 
 
+def step_names() -> list[str]:
+    """Return the names of the steps of a usual run, as its result counts them."""
+    return [COMPARING, *(f"{ASKING}{PLANNERS[name][0] if name in PLANNERS else name}" for name in USUAL)]
+
+
 def perturbed_paths(paths: int, draws: int) -> int:
     """Return how many paths are asked about: each as it is, and its draws of each other scale."""
     return paths * (1 + draws * (len(SCALES) - 1))
@@ -163,14 +191,14 @@ class Questions:
     """What is asked about each path."""
 
     networks: tuple[TrainedNetwork, ...]
-    shipped: bool  # whether the planner that ships is asked too
+    planners: tuple[str, ...]  # of PLANNERS
     draws: int
     reference: str
     reference_draws: int
 
-    def models(self) -> dict[str, Callable[[Path], Answered]]:
+    def models(self) -> dict[str, Ask]:
         """Return those that are asked, by name."""
-        return {each.name: _network(each) for each in self.networks} | ({SHIPPED: _shipped} if self.shipped else {})
+        return {each.name: _network(each) for each in self.networks} | dict(PLANNERS[name] for name in self.planners)
 
 
 def _trials_of(questions: Questions, item: PaperItem) -> dict[str, Any]:
@@ -211,11 +239,12 @@ def _flown(begun: RobustnessTrial, path: Path, found: Answered | str, clean: Ans
         trial,
         h_variation=float(np.abs(found.h - clean.h).max()),
         h_relative=float(np.abs(found.h / clean.h - 1.0).max()),
+        speed_variation=float(np.abs(found.speed - clean.speed).max()),
         cosine_variation=float(np.abs(found.cosine - clean.cosine).max()),
     )
 
 
-def _answered(ask: Callable[[Path], Answered], path: Path) -> Answered | str:
+def _answered(ask: Ask, path: Path) -> Answered | str:
     """Return the answer, or why there is none."""
     try:
         return ask(path)
@@ -223,17 +252,12 @@ def _answered(ask: Callable[[Path], Answered], path: Path) -> Answered | str:
         return str(error)
 
 
-def _network(trained: TrainedNetwork) -> Callable[[Path], Answered]:
+def _network(trained: TrainedNetwork) -> Ask:
     def ask(path: Path) -> Answered:
         answers = answer(trained.network, path_inputs(path, NODES + 1)[None], trained.options.inputs)[0]
-        return Answered(recover_profile(answers, path.end), answers[:, 0], answers[:, 1])
+        return _answer(recover_profile(answers, path.end), path, answers[:, 0], answers[:, 1])
 
     return ask
-
-
-def _shipped(path: Path) -> Answered:
-    profile = shipped_profile(path)
-    return Answered(profile, profile.h, np.cos(profile.yaw))
 
 
 def _time(planner: Planner, path: Path) -> float:
@@ -241,63 +265,3 @@ def _time(planner: Planner, path: Path) -> float:
         return trajectory_by(profile_by(planner))(path).duration
     except CfplanError:
         return float("nan")
-
-
-def robustness_table(trials: Sequence[RobustnessTrial], names: Iterable[str], reference: str) -> Table:
-    """Return the paper's Table 2 with the paper's numbers beside."""
-    first, second, third = (f"{100 * place:g} cm, {100 * speed:g} cm/s" for place, speed in TOLERANCES)
-    columns = (
-        Column("model", "model"),
-        Column("epsilon", "ε", "m", "g"),
-        Column("trials"),
-        Column("deviation", "largest deviation", "m", ".3f", meaning=f"mean; a failure counts as {LOST:g} m"),
-        Column("deviation_flown", "without failures", "m", ".3f"),
-        Column("paper_deviation", "paper", "m", ".3f"),
-        Column("failed", "failures", of="trials", meaning=f"no plan, a crash, or {LOST:g} m from its place"),
-        Column("slower", f"time over {reference}, same path", "%", "+.2f"),
-        Column("slower_clean", "clean path", "%", "+.2f"),
-        Column("paper_slower", "paper", "%", "+.2f", meaning="it does not say on which of the two"),
-        Column("h_variation", "variation of h", "", ".3f", meaning="largest change at a node, mean over trials"),
-        Column("h_relative", "relative", "%", ".1f", meaning="the same, as a share of h there"),
-        Column("cosine_variation", "variation of cos ψ", "", ".3f", meaning="largest change at a node, likewise"),
-        Column("paper_variation", "paper", "", ".3f", meaning="of both outputs, in units that it does not name"),
-        Column("reached_1", f"in BRT: {first}", "%", ".1f"),
-        Column(
-            "reached_2", second, "%", ".1f",
-            meaning="share of planned states whose position is passed within that in the time before, at a velocity "
-            "within that, by the controller from where it is",
-        ),
-        Column("reached_3", third, "%", ".1f"),
-        Column("paper_in_brt", "paper", "%", ".1f", meaning="within a tolerance that it does not name"),
-    )  # fmt: skip
-    rows = []
-    for name in names:
-        for epsilon in SCALES:
-            own = [trial for trial in trials if (trial.model, trial.epsilon) == (name, epsilon)]
-            if own:
-                rows.append(_row(own))
-    title = f"Perturbed paths, {PAPER.limits.speed:g} m/s, motor lag {PAPER_LAG:g} s"
-    return Table("robustness", title, columns, tuple(rows))
-
-
-def _row(own: Sequence[RobustnessTrial]) -> dict[str, Any]:
-    printed = ROBUSTNESS.get((own[0].model, own[0].epsilon))
-    reached = np.array([trial.reached if not trial.reason else (0.0,) * len(TOLERANCES) for trial in own])
-    return {
-        "model": own[0].model,
-        "epsilon": own[0].epsilon,
-        "trials": len(own),
-        "deviation": finite_mean(LOST if trial.failed else trial.deviation for trial in own),
-        "deviation_flown": finite_mean(trial.deviation for trial in own if not trial.failed),
-        "failed": sum(trial.failed for trial in own),
-        "slower": finite_mean(trial.travel_time / trial.own_time - 1.0 for trial in own),
-        "slower_clean": finite_mean(trial.travel_time / trial.clean_time - 1.0 for trial in own),
-        "h_variation": finite_mean(trial.h_variation for trial in own),
-        "h_relative": finite_mean(trial.h_relative for trial in own),
-        "cosine_variation": finite_mean(trial.cosine_variation for trial in own),
-        **{f"reached_{k + 1}": float(share) for k, share in enumerate(reached.mean(axis=0))},
-        "paper_deviation": printed.deviation if printed else None,
-        "paper_slower": printed.slower if printed else None,
-        "paper_variation": printed.variation if printed else None,
-        "paper_in_brt": printed.in_brt if printed else None,
-    }

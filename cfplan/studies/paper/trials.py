@@ -69,9 +69,9 @@ def planners(networks: Iterable[TrainedNetwork]) -> dict[str, Plan]:
     return found | {SHIPPED: profile_by(plan_learned)}
 
 
-def paper_task(path: Path) -> PlanningTask:
-    """Return what planners are asked: the paper's vehicle and limits, free yaw, 100 points."""
-    return PlanningTask(path, PAPER.airframe, PAPER.limits, NODES, YawMode.FREE)
+def paper_task(path: Path, yaw: YawMode = YawMode.FREE) -> PlanningTask:
+    """Return what planners are asked: the paper's vehicle and limits, 100 points, and free yaw as in the paper."""
+    return PlanningTask(path, PAPER.airframe, PAPER.limits, NODES, yaw)
 
 
 def profile_of(planner: Planner, task: PlanningTask) -> SpeedProfile:
@@ -87,12 +87,12 @@ def profile_by(planner: Planner) -> Plan:
     return lambda path: profile_of(planner, paper_task(path))
 
 
-def shipped_profile(path: Path) -> SpeedProfile:
+def shipped_profile(path: Path, yaw: YawMode = YawMode.FREE) -> SpeedProfile:
     """Return what the planner that ships flies: the network's profile, refined to the optimum and certified.
 
     That is how the policy of planning finishes it, whether it passes or not; `repair` would leave alone what passes.
     """
-    task = paper_task(path)
+    task = paper_task(path, yaw)
     return refine(task, profile_of(plan_learned, task)).trajectory.profile
 
 

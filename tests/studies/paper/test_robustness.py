@@ -11,7 +11,8 @@ from cfplan.cli import cfplan
 from cfplan.errors import InputError
 from cfplan.geometry.path_file import load_path_file
 from cfplan.safety.limits_file import load_limits
-from cfplan.studies.paper.robustness import SCALES, SHIPPED, robustness
+from cfplan.studies.paper.robustness import robustness
+from cfplan.studies.paper.robustness_tables import SCALES, SHIPPED, SHIPPED_FIXED
 from cfplan.studies.path_robustness import path_robustness
 
 REPOSITORY = Path(__file__).parents[3]
@@ -19,13 +20,15 @@ REPOSITORY = Path(__file__).parents[3]
 
 @pytest.fixture(scope="module")
 def quick():
-    return robustness(paths=1, draws=2, models=["LSTM", "shipped"], reference="expert", quick=True)
+    return robustness(paths=1, draws=2, models=["LSTM", "shipped", "shipped-fixed"], reference="expert", quick=True)
 
 
 def test_the_quick_run_asks_each_model_about_each_scale(quick):
     rows = quick.table("robustness").rows
-    assert [(row["model"], row["epsilon"]) for row in rows] == [(m, e) for m in ("LSTM", SHIPPED) for e in SCALES]
-    assert [row["trials"] for row in rows] == 2 * [1, 2, 2, 2]
+    assert [(row["model"], row["epsilon"]) for row in rows] == [
+        (m, e) for m in ("LSTM", SHIPPED, SHIPPED_FIXED) for e in SCALES
+    ]
+    assert [row["trials"] for row in rows] == 3 * [1, 2, 2, 2]
     assert [row["paper_in_brt"] for row in rows[:4]] == [None, 0.9, 0.788, 0.7]
 
 
@@ -40,6 +43,24 @@ def test_what_is_certified_is_followed_and_changes_with_its_path(quick):
     changes = [np.mean([t["h_variation"] for t in trials if t["epsilon"] == scale]) for scale in SCALES]
     assert changes[0] == 0.0
     assert changes[1] < changes[2] < changes[3]
+
+
+def test_how_answers_vary_is_told_of_each_scale_and_yaw_that_is_held_does_not(quick):
+    rows = {(row["model"], row["epsilon"]): row for row in quick.table("variation").rows}
+    assert len(rows) == 3 * len(SCALES[1:])
+    trials = quick.table("trials").rows
+    for (model, epsilon), row in rows.items():
+        own = [t["cosine_variation"] for t in trials if (t["model"], t["epsilon"]) == (model, epsilon)]
+        assert row["cosine_variation"] == pytest.approx(np.mean(own))
+        assert row["cosine_most"] == pytest.approx(max(own))  # of the one path
+        assert (row["cosine_variation"] == 0.0) == (model == SHIPPED_FIXED)
+        assert 0.0 < row["h_relative"] < 2.0
+    time = {t["draw"]: t["travel_time"] for t in trials if (t["model"], t["epsilon"]) == (SHIPPED, 0.1)}
+    held = {t["draw"]: t["travel_time"] for t in trials if (t["model"], t["epsilon"]) == (SHIPPED_FIXED, 0.1)}
+    cost = np.mean([held[draw] / time[draw] - 1.0 for draw in time])
+    assert rows[SHIPPED_FIXED, 0.1]["slower_free"] == pytest.approx(cost)
+    assert cost > -1e-4  # what is free may be held too
+    assert rows[SHIPPED, 0.1]["slower_free"] is None
 
 
 def test_unknown_models_and_no_draws_are_refused():
