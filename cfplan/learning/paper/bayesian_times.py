@@ -7,8 +7,9 @@ promise the largest gain of time, or where none does, those that the classifiers
 
 What is theirs: times as factors on the fastest uniform timing of each check, half of the cheap check's samples feasible
 and half not, uniform timings to begin the dear one, acquisition, thresholds and budgets. The classifier of the dear
-check sees the latent value of the cheap one beside the factors. What differs: the processes are scikit-learn's, with
-Laplace's approximation and without inducing points; there are CANDIDATES in place of 16,384; the lower confidence bound
+check sees the latent value of the cheap one beside the factors. What differs: hyperparameters are fitted by
+scikit-learn, with Laplace's approximation and without inducing points (classifier.py beside this file goes on from
+there); there are CANDIDATES in place of 16,384; the lower confidence bound
 is CONFIDENCE standard deviations below the mean.
 """
 
@@ -23,6 +24,7 @@ from scipy.special import expit
 from scipy.stats import qmc
 
 from cfplan.errors import InfeasibleError, InputError
+from cfplan.learning.paper.classifier import fit
 
 Check = Callable[[NDArray], bool]  # whether a motion with these segment times, (S,) s, passes
 LEAST, MOST = 0.1, 1.9  # factors on the nominal times that are considered
@@ -96,7 +98,7 @@ def optimise_times(
     best = np.ones(len(nominal))
     some = random.permutation(len(cheap.passed))[:SHAPED]
     shaped = _fitted(cheap.factors[some], cheap.passed[some])
-    cheap_model, chosen_low = _fitted(cheap.factors, cheap.passed, shaped), 0
+    cheap_model, chosen_low = fit(shaped.kernel_, cheap.factors, cheap.passed), 0
     for _ in range(budget.iterations):
         while True:
             dear_model = _fitted(_with_latent(cheap_model, dear.factors), dear.passed)
@@ -107,7 +109,7 @@ def optimise_times(
                 break
             chosen_low += 1
             cheap.ask(factors)
-            cheap_model = _fitted(cheap.factors, cheap.passed, shaped)
+            cheap_model = fit(shaped.kernel_, cheap.factors, cheap.passed, cheap_model)
         if dear.ask(factors) and factors @ dear.nominal < best @ dear.nominal:
             best = factors
     return OptimisedTimes(best * dear.nominal, uniform, cheap.asked, dear.asked)
@@ -176,13 +178,11 @@ def _next(
     return first[1], first[2]
 
 
-def _fitted(inputs: NDArray, passed: NDArray, like: Any = None) -> Any:
-    """Return a classifier of what passes; its hyperparameters are fitted, or are those of `like`."""
+def _fitted(inputs: NDArray, passed: NDArray) -> Any:
+    """Return a classifier of what passes, with its hyperparameters fitted."""
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
-    if like is not None:
-        return _classifier()(like.kernel_, optimizer=None).fit(inputs, passed)
     kernel = ConstantKernel(10.0, (0.1, 1e4)) * RBF(np.full(inputs.shape[1], 0.5), (0.02, 100.0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # of hyperparameters at their bounds: an input without say
