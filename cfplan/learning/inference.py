@@ -161,36 +161,52 @@ def _project_interpreted(out: NDArray, inputs: NDArray, weights: NDArray, bias: 
 
 @njit(interpreted=_project_interpreted, fastmath=True, error_model="numpy")
 def _project(out: NDArray, inputs: NDArray, weights: NDArray, bias: NDArray) -> None:
-    """Write inputs, (R, I), @ weights, (I, K), + bias, (K,), to `out`: four rows of either at once."""
+    """Write inputs, (R, I), @ weights, (I, K), + bias, (K,), to `out`: eight rows by four at once."""
     rows, width, whole = len(inputs), len(bias), inputs.shape[1] - inputs.shape[1] % 4
-    for begin in range(0, rows, 4):
-        # the last rows again and again where there are no four
-        r0, r1, r2, r3 = begin, min(begin + 1, rows - 1), min(begin + 2, rows - 1), min(begin + 3, rows - 1)
-        a, b, c, d = out[r0], out[r1], out[r2], out[r3]
-        x, y, z, w = inputs[r0], inputs[r1], inputs[r2], inputs[r3]
-        sums = np.empty((4, width), np.float32)
-        s, t, u, v = sums[0], sums[1], sums[2], sums[3]
+    sums = np.empty((8, width), np.float32)
+    s0, s1, s2, s3, s4, s5, s6, s7 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]
+    for begin in range(0, rows, 8):
+        last = rows - 1  # again and again where there are no eight
+        a, b = inputs[begin], inputs[min(begin + 1, last)]
+        c, d = inputs[min(begin + 2, last)], inputs[min(begin + 3, last)]
+        e, f = inputs[min(begin + 4, last)], inputs[min(begin + 5, last)]
+        g, h = inputs[min(begin + 6, last)], inputs[min(begin + 7, last)]
         for k in range(width):
-            s[k] = t[k] = u[k] = v[k] = bias[k]
+            s0[k] = s1[k] = s2[k] = s3[k] = s4[k] = s5[k] = s6[k] = s7[k] = bias[k]
         for j in range(0, whole, 4):
             w0, w1, w2, w3 = weights[j], weights[j + 1], weights[j + 2], weights[j + 3]
-            x0, x1, x2, x3 = x[j], x[j + 1], x[j + 2], x[j + 3]
-            y0, y1, y2, y3 = y[j], y[j + 1], y[j + 2], y[j + 3]
-            z0, z1, z2, z3 = z[j], z[j + 1], z[j + 2], z[j + 3]
-            v0, v1, v2, v3 = w[j], w[j + 1], w[j + 2], w[j + 3]
+            a0, a1, a2, a3 = a[j], a[j + 1], a[j + 2], a[j + 3]
+            b0, b1, b2, b3 = b[j], b[j + 1], b[j + 2], b[j + 3]
+            c0, c1, c2, c3 = c[j], c[j + 1], c[j + 2], c[j + 3]
+            d0, d1, d2, d3 = d[j], d[j + 1], d[j + 2], d[j + 3]
+            e0, e1, e2, e3 = e[j], e[j + 1], e[j + 2], e[j + 3]
+            f0, f1, f2, f3 = f[j], f[j + 1], f[j + 2], f[j + 3]
+            g0, g1, g2, g3 = g[j], g[j + 1], g[j + 2], g[j + 3]
+            h0, h1, h2, h3 = h[j], h[j + 1], h[j + 2], h[j + 3]
             for k in range(width):
-                s[k] += (x0 * w0[k] + x1 * w1[k]) + (x2 * w2[k] + x3 * w3[k])
-                t[k] += (y0 * w0[k] + y1 * w1[k]) + (y2 * w2[k] + y3 * w3[k])
-                u[k] += (z0 * w0[k] + z1 * w1[k]) + (z2 * w2[k] + z3 * w3[k])
-                v[k] += (v0 * w0[k] + v1 * w1[k]) + (v2 * w2[k] + v3 * w3[k])
+                v0, v1, v2, v3 = w0[k], w1[k], w2[k], w3[k]
+                s0[k] += (a0 * v0 + a1 * v1) + (a2 * v2 + a3 * v3)
+                s1[k] += (b0 * v0 + b1 * v1) + (b2 * v2 + b3 * v3)
+                s2[k] += (c0 * v0 + c1 * v1) + (c2 * v2 + c3 * v3)
+                s3[k] += (d0 * v0 + d1 * v1) + (d2 * v2 + d3 * v3)
+                s4[k] += (e0 * v0 + e1 * v1) + (e2 * v2 + e3 * v3)
+                s5[k] += (f0 * v0 + f1 * v1) + (f2 * v2 + f3 * v3)
+                s6[k] += (g0 * v0 + g1 * v1) + (g2 * v2 + g3 * v3)
+                s7[k] += (h0 * v0 + h1 * v1) + (h2 * v2 + h3 * v3)
         for j in range(whole, inputs.shape[1]):
             for k in range(width):
-                s[k] += x[j] * weights[j, k]
-                t[k] += y[j] * weights[j, k]
-                u[k] += z[j] * weights[j, k]
-                v[k] += w[j] * weights[j, k]
-        for k in range(width):
-            a[k], b[k], c[k], d[k] = s[k], t[k], u[k], v[k]
+                v0 = weights[j, k]
+                s0[k] += a[j] * v0
+                s1[k] += b[j] * v0
+                s2[k] += c[j] * v0
+                s3[k] += d[j] * v0
+                s4[k] += e[j] * v0
+                s5[k] += f[j] * v0
+                s6[k] += g[j] * v0
+                s7[k] += h[j] * v0
+        for row in range(min(8, rows - begin)):
+            for k in range(width):
+                out[begin + row, k] = sums[row, k]
 
 
 def _run_interpreted(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, cell: NDArray) -> None:
