@@ -11,9 +11,8 @@ same torque and lets the vehicle level out where setpoints stop (see rate_trade.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numba.extending import register_jitable
@@ -31,7 +30,7 @@ from cfplan.flight.setpoints.rate_trade import (
 )
 from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
-from cfplan.safety.quantities import INSTANT
+from cfplan.safety.quantities import AT_LEAST, AT_MOST, INSTANT
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.joint import JoinedTrajectory
@@ -61,7 +60,7 @@ from cfplan.vehicle.rotations import (
     transposed_product,
     turn_rows,
 )
-from cfplan.vehicle.trajectory import Trajectory
+from cfplan.vehicle.trajectory import FullState, Trajectory
 from cfplan.vehicle.trigonometry import sine
 
 RATE = 100.0  # Hz
@@ -141,15 +140,16 @@ def encode_trajectory(
     moving = int(np.ceil(trajectory.duration * rate)) + 1
     whole = moving + int(np.ceil(hold * rate))
     times = np.arange(whole if count is None else min(whole, count)) / rate
-    payloads = []
+    payloads, planned = [], []
     for rows in _batches(len(times)):
         moments = times[rows] + lead
-        motion = motion_at(trajectory, moments, rate_lead, thrust_lead)
+        states = trajectory.at(moments)
+        motion = _led(states, trajectory, moments, rate_lead, thrust_lead)
         coming = trajectory.acceleration_at(moments + BRAKE_LEAD)
         payloads.append(encode_motion(motion, coming, gains, rows.start, space=space))
+        planned.append(_motion_of(states, states.specific_thrust, states.body_rate))
     sent = np.concatenate(payloads)
-    planned = motion_at(trajectory, times + lead, 0.0, 0.0)
-    return EncodedFlight(times, sent, decode(sent), planned, lead, rate_lead, thrust_lead, gains, space)
+    return EncodedFlight(times, sent, decode(sent), _joined(planned), lead, rate_lead, thrust_lead, gains, space)
 
 
 def motion_at(
@@ -162,9 +162,20 @@ def motion_at(
 
     The acceleration is that of the thrust, less gravity: it includes the compensation for drag.
     """
-    states = trajectory.at(times)
+    return _led(trajectory.at(times), trajectory, times, rate_lead, thrust_lead)
+
+
+def _led(
+    states: FullState, trajectory: Trajectory | JoinedTrajectory, times: NDArray, rate_lead: float, thrust_lead: float
+) -> FullStateSetpoints:
+    """Return the same from the states at those times."""
     thrust = trajectory.specific_thrust_at(times + thrust_lead) if thrust_lead else states.specific_thrust
     turning = lead_rates(trajectory, times, rate_lead) if rate_lead else states.body_rate
+    return _motion_of(states, thrust, turning)
+
+
+def _motion_of(states: FullState, thrust: NDArray, turning: NDArray) -> FullStateSetpoints:
+    """Return the setpoints of states, with these thrusts, (N,) m/s², and body rates, (N, 3) rad/s."""
     acceleration = thrust[:, None] * states.thrust_axis
     acceleration[:, 2] -= GRAVITY
     return FullStateSetpoints(
@@ -174,6 +185,14 @@ def motion_at(
         quaternion=states.quaternion,
         body_rate=turning,
     )
+
+
+def _joined(parts: Sequence[FullStateSetpoints]) -> FullStateSetpoints:
+    """Return setpoints one part behind the other."""
+    if len(parts) == 1:
+        return parts[0]
+    fields = FullStateSetpoints.__slots__
+    return FullStateSetpoints(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
 
 
 def lead_rates(trajectory: Trajectory | JoinedTrajectory, times: NDArray, rate_lead: float = RATE_LEAD) -> NDArray:
@@ -235,7 +254,7 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajector
             hint="encode the trajectory anew",
         )
     flown = check_setpoints(encoded, trajectory, limits)
-    _require_hover(decode(payloads[-1:]), flown, trajectory, len(payloads))
+    _require_hover(flown, trajectory, len(payloads))
 
 
 def check_setpoints(
@@ -261,7 +280,7 @@ def check_setpoints(
         flown = check_motion(payloads[rows], motion, coming, encoded.gains, rows.start, space=encoded.space)
         # What is sent makes up for drag besides, so the planned acceleration is judged, with the packet's error.
         acceleration = planned.acceleration + flown.acceleration - motion.acceleration
-        _check_limits(flown, acceleration, limits, partial(_require, first=rows.start))
+        _check_limits(flown, acceleration, limits, rows.start)
     return flown
 
 
@@ -280,68 +299,125 @@ def check_motion(
     the motion's rates, and the rates that the setpoint's attitude and rates ask for at the motion's attitude. Raises
     NotCertifiedError with the number of the setpoint at fault, counted from `first`.
     """
-    require = partial(_require, first=first)
-    require(payloads[:, 0] == FULL_STATE_TYPE, "the payload is no full state", payloads[:, 0])
+    others = np.flatnonzero(payloads[:, 0] != FULL_STATE_TYPE)
+    if len(others):
+        raise _refused("the payload is no full state", payloads[others[0], 0], first + int(others[0]))
     decoded = decode(payloads)
-    _check_values("position", decoded.position - motion.position, require)
-    _check_values("velocity", decoded.velocity - motion.velocity, require)
-    harmless = harmless_rates(motion, acceleration_ahead, gains, space)
-    sent_rate = np.concatenate([harmless, motion.body_rate[:, 2:]], axis=1)
-    _check_values("body_rate", decoded.body_rate - sent_rate, require)
-
-    planned = (motion.acceleration, motion.quaternion, motion.body_rate)
+    position, velocity, acceleration, quaternion, body_rate = planned = [
+        np.array(getattr(motion, name), dtype=float, order="C") for name in FullStateSetpoints.__slots__
+    ]
+    harmless = harmless_rates(FullStateSetpoints(*planned), acceleration_ahead, gains, space)
     compared, flown, attitude, rate = _made(
-        decoded.acceleration, decoded.quaternion, decoded.body_rate,
-        *(np.array(each, dtype=float, order="C") for each in planned), gains.full_rate,
+        decoded.acceleration, decoded.quaternion, decoded.body_rate, acceleration, quaternion, body_rate,
+        gains.full_rate,
     )  # fmt: skip
-    thrust, level = compared[:, 0], compared[:, 3]
-    turned, off = 2.0 * np.arcsin(np.minimum(compared[:, 1:3].T, 1.0))
-    require(thrust <= _ROUNDED, _OFF.format("acceleration"), thrust)
-    require(turned <= ATTITUDE_QUANTUM, "quaternion in the packet is not that of the trajectory, off by rad", turned)
-    require(level >= _LEAST_LIFT, "the thrust that is sent leans too far, with a vertical share of", level)
-    # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(tilt) as far.
-    require(off * level <= ATTITUDE_QUANTUM, "the controller would not make the planned torque, off by rad", off)
+    check, row, value = _first_fault(
+        decoded.position, position, decoded.velocity, velocity, decoded.body_rate, harmless, body_rate, compared
+    )
+    if check >= 0:
+        raise _refused(_FAULTS[check], value, first + row)
     return replace(decoded, acceleration=flown, quaternion=attitude, body_rate=rate)
 
 
-def _check_values(name: str, error: NDArray, require: Callable[..., None]) -> None:
-    """Check that the errors, (N, 3), of a field are those of rounding."""
-    x, y, z = np.abs(error).T  # a maximum over an axis of three is slow
-    largest = np.maximum(x, np.maximum(y, z))
-    require(largest <= _ROUNDED, _OFF.format(name), largest)
+# What _first_fault() checks, in its order; the value at fault follows.
+_FAULTS = (
+    _OFF.format("position"),
+    _OFF.format("velocity"),
+    _OFF.format("body_rate"),
+    _OFF.format("acceleration"),
+    "quaternion in the packet is not that of the trajectory, off by rad",
+    "the thrust that is sent leans too far, with a vertical share of",
+    "the controller would not make the planned torque, off by rad",
+)
 
 
-def _check_limits(
-    flown: FullStateSetpoints, acceleration: NDArray, limits: PlanLimits, require: Callable[..., None]
-) -> None:
-    """Check that the motion of setpoints keeps the limits; `acceleration`, (N, 3), is that of the motion alone."""
+@njit(error_model="numpy")
+def _first_fault(
+    position: NDArray, planned_position: NDArray, velocity: NDArray, planned_velocity: NDArray, rate: NDArray,
+    harmless: NDArray, planned_rate: NDArray, compared: NDArray,
+) -> tuple[int, int, float]:  # fmt: skip
+    """Return the first of the _FAULTS that there is, -1 where there is none, its first setpoint and the value there.
+
+    Position, velocity and rate are as decoded, (N, 3), and as planned; roll and pitch rates, (N, 2), as they are to be
+    sent. `compared` is that of _made().
+    """
+    for n in range(len(position)):
+        off = _largest_error(position, planned_position, n)
+        if not off <= _ROUNDED:
+            return 0, n, off
+    for n in range(len(position)):
+        off = _largest_error(velocity, planned_velocity, n)
+        if not off <= _ROUNDED:
+            return 1, n, off
+    for n in range(len(position)):
+        off = _larger(abs(rate[n, 0] - harmless[n, 0]), abs(rate[n, 1] - harmless[n, 1]))
+        off = _larger(off, abs(rate[n, 2] - planned_rate[n, 2]))
+        if not off <= _ROUNDED:
+            return 2, n, off
+    for n in range(len(position)):
+        if not compared[n, 0] <= _ROUNDED:
+            return 3, n, compared[n, 0]
+    for n in range(len(position)):
+        turned = 2.0 * math.asin(1.0 if compared[n, 1] > 1.0 else compared[n, 1])
+        if not turned <= ATTITUDE_QUANTUM:
+            return 4, n, turned
+    for n in range(len(position)):
+        if not compared[n, 3] >= _LEAST_LIFT:
+            return 5, n, compared[n, 3]
+    # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(tilt) as far.
+    for n in range(len(position)):
+        off = 2.0 * math.asin(1.0 if compared[n, 2] > 1.0 else compared[n, 2]) * compared[n, 3]
+        if not off <= ATTITUDE_QUANTUM:
+            return 6, n, off
+    return -1, 0, 0.0
+
+
+@register_jitable(forceinline=True)
+def _largest_error(sent: NDArray, planned: NDArray, n: int) -> float:
+    """Return the largest difference of a setpoint's components; NaN where one is."""
+    x, y, z = abs(sent[n, 0] - planned[n, 0]), abs(sent[n, 1] - planned[n, 1]), abs(sent[n, 2] - planned[n, 2])
+    return _larger(_larger(x, y), z)
+
+
+@register_jitable(forceinline=True)
+def _larger(first: float, second: float) -> float:
+    """Return the larger number; what is none before all others."""
+    return first if not first <= second else second
+
+
+def _check_limits(flown: FullStateSetpoints, acceleration: NDArray, limits: PlanLimits, first: int) -> None:
+    """Check that the motion of setpoints keeps the limits; `acceleration`, (N, 3), is that of the motion alone.
+
+    Raises NotCertifiedError with the number of the setpoint at fault, counted from `first`.
+    """
     quantum = np.sqrt(3) * HALF_QUANTUM + _ROUNDING
     force = flown.acceleration + _GRAVITY
     thrust = norms(force)
     known = (flown.velocity, acceleration, flown.body_rate, force)
     measured = measures_at_instants(*(np.array(each, dtype=float, order="C") for each in known))
     lean = quantum / thrust  # an error turns the thrust vector so far
+    extremes = {AT_MOST: measured.max(axis=1), AT_LEAST: measured.min(axis=1)}
     for quantity in INSTANT:
-        value, limit = quantity.worst(measured), quantity.allowed(limits)
+        limit = quantity.allowed(limits)
+        if quantity.excess(quantity.worst(extremes[quantity.side]), limit) <= 0.0:
+            continue  # then no setpoint exceeds it
+        value = quantity.worst(measured)
         rounding = {"rad": lean, "rad/s": quantum + FIRMWARE_GAINS.full_rate * lean}.get(quantity.unit, quantum)
-        require(
-            quantity.excess(value, limit) <= rounding,
-            f"{quantity.noun} in the packet breaks its limit, {limit:.4g} {quantity.unit}, with",
-            value,
-        )
+        beyond = ~(quantity.excess(value, limit) <= rounding)
+        if beyond.any():
+            row = int(beyond.argmax())
+            what = f"{quantity.noun} in the packet breaks its limit, {limit:.4g} {quantity.unit}, with"
+            raise _refused(what, float(value[row]), first + row)
 
 
-def _require_hover(
-    last: FullStateSetpoints, flown: FullStateSetpoints, trajectory: Trajectory | JoinedTrajectory, count: int
-) -> None:
-    """Check that the last setpoint, with which the vehicle is left if nothing more comes, is a hover.
+def _require_hover(flown: FullStateSetpoints, trajectory: Trajectory | JoinedTrajectory, count: int) -> None:
+    """Check that the last of the setpoints, with which the vehicle is left if nothing more comes, is a hover.
 
-    `flown` is the motion that the setpoints make the vehicle fly, the last of them in its last row.
+    `flown` is the motion that they make the vehicle fly; position and velocity are as decoded.
     """
-    moves = [flown.acceleration[-1], flown.body_rate[-1]]
-    end = trajectory.at(trajectory.duration).position
-    off = np.abs(last.position[0] - end).max()
-    if np.any(last.velocity) or np.max(np.abs(moves)) > 4 * HALF_QUANTUM or off > HALF_QUANTUM + _ROUNDING:
+    moves = np.abs(np.stack([flown.acceleration[-1], flown.body_rate[-1]])).max()
+    off = np.abs(flown.position[-1] - trajectory.at(np.array([trajectory.duration])).position[0]).max()
+    if flown.velocity[-1].any() or not moves <= 4 * HALF_QUANTUM or not off <= HALF_QUANTUM + _ROUNDING:
         raise NotCertifiedError(
             "the last setpoint is not a hover at the end of the path",
             where=f"setpoint {count - 1}",
@@ -349,15 +425,13 @@ def _require_hover(
         )
 
 
-def _require(good: NDArray, what: str, values: NDArray, first: int = 0) -> None:
-    """Raise NotCertifiedError at the first bad row; `first` is the number of the setpoint in row 0."""
-    if not np.all(good):
-        row = int(np.flatnonzero(~good)[0])
-        raise NotCertifiedError(
-            f"{what} {values[row]:.4g}",
-            where=f"setpoint {first + row}",
-            hint="plan more slowly, with --speed 0.9; if the plan keeps its limits there, please report this",
-        )
+def _refused(what: str, value: float, setpoint: int) -> NotCertifiedError:
+    """Return the error of a setpoint."""
+    return NotCertifiedError(
+        f"{what} {value:.4g}",
+        where=f"setpoint {setpoint}",
+        hint="plan more slowly, with --speed 0.9; if the plan keeps its limits there, please report this",
+    )
 
 
 # Rows of the panels of _made: what comes in, and what goes out.

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import NotCertifiedError
+from cfplan.flight.setpoints import encoding
 from cfplan.flight.setpoints.encoding import (
     LEAD,
     RATE_LEAD,
@@ -190,11 +191,14 @@ def test_a_packet_that_was_not_encoded_as_meant_is_found(trajectory, monkeypatch
 def test_an_encoder_that_samples_the_trajectory_at_other_times_is_found(trajectory, monkeypatch, name, late):
     """The check evaluates the trajectory by itself, so a fault of the encoder's sampling does not hide in both."""
 
-    def shifted(trajectory, times, *leads):
-        right, wrong = motion_at(trajectory, times, *leads), motion_at(trajectory, times - late, *leads)
-        return replace(right, **{name: getattr(wrong, name)})
+    right = encoding._led
 
-    monkeypatch.setattr("cfplan.flight.setpoints.encoding.motion_at", shifted)
+    def shifted(states, trajectory, times, *leads):
+        early = trajectory.at(times - late)
+        wrong = right(early, trajectory, times - late, *leads)
+        return replace(right(states, trajectory, times, *leads), **{name: getattr(wrong, name)})
+
+    monkeypatch.setattr(encoding, "_led", shifted)
     made = encode_trajectory(trajectory)
     with pytest.raises(NotCertifiedError, match=f"{name}|body_rate"):  # braking goes by velocity and heading
         check_bytes(made, trajectory, LIMITS)
