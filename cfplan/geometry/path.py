@@ -32,6 +32,7 @@ class Path:
     coefficients: NDArray  # (M, D, 3) m, ascending powers of s - breaks[i]; of s - breaks[-1] in the last piece
     origins: NDArray = field(init=False, repr=False)  # (M,) the s about which each piece is expanded
     _tables: tuple[NDArray, ...] = field(init=False, repr=False)  # per order, (M, D - order, 3) of that derivative
+    _length: float = field(init=False, repr=False, default=math.nan)  # m, once it was asked for
 
     def __post_init__(self) -> None:
         breaks = np.array(self.breaks, dtype=float)
@@ -79,8 +80,10 @@ class Path:
 
     @property
     def length(self) -> float:
-        """Return the arc length, m."""
-        return float(self.piece_lengths().sum())
+        """Return the arc length, m, measured when it is first asked for."""
+        if math.isnan(self._length):
+            object.__setattr__(self, "_length", float(self.piece_lengths().sum()))
+        return self._length
 
     def piece_lengths(self) -> NDArray:
         """Return the arc length of each piece, (M,) m, by Gauss-Legendre quadrature of |γ'|."""

@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +169,7 @@ def load_model(folder: Path) -> Model:
     return Model(card, NETWORKS[card.architecture](weights))
 
 
+@cache
 def models_folder() -> Path:
     """Return the folder of the models that come with cfplan."""
     return shipped_folder() / "models"

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cfplan.errors import CfplanError, InfeasibleError, NotCertifiedError
+from cfplan.machine_code import njit
 from cfplan.planners.expert.intersample import violates_at_nodes
 from cfplan.planners.expert.refine import refinements
 from cfplan.planners.task import PlanningTask
@@ -160,8 +162,17 @@ def slow(task: PlanningTask, profile: SpeedProfile, space: Space | None = None, 
 
 
 def _where_slower(before: SpeedProfile, after: SpeedProfile) -> tuple[float, float, float]:
-    change = 1.0 - np.sqrt(after.h / before.h)
-    worst = int(np.argmax(change))
-    if change[worst] <= NOTICEABLE:
-        return 0.0, 0.0, 0.0
-    return np.count_nonzero(change > NOTICEABLE) / len(change), float(change[worst]), float(before.s[worst])
+    share, most, where = _changed(before.h, after.h)
+    return (share, most, float(before.s[where])) if most > NOTICEABLE else (0.0, 0.0, 0.0)
+
+
+@njit
+def _changed(before: NDArray, after: NDArray) -> tuple[float, float, int]:
+    """Return the share of places at which speed falls by more than NOTICEABLE, by how much at most, and where that."""
+    many, most, where = 0, -np.inf, 0
+    for n in range(len(before)):
+        change = 1.0 - np.sqrt(after[n] / before[n])
+        many += change > NOTICEABLE
+        if change > most:
+            most, where = change, n
+    return many / len(before), most, where

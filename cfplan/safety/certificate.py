@@ -230,16 +230,23 @@ def _capped_speed(trajectory: Trajectory, caps: SpeedCaps, segments: Segments) -
 
 def _segments(trajectory: Trajectory) -> Segments:
     """Cut at the grid points, at the breaks of the path, and where the timing was refined because h changes fast."""
-    timing, path = trajectory.timing, trajectory.path
-    every = np.sort(np.concatenate((timing.s, path.breaks)))
-    return Segments(*_cut(timing.s, timing.interval, timing.nodes, path.breaks, every))
+    timing = trajectory.timing
+    return Segments(*_cut(timing.s, timing.interval, timing.nodes, trajectory.path.breaks))
 
 
 @njit(error_model="numpy")
 def _cut(
-    s: NDArray, intervals: NDArray, nodes: NDArray, breaks: NDArray, every: NDArray
+    s: NDArray, intervals: NDArray, nodes: NDArray, breaks: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
     """Return what `_segments` does, of the timing's pieces, which end at `s`, and its profile's table."""
+    every, here, there = np.empty(len(s) + len(breaks)), 0, 0  # both in order
+    for n in range(len(every)):
+        if there == len(breaks) or (here < len(s) and s[here] <= breaks[there]):
+            every[n] = s[here]
+            here += 1
+        else:
+            every[n] = breaks[there]
+            there += 1
     edges, count = every.copy(), 1
     for n in range(1, len(every)):
         if every[n] - every[n - 1] > _SAME * every[-1]:

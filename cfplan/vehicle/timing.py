@@ -55,19 +55,23 @@ def measure(profile: SpeedProfile) -> Timing:
     left, duration, interval, polynomial, stuck = _split(nodes)
     if not np.isnan(stuck):
         raise NotCertifiedError("the speed falls to almost zero", where=f"s = {stuck:.6g}", hint=_REMEDY)
-    total = float(duration.sum())
+    s, time = _edges(left, duration, profile.s[-1])
+    total = float(time[-1])
     if not total <= LONGEST:
         raise NotCertifiedError(
             f"the speed profile takes {total:.0f} s, longer than any flight", where="the whole path", hint=_REMEDY
         )
-    return Timing(
-        profile=profile,
-        s=np.append(left, profile.s[-1]),
-        time=np.append(0.0, np.cumsum(duration)),
-        interval=interval,
-        polynomial=polynomial,
-        nodes=nodes,
-    )
+    return Timing(profile=profile, s=s, time=time, interval=interval, polynomial=polynomial, nodes=nodes)
+
+
+@njit
+def _edges(left: NDArray, duration: NDArray, end: float) -> tuple[NDArray, NDArray]:
+    """Return where pieces begin and the last one ends, and when, (K+1,) each."""
+    s, time = np.empty(len(left) + 1), np.zeros(len(left) + 1)
+    for k in range(len(left)):
+        s[k], time[k + 1] = left[k], time[k] + duration[k]
+    s[len(left)] = end
+    return s, time
 
 
 def duration_of(profile: SpeedProfile) -> float:

@@ -13,7 +13,7 @@ from cfplan.safety.quantities import scaled
 from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.measures import MEASURES, SPEED
+from cfplan.vehicle.measures import SPEED
 from cfplan.vehicle.profile import SpeedProfile
 
 COUNT = 17  # places an interval
@@ -56,13 +56,11 @@ class DensePath:
         step = path.end / nodes
         brisk = turns(path, nodes) > SHARP
         brisk[:END_INTERVALS] = brisk[-END_INTERVALS:] = True
-        self.allowance = np.full((nodes, MEASURES), ALLOWANCE)
-        self.allowance[:, quantities.JUMPS] = THRUST_ALLOWANCE
-        self.allowance[brisk] = FINE_ALLOWANCE
-        self.begins = np.concatenate([[0], np.cumsum(np.where(brisk, FINE_COUNT, COUNT))])
-        self.interval, self.places = _laid_out(brisk, self.begins, _PLACES, _FINE, step)
-        self.derivatives = path.derivatives(step * self.interval + self.places)[1:]
-        self.caps = None if caps is None else caps.at(step * self.interval + self.places)
+        self.allowance, self.begins, self.interval, self.places, s = _laid_out(
+            brisk, quantities.JUMPS, _PLACES, _FINE, step
+        )
+        self.derivatives = path.derivatives(s)[1:]
+        self.caps = None if caps is None else caps.at(s)
 
     def violation(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Violation:
         """Return the violation by a profile with as many intervals; h must be positive."""
@@ -85,15 +83,22 @@ class DensePath:
 
 @njit
 def _laid_out(
-    brisk: NDArray, begins: NDArray, usual: NDArray, fine: NDArray, step: float
-) -> tuple[NDArray, NDArray]:  # fmt: skip
-    """Return the interval of each place, and how far in s it lies in there; one interval's after another's."""
-    interval, within = np.empty(begins[-1], np.int64), np.empty(begins[-1])
+    brisk: NDArray, jumps: NDArray, usual: NDArray, fine: NDArray, step: float
+) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+    """Return the allowance of each interval, (N, MEASURES), and the first place of each, (N+1,); and of each place its
+    interval, how far in s it lies in there, and s: one interval's after another's."""
+    allowance, begins = np.empty((len(brisk), len(jumps))), np.zeros(len(brisk) + 1, np.int64)
+    for k in range(len(brisk)):
+        begins[k + 1] = begins[k] + (len(fine) if brisk[k] else len(usual))
+        for row in range(len(jumps)):
+            allowance[k, row] = FINE_ALLOWANCE if brisk[k] else THRUST_ALLOWANCE if jumps[row] else ALLOWANCE
+    interval, within, s = np.empty(begins[-1], np.int64), np.empty(begins[-1]), np.empty(begins[-1])
     for k in range(len(brisk)):
         places = fine if brisk[k] else usual
         for n in range(len(places)):
-            interval[begins[k] + n], within[begins[k] + n] = k, step * places[n]
-    return interval, within
+            at, x = begins[k] + n, step * places[n]
+            interval[at], within[at], s[at] = k, x, step * k + x
+    return allowance, begins, interval, within, s
 
 
 def _extremes_interpreted(measured: NDArray, begins: NDArray) -> NDArray:

@@ -1,5 +1,6 @@
 """How the interior point method searches a speed-profile problem: where each search starts, and when it stops."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.deadline import NEVER, Deadline
+from cfplan.machine_code import njit
 from cfplan.planners.expert.initial_guess import lowered
 from cfplan.planners.expert.problem import Problem, Segment
 from cfplan.planners.expert.transcription import SplineProgram
@@ -119,9 +121,10 @@ def rejection_reason(attempt: Attempt, segment: Segment) -> str:
     """Return why a solution must be rejected even if the solver reports success; empty where it need not be."""
     if not attempt.solved:
         return attempt.message
-    if not np.isfinite(attempt.coefficients).all():
+    finite, positive = _soundness(attempt.coefficients)
+    if not finite:
         return "the solution is not finite"
-    if (attempt.coefficients[:, 0] > 0).all():  # then so is h, which lies between its coefficients
+    if positive:  # then so is h, which lies between its coefficients
         return ""
     profile = segment.profile(attempt.coefficients)
     places = np.linspace(0.0, 1.0, 9)
@@ -130,3 +133,14 @@ def rejection_reason(attempt: Attempt, segment: Segment) -> str:
     if (profile.at(s, np.repeat(nodes[:, None], len(places), axis=1)).h <= 0).any():
         return "h falls to zero between nodes"
     return ""
+
+
+@njit
+def _soundness(coefficients: NDArray) -> tuple[bool, bool]:
+    """Return whether all coefficients, (N+3, 1 or 2), are finite, and whether all of h are positive."""
+    finite = positive = True
+    for n in range(coefficients.shape[0]):
+        positive = positive and coefficients[n, 0] > 0.0
+        for column in range(coefficients.shape[1]):
+            finite = finite and math.isfinite(coefficients[n, column])
+    return finite, positive

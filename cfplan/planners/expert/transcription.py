@@ -47,14 +47,9 @@ class SplineProgram:
         self.bounds = self._bounds(problem)
 
     def _bounds(self, problem: Problem) -> NDArray:
-        it, at_points = self._variables, problem.lower.size
-        lower, upper = np.full(at_points + self._linear, -np.inf), np.full(at_points + self._linear, np.inf)
-        lower[:at_points], upper[:at_points] = problem.lower.ravel(), problem.upper.ravel()
-        behind = at_points + len(problem.highest)
-        upper[at_points:behind] = problem.highest
-        lower[behind : behind + it.positive] = FLOOR
-        if it.sparsity.of_yaw and not problem.ends.start:
-            lower[-1], upper[-1] = problem.first_yaw
+        it = self._variables
+        least, most = (-np.inf, np.inf) if problem.ends.start else map(float, problem.first_yaw)
+        lower, upper = _limits(problem.lower, problem.upper, problem.highest, self._linear, it.positive, (least, most))
         return bounds_of(lower, upper)
 
     def v_of(self, coefficients: NDArray) -> NDArray:
@@ -63,8 +58,7 @@ class SplineProgram:
 
     def coefficients_of(self, v: NDArray) -> NDArray:
         """Return the table, (N+3, 1 or 2)."""
-        slots = self._variables.slots
-        return np.where(slots >= 0, v[slots], self._fixed)
+        return _table(v, self._variables.slots, self._fixed)
 
     def rows_of(self, constraints: NDArray) -> NDArray:
         """Return the (ROWS, P) rows at points of constraints, (m,)."""
@@ -72,19 +66,52 @@ class SplineProgram:
 
     def evaluate(self, v: NDArray) -> Values:
         """Return f and g at v."""
-        it = self._variables.sparsity
-        _gather(v, it.slots, it.runs, self._fixed_local, self._local, self._kernels.coefficients)
+        self._go_to(v)
         constraints, penalty = self._kernels.evaluate()
-        return Values(_complete(constraints, penalty, self._local, it, self._scale), constraints)
+        return Values(_complete(constraints, penalty, self._local, self._variables.sparsity, self._scale), constraints)
 
     def linearise(self, v: NDArray, terms: NDArray) -> Linearisation:
         """Return the derivatives at v, where the constraints have these barrier.TERMS; jvp holds until the next."""
         it, kernels = self._variables, self._kernels
-        _gather(v, it.sparsity.slots, it.sparsity.runs, self._fixed_local, self._local, kernels.coefficients)
+        self._go_to(v)
         jacobian = kernels.differentiate(terms)
         gradients, matrix = np.zeros((len(terms), it.size)), np.zeros((it.size, it.band + 1))
         _assemble(kernels.work, it.sparsity, terms, self._local, self._scale, gradients, matrix)
         return Linearisation(gradients, matrix, partial(_jvp, jacobian, it.sparsity))
+
+    def _go_to(self, v: NDArray) -> None:
+        """Give the kernels the coefficients at v."""
+        it = self._variables.sparsity
+        _gather(v, it.slots, it.runs, self._fixed_local, self._local, self._kernels.coefficients)
+
+
+@njit
+def _limits(lower, upper, highest, linear, positive, yaw):
+    """Return the least and most of all constraints, (m,) each, with those of the linear ones behind those at points."""
+    points, behind = lower.size, lower.size + len(highest)
+    low, high = np.full(points + linear, -np.inf), np.full(points + linear, np.inf)
+    count = lower.shape[1]
+    for row in range(lower.shape[0]):
+        for p in range(count):
+            low[row * count + p], high[row * count + p] = lower[row, p], upper[row, p]
+    for j in range(len(highest)):
+        high[points + j] = highest[j]
+    for j in range(positive):
+        low[behind + j] = FLOOR
+    if behind + positive < len(low):  # the last is where yaw starts
+        low[-1], high[-1] = yaw
+    return low, high
+
+
+@njit
+def _table(v, slots, fixed):
+    """Return the table of coefficients, of which those without an entry of v are `fixed`."""
+    table = fixed.copy()
+    for n in range(table.shape[0]):
+        for column in range(table.shape[1]):
+            if slots[n, column] >= 0:
+                table[n, column] = v[slots[n, column]]
+    return table
 
 
 @njit

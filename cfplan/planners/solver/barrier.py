@@ -266,29 +266,37 @@ def _accept_step_interpreted(
 
 @njit(interpreted=_accept_step_interpreted, error_model="numpy", fastmath=_SUMS)
 def _accept_step(g, bounds, slacks, step, share, share_dual, barrier, after, terms):
-    """Fill in the slacks after the step, and the terms; return the Errors."""
+    """Fill in the slacks after the step, and the terms; return the Errors.
+
+    In several loops: the compiler takes several constraints at once only where few arrays are written, as they might
+    overlap.
+    """
     lower, upper, has_low, has_high, bounded = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
     ds, dlow, dhigh = step[0], step[1], step[2]
     s, low, high = slacks[0], slacks[1], slacks[2]
     new_s, new_low, new_high = after[0], after[1], after[2]
     sigma, multiplier, slope, residual = terms[0], terms[1], terms[2], terms[3]
-    infeasible, off = np.empty(len(s)), np.empty(len(s))
+    by_below, by_above = np.empty(len(s)), np.empty(len(s))
     for j in range(len(s)):
-        there = s[j] + share * ds[j]
-        below, above = there - lower[j], upper[j] - there
+        new_s[j] = s[j] + share * ds[j]
+    for j in range(len(s)):
+        below, above = new_s[j] - lower[j], upper[j] - new_s[j]
         inverse = 1.0 / (below * above)
-        by_below, by_above = has_low[j] * above * inverse, has_high[j] * below * inverse
-        middle = barrier * by_below
-        of_low = min(max(low[j] + share_dual * dlow[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
-        middle = barrier * by_above
-        of_high = min(max(high[j] + share_dual * dhigh[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
-        new_s[j], new_low[j], new_high[j] = there, of_low, of_high
-        curvature = of_low * by_below + of_high * by_above
-        missed = bounded[j] * (g[j] - there)
-        sigma[j], multiplier[j] = curvature, of_high - of_low
-        slope[j], residual[j] = by_above - by_below, curvature * missed
-        infeasible[j] = abs(missed)
-        below = abs(of_low * (there - lower[j]) - has_low[j] * barrier)
-        above = abs(of_high * (upper[j] - there) - has_high[j] * barrier)
+        by_below[j], by_above[j] = has_low[j] * above * inverse, has_high[j] * below * inverse
+    for j in range(len(s)):
+        middle = barrier * by_below[j]
+        new_low[j] = min(max(low[j] + share_dual * dlow[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
+    for j in range(len(s)):
+        middle = barrier * by_above[j]
+        new_high[j] = min(max(high[j] + share_dual * dhigh[j], middle / COMPLEMENTARY), middle * COMPLEMENTARY)
+    for j in range(len(s)):
+        curvature = new_low[j] * by_below[j] + new_high[j] * by_above[j]
+        sigma[j], multiplier[j] = curvature, new_high[j] - new_low[j]
+        slope[j], residual[j] = by_above[j] - by_below[j], curvature * (bounded[j] * (g[j] - new_s[j]))
+    infeasible, off = by_below, by_above  # whose memory is no longer needed
+    for j in range(len(s)):
+        infeasible[j] = abs(bounded[j] * (g[j] - new_s[j]))
+        below = abs(new_low[j] * (new_s[j] - lower[j]) - has_low[j] * barrier)
+        above = abs(new_high[j] * (upper[j] - new_s[j]) - has_high[j] * barrier)
         off[j] = below if below > above else above
     return _largest(infeasible), _largest(off)
