@@ -31,8 +31,10 @@ from cfplan.safety.limits import Limits
 
 FIRST_PART, NEXT_PART = 0.5, 0.8  # s of a plan committed at once, at least: its beginning, and more of it
 PART = 4.0  # likewise, for each s that planning looks ahead
-SLACK = 0.003  # s more than that
-FARTHEST = 3000  # setpoints ahead of which no more of a plan is committed, until the vehicle comes nearer
+SLACK = 0.001  # s more than that
+NEAR = 0.5  # s before one must plan the next part of a plan, from when on that is done
+QUIET = 1.0  # s without a request, after which more of a plan is committed than is near: others may replace it soon
+FARTHEST = 30.0  # s ahead of which no more of it is committed even then, until the vehicle comes nearer
 
 
 class Wish(StrEnum):
@@ -101,9 +103,13 @@ def part_within(ahead: float, least: float = FIRST_PART) -> int:
     return round(max(least, PART * ahead) * RATE)
 
 
-def wants_more(held: HeldFlight, first: int) -> bool:
-    """Return whether the next part of a plan is to be planned, where one may plan from setpoint `first` on."""
-    return held.unfinished and (held.stops_from is None or held.stops_from < first + FARTHEST)
+def wants_more(held: HeldFlight, first: int, quiet: float) -> bool:
+    """Return whether the next part of a plan is to be planned, where one may plan from setpoint `first` on.
+
+    It has been `quiet`, s, since the last request.
+    """
+    within = NEAR if quiet < QUIET else FARTHEST
+    return held.unfinished and (held.stops_from is None or held.stops_from < first + round(within * RATE))
 
 
 def presses(held: HeldFlight, first: int, ahead: float) -> bool:

@@ -21,7 +21,7 @@ import numpy as np
 
 from cfplan.errors import CfplanError
 from cfplan.flight.clock import REAL_CLOCK
-from cfplan.flight.pilot.proposals import PilotAnswer, read_answer
+from cfplan.flight.pilot.proposals import LOOKS_UNTIL, PilotAnswer, read_answer
 from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, splice
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
@@ -60,15 +60,14 @@ from cfplan.safety.limits import Limits
 
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
-LEARNED_FROM = 10  # plans, by which one knows how long the next may take
-IN_TIME = 0.6  # share of them for which what is taken to be needed was enough: one that comes late is planned again
+LEARNED_FROM = 15  # plans, by which one knows how long the next may take
 AGAIN = 1.2  # by how much longer than the first the next one is taken to need then, at least
 TRIES = 4  # of a request whose proposal comes late
 ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
 _GARBAGE = 100_000  # objects, after which it is looked through in any case
 _SWITCH_INTERVAL = 0.0002  # s; a thread with loops gets the interpreter back after at most this
 PRIORITY = -10  # niceness of the planner where that is allowed: behind the pilot, before all else
-_LOOK_AGAIN = 1.0  # s, until the planner sees whether it has
+_LOOK_AGAIN = 0.05  # s, until the planner sees whether more of a plan is to be made
 _ANSWER_WITHIN = 1.0  # s in which a pilot answers; what comes later counts as well
 NO_ANSWER = "the pilot does not answer; where it still accepts what was proposed last, that is flown"
 _CLOSE_WITHIN = 1.0  # s
@@ -135,7 +134,11 @@ class AirPlanner:
 
 
 class _Lead:
-    """How far ahead of the clock to plan, by how long plans took lately: most, not all, are to be in time."""
+    """How far ahead of the clock to plan, by how long plans took lately.
+
+    One that comes late is planned again, which takes about as long as they take. So what is best is as far as is least
+    in the mean, with the time for those of them again that would have come late.
+    """
 
     def __init__(self, first: float):
         """Begin with what a plan is taken to need before any was made, s."""
@@ -150,7 +153,9 @@ class _Lead:
     @property
     def ahead(self) -> float:
         """Return what the next plan is taken to need, s, with its way to the pilot."""
-        return float(np.quantile(self._took, IN_TIME)) + SLACK
+        took = np.sort(self._took)
+        late = np.arange(len(took) - 1, -1, -1) / len(took)
+        return float(took[np.argmin(took + late * np.median(took))]) + SLACK
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +178,10 @@ class _Worker:
         self._begun: float | None = None  # s, when setpoint 0 was due
         self._plans, self._stops, self._parts = _Lead(FIRST_TIME), _Lead(FIRST_STOP), _Lead(FIRST_STOP)
         self._checks: deque[float] = deque([0.0], maxlen=LEARNED_FROM)  # s from a plan to its proposal
+        self._equal: deque[int] = deque([0], maxlen=LEARNED_FROM)  # setpoints that proposals left out as equal
         self._waiting: tuple[PathRequest, float] | None = None
+        self._asked = -math.inf  # s, when the last request came
+        self._busy = False  # whether something was done since garbage was looked for
         self._proposed: _Proposed | None = None
         self._accepted = 0  # number of the request whose plan is flown
 
@@ -212,9 +220,12 @@ class _Worker:
     def _serve_next(self) -> PathAnswer | None:
         """Wait for something to do, and do it; return what there is to tell."""
         if self._waiting is None and not self._wants_more():
-            gc.collect()
+            if self._busy:
+                gc.collect()
+            self._busy = False
             wait([self._requests, self._pilot], _LOOK_AGAIN if self._held.unfinished else None)
         self._read(0.0)
+        self._busy = self._busy or self._waiting is not None or self._wants_more()
         if self._wants_more() and (self._waiting is None or presses(self._held, *self._next(self._plans))):
             return self._go_on() if self._proposed is None else self._settle()
         if self._waiting is None:
@@ -224,13 +235,15 @@ class _Worker:
         return None if answer is None else replace(answer, seconds=REAL_CLOCK.now() - since)
 
     def _wants_more(self) -> bool:
-        return self._held.unfinished and wants_more(self._held, self._next(self._parts)[0])
+        quiet = REAL_CLOCK.now() - self._asked
+        return self._held.unfinished and wants_more(self._held, self._next(self._parts)[0], quiet)
 
     def _next(self, lead: _Lead, least: float = 0.0) -> tuple[int, float]:
         """Return the setpoint from which on one may plan now, and how far ahead it is, s, `least` at least."""
         assert self._begun is not None
         ahead = max(lead.ahead, least)
-        return math.ceil((REAL_CLOCK.now() - self._begun + ahead) * RATE) + LEAST_AHEAD, ahead
+        arrives = REAL_CLOCK.now() - self._begun + ahead
+        return math.ceil((arrives + LOOKS_UNTIL) * RATE) - 1 + LEAST_AHEAD, ahead
 
     def _read(self, patience: float) -> PilotAnswer | None:
         """Take what has come; return the pilot's answer to a proposal if there is one, waiting for it if asked to.
@@ -252,7 +265,8 @@ class _Worker:
                 request = self._requests.recv()
                 if self._waiting is not None:
                     self._requests.send(PathAnswer(self._waiting[0].number, PathVerdict.SUPERSEDED))
-                self._waiting = request, REAL_CLOCK.now()
+                self._asked = REAL_CLOCK.now()
+                self._waiting = request, self._asked
         return found
 
     def _answer(self, request: PathRequest, received: float) -> PathAnswer | None:
@@ -273,7 +287,7 @@ class _Worker:
             except TooLateError as error:
                 # Known ways need less time than it took to find them.
                 took = 0.0 if attempt.ways.failed else REAL_CLOCK.now() - begun + self._checking
-                lead.note(REAL_CLOCK.now() - begun + self._checking)
+                lead.note(REAL_CLOCK.now() - begun + self._checking - self._left_out)
                 reason = str(error)
                 continue
             except CfplanError as error:
@@ -293,6 +307,7 @@ class _Worker:
                 return answer_held(request, made)
             if made.plan is not None:
                 self._checks.append(took - made.plan.seconds)
+                self._equal.append(made.equal)
             sent = _Proposed(made, request, received, begun, proposed)
             if made.stop is not None:
                 answer = self._propose(replace(sent, made=made.stop))
@@ -300,7 +315,7 @@ class _Worker:
                     answer = self._propose(replace(sent, made=following(made, self._held.commitment)))
             elif self._late_by(made.proposal.splice) > 0.0:
                 reason = Fault.LATE.value
-                lead.note(took)
+                lead.note(took - made.equal / RATE)
                 continue
             elif made.plan is not None and self._another_waits():
                 self._send(replace(sent, before=self._held))
@@ -309,7 +324,7 @@ class _Worker:
                 answer = self._propose(sent)
             if answer is None:
                 return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER)
-            lead.note(max(answer.came, proposed) - begun)
+            lead.note(max(answer.came, proposed) - begun - made.equal / RATE)
             reason = answer.reason
             if not reason.startswith(Fault.LATE):
                 return self._outcome(sent, answer)
@@ -340,17 +355,23 @@ class _Worker:
 
     def _too_late(self, splice: int) -> bool:
         """Return whether what is planned from a setpoint on, and must be checked still, comes to the pilot too late."""
-        return self._late_by(splice) + self._checking > 0.0
+        return self._late_by(splice) + self._checking - self._left_out > 0.0
 
     def _late_by(self, splice: int) -> float:
         """Return how much too late, s, what is sent now comes to the pilot, where it begins at a setpoint."""
         assert self._begun is not None
-        return REAL_CLOCK.now() + ON_THE_WAY - (self._begun + (splice - LEAST_AHEAD) / RATE)
+        looks_until = self._begun + (splice - LEAST_AHEAD + 1) / RATE - LOOKS_UNTIL
+        return REAL_CLOCK.now() + ON_THE_WAY - looks_until
 
     @property
     def _checking(self) -> float:
         """Return how long the checks of a plan take, s."""
         return float(np.median(self._checks))
+
+    @property
+    def _left_out(self) -> float:
+        """Return by how much later than where they might most proposals begin, s, as setpoints before are equal."""
+        return float(np.median(self._equal)) / RATE
 
     def _planned(self, request: PathRequest, first: int, part: int, attempt: AnswerAttempt) -> Replanned | HeldFlight:
         """Return what is to be proposed, from rest where no plan leads there from the motion."""
@@ -432,7 +453,7 @@ class _Worker:
         proposed, self._proposed = self._proposed, None
         assert proposed is not None
         if proposed.before is not None:  # nobody waits for it
-            self._plans.note(max(answer.came, proposed.proposed) - proposed.begun)
+            self._plans.note(max(answer.came, proposed.proposed) - proposed.begun - made.equal / RATE)
             told = self._outcome(proposed, answer)
             self._requests.send(replace(told, seconds=REAL_CLOCK.now() - proposed.received))
             if answer.commitment is None:

@@ -108,6 +108,7 @@ class Replanned:
     plan: Plan | None  # None for a stop, which brakes along the plan before
     joint: float  # s from setpoint 0, from when on the motion is another
     stop: "Replanned | None" = None  # to be proposed before it, where it begins from the rest behind that
+    equal: int = 0  # setpoints by which the proposal begins later than it might, as so many are the committed ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,8 +359,22 @@ def _replan_at(
 def _proposed(held: HeldFlight, splice: int, made: CertifiedFlight, planned: Plan | None, joint: float) -> Replanned:
     """Return the proposal of what was certified; `held` has the trajectories and waypoints behind it."""
     ending = 0 if made.following is None else len(made.payloads) - made.following - 1
-    proposal = propose(held.commitment, splice, made.payloads, made.stops, ending, goes_on=planned is None)
-    return Replanned(proposal, held_with(held, splice, made), planned, joint)
+    equal = 0 if planned is None else _equal(held.commitment, splice, made.payloads)
+    payloads, stops = made.payloads[equal:], made.stops[equal:]
+    proposal = propose(held.commitment, splice + equal, payloads, stops, ending, goes_on=planned is None)
+    return Replanned(proposal, held_with(held, splice, made), planned, joint, equal=equal)
+
+
+def _equal(commitment: Commitment, splice: int, payloads: NDArray) -> int:
+    """Return how many setpoints from a splice on may be left out: the next one is the committed one to the byte, too.
+
+    What is looked ahead changes setpoints by less than packets round for a while. So long, the pilot may send what it
+    is bound to, and a proposal that leaves this out is in time for longer.
+    """
+    ahead = payloads[:SPLICE_AHEAD]
+    rows = np.minimum(np.arange(splice, splice + len(ahead)), commitment.last) - commitment.first
+    same = (commitment.payloads[rows] == ahead).all(axis=1)
+    return max(int(np.argmin(same)) - 1, 0) if not same.all() else 0
 
 
 def held_with(held: HeldFlight, splice: int, made: CertifiedFlight) -> HeldFlight:

@@ -85,6 +85,7 @@ class SteppedPlanner:
         self._number = 0
         self._begun = math.nan
         self._waiting: tuple[PathRequest, float] | None = None
+        self._asked = -math.inf  # s, when the last request came
         self._in_hand: _InHand | None = None
         self._accepted = 0  # number of the request whose plan is flown
 
@@ -93,7 +94,8 @@ class SteppedPlanner:
         self._number += 1
         if self._waiting is not None:
             self._on_answer(PathAnswer(self._waiting[0].number, PathVerdict.SUPERSEDED))
-        self._waiting = PathRequest(self._number, wish, tuple(waypoints)), self._clock.now()
+        self._asked = self._clock.now()
+        self._waiting = PathRequest(self._number, wish, tuple(waypoints)), self._asked
         return self._number
 
     @property
@@ -108,11 +110,15 @@ class SteppedPlanner:
     def begin(self, start: float) -> None:
         self._begun = start
 
+    def wait(self, patience: float) -> bool:
+        return False  # it plans in the pilot's ticks
+
     def newest(self) -> Proposal | None:
         now = self._clock.now()
         if self._in_hand is None and self.fault is not PlannerFault.KILLED:
             first, ahead = self._next(now)
-            if wants_more(self.held, first) and (self._waiting is None or presses(self.held, first, ahead)):
+            more = wants_more(self.held, first, now - self._asked)
+            if more and (self._waiting is None or presses(self.held, first, ahead)):
                 self._go_on(now, first, part_within(ahead, NEXT_PART))
             elif self._waiting is not None:
                 (request, asked), self._waiting = self._waiting, None

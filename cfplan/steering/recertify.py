@@ -93,22 +93,24 @@ def recertify(record: Record) -> Recertified:
                 hint="the record was changed since, or made by another version",
             )
     limits = next(plan.limits for plan in (first, *plans) if plan is not None)
+    joints = dict(zip(record.answers.splice.tolist(), record.answers.joint.tolist(), strict=True))
     jump, stops, setpoints = 0.0, 0, len(held.commitment.payloads)
     for number, plan in enumerate(plans, 1):
         splice = int(commitments.splice[number])
+        joint = float(joints.get(splice, (splice + SPLICE_AHEAD) / RATE))
         if plan is not None:
-            jump, limits = max(jump, _jump(at_rest_from(held, splice, limits), splice, plan)), plan.limits
-        held = _committed(
-            held, splice, plan, limits, commitments.payloads[number], int(commitments.checksum[number]), number
-        )
+            resting = at_rest_from(held, round(joint * RATE) - SPLICE_AHEAD, limits)
+            jump, limits = max(jump, _jump(resting, splice, joint, plan)), plan.limits
+        told, checksum = commitments.payloads[number], int(commitments.checksum[number])
+        held = _committed(held, splice, joint, plan, limits, told, checksum, number)
         stops += held.exact_from > 0
         setpoints += len(commitments.payloads[number]) // PAYLOAD_SIZE
     sequence = committed_setpoints(record) if len(commitments.time) else held.commitment.payloads
     streamed, left_after = _compare(record, sequence)
     certificates = sorted(found, key=lambda certificate: certificate.worst.share)
     worst_of_all = certificates[-1] if certificates else None
-    joints = sum(plan is not None for plan in plans)
-    return Recertified(len(found), stops, worst_of_all, joints, jump, setpoints, streamed, left_after)
+    count = sum(plan is not None for plan in plans)
+    return Recertified(len(found), stops, worst_of_all, count, jump, setpoints, streamed, left_after)
 
 
 def _plan_of(record: Record, checksum: int) -> Plan | None:
@@ -135,17 +137,16 @@ def _beginning(record: Record, plans: list[Plan | None]) -> tuple[HeldFlight, Pl
     return hold_hover((x, y, z), yaw, first_made.limits), None
 
 
-def _jump(held: HeldFlight, splice: int, plan: Plan) -> float:
-    """Return by how much position to jerk jump at a joint. Raises NotCertifiedError where they do."""
-    time = (splice + SPLICE_AHEAD) / RATE
-    before, after = held.flown.at(time), plan.trajectory.at(0.0)
+def _jump(held: HeldFlight, splice: int, joint: float, plan: Plan) -> float:
+    """Return by how much position to jerk jump at a joint, s. Raises NotCertifiedError where they do."""
+    before, after = held.flown.at(joint), plan.trajectory.at(0.0)
     jumps = [
         float(np.abs(getattr(after, name) - getattr(before, name)).max())
         for name in ("position", "velocity", "acceleration", "jerk")
     ]
     if max(jumps) > _SAME:
         raise NotCertifiedError(
-            f"the motion jumps by {max(jumps):.2g} at {time:.2f} s",
+            f"the motion jumps by {max(jumps):.2g} at {joint:.2f} s",
             where=f"the joint behind setpoint {splice}",
             hint="the record was changed since, or made by another version",
         )
@@ -153,7 +154,14 @@ def _jump(held: HeldFlight, splice: int, plan: Plan) -> float:
 
 
 def _committed(
-    held: HeldFlight, splice: int, plan: Plan | None, limits: Limits, payloads: bytes, checksum: int, number: int
+    held: HeldFlight,
+    splice: int,
+    joint: float,
+    plan: Plan | None,
+    limits: Limits,
+    payloads: bytes,
+    checksum: int,
+    number: int,
 ) -> HeldFlight:
     """Certify a plan again, or another part of it, and return what was held with that.
 
@@ -161,25 +169,27 @@ def _committed(
     """
     where = f"plan {number}, from setpoint {splice} on"
     told = np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
-    held, flown = at_rest_from(held, splice, limits), held.flown
+    begin = splice if plan is None else round(joint * RATE) - SPLICE_AHEAD  # before it all is as committed before
+    held, flown = at_rest_from(held, begin, limits), held.flown
     if plan is not None:
-        flown = held.flown.continued((splice + SPLICE_AHEAD) / RATE, plan.trajectory)
+        flown = held.flown.continued(joint, plan.trajectory)
     elif held.stops_from is None or not _goes_on(flown, splice, told, limits):
         return _stopped(held, splice, told, checksum, where, limits)
-    since, starts = flown.since(splice / RATE), snapshots_at(held, splice)
+    since, starts, equal = flown.since(begin / RATE), snapshots_at(held, begin), splice - begin
     try:
-        if len(told) == len(encode_trajectory(since, gains=gains_under(limits), space=limits.space).payloads):
+        if len(told) + equal == len(encode_trajectory(since, gains=gains_under(limits), space=limits.space).payloads):
             made = certify_whole(since, limits, starts)
         else:
-            made = certify_beginning(since, len(told) - BEHIND, limits, starts, foresee=False)
+            made = certify_beginning(since, len(told) + equal - BEHIND, limits, starts, foresee=False)
     except CfplanError as error:
         raise NotCertifiedError(f"{error.where}: {error.what}", where=where, hint=error.hint) from error
-    if told.shape != made.payloads.shape or (told != made.payloads).any():
+    certified, stops = made.payloads[equal:], made.stops[equal:]
+    if told.shape != certified.shape or (told != certified).any():
         raise NotCertifiedError("the setpoints are not those of the plan", where=where, hint="was the record changed?")
-    if checksum_of(splice, made.payloads, made.stops) != checksum:
+    if checksum_of(splice, certified, stops) != checksum:
         raise NotCertifiedError("the stops are not those that were verified", where=where, hint="was it changed?")
-    with_it = held_with(replace(held, flown=flown), splice, made)
-    return replace(with_it, commitment=Commitment(splice, made.payloads, made.stops))
+    with_it = held_with(replace(held, flown=flown), begin, made)
+    return replace(with_it, commitment=Commitment(splice, certified, stops))
 
 
 def _goes_on(flown: JoinedTrajectory, splice: int, told: NDArray, limits: Limits) -> bool:

@@ -211,15 +211,16 @@ def _vehicle(limits: Limits) -> list[TimeOut]:
 
 
 def _planner() -> list[TimeOut]:
-    commitment, planner, steered = (
-        "flight/setpoints/commitment.py", "preparation/planner_process.py", "steering/steered_vehicle.py"
+    commitment, proposals, planner, steered = (
+        "flight/setpoints/commitment.py", "flight/pilot/proposals.py", "preparation/planner_process.py",
+        "steering/steered_vehicle.py",
     )  # fmt: skip
     return [
         TimeOut(
             "a plan, so late that less than this is left until its first setpoint that is another",
-            (_read(commitment, "LEAST_AHEAD") + 1) / 100.0,
+            _read(proposals, "LOOKS_UNTIL"),
             "it is refused as late and planned again, farther ahead; the vehicle flies what was committed before",
-            "the pilot", commitment,
+            "the pilot", proposals,
         ),
         TimeOut(
             "the planner: dead, hanging or wrong", 0.0,

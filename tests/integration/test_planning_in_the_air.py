@@ -23,6 +23,7 @@ from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
 from cfplan.preparation.replan import HeldFlight, Replanned, accepted, halt, hold, replan
 from cfplan.safety.certificate import certify
+from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.vehicle.joint import JoinedTrajectory
 
 pytestmark = pytest.mark.integration
@@ -172,6 +173,53 @@ def test_in_the_hover_at_its_end_a_flight_goes_on(held, mission, limits):
     assert flight.outcome.exit_code is ExitCode.OK
     assert len(planner.plans) == 1
     np.testing.assert_allclose(flight.truth.position[-1, :2], [0.0, 0.5], atol=0.1)
+
+
+class BetweenTicks(HeldProposals):
+    """A proposal that comes at a time, s, on the clock, between two setpoints."""
+
+    def __init__(self, clock):
+        super().__init__()
+        self._clock, self._comes, self._coming = clock, math.inf, None
+
+    def send(self, proposal: Proposal, comes: float) -> None:
+        self._comes, self._coming = comes, proposal
+
+    def wait(self, patience: float) -> bool:
+        self._clock.sleep(max(min(self._comes - self._clock.now(), patience), 0.0))
+        return self._clock.now() >= self._comes
+
+    def newest(self) -> Proposal | None:
+        if self._clock.now() < self._comes:
+            return None
+        self._comes = math.inf
+        return self._coming
+
+
+@pytest.mark.parametrize(("before", "in_time"), [(0.006, True), (0.002, False)])
+def test_a_proposal_that_comes_well_before_the_next_setpoint_may_begin_with_the_one_just_sent(
+    held, mission, limits, before, in_time
+):
+    """`before` is in s. Later, the pilot looks at it once that setpoint is sent: then it comes too late."""
+    lab, answers = SteppedLab(limits.airframe), []
+    proposals, streams = BetweenTicks(lab.clock), False
+    proposals.on_answer = lambda _, answer: answers.append(answer)
+    made = replan(held, 150, [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0]], limits)
+    splice = made.proposal.splice
+
+    def react(message: Telemetry) -> None:
+        nonlocal streams
+        streams = streams or (isinstance(message, PhaseEntered) and message.phase is Phase.STREAM)
+        if streams and not answers and isinstance(message, SetpointSent) and message.index == splice:
+            proposals.send(made.proposal, message.due + 1.0 / RATE - before)
+
+    flight = fly_stepped(mission, react, lab=lab, proposals=proposals)
+    assert flight.outcome.exit_code is ExitCode.OK
+    assert [type(answer) for answer in answers] == [Commitment if in_time else Refusal]
+    assert flight.outcome.lateness.max < 1e-6
+    assert_is_one_motion(
+        flight, made.held.flown if in_time else held.flown, limits, 10_000 if in_time else held.commitment.last
+    )
 
 
 def late(planner, now, limits):

@@ -72,8 +72,9 @@ def test_simulated_on_from_a_snapshot_a_flight_is_the_whole_flight(held, limits)
 
 
 def test_new_waypoints_replace_those_ahead(held, limits):
-    new = after(held, limits, replan(held, NOW + 5, [[-0.5, 0.8, 1.0], [0.5, 2.0, 1.0]], limits))
-    assert new.commitment.splices == (NOW + 5,)
+    made = replan(held, NOW + 5, [[-0.5, 0.8, 1.0], [0.5, 2.0, 1.0]], limits)
+    new = after(held, limits, made)
+    assert new.commitment.splices == (NOW + 5 + made.equal,)
     end = decode(new.commitment.payloads[-1:])
     np.testing.assert_allclose(end.position, [[0.5, 2.0, 1.0]], atol=5.1e-4)
 
@@ -208,13 +209,30 @@ def test_each_part_ends_at_rest_inside_and_its_beginning_is_the_plan(held, limit
     plan_bytes = encode_trajectory(last.flown, gains=gains_under(limits), space=limits.space).payloads
     for made in parts[:-1]:
         proposal, stops_from = made.proposal, made.held.stops_from
-        assert stops_from == proposal.splice + PART
-        np.testing.assert_array_equal(proposal.payloads[:PART], plan_bytes[proposal.splice : stops_from])
-        np.testing.assert_array_equal(proposal.stops[PART], proposal.payloads[PART : PART + 121])
+        assert stops_from == proposal.splice - made.equal + PART
+        before_stop = stops_from - proposal.splice
+        np.testing.assert_array_equal(proposal.payloads[:before_stop], plan_bytes[proposal.splice : stops_from])
+        np.testing.assert_array_equal(proposal.stops[before_stop], proposal.payloads[before_stop : before_stop + 121])
         worst = link_loss_at_every_setpoint(
             proposal.payloads, limits, starts=snapshots_at(made.held, proposal.splice)
         ).worst
         assert worst.beyond <= 0.0
+
+
+def test_a_proposal_leaves_out_what_is_committed_to_the_byte_and_its_first_setpoint_is(held, limits):
+    """Packets round what looking ahead changes at first. So the pilot has more time until the first that is another."""
+    left_out = []
+    for begin in range(NOW, NOW + 60, 10):
+        made = replan(held, begin, [[-0.5, 0.8, 1.0], [0.5, 2.0, 1.0]], limits)
+        proposal, committed = made.proposal, held.commitment.payloads
+        assert proposal.splice == begin + made.equal
+        np.testing.assert_array_equal(proposal.payloads[0], committed[proposal.splice])
+        assert (proposal.payloads[1] != committed[proposal.splice + 1]).any()
+        whole = encode_trajectory(made.held.flown, gains=gains_under(limits), space=limits.space).payloads
+        np.testing.assert_array_equal(whole[begin : begin + made.equal], committed[begin : begin + made.equal])
+        np.testing.assert_array_equal(proposal.payloads, whole[proposal.splice :])
+        left_out.append(made.equal)
+    assert max(left_out) > 0
 
 
 def test_a_part_that_comes_too_late_goes_on_from_rest(held, limits):
@@ -222,7 +240,7 @@ def test_a_part_that_comes_too_late_goes_on_from_rest(held, limits):
     first = after(held, limits, made)
     late = first.stops_from + 30
     made = go_on(first, late, limits, PART)
-    assert made.proposal.splice == first.stops_from + 120 + LOOKS_BACK  # where it rests
+    assert made.proposal.splice - made.equal == first.stops_from + 120 + LOOKS_BACK  # where it rests
     after(first, limits, made, late - 5)
     np.testing.assert_allclose(made.held.ahead, FAR)
     np.testing.assert_allclose(made.plan.path(0.0), first.rest[0])
@@ -270,7 +288,7 @@ def interrupted(held, limits):
 def test_where_a_part_does_not_pass_the_vehicle_stops_before_it_and_goes_on_from_there(interrupted, limits):
     assert interrupted.unfinished
     made = go_on(interrupted, NOW + 30, limits, PART)
-    assert made.proposal.splice == interrupted.exact_from  # long before the vehicle comes there
+    assert made.proposal.splice - made.equal == interrupted.exact_from  # long before the vehicle comes there
     assert made.plan is not None
     later = after(interrupted, limits, made, NOW + 25)
     np.testing.assert_allclose(later.ahead[-1], FAR[-1])
@@ -286,10 +304,10 @@ def test_other_waypoints_are_flown_at_once_before_such_a_stop(interrupted, limit
         held = after(held, limits, go_on(held, NOW + 30, limits, PART), NOW + 25)
     first = NOW + 40
     made = replan(held, first, [[-0.8, 0.6, 1.1], [0.5, 1.8, 1.0]], limits, part=PART)
-    assert made.proposal.splice < first + 36
+    assert made.proposal.splice - made.equal < first + 36
     new = after(held, limits, made, first - 5)
     encoded = encode_trajectory(new.flown.since(first / RATE), gains=gains_under(limits), space=limits.space)
-    rows = slice(first - new.commitment.first, made.proposal.splice + PART - new.commitment.first)
+    rows = slice(first - new.commitment.first, made.proposal.splice - made.equal + PART - new.commitment.first)
     np.testing.assert_array_equal(new.commitment.payloads[rows], encoded.payloads[: rows.stop - rows.start])
 
 
@@ -309,7 +327,7 @@ def test_a_stop_is_as_soon_before_such_a_stop_and_nothing_follows_it(interrupted
 def test_within_a_stop_nothing_is_left_until_it_rests(interrupted, limits):
     within = interrupted.exact_from - 60
     made = replan(interrupted, within, [[0.0, 0.5, 1.0]], limits)
-    assert made.proposal.splice == interrupted.exact_from
+    assert made.proposal.splice - made.equal == interrupted.exact_from
 
 
 def test_where_no_way_leads_on_from_the_motion_one_leads_on_from_rest_behind_a_stop(held, limits):

@@ -1,7 +1,7 @@
 """Absolute deadlines at a fixed rate, and how late they were met."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,8 +40,11 @@ class Deadlines:
         passed = math.floor((self._now() - self._first) / self._period)
         return self._first + (max(self._count, passed) + 1) * self._period
 
-    def wait(self) -> float:
-        """Sleep until the next deadline that is still to come; return its time, s."""
+    def wait(self, meanwhile: Callable[[float], None] = lambda due: None) -> float:
+        """Sleep until the next deadline that is still to come; return its time, s.
+
+        `meanwhile` is called before with that time, and should come back by then.
+        """
         self._count += 1
         due = self._first + self._count * self._period
         now = self._now()
@@ -51,5 +54,7 @@ class Deadlines:
             self._count += missed
             due += missed * self._period
         if due > now:
-            self._sleep(due - now)
+            meanwhile(due)
+            if (left := due - self._now()) > 0.0:
+                self._sleep(left)
         return due

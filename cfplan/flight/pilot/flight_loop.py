@@ -24,7 +24,7 @@ from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Rung
-from cfplan.flight.pilot.proposals import NO_PROPOSALS, ProposalSource
+from cfplan.flight.pilot.proposals import LOOKS_UNTIL, NO_PROPOSALS, ProposalSource
 from cfplan.flight.pilot.stream import Stream, stream_of
 from cfplan.flight.radio.link import Link
 from cfplan.flight.setpoints.commitment import Commitment, splice
@@ -93,6 +93,7 @@ class FlightLoop:
         self.left_alone = False
         """The vehicle had no setpoint for so long that it left its stream by itself; until `hold_where_it_is`."""
         self._sent_at = math.inf  # s, when the last setpoint was sent
+        self._just_sent = -1  # number of the last setpoint of the plan that was sent; -1 before the first
         self._begun: deque[Stream] = deque(maxlen=_STREAMS)  # the last streams, each with its start
         self.pose_fault = ""  # why the last pose was not good
         self._forwarded = math.inf  # s, the time of the last pose that was forwarded
@@ -178,12 +179,22 @@ class FlightLoop:
         """Time, s, from the plan's first setpoint to the first of those that only hover at its end."""
         return self.commitment.motion_ends / self.mission.rate
 
-    def _consider_proposal(self, now: float) -> None:
-        """Fly what a planner proposes from its splice on if it verifies; answer the planner."""
+    def _consider_meanwhile(self, due: float) -> None:
+        """Look at proposals that come well before the next setpoint of the plan is `due`, s."""
+        while self.stream is self.plan and (left := due - LOOKS_UNTIL - self.now()) > 0.0:
+            if not self._proposals.wait(left):
+                return
+            self._consider_proposal(self.now(), self._just_sent)
+
+    def _consider_proposal(self, now: float, sent: int) -> None:
+        """Fly what a planner proposes from its splice on if it verifies; answer the planner.
+
+        `sent` is the number of the setpoint that was sent last.
+        """
         proposal = self._proposals.newest()
         if proposal is None:
             return
-        answer = splice(self.commitment, proposal, self.plan.number(now), self.limits.space)
+        answer = splice(self.commitment, proposal, sent, self.limits.space)
         if isinstance(answer, Commitment):
             if not self.commitment.splices:
                 self.history.report(committed(now, self.commitment.first, 0, self.commitment.payloads))
@@ -243,7 +254,7 @@ class FlightLoop:
 
     def tick(self) -> float:
         """Serve one deadline: the setpoint, then the pose, then the abort monitor. Return the time after it, s."""
-        due = self._deadlines.wait()
+        due = self._deadlines.wait(self._consider_meanwhile)
         now = self.now()
         stream = self.stream
         self._note_left_alone(now)
@@ -264,7 +275,8 @@ class FlightLoop:
         if self._feeding:
             self._forward_poses()
         if stream is not None and stream is self.plan:
-            self._consider_proposal(now)
+            self._just_sent = self.plan.number(now)
+            self._consider_proposal(now, self._just_sent)
         self._monitor_flight(now, now - due)
         return now
 

@@ -13,6 +13,7 @@ from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal
 
 LONGEST_MESSAGE = 1 << 26  # bytes, of a proposal: five minutes of flight
+LOOKS_UNTIL = 0.003  # s before a setpoint is due, until when the pilot looks at what comes; else once that is sent
 # kind, checksum of the proposal, of the commitment, and when setpoint 0 is due, or the proposal came, s
 _ANSWER = struct.Struct("<8sIId")
 _BEGUN, _ACCEPTED, _REFUSED = b"begun   ", b"accepted", b"refused "
@@ -23,6 +24,11 @@ class ProposalSource(Protocol):
 
     def begin(self, start: float) -> None:
         """Tell the planner that setpoint 0 is due at `start`, s on the clock of time.monotonic(). Must not wait."""
+
+    def wait(self, patience: float) -> bool:
+        """Wait for a proposal, at most for `patience`, s; return whether there is one, or False at once where none
+        comes between the pilot's ticks.
+        """
 
     def newest(self) -> Proposal | None:
         """Return the newest proposal since the last call, None where there is none. Must not wait."""
@@ -36,6 +42,9 @@ class NoProposals:
 
     def begin(self, start: float) -> None:
         pass
+
+    def wait(self, patience: float) -> bool:
+        return False
 
     def newest(self) -> Proposal | None:
         return None
@@ -61,6 +70,9 @@ class HeldProposals:
         """Propose; a proposal that was not taken yet is forgotten."""
         self._newest = proposal
 
+    def wait(self, patience: float) -> bool:
+        return False
+
     def newest(self) -> Proposal | None:
         proposal, self._newest = self._newest, None
         return proposal
@@ -80,8 +92,20 @@ class ReceivedProposals(HeldProposals):
         self._connection = connection
         self._answers: SimpleQueue[bytes] = SimpleQueue()
         self._came = (0, 0.0)  # checksum of the proposal that came last, and when, s
+        self._given = threading.Event()
         threading.Thread(target=self._read, name="proposals", daemon=True).start()
         threading.Thread(target=self._write, name="answers", daemon=True).start()
+
+    def give(self, proposal: Proposal) -> None:
+        super().give(proposal)
+        self._given.set()
+
+    def wait(self, patience: float) -> bool:
+        return REAL_CLOCK.wait(self._given, patience)
+
+    def newest(self) -> Proposal | None:
+        self._given.clear()
+        return super().newest()
 
     def begin(self, start: float) -> None:
         self._answers.put(_ANSWER.pack(_BEGUN, 0, 0, start))

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 from numpy.typing import NDArray
 
@@ -38,7 +38,7 @@ class Stream:
         self.first, self.last = first, first + len(payloads) - 1
         state = decode(payloads)
         fields = (state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate)
-        self._states: list[State] = list(zip(*(map(tuple, field.tolist()) for field in fields), strict=True))
+        self._fields = fields
 
     def starting_at(self, start: float) -> "Stream":
         """Return the same setpoints with another start, s."""
@@ -65,7 +65,8 @@ class Stream:
 
     def state(self, index: int) -> State:
         """Return position, velocity, acceleration, quaternion and body rate as the vehicle decodes them."""
-        return self._states[index - self.first]
+        row = index - self.first
+        return cast(State, tuple(tuple(field[row].tolist()) for field in self._fields))
 
     def position(self, time: float) -> Triple:
         """Return where the vehicle is asked to be, m, at a time, s."""

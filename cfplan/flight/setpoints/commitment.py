@@ -199,10 +199,14 @@ def splice(commitment: Commitment, proposal: Proposal, now: int, space: Space) -
         return refusal
     first = max(min(proposal.splice, now) - KEPT_BEHIND, commitment.first)
     behind = np.minimum(np.arange(first, proposal.splice), commitment.last) - commitment.first
+    payloads = np.concatenate([commitment.payloads[behind], proposal.payloads])
+    stops = np.concatenate([commitment.stops[behind], proposal.stops])
+    for array in (payloads, stops):
+        array.setflags(write=False)  # so they are kept as they are, not copied again
     return Commitment(
         first,
-        np.concatenate([commitment.payloads[behind], proposal.payloads]),
-        np.concatenate([commitment.stops[behind], proposal.stops]),
+        payloads,
+        stops,
         (*(one for one in commitment.splices if first <= one < proposal.splice), proposal.splice),
         zlib.crc32(_CHAIN.pack(commitment.checksum, proposal.checksum)),
     )
