@@ -123,7 +123,8 @@ def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(b
     answer = answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)]), planner, pilot)
     assert answer.verdict is PathVerdict.ACCEPTED, answer
     assert isinstance(pilot.given[-1], Commitment)
-    ahead = round(answer.joint * RATE) - pilot.commitment.splices[-1]
+    assert answer.splice in pilot.commitment.splices
+    ahead = round(answer.joint * RATE) - answer.splice
     assert 0 < ahead <= SPLICE_AHEAD  # less by the setpoints that are the committed ones
     again = answer_to(planner.request(Wish.EXTEND, [(0.5, -0.5, 1.0)]), planner, pilot)
     assert again.verdict is PathVerdict.ACCEPTED, again
