@@ -139,9 +139,14 @@ def _link() -> list[TimeOut]:
 
 def _poses(limits: Limits) -> list[TimeOut]:
     landing, child, client = "flight/pilot/landing.py", "flight/mocap/child.py", "flight/mocap/datastream_client.py"
+    predictor = "flight/mocap/pose_predictor.py"
     return [
         TimeOut(
             "a pose, before take-off", limits.pose.age_warning, "preflight refuses", "the pilot", "pose.age_warning",
+        ),
+        TimeOut(
+            "a pose, in the air", _read(predictor, "FARTHEST"),
+            "it is carried on by what the vehicle's sensors have measured since", "the pilot", predictor,
         ),
         TimeOut(
             "poses", limits.pose.age_brake,

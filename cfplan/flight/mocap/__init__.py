@@ -1,3 +1,14 @@
 """Poses from motion capture: sources, the Vicon DataStream, and the gates that poses pass."""
 
-__all__ = ["datastream", "frames", "pose_gate", "pose_predictor", "poses", "source", "survey", "uri"]
+__all__ = [
+    "datastream",
+    "dead_reckoning",
+    "frames",
+    "pose_gate",
+    "pose_predictor",
+    "pose_steps",
+    "poses",
+    "source",
+    "survey",
+    "uri",
+]

@@ -29,6 +29,11 @@ class PosePredictor:
             self._poses.popleft()
 
     @property
+    def last(self) -> Pose:
+        """Return the last pose. Needs one."""
+        return self._poses[-1]
+
+    @property
     def middle(self) -> float:
         """Return the time, s, in the middle of the line; not a number while there are too few poses."""
         count = len(self._poses)

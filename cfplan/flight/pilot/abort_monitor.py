@@ -21,6 +21,7 @@ DISAGREEMENT_FACTOR = 5.0  # times preflight's limit that estimate and pose may 
 # m/s, horizontally and lasting, that the poses may move otherwise than the vehicle believes, while it flies slowly:
 # 0.05 in the virtual lab, where the wind blows 0.15, and 0.4 once the vehicle cannot be held any more.
 MOVES_OTHERWISE = Ladder(brake=0.2, land=0.2, cut=0.3)
+FALLEN = 0.15  # m below its setpoint, of a vehicle on the floor that got there without being asked
 # By what a quantity of the table with a ladder is measured.
 MEASURED: Mapping[str, Callable[[Estimate, VehicleStatus], Triple]] = MappingProxyType(
     {
@@ -54,6 +55,8 @@ class Observation:
     wanted: Triple | None = None
     """m, where the vehicle should have been when the pose was taken; None where no setpoint says so."""
     estimate: Estimate | None = None
+    asked: Triple | None = None
+    """m, where the vehicle should have been at the time of its estimate; None where no setpoint says so."""
     status: VehicleStatus | None = None
     otherwise: float = 0.0
     """m/s, horizontally, between the motion of the poses and that of the estimate; 0 where that is not looked at."""
@@ -91,6 +94,7 @@ class AbortMonitor:
         yield from self._pose(observation)
         yield from self._vehicle(observation)
         yield from self._motion(observation)
+        yield from self._fallen(observation)
         if observation.late > LATEST_SETPOINT:
             yield safety_abort(Rung.BRAKE, f"a setpoint was {observation.late:.2f} s late")
 
@@ -160,6 +164,15 @@ class AbortMonitor:
             text = f"{quantity.name} of {{:.1f}} {quantity.unit}"
             measured = _rung(getattr(limits, quantity.ladder), value, text)
             yield self._lasting(quantity.name, observation.now, measured)
+
+    def _fallen(self, observation: Observation) -> Iterator[Abort]:
+        """Yield that a vehicle without poses lies on the floor: what it believes after that is worth nothing."""
+        estimate, asked = observation.estimate, observation.asked
+        if estimate is None or asked is None or observation.without_pose <= self._limits.pose.age_brake:
+            return
+        below = asked[2] - estimate.position[2]
+        if estimate.position[2] < self._limits.space.low[2] and below > FALLEN:
+            yield safety_abort(Rung.CUT, f"it is on the floor without poses, {below:.2f} m below its setpoint")
 
     def _beyond_fence(self, position: Triple) -> float:
         """Return how far, m, a position is beyond the space less its margin; the floor does not count."""

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.firmware import Timeouts
+from cfplan.flight.mocap.dead_reckoning import SensedMotion
 from cfplan.flight.mocap.pose_gate import PoseGate
-from cfplan.flight.mocap.pose_predictor import PosePredictor
+from cfplan.flight.mocap.pose_predictor import FARTHEST, PosePredictor
+from cfplan.flight.mocap.pose_steps import SMALLEST, PoseSteps
 from cfplan.flight.mocap.poses import Pose, PoseSource
 from cfplan.flight.pilot.abort_monitor import LINK_GONE, Abort, AbortMonitor, Observation
 from cfplan.flight.pilot.deadlines import Deadlines
@@ -80,7 +82,8 @@ class FlightLoop:
         self.mission, self.limits, self.history, self.now = mission, mission.limits, history, clock.now
         self._source, self._orders, self._proposals, self._clock = source, orders, proposals, clock
         self._monitor, self._pose_gate = AbortMonitor(mission.limits), PoseGate(mission.limits.pose.jump)
-        self._predictor = PosePredictor()
+        self._predictor, self._sensed = PosePredictor(), SensedMotion()
+        self._steps = PoseSteps(mission.limits.pose.jump)
         self._deadlines = Deadlines(mission.rate, clock)
         self._link: Link | None = None
         self._feeding = False  # poses are read and forwarded
@@ -282,6 +285,7 @@ class FlightLoop:
 
     def _forward_poses(self) -> None:
         newest, estimate = None, self.link.estimate
+        self._sensed.note(estimate, self.link.status)
         if not self.airborne or estimate is None or self.now() - estimate.time > self.limits.pose.age_warning:
             estimate, self._log_since = None, self.now()
         else:
@@ -295,17 +299,43 @@ class FlightLoop:
             if not fault:
                 newest = pose
                 self.recent.append(pose)
-                self._predictor.add(pose)
+                self._predictor.add(self._smooth(pose))
                 self._note_deviation(pose)
         if self._source.fault != self._source_fault:
             self._source_fault = self._source.fault
             self.history.say(Level.WARNING, f"motion capture: {self._source_fault or 'good again'}")
         now = self.now()
         if newest is not None and now - newest.time < self.limits.pose.age_brake:
-            self.link.send_pose(self._predictor.position(now), newest.quaternion)
-            self._forwarded = newest.time
+            self._send_pose(newest, now)
         while len(self.recent) > 1 and self.recent[0].time < self.recent[-1].time - _RECENT:
             self.recent.popleft()
+
+    def _smooth(self, pose: Pose) -> Pose:
+        """Return a good pose without its step, in the air, from where the last ones led."""
+        if not self.airborne:
+            return pose
+        led, stepped = self._predictor.position(pose.time), self._steps.kept_back
+        expected: Triple | None = led
+        off = math.dist(pose.position, led)
+        if off > SMALLEST:  # then by what the vehicle's sensors say, too
+            reckoned = self._sensed.reckon(self._predictor, pose.time)
+            expected = reckoned[0] if reckoned is not None else None
+        smoothed = self._steps.smooth(pose, expected)
+        if self._steps.kept_back and not stepped:
+            self.history.say(Level.WARNING, f"pose: stepped {off:.2f} m, which the vehicle gets to know slowly")
+        return smoothed
+
+    def _send_pose(self, newest: Pose, now: float) -> None:
+        """Send the newest pose, carried on to now. A late one is sent only if it is known what happened since."""
+        position, quaternion = self._predictor.position(now), newest.quaternion
+        if self.airborne and now - newest.time > FARTHEST:
+            reckoned = self._sensed.reckon(self._predictor, now)
+            turned = self._sensed.turn(quaternion, newest.time, now)
+            if reckoned is None or turned is None:
+                return
+            position, quaternion = reckoned[0], turned
+        self.link.send_pose(position, quaternion)
+        self._forwarded = newest.time
 
     def _believed(self, estimate: Estimate | None, time: float) -> Triple | None:
         """Return where the vehicle believes that it was, m; None unless its log has come since before the last pose.
@@ -339,6 +369,7 @@ class FlightLoop:
             without_pose=self.blind_for,
             wanted=self.wanted(pose.time) if pose is not None else None,
             estimate=link.estimate,
+            asked=self.wanted(link.estimate.time) if link.estimate is not None else None,
             status=link.status,
             otherwise=self._moves_otherwise(now),
             late=late if self.stream is not None and not self.stream.on_board else 0.0,

@@ -50,6 +50,23 @@ def test_poses_that_stay_late_land_as_soon_as_none_at_all(monitor):
 
 
 @pytest.mark.parametrize(
+    ("height", "asked", "without", "expected"),
+    [
+        (-0.01, 0.5, 0.2, Rung.CUT),
+        (-0.01, 0.5, 0.1, Rung.NONE),  # poses correct the estimate
+        (0.01, 0.5, 0.2, Rung.NONE),
+        (-0.01, 0.1, 0.2, Rung.NONE),  # it follows its setpoint
+        (-0.2, -0.3, 0.2, Rung.NONE),  # a landing without poses
+    ],
+)
+def test_a_vehicle_that_fell_to_the_floor_without_poses_is_cut(monitor, height, asked, without, expected):
+    seen = observation(place=(0.0, 0.0, height), without_pose=without, asked=(0.0, 0.0, asked))
+    assert rung(monitor, seen) is expected
+    if expected:
+        assert "on the floor without poses, 0.51 m below its setpoint" in monitor.gravest(seen).text
+
+
+@pytest.mark.parametrize(
     ("off", "expected"), [(0.29, Rung.NONE), (0.31, Rung.BRAKE), (0.61, Rung.LAND), (1.01, Rung.CUT)]
 )
 def test_deviation_climbs_the_ladder(monitor, off, expected):
