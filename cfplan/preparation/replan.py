@@ -61,7 +61,9 @@ STOPS = (0.46, 0.48, 0.5, 0.52, 0.54, 0.55, 0.56, 0.58, 0.6, 0.65, 0.7, 0.8, 1.0
 """s within which a request to stop is tried to be met. From 2 m/s straight on 0.54 s brake at 6.9 m/s², a tilt of 35°;
 where the vehicle turns or slows down already it is more or less. One that holds its deceleration is planned to rest
 0.1 m sooner, but motors that lag let the vehicle overshoot that by as much."""
-STRAYS = 0.04  # m, that the vehicle may stray in a stop shorter than others: as flights do in the virtual lab
+STRAYS = 0.02  # m, that a stop shorter than others may add to how far the vehicle strays in its dry run
+"""Where it adds more, motors are at their ends, and a little noise makes it several times as much: of two stops that
+strayed by 2.8 and 4.0 cm in the dry run, the flights strayed by 8.9 and 6.1 cm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -483,7 +485,7 @@ def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration:
     after = [padded[min(row, len(rows)) :][: whole.shape[1]] for row in range(len(payloads) - 1)]
     stops = np.concatenate([whole, np.stack(after)])
     starts = snapshots_at(held, splice)
-    _rehearse_stop(payloads, duration, limits, starts)
+    _rehearse_stop(payloads, duration, limits, starts, held.flown.at(splice / RATE).position)
     lost = link_loss_at_walls(payloads, limits, starts=starts)
     require_inside(lost, limits)
     meet_gaps(payloads, limits, starts)
@@ -493,18 +495,21 @@ def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration:
     return Replanned(proposal, later, None, splice / RATE)
 
 
-def _rehearse_stop(payloads: NDArray, duration: float, limits: Limits, starts: NDArray) -> None:
+def _rehearse_stop(payloads: NDArray, duration: float, limits: Limits, starts: NDArray, begin: NDArray) -> None:
     """Raise NotCertifiedError where the dry run of a stop fails, or strays as far as only a shorter stop does.
 
-    What motors can do is certified of the motion, which they follow late. Where a short stop leans from one side to
-    the other at little thrust, controlling the attitude takes what is left of a motor; then the firmware lowers the
+    `begin`, (3,) m, is where the vehicle is wanted when the payloads begin: how far it is from there is no fault of the
+    stop. What motors can do is certified of the motion, which they follow late. Where a short stop leans from one side
+    to the other at little thrust, controlling the attitude takes what is left of a motor; then the firmware lowers the
     thrust of all, and the vehicle sinks: by 0.2 m where it came over the top of a climb.
     """
-    run = rehearse_setpoints(payloads, limits.airframe, limits.flight, snapshot=as_believed(starts, limits))
+    believed = as_believed(starts, limits)
+    run = rehearse_setpoints(payloads, limits.airframe, limits.flight, snapshot=believed)
     run.require_passed()
-    if duration < DURATION and not run.deviation <= STRAYS:
+    most = math.dist(believed[:3], begin) + STRAYS
+    if duration < DURATION and not run.deviation <= most:
         raise NotCertifiedError(
-            f"within {duration:g} s the vehicle strays {run.deviation:.2f} m from the stop, more than {STRAYS:g} m",
+            f"within {duration:g} s the vehicle strays {run.deviation:.3f} m from the stop, more than {most:.3f} m",
             where="dry run",
             hint="stop within a longer time",
         )
