@@ -61,7 +61,8 @@ from cfplan.safety.limits import Limits
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 LEARNED_FROM = 15  # plans, by which one knows how long the next may take
-AGAIN = 1.2  # by how much longer than the first the next one is taken to need then, at least
+IN_TIME = 0.6  # share of them for which what is taken to be needed was enough: one that comes late is planned again
+AGAIN = 1.2  # by how much longer than the first the next one is taken to need where that came late, at least
 TRIES = 4  # of a request whose proposal comes late
 ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
 _GARBAGE = 100_000  # objects, after which it is looked through in any case
@@ -134,28 +135,30 @@ class AirPlanner:
 
 
 class _Lead:
-    """How far ahead of the clock to plan, by how long plans took lately.
-
-    One that comes late is planned again, which takes about as long as they take. So what is best is as far as is least
-    in the mean, with the time for those of them again that would have come late.
-    """
+    """How far ahead of the clock to plan, by how long plans took lately: most, not all, are to be in time."""
 
     def __init__(self, first: float):
         """Begin with what a plan is taken to need before any was made, s."""
-        self._took: deque[float] = deque([first], maxlen=LEARNED_FROM)
+        self._took: deque[tuple[float, float]] = deque([(first, 0.0)], maxlen=LEARNED_FROM)
 
-    def note(self, seconds: float, *, only: bool = False) -> None:
-        """Learn how long a plan took, s; with `only`, forget what was known before."""
+    def note(self, seconds: float, left_out: float = 0.0, *, only: bool = False) -> None:
+        """Learn how long a plan took, s; with `only`, forget what was known before.
+
+        `left_out`, s, is by how much later it began than where it was planned from.
+        """
         if only:
             self._took.clear()
-        self._took.append(seconds)
+        self._took.append((seconds, left_out))
+
+    @property
+    def median(self) -> float:
+        """Return how long plans took, s."""
+        return float(np.median([took for took, _ in self._took]))
 
     @property
     def ahead(self) -> float:
         """Return what the next plan is taken to need, s, with its way to the pilot."""
-        took = np.sort(self._took)
-        late = np.arange(len(took) - 1, -1, -1) / len(took)
-        return float(took[np.argmin(took + late * np.median(took))]) + SLACK
+        return float(np.quantile([took - left_out for took, left_out in self._took], IN_TIME)) + SLACK
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -285,9 +288,10 @@ class _Worker:
             try:
                 made = self._planned(request, first, part_within(ahead), attempt)
             except TooLateError as error:
-                # Known ways need less time than it took to find them.
-                took = 0.0 if attempt.ways.failed else REAL_CLOCK.now() - begun + self._checking
-                lead.note(REAL_CLOCK.now() - begun + self._checking - self._left_out)
+                took = REAL_CLOCK.now() - begun + self._checking
+                lead.note(took, self._left_out)
+                if attempt.ways.found is not None:  # a way that is known needs less time than it took to find it
+                    took = min(took, lead.median)
                 reason = str(error)
                 continue
             except CfplanError as error:
@@ -315,7 +319,7 @@ class _Worker:
                     answer = self._propose(replace(sent, made=following(made, self._held.commitment)))
             elif self._late_by(made.proposal.splice) > 0.0:
                 reason = Fault.LATE.value
-                lead.note(took - made.equal / RATE)
+                lead.note(took, made.equal / RATE)
                 continue
             elif made.plan is not None and self._another_waits():
                 self._send(replace(sent, before=self._held))
@@ -324,7 +328,7 @@ class _Worker:
                 answer = self._propose(sent)
             if answer is None:
                 return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER)
-            lead.note(max(answer.came, proposed) - begun - made.equal / RATE)
+            lead.note(max(answer.came, proposed) - begun, made.equal / RATE)
             reason = answer.reason
             if not reason.startswith(Fault.LATE):
                 return self._outcome(sent, answer)
@@ -453,7 +457,7 @@ class _Worker:
         proposed, self._proposed = self._proposed, None
         assert proposed is not None
         if proposed.before is not None:  # nobody waits for it
-            self._plans.note(max(answer.came, proposed.proposed) - proposed.begun - made.equal / RATE)
+            self._plans.note(max(answer.came, proposed.proposed) - proposed.begun, made.equal / RATE)
             told = self._outcome(proposed, answer)
             self._requests.send(replace(told, seconds=REAL_CLOCK.now() - proposed.received))
             if answer.commitment is None:
