@@ -95,8 +95,8 @@ def flat_states(
 
 
 def thrusts_at(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray) -> NDArray:
-    """Return the specific thrust, m/s², at each s, (N,), and nothing else of the full state."""
-    return np.asarray(_filled(np.empty((1, len(s))), _THRUST, airframe, path, profile, s)[0])
+    """Return the specific thrust, (1, N) m/s², at each s, (N,), and nothing else of the full state."""
+    return _filled(np.empty((1, len(s))), _THRUST, airframe, path, profile, s)
 
 
 def body_rates_at(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray) -> NDArray:

@@ -5,6 +5,7 @@ the squared tangent of half the tilt for the tilt. safety/quantities.py says wha
 which limit binds it.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -89,24 +90,48 @@ def measures_at_instants(velocity: NDArray, acceleration: NDArray, body_rate: ND
 
     `force`, m/s², is the thrust over mass, as a vector.
     """
-    out, nan = np.empty((MEASURES, len(force))), np.nan
+    out = np.empty((MEASURES, len(force)))
     for n in range(len(force)):
-        x, y, z = force[n, 0], force[n, 1], force[n, 2]
-        thrust = np.sqrt(x * x + y * y + z * z)
-        values = measures(
-            Flat(
-                (velocity[n, 0], velocity[n, 1], velocity[n, 2]),
-                (acceleration[n, 0], acceleration[n, 1], acceleration[n, 2]),
-                (nan, nan, nan),
-                (nan, nan, nan),
-                thrust,
-                (x / thrust, y / thrust, z / thrust),
-                (body_rate[n, 0], body_rate[n, 1], body_rate[n, 2]),
-                (nan, nan, nan),
-                (nan, nan, nan),
-                (nan, nan, nan, nan),
-            )
-        )
+        values = _at_instant(velocity, acceleration, body_rate, force, n)
         for row in range(MEASURES):
             out[row, n] = values[row]
     return out
+
+
+@njit(error_model="numpy", fastmath=ROUNDING)
+def extremes_at_instants(velocity: NDArray, acceleration: NDArray, body_rate: NDArray, force: NDArray) -> NDArray:
+    """Return the largest and the least, (2, MEASURES), of what measures_at_instants() gives; NaN where one is NaN."""
+    out = np.empty((2, MEASURES))
+    for n in range(len(force)):
+        values = _at_instant(velocity, acceleration, body_rate, force, n)
+        for row in range(MEASURES):
+            value, high, low = values[row], out[0, row], out[1, row]
+            if n == 0 or math.isnan(value):
+                out[0, row] = out[1, row] = value
+            elif value > high:
+                out[0, row] = value
+            elif value < low:
+                out[1, row] = value
+    return out
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def _at_instant(
+    velocity: NDArray, acceleration: NDArray, body_rate: NDArray, force: NDArray, n: int
+) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]:
+    x, y, z, nan = force[n, 0], force[n, 1], force[n, 2], np.nan
+    thrust = np.sqrt(x * x + y * y + z * z)
+    return measures(
+        Flat(
+            (velocity[n, 0], velocity[n, 1], velocity[n, 2]),
+            (acceleration[n, 0], acceleration[n, 1], acceleration[n, 2]),
+            (nan, nan, nan),
+            (nan, nan, nan),
+            thrust,
+            (x / thrust, y / thrust, z / thrust),
+            (body_rate[n, 0], body_rate[n, 1], body_rate[n, 2]),
+            (nan, nan, nan),
+            (nan, nan, nan),
+            (nan, nan, nan, nan),
+        )
+    )

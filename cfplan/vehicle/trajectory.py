@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.geometry.path import Path
+from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.dense import (
     STATES,
@@ -91,23 +92,29 @@ class Trajectory:
     def specific_thrust_at(self, times: NDArray) -> NDArray:
         """Return (N,) m/s²: what at() gives of it at each time, (N,) s, in a third of the time."""
         thrust = thrusts_at(self.airframe, self.path, self.profile, self.s_at(times))
-        thrust[self._resting(times)] = GRAVITY
-        return thrust
+        _rest(thrust, times, self.duration, GRAVITY)
+        return thrust[0]
 
     def body_rate_at(self, times: NDArray) -> NDArray:
         """Return (N, 3) rad/s likewise."""
         rate = body_rates_at(self.airframe, self.path, self.profile, self.s_at(times))
-        rate[:, self._resting(times)] = 0.0
+        _rest(rate, times, self.duration, 0.0)
         return rate.T
 
     def acceleration_at(self, times: NDArray) -> NDArray:
         """Return (N, 3) m/s² likewise."""
         acceleration = accelerations_at(self.airframe, self.path, self.profile, self.s_at(times))
-        acceleration[:, self._resting(times)] = 0.0
+        _rest(acceleration, times, self.duration, 0.0)
         return acceleration.T
 
-    def _resting(self, times: NDArray) -> NDArray:
-        return ~((times >= 0.0) & (times <= self.duration))
+
+@njit
+def _rest(rows: NDArray, times: NDArray, duration: float, value: float) -> None:
+    """Give rows, (K, N), the value that they have at rest at times before 0 and after the duration, s."""
+    for n in range(len(times)):
+        if not 0.0 <= times[n] <= duration:
+            for row in range(len(rows)):
+                rows[row, n] = value
 
 
 def state_at(

@@ -34,7 +34,7 @@ from cfplan.safety.quantities import AT_LEAST, AT_MOST, INSTANT
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.joint import JoinedTrajectory
-from cfplan.vehicle.measures import measures_at_instants
+from cfplan.vehicle.measures import extremes_at_instants, measures_at_instants
 from cfplan.vehicle.panels import (
     WIDTH,
     give_out,
@@ -201,8 +201,18 @@ def lead_rates(trajectory: Trajectory | JoinedTrajectory, times: NDArray, rate_l
     From the end on they are 0, as the vehicle may be left with any setpoint there.
     """
     rates = trajectory.body_rate_at(np.concatenate([times + rate_lead, times - rate_lead]))
-    mean = LEADING_SHARE * rates[: len(times)] + (1.0 - LEADING_SHARE) * rates[len(times) :]
-    mean[times >= trajectory.duration] = 0.0
+    return _mean_rates(np.array(rates.T, dtype=float, order="C"), times, trajectory.duration)
+
+
+@njit
+def _mean_rates(rates: NDArray, times: NDArray, duration: float) -> NDArray:
+    """Return what lead_rates() does, of the rates ahead and then those before, (3, 2 N)."""
+    mean, count = np.zeros((len(times), 3)), len(times)
+    for n in range(count):
+        if not times[n] >= duration:
+            for axis in range(3):
+                ahead, before = rates[axis, n], rates[axis, count + n]
+                mean[n, axis] = LEADING_SHARE * ahead + (1.0 - LEADING_SHARE) * before
     return mean
 
 
@@ -390,18 +400,17 @@ def _check_limits(flown: FullStateSetpoints, acceleration: NDArray, limits: Plan
 
     Raises NotCertifiedError with the number of the setpoint at fault, counted from `first`.
     """
-    quantum = np.sqrt(3) * HALF_QUANTUM + _ROUNDING
     force = flown.acceleration + _GRAVITY
-    thrust = norms(force)
-    known = (flown.velocity, acceleration, flown.body_rate, force)
-    measured = measures_at_instants(*(np.array(each, dtype=float, order="C") for each in known))
+    known = [np.array(each, dtype=float, order="C") for each in (flown.velocity, acceleration, flown.body_rate, force)]
+    highest, lowest = extremes_at_instants(*known)
+    extremes = {AT_MOST: highest, AT_LEAST: lowest}
+    doubtful = [q for q in INSTANT if not q.excess(q.worst(extremes[q.side]), q.allowed(limits)) <= 0.0]
+    if not doubtful:
+        return
+    quantum, thrust, measured = np.sqrt(3) * HALF_QUANTUM + _ROUNDING, norms(force), measures_at_instants(*known)
     lean = quantum / thrust  # an error turns the thrust vector so far
-    extremes = {AT_MOST: measured.max(axis=1), AT_LEAST: measured.min(axis=1)}
-    for quantity in INSTANT:
-        limit = quantity.allowed(limits)
-        if quantity.excess(quantity.worst(extremes[quantity.side]), limit) <= 0.0:
-            continue  # then no setpoint exceeds it
-        value = quantity.worst(measured)
+    for quantity in doubtful:
+        value, limit = quantity.worst(measured), quantity.allowed(limits)
         rounding = {"rad": lean, "rad/s": quantum + FIRMWARE_GAINS.full_rate * lean}.get(quantity.unit, quantum)
         beyond = ~(quantity.excess(value, limit) <= rounding)
         if beyond.any():

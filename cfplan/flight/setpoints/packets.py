@@ -45,11 +45,13 @@ def encode(setpoints: FullStateSetpoints, first: int = 0) -> NDArray:
     """
     compressed = compress_quaternion(setpoints.quaternion, first)
     payloads = np.empty((len(compressed), PAYLOAD_SIZE), dtype=np.uint8)
-    values = np.stack([getattr(setpoints, name) for name in _IN_MILLI]).astype(float, copy=False)
-    bad, field = _packed(payloads, values, compressed)
+    position, velocity, acceleration, rate = values = [
+        np.array(getattr(setpoints, name), dtype=float, order="C") for name in _IN_MILLI
+    ]
+    bad, field = _packed(payloads, (position, velocity, acceleration, rate), compressed)
     if bad >= 0:
         raise NotCertifiedError(
-            f"{_IN_MILLI[field]} {values[field, bad]} does not fit a packet (at most {LARGEST})",
+            f"{_IN_MILLI[field]} {values[field][bad]} does not fit a packet (at most {LARGEST})",
             where=f"setpoint {first + bad}",
             hint="keep the flight within that of the room's origin, and its limits below that",
         )
@@ -99,8 +101,8 @@ def decompress_quaternion(compressed: ArrayLike) -> NDArray:
 
 
 @njit(error_model="numpy")
-def _packed(out: NDArray, values: NDArray, compressed: NDArray) -> tuple[int, int]:
-    """Write the payloads, (N, 29), from the fields of _IN_MILLI, (4, N, 3), and the compressed quaternions, (N,).
+def _packed(out: NDArray, values: tuple[NDArray, ...], compressed: NDArray) -> tuple[int, int]:
+    """Write the payloads, (N, 29), from the fields of _IN_MILLI, (N, 3) each, and the compressed quaternions, (N,).
 
     Returned are the first row that does not fit, -1 where all do, and its field.
     """
@@ -108,7 +110,7 @@ def _packed(out: NDArray, values: NDArray, compressed: NDArray) -> tuple[int, in
         out[n, 0] = FULL_STATE_TYPE
         for field in range(4):
             for axis in range(3):
-                value = values[field, n, axis]
+                value = values[field][n, axis]
                 if not abs(value) <= LARGEST:
                     return n, field
                 milli, place = int(np.rint(value * 1000.0)), _FIELD_PLACES[field] + 2 * axis
