@@ -12,6 +12,7 @@ has the same bounds). Where the path rests, only its fourth derivative bounds th
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -80,6 +81,7 @@ class ScaledLimits(NamedTuple):
 View = Callable[[Airframe, PlanLimits], ScaledLimits]  # what a network sees of vehicle and limits
 
 
+@lru_cache(maxsize=16)
 def scaled_limits(airframe: Airframe, limits: PlanLimits) -> ScaledLimits:
     """Return limits under which the vehicle can hover, in their own units."""
     time = limits.speed / GRAVITY
@@ -100,6 +102,8 @@ def scaled_limits(airframe: Airframe, limits: PlanLimits) -> ScaledLimits:
         limits.specific_thrust_min / GRAVITY, limits.tilt, *(each * limits.speed / weight for each in airframe.drag),
     ])  # fmt: skip
     numbers[:LOGARITHMS] = np.log(numbers[:LOGARITHMS])
+    for array in (bounds, numbers):
+        array.setflags(write=False)
     return ScaledLimits(limits.speed * time, time, bounds, numbers)
 
 

@@ -35,10 +35,11 @@ from cfplan.learning.inference import Network
 from cfplan.learning.model_files import Model, find_model
 from cfplan.learning.smooth import Begin, smoothed
 from cfplan.learning.windows import overlapped, windows_over
+from cfplan.machine_code import njit
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import FREE_START, PlanningTask
 from cfplan.vehicle.profile import BoundaryState
-from cfplan.vehicle.profile_spline import coefficients_of, spline_profile
+from cfplan.vehicle.profile_spline import coefficients_of, spline_at, spline_profile
 from cfplan.vehicle.yaw_spline import YawSpline
 
 LEAST_NODES = 10
@@ -98,7 +99,7 @@ def plan_learned(task: PlanningTask, *, model: Model | None = None, view: View =
     if task.refusal:
         return task.refusal
     coefficients, yaw = propose(task, model, view)
-    if not (np.isfinite(coefficients).all() and np.isfinite(yaw.yaw).all() and (coefficients[1:-1] > 0).all()):
+    if not _sound(coefficients, yaw.yaw):
         return Solution(Status.NOT_CONVERGED, None, f"the network {model.name} answered what is not a number")
     stats: dict[str, float | int | str] = {
         "solve_seconds": time.perf_counter() - began,
@@ -107,6 +108,19 @@ def plan_learned(task: PlanningTask, *, model: Model | None = None, view: View =
         "model": model.name,
     }
     return Solution(Status.SOLVED, spline_profile(coefficients, task.path.end, yaw), "", stats)
+
+
+@njit
+def _sound(coefficients: NDArray, yaw: NDArray) -> bool:
+    """Return whether all are finite and the coefficients, but for the outermost, positive."""
+    sound = True
+    for n in range(len(coefficients)):
+        sound = sound and math.isfinite(coefficients[n])
+    for n in range(1, len(coefficients) - 1):
+        sound = sound and coefficients[n] > 0.0
+    for n in range(len(yaw)):
+        sound = sound and math.isfinite(yaw[n])
+    return sound
 
 
 def propose(task: PlanningTask, model: Model, view: View = scaled_limits) -> tuple[NDArray, YawSpline]:
@@ -145,11 +159,9 @@ def _laid_over(
     coefficients: NDArray, nodes: int, path: Path, start: BoundaryState | None, end: BoundaryState | None
 ) -> NDArray:
     """Return the (N+3,) coefficients of nearly the same h over more intervals; ends are kept as they are."""
-    count = len(coefficients) - 3
-    still = YawSpline(np.zeros(count + 1), np.zeros(count + 1), np.zeros(count))
     step = path.end / nodes
-    found = spline_profile(coefficients, path.end, still).at(np.linspace(0.0, path.end, nodes + 1))
-    fine = coefficients_of(found.h, found.dh, found.ddh, step)
+    h, dh, ddh = spline_at(coefficients, path.end, nodes)
+    fine = coefficients_of(h, dh, ddh, step)
     fine = np.maximum(fine, LEAST_SHARE * coefficients.min())
     for there, state, s in ((fine, start, 0.0), (fine[::-1], end, path.end)):
         if state is not None:

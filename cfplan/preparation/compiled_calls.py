@@ -42,6 +42,7 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         from cfplan.flight.setpoints.rate_trade import gains_under
         from cfplan.flight.setpoints.stops import encode_stops
         from cfplan.geometry.min_snap import min_snap
+        from cfplan.learning.model_files import find_model
         from cfplan.planning.plan import plan
         from cfplan.safety.limits_file import load_limits
         from cfplan.simulation.glitches import glitch_at_sampled_setpoints
@@ -53,7 +54,9 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         path = min_snap(middle + 0.2 * places)
         path.check()
         with suppress(CfplanError):  # there may be no model for this vehicle
-            plan(path, limits.airframe, limits, planner="learned", nodes=NODES)
+            model = find_model(limits.airframe, limits.plan)
+            nodes = 1 + (model.window if model else NODES)  # more than a network is asked for: it is laid over these
+            plan(path, limits.airframe, limits, planner="learned", nodes=nodes)
         planned = plan(path, limits.airframe, limits, planner="expert", nodes=NODES)  # exceeds limits between nodes
         encoded = encode_trajectory(planned.trajectory, gains=gains_under(limits), space=limits.space)
         begin, first = encoded.payloads[:2], np.array([0])

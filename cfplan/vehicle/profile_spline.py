@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.banded import solve_definite
 from cfplan.machine_code import njit
-from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.profile import SpeedProfile, h_within
 from cfplan.vehicle.rotations import Scalar
 from cfplan.vehicle.yaw_spline import YawSpline
 
@@ -44,6 +44,20 @@ def _on_grid(cubic: NDArray, end: float) -> tuple[NDArray, NDArray, NDArray, NDA
             dddh[n] = (cubic[n + 3] - cubic[n + 2] - next_rise - second) / step**3
     s[count] = end
     return s, h, dh, ddh, dddh
+
+
+@njit
+def spline_at(cubic: NDArray, end: float, nodes: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Return h with two derivatives, (nodes+1,) each, of the spline with coefficients (N+3,) on another such grid."""
+    s, h, dh, ddh, dddh = _on_grid(cubic, end)
+    values, slopes, bends = np.empty(nodes + 1), np.empty(nodes + 1), np.empty(nodes + 1)
+    k, step = 0, end / nodes
+    for n in range(nodes + 1):
+        place = n * step if n < nodes else end
+        while k < len(dddh) - 1 and s[k + 1] <= place:
+            k += 1
+        values[n], slopes[n], bends[n], _ = h_within(place - s[k], h[k], dh[k], ddh[k], dddh[k])
+    return values, slopes, bends
 
 
 def h_coefficients(profile: SpeedProfile) -> NDArray:

@@ -1,5 +1,6 @@
 """Limits exceeded between the points where the optimiser holds them: by how much, in which interval."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -157,10 +158,19 @@ def turns(path: Path, nodes: int) -> NDArray:
     """Return (N,) rad: by how much the direction of the path differs from one end of each interval to the other."""
     s = np.arange(nodes + 1) * (path.end / nodes)
     s[0], s[-1] = s[1], s[-2]  # at rest there is no direction
-    tangent = path(s, 1)
-    length = np.maximum(np.sqrt(np.einsum("nk,nk->n", tangent, tangent)), 1e-12)
-    cosine = np.einsum("nk,nk->n", tangent[1:], tangent[:-1]) / (length[1:] * length[:-1])
-    return np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0))
+    return np.asarray(_angles(path(s, 1)))
+
+
+@njit
+def _angles(vectors: NDArray) -> NDArray:
+    """Return the angles, (N,) rad, between one vector of (N+1, 3) and the next."""
+    angles = np.empty(len(vectors) - 1)
+    for n in range(len(angles)):
+        x, y, z = vectors[n]
+        p, q, r = vectors[n + 1]
+        lengths = max(math.sqrt(x * x + y * y + z * z), 1e-12) * max(math.sqrt(p * p + q * q + r * r), 1e-12)
+        angles[n] = math.acos(min(max((x * p + y * q + z * r) / lengths, -1.0), 1.0))
+    return angles
 
 
 @njit

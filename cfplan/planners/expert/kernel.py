@@ -79,7 +79,7 @@ class CompiledKernels:
         self._values, self._derivatives = (machine_code()[f"{family(free_yaw)}_{title}"] for title in _TITLES)
         self.coefficients, self.work = np.empty((self._k, self._points)), _work(self._k, self._points)
         self._jacobian = np.empty((ROWS * self._k, self._points))
-        self._given = [np.array(each, dtype=float, order="C") for each in (data, common, weights)]  # kept alive
+        self._given = [np.ascontiguousarray(each, dtype=float) for each in (data, common, weights)]  # kept alive
         self._inputs = tuple(_address(each) for each in (self.coefficients, *self._given))
         at = _address(self.work)
         self._outputs = _address(self._jacobian), at, at + 8 * len(TERMS) * self._k * self._points
@@ -92,8 +92,8 @@ class CompiledKernels:
         return result[:rows], result[rows:]
 
     def differentiate(self, terms: NDArray) -> NDArray:
-        first, row = _address(terms), 8 * terms.shape[1]
-        by_kind = (first + kind * row for kind in range(len(terms)))
+        first, row = _address(terms), 8 * terms.shape[1]  # of one of four kinds
+        by_kind = first, first + row, first + 2 * row, first + 3 * row
         self._derivatives(self._points, *self._inputs, *by_kind, *self._outputs)
         return self._jacobian
 

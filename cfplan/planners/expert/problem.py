@@ -1,5 +1,6 @@
 """The numbers of one speed-profile problem: a stretch of path and its limits at points, and how limits are lowered."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -118,10 +119,10 @@ def build_problem(
     margin = MARGIN * (1.0 - held_by(ends, nodes))
     if ends.joint is not None:
         margin[ends.joint - AROUND_JOINT : ends.joint + AROUND_JOINT] = JOINT_MARGIN
-    nominal = np.linalg.norm(path(layout.speed_s * step, 1), axis=1)
-    speed = allowed_speed(limits.speed, segment.caps, layout.speed_s * step)
-    highest = ((1.0 - margin[layout.speed_interval]) * speed / np.maximum(nominal, REST)) ** 2 / unit
-    highest = np.minimum(highest, CEILING * segment.slowness**2)
+    s = layout.speed_s * step
+    speed = np.full(len(s), allowed_speed(limits.speed, segment.caps, s), dtype=float)
+    ceiling = CEILING * segment.slowness**2
+    nominal, highest = _highest(path(s, 1), layout.speed_interval, margin, speed, unit, ceiling)
     for node, boundary in ((0, ends.start), (nodes, ends.end)):
         if boundary:
             highest[node] = np.inf  # the state decides, and was checked
@@ -137,6 +138,19 @@ def build_problem(
         np.array((penalties or point_constraints.Penalties()).weights()), lower, upper, highest,
         (yaw_angle, yaw_angle + FREE_START), coefficients,
     )  # fmt: skip
+
+
+@njit(error_model="numpy")
+def _highest(
+    tangent: NDArray, interval: NDArray, margin: NDArray, speed: NDArray, unit: float, ceiling: float
+) -> tuple[NDArray, NDArray]:
+    """Return |γ'| where the speed limit holds, from γ', (K, 3), and x at most there by the speeds allowed, (K,)."""
+    nominal, highest = np.empty(len(tangent)), np.empty(len(tangent))
+    for n in range(len(tangent)):
+        nominal[n] = math.sqrt(tangent[n, 0] ** 2 + tangent[n, 1] ** 2 + tangent[n, 2] ** 2)
+        root = (1.0 - margin[interval[n]]) * speed[n] / max(nominal[n], REST)
+        highest[n] = min(root * root / unit, ceiling)
+    return nominal, highest
 
 
 def _point_data(segment: Segment, step: float) -> NDArray:
