@@ -22,6 +22,7 @@ from cfplan.flight.setpoints.stop_certificate import encode_certified_stops
 from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
+from cfplan.preparation.local_slowing import Assessment
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import dry_run, rehearse_setpoints
 from cfplan.simulation.glitches import glitch_where_nearly_lost
@@ -128,31 +129,33 @@ def _certified(
     """
 
     # What is mostly compiled loops runs beside what is mostly Python: two threads of that would hinder each other.
-    foreseen = _BESIDE.submit(foresee)
     losing = _BESIDE.submit(link_loss_at_walls, payloads, limits, starts=starts)
     gaps = _BESIDE.submit(meet_gaps, payloads, limits, starts)
+    foreseen = _BESIDE.submit(foresee)
     refused: CfplanError | None = None
+    within: Assessment | None = None
     try:
         along = encoded.motion if motion is None else motion
         count = len(encoded.payloads)
         stops, passed = encode_certified_stops(along, limits, RATE, encoded.gains, encoded.space, count=count)
         passed.require(limits)
         rehearse()
+        lost = losing.result()
+        if lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
+            within = assess_link_loss_of_stops(encoded, limits, lost, margin=0.0, stops=stops)
     except CfplanError as error:
         refused = error
-    beside: list[Future[Any]] = [foreseen, losing, gaps]
-    wait(beside)  # nothing goes on behind the caller's back
+    finally:
+        beside: list[Future[Any]] = [losing, gaps, foreseen]
+        wait(beside)  # nothing goes on behind the caller's back
     foreseen.result()
     gaps.result()
     if refused is not None:
         raise refused
-    lost = losing.result()
     require_inside(lost, limits)
-    if not limits.link_loss.only_warn:
-        within = assess_link_loss_of_stops(encoded, limits, lost, margin=0.0, stops=stops)
-        if not within.passed:
-            what = f"{within.what} from {within.time[within.worst]:.2f} s on {within.describe(within.worst)}"
-            raise EndsBadlyError(what, where="link loss", hint=OUTSIDE_HINT)
+    if within is not None and not within.passed:
+        what = f"{within.what} from {within.time[within.worst]:.2f} s on {within.describe(within.worst)}"
+        raise EndsBadlyError(what, where="link loss", hint=OUTSIDE_HINT)
     return stops, lost
 
 

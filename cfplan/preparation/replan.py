@@ -119,6 +119,7 @@ class AnswerAttempt:
 
     too_late: Callable[[int], bool]  # whether a plan from a setpoint on, not certified yet, will come too late for it
     ways: Ways
+    too_fast: set[float] = field(default_factory=set)  # m/s, at which it would end badly; written as speeds are tried
 
 
 def hold(planned: Plan, waypoints: ArrayLike) -> HeldFlight:
@@ -280,16 +281,21 @@ def _replan_within(
 ) -> Replanned:
     """Return what replan() does, at the speed that is asked for, or slower where it must be."""
     fastest = min(held.speed, limits.plan.speed)
+    speeds = (fastest, *(slower for slower in SLOWER if slower < fastest))
     refused: InfeasibleError | None = None
-    for speed in (fastest, *(slower for slower in SLOWER if slower < fastest)):
+    for speed in [one for one in speeds[:-1] if attempt is None or one not in attempt.too_fast] + [speeds[-1]]:
         for later in LATER:
             if later and held.stops_from is not None and splice + later >= held.stops_from:
                 break
             try:
-                at_once = attempt if speed == fastest and not later else None  # ways are known of that alone
+                at_once = None if later else attempt  # ways are known of that alone
                 return _replan_at(speed, held, splice + later, points, limits, keep, yaw_angle, part, at_once)
             except EndsBadlyError as error:
                 refused = error
+                if at_once is not None:
+                    at_once.too_fast.add(speed)
+                    if at_once.too_late(splice) and speed != speeds[-1]:
+                        raise TooLateError("it is to be flown slower", where="request", hint=LATE_HINT) from error
                 break  # slower
             except NoWayError as error:
                 refused = refused or error
@@ -364,7 +370,8 @@ def _proposed(held: HeldFlight, splice: int, made: CertifiedFlight, planned: Pla
     equal = 0 if planned is None else _equal(held.commitment, splice, made.payloads)
     payloads, stops = made.payloads[equal:], made.stops[equal:]
     proposal = propose(held.commitment, splice + equal, payloads, stops, ending, goes_on=planned is None)
-    return Replanned(proposal, held_with(held, splice, made), planned, joint, equal=equal)
+    later = held_with(held, splice, made, since=held.commitment.first)
+    return Replanned(proposal, later, planned, joint, equal=equal)
 
 
 def _equal(commitment: Commitment, splice: int, payloads: NDArray) -> int:
@@ -379,9 +386,12 @@ def _equal(commitment: Commitment, splice: int, payloads: NDArray) -> int:
     return max(int(np.argmin(same)) - 1, 0) if not same.all() else 0
 
 
-def held_with(held: HeldFlight, splice: int, made: CertifiedFlight) -> HeldFlight:
-    """Return what is held once what was certified from setpoint `splice` on is committed."""
-    rows = np.arange(max(splice - _SNAPSHOTS_KEPT, held.begin), splice) - held.begin
+def held_with(held: HeldFlight, splice: int, made: CertifiedFlight, since: int = 0) -> HeldFlight:
+    """Return what is held once what was certified from setpoint `splice` on is committed.
+
+    No plan leaves it before setpoint `since` any more.
+    """
+    rows = np.arange(min(max(splice - _SNAPSHOTS_KEPT, held.begin, since), splice), splice) - held.begin
     before = held.snapshots[:, np.minimum(rows, held.snapshots.shape[1] - 1)]  # behind the last the vehicle waits
     return replace(
         held,

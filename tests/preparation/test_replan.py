@@ -9,10 +9,13 @@ from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajector
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.min_snap import centripetal_times, min_snap
-from cfplan.planning.continuation import continue_plan
+from cfplan.planning.continuation import TooLateError, Ways, continue_plan
 from cfplan.planning.plan import plan
+from cfplan.preparation import replan as replanning
+from cfplan.preparation.certified_flight import EndsBadlyError
 from cfplan.preparation.replan import (
     LOOKS_BACK,
+    AnswerAttempt,
     accepted,
     after_failure,
     at_pace,
@@ -233,6 +236,27 @@ def test_a_proposal_leaves_out_what_is_committed_to_the_byte_and_its_first_setpo
         np.testing.assert_array_equal(proposal.payloads, whole[proposal.splice :])
         left_out.append(made.equal)
     assert max(left_out) > 0
+
+
+def test_a_plan_that_would_end_badly_and_is_late_is_made_slower_at_once_the_next_time(held, limits, monkeypatch):
+    """By then it is too late to fly it slower from the same joint, and at full speed it would end badly again."""
+    certify, tried, late = replanning.certify_whole, [], True
+
+    def ends_badly_if_fast(flown, limits, starts):
+        tried.append(max(np.linalg.norm(flown.at(np.arange(1.5, flown.duration, 0.05)).velocity, axis=1)))
+        if tried[-1] > 1.5:
+            raise EndsBadlyError("it ends outside", where="link loss")
+        return certify(flown, limits, starts)
+
+    monkeypatch.setattr(replanning, "certify_whole", ends_badly_if_fast)
+    attempt = AnswerAttempt(lambda splice: late and bool(tried), Ways())
+    far = [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0], [-0.8, -1.8, 1.0]]
+    with pytest.raises(TooLateError):
+        replan(held, NOW, far, limits, attempt=attempt)
+    late = False
+    made = replan(held, NOW + 10, far, limits, attempt=attempt)
+    assert len(tried) == 2
+    assert made.plan is not None
 
 
 def test_a_part_that_comes_too_late_goes_on_from_rest(held, limits):
