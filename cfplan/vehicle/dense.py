@@ -83,40 +83,35 @@ def dense_rows(
     return out
 
 
-def flat_states(
-    airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray, interval: NDArray | None = None
-) -> NDArray:
-    """Return (STATE_ROWS, N): position, the full state, and the attitude at each s, (N,).
+def flat_states(source: SampleSource, breaks: NDArray, s: NDArray, interval: NDArray | None = None) -> NDArray:
+    """Return (STATE_ROWS, N): position, the full state, and the attitude at each s, (N,); `breaks` are the path's.
 
     `interval` tells whose polynomials of the profile hold, that on the right of a grid point where it is not given; a
     break of the path belongs to the piece on its right.
     """
-    return _filled(np.empty((STATE_ROWS, len(s))), _WHOLE, airframe, path, profile, s, interval)
+    return _filled(STATE_ROWS, _WHOLE, source, breaks, s, interval)
 
 
-def thrusts_at(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray) -> NDArray:
+def thrusts_at(source: SampleSource, breaks: NDArray, s: NDArray) -> NDArray:
     """Return the specific thrust, (1, N) m/s², at each s, (N,), and nothing else of the full state."""
-    return _filled(np.empty((1, len(s))), _THRUST, airframe, path, profile, s)
+    return _filled(1, _THRUST, source, breaks, s)
 
 
-def body_rates_at(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray) -> NDArray:
+def body_rates_at(source: SampleSource, breaks: NDArray, s: NDArray) -> NDArray:
     """Return the body rates, (3, N) rad/s, at each s, (N,), and nothing else of the full state."""
-    return _filled(np.empty((3, len(s))), _RATE, airframe, path, profile, s)
+    return _filled(3, _RATE, source, breaks, s)
 
 
-def accelerations_at(airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray) -> NDArray:
+def accelerations_at(source: SampleSource, breaks: NDArray, s: NDArray) -> NDArray:
     """Return the acceleration, (3, N) m/s², at each s, (N,), and nothing else of the full state."""
-    return _filled(np.empty((3, len(s))), _ACCELERATION, airframe, path, profile, s)
+    return _filled(3, _ACCELERATION, source, breaks, s)
 
 
 def _filled(
-    out: NDArray, part: int, airframe: Airframe, path: Path, profile: SpeedProfile, s: NDArray,
-    interval: NDArray | None = None,
-) -> NDArray:  # fmt: skip
-    _states(
-        out, part, compiled_body(airframe), path.breaks, path.origins, _whole_blocks(path.coefficients),
-        profile.table(), s, _FIND if interval is None else interval,
-    )  # fmt: skip
+    rows: int, part: int, source: SampleSource, breaks: NDArray, s: NDArray, interval: NDArray | None = None
+) -> NDArray:
+    out, (body, coefficients, origins, nodes) = np.empty((rows, len(s))), source
+    _states(out, part, body, breaks, origins, coefficients, nodes, s, _FIND if interval is None else interval)
     return out
 
 

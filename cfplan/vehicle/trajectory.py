@@ -11,10 +11,12 @@ from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.dense import (
     STATES,
+    SampleSource,
     accelerations_at,
     body_rates_at,
     flat_states,
     rest_outside,
+    sample_source,
     thrusts_at,
 )
 from cfplan.vehicle.profile import SpeedProfile
@@ -55,9 +57,11 @@ class Trajectory:
     profile: SpeedProfile
     airframe: Airframe
     timing: Timing = field(init=False, repr=False)
+    source: SampleSource = field(init=False, repr=False, compare=False)  # what states are computed from
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "timing", measure(self.profile))
+        object.__setattr__(self, "source", sample_source(self.airframe, self.path, self.profile))
         start, end = float(self.profile.s[0]), float(self.profile.s[-1])
         if abs(start) > _SAME_S or abs(end - self.path.end) > _SAME_S * (1.0 + self.path.end):
             raise NotCertifiedError(
@@ -84,26 +88,26 @@ class Trajectory:
         times = np.asarray(time, dtype=float)
         flat = times.reshape(-1)
         s = self.s_at(flat)
-        table = flat_states(self.airframe, self.path, self.profile, s)
+        table = flat_states(self.source, self.path.breaks, s)
         rest_outside(table, flat, self.duration, self.airframe.hover_thrust)
         state = _of_table(table, s, flat)
         return state if times.ndim else FullState(*(getattr(state, name)[0] for name in FullState.__slots__))
 
     def specific_thrust_at(self, times: NDArray) -> NDArray:
         """Return (N,) m/s²: what at() gives of it at each time, (N,) s, in a third of the time."""
-        thrust = thrusts_at(self.airframe, self.path, self.profile, self.s_at(times))
+        thrust = thrusts_at(self.source, self.path.breaks, self.s_at(times))
         _rest(thrust, times, self.duration, GRAVITY)
         return thrust[0]
 
     def body_rate_at(self, times: NDArray) -> NDArray:
         """Return (N, 3) rad/s likewise."""
-        rate = body_rates_at(self.airframe, self.path, self.profile, self.s_at(times))
+        rate = body_rates_at(self.source, self.path.breaks, self.s_at(times))
         _rest(rate, times, self.duration, 0.0)
         return rate.T
 
     def acceleration_at(self, times: NDArray) -> NDArray:
         """Return (N, 3) m/s² likewise."""
-        acceleration = accelerations_at(self.airframe, self.path, self.profile, self.s_at(times))
+        acceleration = accelerations_at(self.source, self.path.breaks, self.s_at(times))
         _rest(acceleration, times, self.duration, 0.0)
         return acceleration.T
 
@@ -127,7 +131,7 @@ def state_at(
     interval: NDArray | None = None,
 ) -> FullState:
     """Return the full state at s, (N,), by the polynomials of `interval` where given (see SpeedProfile.at)."""
-    return _of_table(flat_states(airframe, path, profile, s, interval), s, time)
+    return _of_table(flat_states(sample_source(airframe, path, profile), path.breaks, s, interval), s, time)
 
 
 def _of_table(table: NDArray, s: NDArray, time: NDArray) -> FullState:
