@@ -24,7 +24,7 @@ WHOLE = MappingProxyType({
     "architectures": {"path": 200}, "inputs": {"path": 200}, "robustness": dict.fromkeys(
         step_names(), perturbed_paths(100, 10)
     ),
-    "yaw-consistency": {"pair": 100}, "baselines": {"path": 50, "corridor": 2000}, "hardware": {"plan": 136},
+    "yaw-consistency": {"pair": 100}, "baselines": {"path": 50, "corridor": 2000}, "hardware": {"plan": 150},
     "simulators": {"flight": 64},
     "long": {"plan": 63},
 })  # fmt: skip
