@@ -280,6 +280,7 @@ def _replan_within(
     attempt: AnswerAttempt | None = None,
 ) -> Replanned:
     """Return what replan() does, at the speed that is asked for, or slower where it must be."""
+    splice, _ = _leaving(at_rest_from(held, splice, limits), splice, keep)  # from there on it may be later
     fastest = min(held.speed, limits.plan.speed)
     speeds = (fastest, *(slower for slower in SLOWER if slower < fastest))
     refused: InfeasibleError | None = None

@@ -367,3 +367,15 @@ def test_where_no_way_leads_on_from_the_motion_one_leads_on_from_rest_behind_a_s
     np.testing.assert_allclose(end, behind, atol=1e-3)
     still = stopped.exact_from - new.commitment.first
     assert not decode(new.commitment.payloads[still : still + 5]).velocity.any()
+
+
+def test_waypoints_that_follow_a_plan_from_rest_may_be_asked_for_long_before_it_begins(held, limits):
+    """At the moment itself at which it begins to move no way leads on from the motion; a little later one does."""
+    back = held.flown.at((NOW + 5) / RATE).position - 0.15 * held.flown.at((NOW + 5) / RATE).velocity
+    made = replan_behind_stop(held, NOW + 5, [back, [0.6, 0.2, 1.0]], limits)
+    stopped = after(held, limits, made.stop)
+    turned = after(stopped, limits, following(made, stopped.commitment))
+    more = replan(turned, NOW + 20, [[-0.6, 1.5, 1.1]], limits, keep=True)
+    assert more.joint > turned.flown.starts[-1] > (NOW + 60) / RATE
+    new = after(turned, limits, more, NOW + 15)
+    np.testing.assert_allclose(new.ahead, [back, [0.6, 0.2, 1.0], [-0.6, 1.5, 1.1]])

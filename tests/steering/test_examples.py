@@ -1,6 +1,7 @@
 """The examples fly as they stand, on the virtual vehicle and the stepped clock."""
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -8,6 +9,7 @@ import pytest
 
 import cfplan
 from cfplan.errors import ExitCode
+from cfplan.simulation.virtual_crazyflie import battery
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -36,6 +38,18 @@ def test_a_moving_target_is_followed(vehicle):
 def test_a_tour_of_random_waypoints_goes_on(vehicle):
     accepted, _ = example("random_tour").fly(vehicle, 8.0)
     assert accepted >= 3
+
+
+@pytest.mark.slow
+def test_a_tour_goes_on_for_ten_minutes_with_a_battery_that_lasts(limits, monkeypatch):
+    monkeypatch.setattr(battery, "_CAPACITY", 10.0 * battery._CAPACITY)
+    lasting = replace(limits, battery=replace(limits.battery, endurance=900.0))
+    with cfplan.connect("sim://0", stepped=True, safety=lasting, records=None) as vehicle:
+        accepted, refused = example("random_tour").fly(vehicle, 600.0)
+    assert vehicle.outcome.exit_code is ExitCode.OK
+    assert vehicle.outcome.deviation.max < 0.05
+    assert accepted > 100
+    assert refused <= 3  # drawn too near to one another
 
 
 def test_a_gate_that_moves_is_flown_through(vehicle):
