@@ -170,8 +170,8 @@ class AbortMonitor:
         estimate, asked = observation.estimate, observation.asked
         if estimate is None or asked is None or observation.without_pose <= self._limits.pose.age_brake:
             return
-        below = asked[2] - estimate.position[2]
-        if estimate.position[2] < self._limits.space.low[2] and below > FALLEN:
+        floor, below = self._limits.space.low[2], asked[2] - estimate.position[2]
+        if estimate.position[2] < floor < asked[2] and below > FALLEN:  # landings ask for places beneath the floor
             yield safety_abort(Rung.CUT, f"it is on the floor without poses, {below:.2f} m below its setpoint")
 
     def _beyond_fence(self, position: Triple) -> float:
