@@ -4,6 +4,7 @@ Appended options make it small (the last of an option counts), and of many paths
 taken as it stands holds tests/cli/test_commands_of_the_pages.py.
 """
 
+import re
 import shlex
 import shutil
 import subprocess
@@ -51,6 +52,7 @@ SMALL = {  # of a command, by its beginning: what is appended
     "study robustness": QUICK,
     "study scaling": "--repeats 1",
     "study steering": "--flights 1 --requests 5 --seconds 10",
+    "study simulators": QUICK,
     "study stops": "",
     "study unseen-limits": "--paths 1",
     "study yaw-consistency": "--pairs 1",
@@ -63,7 +65,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.integration, pytest.mark.timeout(900
 def small(line: str) -> list[str]:
     """Return the words of a command, made small."""
     beginning = next(key for key in SMALL if line.removeprefix("cfplan ").startswith(key))
-    words = [word for part in shlex.split(line)[1:] for word in sorted(glob(part)) or [part]]
+    asked = re.sub(r" --add \S+", "", line)  # results of other seeds, which only their owner has
+    words = [word for part in shlex.split(asked)[1:] for word in sorted(glob(part)) or [part]]
     paths = [word for word in words if word.startswith("flights/")]
     left_out = paths[1:] if len(paths) > 2 else []  # one path and the next, of identification, are both needed
     return [word for word in words if word not in left_out] + SMALL[beginning].split()
