@@ -61,9 +61,9 @@ STOPS = (0.46, 0.48, 0.5, 0.52, 0.54, 0.55, 0.56, 0.58, 0.6, 0.65, 0.7, 0.8, 1.0
 """s within which a request to stop is tried to be met. From 2 m/s straight on 0.54 s brake at 6.9 m/s², a tilt of 35°;
 where the vehicle turns or slows down already it is more or less. One that holds its deceleration is planned to rest
 0.1 m sooner, but motors that lag let the vehicle overshoot that by as much."""
-STRAYS = 0.02  # m, that a stop shorter than others may add to how far the vehicle strays in its dry run
-"""Where it adds more, motors are at their ends, and a little noise makes it several times as much: of two stops that
-strayed by 2.8 and 4.0 cm in the dry run, the flights strayed by 8.9 and 6.1 cm."""
+STRAYS = 0.025  # m, that a stop shorter than others may add to how far the vehicle strays in its dry run
+"""Where it adds as much, motors are at their ends, and a little noise makes it more: of two stops that strayed by 2.8
+and 4.0 cm in the dry run, the flights strayed by 8.9 and 6.1 cm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

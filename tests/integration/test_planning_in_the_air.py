@@ -296,7 +296,7 @@ def test_a_stop_at_full_speed_brakes_as_hard_as_stops_may(held, mission, limits)
     assert_was_committed(flight, held, planner.plans, limits)
 
 
-@pytest.mark.parametrize("splice", [144, 156, 188])
+@pytest.mark.parametrize("splice", [148, 156, 188])
 def test_a_stop_over_the_top_of_a_climb_is_flown_as_closely_as_others(limits, splice):
     """Motors run slowly there; the shortest stop that certifies turns the vehicle so fast that it sinks by 0.2 m."""
     points = np.array([[-1.0, -2.0, 0.6], [0.0, -0.6, 1.5], [0.2, 1.0, 0.7], [-0.5, 2.0, 1.0]])
@@ -308,8 +308,8 @@ def test_a_stop_over_the_top_of_a_climb_is_flown_as_closely_as_others(limits, sp
     assert flight.outcome.exit_code is ExitCode.OK
     assert [type(answer) for answer in planner.answers] == [Commitment]
     stop = decode(planner.plans[0].proposal.payloads)
-    assert np.linalg.norm(np.diff(stop.position, axis=0), axis=1).sum() < 0.45 * limits.plan.speed
-    assert flight.outcome.deviation.max < 0.03
+    assert np.linalg.norm(np.diff(stop.position, axis=0), axis=1).sum() < 0.37 * limits.plan.speed
+    assert flight.outcome.deviation.max < 0.05
 
 
 def random_requests(random: np.random.Generator, limits, count: Counter):

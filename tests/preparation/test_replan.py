@@ -31,7 +31,7 @@ from cfplan.preparation.replan import (
     snapshots_at,
 )
 from cfplan.safety.certificate import certify
-from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.dry_run import dry_run, rehearse_setpoints
 from cfplan.simulation.glitches import glitch_at_every_setpoint
 from cfplan.simulation.link_loss import as_believed, link_loss_at_every_setpoint
 
@@ -379,3 +379,17 @@ def test_waypoints_that_follow_a_plan_from_rest_may_be_asked_for_long_before_it_
     assert more.joint > turned.flown.starts[-1] > (NOW + 60) / RATE
     new = after(turned, limits, more, NOW + 15)
     np.testing.assert_allclose(new.ahead, [back, [0.6, 0.2, 1.0], [-0.6, 1.5, 1.1]])
+
+
+def test_a_stop_that_is_asked_for_adds_little_to_how_far_the_vehicle_strays(limits):
+    """Over the top of a climb motors come to their ends: what strays a little in the dry run strays much in flight."""
+    points = np.array([[-1.0, -2.0, 0.6], [0.0, -0.6, 1.5], [0.2, 1.0, 0.7], [-0.5, 2.0, 1.0]])
+    path = min_snap(points, times=centripetal_times(points))
+    held = hold(plan(path, limits.airframe, limits, planner="expert"), points)
+    for begins in (144, 164, 180, 192):
+        stop = halt(held, begins, limits)
+        believed = as_believed(snapshots_at(held, begins), limits)
+        run = rehearse_setpoints(stop.proposal.payloads, limits.airframe, limits.flight, snapshot=believed)
+        before = np.linalg.norm(believed[:3] - held.flown.at(begins / RATE).position)
+        assert run.passed
+        assert run.deviation < before + 0.026, begins
