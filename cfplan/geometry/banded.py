@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cfplan.machine_code import njit
 
 REGULARISED, REGULARISED_MOST = 1e-4, 1e14  # added to a diagonal where it must, at first and at most
-_LEAST_PIVOT = 1e-12  # of matrices that are regularised
+_LEAST_PIVOT = 1e-12  # of matrices whose diagonal is about 1
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -78,7 +78,7 @@ def solve_regularised(matrix, right, regularised):
 def solve_definite(matrix: NDArray, right: NDArray) -> NDArray:
     """Return the solution for right sides, (size, K), of a positive definite matrix, (size, width).
 
-    Raises LinAlgError where the matrix is not positive definite.
+    Raises LinAlgError where the matrix is not positive definite, or so nearly not that rounding decides.
     """
     solution, definite = _solve_columns(np.ascontiguousarray(matrix), np.ascontiguousarray(right))
     if not definite:
@@ -88,7 +88,7 @@ def solve_definite(matrix: NDArray, right: NDArray) -> NDArray:
 
 @njit(error_model="numpy")
 def _solve_columns(matrix, right):
-    factor, definite = factorise(matrix, 0.0, 0.0)
+    factor, definite = factorise(matrix, 0.0, _LEAST_PIVOT * matrix[:, 0].max())
     solution = np.empty_like(right)
     for k in range(right.shape[1]):
         column = solve(factor, right[:, k].copy())
