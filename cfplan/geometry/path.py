@@ -9,7 +9,7 @@ from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
-from cfplan.geometry.polynomials import shifted
+from cfplan.geometry.polynomials import padded, shifted
 from cfplan.machine_code import njit
 
 MAX_ORDER = 5
@@ -31,7 +31,7 @@ class Path:
     breaks: NDArray  # (M+1,) ascending from 0
     coefficients: NDArray  # (M, D, 3) m, ascending powers of s - breaks[i]; of s - breaks[-1] in the last piece
     origins: NDArray = field(init=False, repr=False)  # (M,) the s about which each piece is expanded
-    _tables: tuple[NDArray, ...] = field(init=False, repr=False)  # per order, (M, D - order, 3) of that derivative
+    _tables: list[NDArray] = field(init=False, repr=False)  # (M, D - order, 3) of each derivative asked for so far
     _length: float = field(init=False, repr=False, default=math.nan)  # m, once it was asked for
 
     def __post_init__(self) -> None:
@@ -53,22 +53,26 @@ class Path:
             raise InputError("breaks of a path must ascend from 0", where="path", hint="give each piece a length")
         origins = breaks[:-1].copy()
         origins[-1] = breaks[-1]
-        tables = [table]
-        for _ in range(MAX_ORDER):
-            powers = np.arange(1, tables[-1].shape[1])
-            with np.errstate(over="ignore"):
-                derivative = tables[-1][:, 1:] * powers[:, None]
-            tables.append(derivative if len(powers) else np.zeros((len(table), 1, 3)))
-        if not all(np.isfinite(derivative).all() for derivative in tables[1:]):
+        with np.errstate(over="ignore"):
+            steepest = np.abs(table).max() * float(table.shape[1]) ** MAX_ORDER
+        if not np.isfinite(steepest):
             raise InputError(
                 "coefficients of a path are too large to have derivatives", where="path", hint="give them in metres"
             )
-        for array in (breaks, origins, *tables):
+        for array in (breaks, origins, table):
             array.setflags(write=False)
-        for name, value in (
-            ("breaks", breaks), ("coefficients", table), ("origins", origins), ("_tables", tuple(tables)),
-        ):  # fmt: skip
+        for name, value in (("breaks", breaks), ("coefficients", table), ("origins", origins), ("_tables", [table])):
             object.__setattr__(self, name, value)
+
+    def _table(self, order: int) -> NDArray:
+        """Return (M, D - order, 3), the coefficients of a derivative."""
+        while len(self._tables) <= order:
+            before = self._tables[-1]
+            powers = np.arange(1, before.shape[1])
+            derivative = before[:, 1:] * powers[:, None] if len(powers) else np.zeros((len(before), 1, 3))
+            derivative.setflags(write=False)
+            self._tables.append(derivative)
+        return self._tables[order]
 
     @property
     def end(self) -> float:
@@ -96,7 +100,7 @@ class Path:
         if not 0 <= order <= MAX_ORDER:
             raise ValueError(f"a path has derivatives of order 0 to {MAX_ORDER}, not {order}")
         s = np.array(s, dtype=float)
-        return _values(self.breaks, self.origins, self._tables[order], s.ravel()).reshape(*s.shape, 3)
+        return _values(self.breaks, self.origins, self._table(order), s.ravel()).reshape(*s.shape, 3)
 
     def derivatives(self, s: NDArray) -> NDArray:
         """Return γ and its first four derivatives at s, (N,), in one pass, (5, 3, N)."""
@@ -116,6 +120,13 @@ class Path:
         breaks = np.concatenate([[low], inner, [high]])
         origins = np.append(breaks[:-2], high)
         return Path(breaks - low, shifted(self.coefficients[piece], origins - self.origins[piece]))
+
+    def followed_by(self, other: "Path") -> "Path":
+        """Return this path and then another, in the same unit of s, that begins with the derivatives of its end."""
+        count = max(self.coefficients.shape[1], other.coefficients.shape[1])
+        before, after = padded(self.coefficients, count), padded(other.coefficients, count)
+        before[-1] = shifted(before[-1:], self.breaks[-2:-1] - self.breaks[-1])[0]  # the last piece no more
+        return Path(np.append(self.breaks, self.end + other.breaks[1:]), np.concatenate([before, after]))
 
     def placed(self, offset: ArrayLike, yaw: float = 0.0) -> "Path":
         """Return this path turned by `yaw`, rad, about the world's z axis, then moved by `offset`, (3,) m."""
@@ -146,7 +157,7 @@ class Path:
 
     def _slowest(self, low: NDArray, high: NDArray) -> NDArray:
         """Return the s of the least |γ'| in each interval [low, high], by golden-section search."""
-        return _slowest_within(self.breaks, self.origins, self._tables[1], low, high)
+        return _slowest_within(self.breaks, self.origins, self._table(1), low, high)
 
     def _refuse(self, what: str, s: float, where: str) -> None:
         x, y, z = self(s)

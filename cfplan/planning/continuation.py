@@ -4,13 +4,14 @@ A path laid from where the vehicle is, with the velocity that it has, may swing 
 turn too sharply for its speed. That depends on the nominal time that its first segment takes, and on the unit of s in
 which its start is given: that of the path left, which keeps the curve where waypoints stay, or time, which is gentle
 where the path left is about to stop. Where all of these swing outside the space, guides keep the path near the
-straight lines between waypoints. Where the vehicle must turn back, it may first go on a little as it would have.
-Several paths are tried, first the one that looks fastest by a cheap estimate.
+straight lines between waypoints. Where all that was ahead is dropped, the vehicle may first go on a little on the path
+left, and brake there; where waypoints stay, it loses less time if it is asked again a little later. Several paths are
+tried, first the one that looks fastest by a cheap estimate.
 """
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
@@ -26,8 +27,7 @@ from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.features import REFERENCE, ScaledLimits, node_features, scaled_limits
-from cfplan.planners.expert.expert import plan_expert
-from cfplan.planners.expert.search import COLD_START
+from cfplan.planners.expert.expert import plan_early
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import check_endurance
@@ -42,16 +42,15 @@ from cfplan.vehicle.joint import Joint, joint_at
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
 
-# Nominal times of the first segment that are tried, in its own, where s goes on as it was and where it is time. Shorter
-# ones look faster than they are: the state at the start allows too little.
-FIRST_TIMES, FIRST_TIMES_TIMED = (0.7, 1.0, 1.4, 2.0, 3.0), (1.0, 1.4, 2.0)
-VIA = (0.25, 0.5, 0.8)  # s later on the path left, a place through which the vehicle may go before it turns off
-FIRST_TIMES_VIA = (1.0, 1.8, 3.0)  # of the segment behind that place
+# Nominal times of the first segment that are tried, in its own: where s goes on as it was, where it is time, and behind
+# what is still flown of the path left, for so long, s. Of 1,100 continuations these find a way for all but 0.5 %.
+FIRST_TIMES, FIRST_TIMES_TIMED, FIRST_TIMES_LATER = (0.7, 1.0, 1.4, 2.0, 3.0), (1.0, 1.4, 2.0), (1.0, 1.4, 2.0)
+LATER = (0.1, 0.35)
 GUIDES = (0.15, 0.3, 0.08, 0.5)  # m from waypoints, at which guides lie, in the order in which they are tried
 GUIDES_IN_MOTION, FIRST_TIMES_GUIDED = (0.3, 0.1), (1.0, 1.6)  # likewise, and of the first segment
-NEAR_VIA = 0.1  # m from the joint or a waypoint, nearer than which there is no such place
+NEAR = 0.05  # m from waypoint 1, nearer than which the path left is not left later
 RATE = 1.0  # units of s a second, where it is time: about the speed in m/s
-TRIES, MOST_TRIES = 6, 9  # paths of a kind that are planned, and of all
+TRIES, MOST_TRIES = 5, 14  # paths of a kind that are planned, and of all
 SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², and s before that, with which the vehicle slows down to a lower speed
 STOPPING = 0.6  # s of the way left, on which a vehicle that stops comes to rest
 OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
@@ -117,9 +116,14 @@ def continue_plan(
     check_waypoints(points, limits)
     known = scaled_limits(limits.airframe, limits.plan)
     failure = ""
-    straight = _ways(joint, points, times, trajectory)
-    kinds = (lambda: straight, lambda: _ways_guided(joint, trajectory, points),
-             lambda: _ways_later(joint, trajectory, points))  # fmt: skip
+    begins = _begins(joint, trajectory, points, times)
+    straight = _straight(begins, points, times)
+    kinds = (
+        lambda: straight,
+        lambda: [way for begin in begins[2:] for way in _ways(begin, points, FIRST_TIMES_LATER)],
+        lambda: _guided(begins[2:], points, FIRST_TIMES_GUIDED[1:]),
+        lambda: _guided(begins[:2], points, FIRST_TIMES_GUIDED),
+    )
     for number, way in islice(_sound(kinds, limits, known, ways), MOST_TRIES):
         if ways.failed and too_late():
             raise TooLateError("no way has been found in time", where="request", hint=LATE_HINT)
@@ -134,7 +138,7 @@ def continue_plan(
             return Continuation(_plan(found, task, limits, time.perf_counter() - begun), way.reached)
         ways.failed.add(number)
         failure = found
-    failure = failure or _unsound(straight[0]().path, limits)
+    failure = failure or _unsound(_made(straight)[0][1].path, limits)
     speed = float(np.linalg.norm(trajectory.at(leave).velocity))
     away = float(np.linalg.norm(points[0] - joint.derivatives[0]))
     raise NoWayError(
@@ -186,53 +190,75 @@ class _Way(NamedTuple):
     reached: tuple[float, ...]
 
 
-_Maker = Callable[[], _Way]
+class _Begin(NamedTuple):
+    """A place from which a path goes on, in some unit of s, and what is flown before that of the path left."""
+
+    derivatives: NDArray  # (5, 3) γ to γ'''' there
+    state: BoundaryState  # of the joint
+    before: Path | None = None
 
 
-def _ways(joint: Joint, points: NDArray, times: ArrayLike | None, trajectory: Trajectory) -> list[_Maker]:
-    """Return what makes the paths that are worth a try."""
-    straight = centripetal_times(np.concatenate([joint.derivatives[:1], points]))
-    made: list[_Maker] = []
-    if times is not None:
-        made.append(partial(_way, joint, points, np.asarray(times, dtype=float)))
-    for begin, factors in ((joint, FIRST_TIMES), (joint.timed(trajectory, RATE), FIRST_TIMES_TIMED)):
-        made += [
-            partial(_way, begin, points, np.concatenate([[factor * straight[0]], straight[1:]])) for factor in factors
-        ]
-    return made
+_Maker = Callable[[], _Way] | None  # None where there is no such way here
 
 
-def _ways_later(joint: Joint, trajectory: Trajectory, points: NDArray) -> list[_Maker]:
-    """Return what makes paths that go on a little as the one left would, before they turn off."""
-    made: list[_Maker] = []
-    for later in VIA:
+def _begins(joint: Joint, trajectory: Trajectory, points: NDArray, times: ArrayLike | None) -> list[_Begin | None]:
+    """Return the joint, the same where s is time, and each place later; None where there is none."""
+    timed = joint.timed(trajectory, RATE)
+    begins: list[_Begin | None] = [_Begin(joint.derivatives, joint.state), _Begin(timed.derivatives, timed.state)]
+    for later in LATER:
         s = float(trajectory.s_at(min(joint.time + later, trajectory.duration)))
-        via = trajectory.path(s)
-        if min(math.dist(via, joint.derivatives[0]), math.dist(via, points[0])) > NEAR_VIA:
-            onwards = centripetal_times(np.concatenate([via[None], points]))
-            for factor in FIRST_TIMES_VIA:
-                ahead = np.concatenate([[s - joint.s, factor * onwards[0]], onwards[1:]])
-                made.append(partial(_way, joint, np.concatenate([via[None], points]), ahead, range(1, len(ahead))))
+        place = trajectory.path.derivatives(np.array([s]))[:, :, 0]
+        moves = joint.time + later < trajectory.duration and s > joint.s
+        if times is None and moves and math.dist(place[0], points[0]) > NEAR:
+            begins.append(_Begin(place, joint.state, trajectory.path.part(joint.s, s)))
+        else:
+            begins.append(None)
+    return begins
+
+
+def _straight(begins: Sequence[_Begin | None], points: NDArray, times: ArrayLike | None) -> list[_Maker]:
+    """Return what makes the paths of least snap through the waypoints; first the rest of the path left, if it stays."""
+    made: list[_Maker] = []
+    if times is not None and begins[0] is not None:
+        made.append(partial(_way, begins[0], points, np.asarray(times, dtype=float)))
+    for begin, factors in zip(begins[:2], (FIRST_TIMES, FIRST_TIMES_TIMED), strict=True):
+        made += _ways(begin, points, factors)
     return made
 
 
-def _ways_guided(joint: Joint, trajectory: Trajectory, points: NDArray) -> list[_Maker]:
+def _guided(begins: Sequence[_Begin | None], points: NDArray, factors: Sequence[float]) -> list[_Maker]:
     """Return what makes paths that keep near the straight lines between the waypoints."""
     made: list[_Maker] = []
     for away in GUIDES_IN_MOTION:
-        guided, rows = with_guides(np.concatenate([joint.derivatives[:1], points]), away, first_too=False)
-        onwards = centripetal_times(guided)
-        for begin in (joint, joint.timed(trajectory, RATE)):
-            for factor in FIRST_TIMES_GUIDED:
-                ahead = np.concatenate([[factor * onwards[0]], onwards[1:]])
-                made.append(partial(_way, begin, guided[1:], ahead, [row - 1 for row in rows[1:]]))
+        for begin in begins:
+            made += _ways(begin, points, factors, away)
     return made
 
 
-def _way(joint: Joint, points: NDArray, times: NDArray, rows: Sequence[int] | None = None) -> _Way:
+def _ways(begin: _Begin | None, points: NDArray, factors: Sequence[float], guides: float | None = None) -> list[_Maker]:
+    """Return what makes paths whose first segments take these shares of their time, with guides so far, m, or none."""
+    if begin is None:
+        return [None] * len(factors)
+    through, rows = np.concatenate([begin.derivatives[:1], points]), None
+    if guides is not None:
+        through, at = with_guides(through, guides, first_too=False)
+        rows = [row - 1 for row in at[1:]]
+    times = centripetal_times(through)
+    ahead = [np.concatenate([[factor * times[0]], times[1:]]) for factor in factors]
+    return [partial(_way, begin, through[1:], each, rows) for each in ahead]
+
+
+def _way(begin: _Begin, points: NDArray, times: NDArray, rows: Sequence[int] | None = None) -> _Way:
     """Return the path through points, of which those of the `rows`, or all, are waypoints."""
-    path, reached = continued_min_snap(joint.derivatives, points, times), np.cumsum(times).tolist()
-    return _Way(path, joint.state, tuple(reached if rows is None else (reached[row] for row in rows)))
+    path, reached = continued_min_snap(begin.derivatives, points, times), np.cumsum(times)
+    if begin.before is not None:
+        path, reached = begin.before.followed_by(path), reached + begin.before.end
+    return _Way(path, begin.state, tuple((reached if rows is None else reached[list(rows)]).tolist()))
+
+
+def _made(makers: Sequence[_Maker], without: Container[int] = ()) -> list[tuple[int, _Way]]:
+    """Return the ways that there are, and their numbers."""
+    return [(k, maker()) for k, maker in enumerate(makers) if maker is not None and k not in without]
 
 
 def _sound(
@@ -245,12 +271,14 @@ def _sound(
     first = ways.found
     if first is not None:
         makers = kinds[first[0]]()
-        if first[1] < len(makers) and not _unsound((way := makers[first[1]]()).path, limits):
+        maker = makers[first[1]] if first[1] < len(makers) else None
+        if maker is not None and not _unsound((way := maker()).path, limits):
             yield first, way
     for kind, make in enumerate(kinds):
-        made = [((kind, k), maker()) for k, maker in enumerate(make()) if (kind, k) not in (first, *ways.failed)]
-        fastest_first = sorted(made, key=lambda each: _least_time(each[1].path, known))
-        yield from islice((each for each in fastest_first if not _unsound(each[1].path, limits)), TRIES)
+        tried = {k for at, k in ways.failed | ({first} if first else set()) if at == kind}
+        fastest_first = sorted(_made(make(), tried), key=lambda each: _least_time(each[1].path, known))
+        sound = (((kind, k), way) for k, way in fastest_first if not _unsound(way.path, limits))
+        yield from islice(sound, TRIES)
 
 
 def _unsound(path: Path, limits: Limits) -> str:
@@ -313,7 +341,7 @@ def _solve(task: PlanningTask, limits: Limits) -> _Found | str:
     solution = Solution(Status.BAD_BOUNDARY, None)
     for allowed in (with_room(task.limits, task.airframe), task.limits):
         if solution.status is Status.BAD_BOUNDARY:
-            solution = plan_expert(replace(task, limits=allowed), starts=COLD_START[:1])  # others never help here
+            solution = plan_early(replace(task, limits=allowed))
     if solution.profile is None:
         return f"{solution.status} ({' '.join(solution.reason.split())})" if solution.reason else str(solution.status)
     trajectory = Trajectory(task.path, solution.profile, task.airframe)

@@ -15,6 +15,16 @@ def path() -> Path:
     return min_snap([[0, 0, 1], [1.2, 0.4, 1.1], [1.5, -0.8, 0.7], [-0.3, -1.0, 1.2]])
 
 
+@pytest.mark.parametrize("at", [0.02, 0.4, 0.99])
+def test_two_parts_one_after_another_are_the_path(path, at):
+    joined = path.part(0.0, at * path.end).followed_by(path.part(at * path.end, path.end))
+    assert joined.end == pytest.approx(path.end)
+    s = np.linspace(0.0, path.end, 400)
+    for order in range(5):
+        np.testing.assert_allclose(joined(s, order), path(s, order), atol=1e-9 * np.abs(path(s, order)).max())
+    assert not joined(path.end, 1).any()  # exactly: it rests there
+
+
 @pytest.mark.parametrize("order", range(5))
 def test_each_derivative_is_the_slope_of_the_one_below(path, order):
     step = 1e-5

@@ -142,7 +142,25 @@ def test_most_waypoints_anywhere_in_the_space_are_flown_in_motion(flown, limits)
             continue
         made += 1
         np.testing.assert_allclose(new.plan.path(np.array(new.reached)), points, atol=1e-9)
-    assert made >= 0.85 * tried
+    assert made >= 0.9 * tried
+
+
+def test_who_must_turn_back_brakes_along_the_path_left_and_then_turns(flown, limits):
+    """No curve leads back from full speed inside the walls; a waypoint a metre behind is reached all the same."""
+    trajectory, braked = flown.trajectory, 0
+    for share in np.arange(0.1, 0.9, 0.05):
+        leave = share * trajectory.duration
+        state = trajectory.at(leave)
+        back = state.position - state.velocity / np.linalg.norm(state.velocity)
+        back = np.clip(back, np.array(limits.space.low) + 0.3, np.array(limits.space.high) - 0.3)
+        made = continue_plan(trajectory, leave, [back], limits)
+        begun = made.plan.path.breaks[1] / 2
+        s = float(trajectory.s_at(leave))
+        if np.allclose(made.plan.path(begun), trajectory.path(s + begun), atol=1e-9):
+            braked += 1
+            later = made.plan.trajectory.time_at(begun)
+            assert np.linalg.norm(made.plan.trajectory.at(later).velocity) <= limits.plan.speed
+    assert braked >= 3
 
 
 @pytest.mark.parametrize("waypoints", [[], [[1, 2]], [[np.nan, 0, 1]], [[0.5, 0, 1], [0.5, 0, 1]]])

@@ -15,7 +15,7 @@ alone, an optimiser lets it run away or stop short. There h stays constant over 
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from numpy.typing import NDArray
 
@@ -23,10 +23,18 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert.initial_guess import guess_spline
 from cfplan.planners.expert.layout import Shape, layout_of
 from cfplan.planners.expert.point_constraints import Penalties
-from cfplan.planners.expert.problem import Ends, Segment, build_problem, slowness_of
-from cfplan.planners.expert.search import COLD_START, Start, rejection_reason, solve
+from cfplan.planners.expert.problem import Ends, Problem, Segment, build_problem, interval_of, slowness_of
+from cfplan.planners.expert.search import (
+    COLD_START,
+    WARM_START,
+    Start,
+    early_start,
+    refining_restarts,
+    rejection_reason,
+    solve,
+)
 from cfplan.planners.expert.tightening import Tightened, tighten_until_feasible
-from cfplan.planners.expert.windows import WindowSize, by_windows, failed_status, solution_of
+from cfplan.planners.expert.windows import LONG_WINDOW, WindowSize, by_windows, failed_status, solution_of
 from cfplan.planners.solution import Solution
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.yaw_spline import YawSpline
@@ -53,6 +61,29 @@ def plan_expert(
     Raises:
         InputError: fewer nodes than the path needs.
     """
+    return _plan(task, window, penalties, lambda problem, segment: (starts, WARM_START))
+
+
+def plan_early(task: PlanningTask) -> Solution:
+    """Plan as plan_expert() does, but stop within about 0.02 % of the fastest, as refine() does, after one search.
+
+    That takes half the time. Raises as plan_expert() does.
+    """
+
+    def searches(problem: Problem, segment: Segment) -> tuple[Sequence[Start], Sequence[Start]]:
+        interval = interval_of(segment, problem.coefficients)
+        return (early_start(interval),), refining_restarts(interval)[:2]
+
+    return _plan(task, LONG_WINDOW, None, searches)
+
+
+def _plan(
+    task: PlanningTask,
+    window: WindowSize,
+    penalties: Penalties | None,
+    searches: Callable[[Problem, Segment], tuple[Sequence[Start], Sequence[Start]]],
+) -> Solution:
+    """Plan a task from a guess; `searches` are those that begin there, and those that go on with lower limits."""
     task.check_nodes()
     if task.refusal:
         return task.refusal
@@ -67,9 +98,10 @@ def plan_expert(
 
     def search(segment: Segment, _near: NDArray) -> Tightened | str:
         problem = build_problem(segment, task.yaw_angle, penalties)
+        starts, restarts = searches(problem, segment)
         attempt = solve(problem, problem.coefficients, starts, task.deadline)
         return rejection_reason(attempt, segment) or tighten_until_feasible(
-            attempt, problem, segment, deadline=task.deadline
+            attempt, problem, segment, restarts, task.deadline
         )
 
     joined = by_windows(whole, window, search)

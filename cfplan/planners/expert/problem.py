@@ -153,6 +153,12 @@ def _highest(
     return nominal, highest
 
 
+def interval_of(segment: Segment, coefficients: NDArray) -> float:
+    """Return how long an interval takes about, s, with these coefficients, (N+3, 1 or 2)."""
+    slowness = float(((segment.unit * np.maximum(coefficients[:, 0], FLOOR)) ** -0.5).sum()) / len(coefficients)
+    return segment.path.end / segment.layout.shape.nodes * slowness
+
+
 def _point_data(segment: Segment, step: float) -> NDArray:
     """Return the point data, (POINT_DATA, P), in node units."""
     layout, yaw = segment.layout, segment.yaw

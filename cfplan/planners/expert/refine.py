@@ -17,7 +17,7 @@ from cfplan.deadline import Deadline
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert.initial_guess import lowered
 from cfplan.planners.expert.layout import Shape, layout_of
-from cfplan.planners.expert.problem import FLOOR, Ends, Problem, Segment, build_problem, slowness_of
+from cfplan.planners.expert.problem import FLOOR, Ends, Problem, Segment, build_problem, interval_of, slowness_of
 from cfplan.planners.expert.search import (
     COLD_START,
     Attempt,
@@ -30,6 +30,7 @@ from cfplan.planners.expert.search import (
 )
 from cfplan.planners.expert.tightening import Tightened, tighten, tighten_until_feasible
 from cfplan.planners.expert.windows import (
+    LONG_WINDOW,
     Joined,
     WindowSize,
     by_windows,
@@ -44,7 +45,6 @@ from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.profile_spline import h_coefficients
 from cfplan.vehicle.yaw_spline import YawSpline
 
-WINDOW = WindowSize(kept=224, ahead=32)
 # Share of h by which the search begins below the given profile: where that uses limits to the full, nearly all
 # constraints then begin inside their bounds, and steps are long.
 SLOWER = 0.1
@@ -53,7 +53,7 @@ SLOWER = 0.1
 CRAWLED = 16
 
 
-def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WINDOW) -> Solution:
+def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = LONG_WINDOW) -> Solution:
     """Plan a profile within about 0.02 % of the fastest, on the grid of the given one.
 
     Yaw is that of the profile, not of the task; where the task leaves it free it is optimised too. A profile may come
@@ -64,7 +64,7 @@ def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WI
 
 
 def refinements(
-    task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = WINDOW,
+    task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = LONG_WINDOW,
     restarts: Callable[..., Sequence[Start]] = refining_restarts,
 ) -> Iterator[Solution]:  # fmt: skip
     """Yield the refined profile, after each round in which limits exceeded between points are lowered.
@@ -113,9 +113,7 @@ class _HeldAtPoints(NamedTuple):
 def _hold_at_points(task: PlanningTask, segment: Segment, near: NDArray) -> _HeldAtPoints | str:
     """Solve the problem from the coefficients `near`, or return why not."""
     ends = segment.ends
-    slowness = float((1.0 / np.sqrt(segment.unit * near[:, 0])).sum()) / len(near)
-    step = segment.path.end / segment.layout.shape.nodes
-    interval = step * slowness
+    interval, step = interval_of(segment, near), segment.path.end / segment.layout.shape.nodes
     agrees = not ends.end and (ends.continues or not ends.start)  # with the boundary states
     rate, angle, capped = segment.unit**0.5 / step, task.yaw_angle, segment.caps is not None
     problem = build_problem(segment, angle, coefficients=lowered(near, SLOWER, ends.held, rate) if agrees else None)

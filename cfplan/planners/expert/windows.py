@@ -32,6 +32,9 @@ class WindowSize(NamedTuple):
     ahead: int  # beyond those, planned and not kept
 
 
+LONG_WINDOW = WindowSize(kept=224, ahead=32)  # for searches that stop early
+
+
 class Joined(NamedTuple):
     """The windows' solutions put together."""
 

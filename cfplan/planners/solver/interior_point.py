@@ -88,6 +88,7 @@ class Search:
     push: float = 1e-2  # how far slacks start inside their bounds at least, of the span between them
     multipliers: float = 1.0  # at first, times what the barrier makes of their slacks
     iterations: int = 100
+    least_step: float = 0.0  # share of a Newton step; one that must be shorter is the last: there may be no solution
 
 
 class Multipliers(NamedTuple):
@@ -190,7 +191,7 @@ def minimise(
         del near, dg  # so that the next ones get their memory, which the processor's cache still holds
         before = infeasible, values.cost + walls
         step = _line_search(program, v, dv, slacks, direction, barrier, before, slope + direction.slope, filtered)
-        if step is None:
+        if step is None or step.share < search.least_step:
             return ended(False, iteration, "no step improves the solution")
         if step.widens:
             filtered.pairs.append(((1 - FILTER) * infeasible, before[1] - FILTER * infeasible))

@@ -10,7 +10,7 @@ from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.expert.expert import plan_early, plan_expert
 from cfplan.planners.expert.windows import WindowSize
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
@@ -236,3 +236,27 @@ def test_the_solver_prints_nothing(capfd):
     captured = capfd.readouterr()
     assert captured.out == ""
     assert captured.err == ""
+
+
+@pytest.mark.parametrize("yaw", YawMode)
+def test_a_plan_that_stops_early_is_certified_and_nearly_as_fast(yaw):
+    path = min_snap(CORNERED)
+    task = PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, yaw=yaw)
+    best, early = plan_expert(task), plan_early(task)
+    assert certify(Trajectory(path, solved(early), HARDWARE.airframe), HARDWARE.limits).passed
+    assert duration(path, solved(early), HARDWARE.airframe) < 1.001 * duration(path, solved(best), HARDWARE.airframe)
+    assert early.stats["iterations"] < 0.75 * best.stats["iterations"]
+
+
+def test_what_cannot_be_braked_for_is_given_up_early():
+    """A little before a sharp corner; plan_expert's first search takes 60 steps to see that."""
+    corner = min_snap([[0, 0, 1], [1, 0, 1], [1, 0.4, 1], [0.3, 0.4, 1]])
+    path = corner.part(0.8, corner.end)
+    nominal = float(np.linalg.norm(path(0.0, 1)))
+    for speed, leads_on in ((1.4, True), (1.8, False)):
+        start = BoundaryState((speed / nominal) ** 2, 0.0, 0.0, 0.0, 0.0)
+        task = PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, start=start)
+        assert task.refusal is None
+        solution = plan_early(task)
+        assert (solution.profile is not None) is leads_on
+    assert solution.reason == "no step improves the solution"

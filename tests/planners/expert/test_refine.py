@@ -8,8 +8,8 @@ import pytest
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.planners.expert.expert import plan_expert
-from cfplan.planners.expert.refine import WINDOW, refine
-from cfplan.planners.expert.windows import WindowSize, windows_of
+from cfplan.planners.expert.refine import refine
+from cfplan.planners.expert.windows import LONG_WINDOW, WindowSize, windows_of
 from cfplan.planners.solution import Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
@@ -53,7 +53,7 @@ def test_a_profile_near_the_experts_becomes_as_fast_and_certified_in_fewer_steps
 
 
 def test_windows_cover_a_path_and_each_looks_ahead():
-    kept, ahead = WINDOW
+    kept, ahead = LONG_WINDOW
     for nodes in (1, 100, kept + ahead, kept + ahead + 1, 1000):
         windows = windows_of(nodes, kept, ahead)
         assert windows[0][0] == 0
