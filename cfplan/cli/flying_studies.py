@@ -149,7 +149,7 @@ def _by_seeds(
         "--seconds", type=click.FloatRange(1.0), default=60.0, show_default=True, help="Of all other requests."
     ),
     click.option(
-        "--rate", type=click.FloatRange(0.1, 1000.0), default=50.0, show_default=True, help="Of those, a second."
+        "--rate", type=click.FloatRange(0.1, 1000.0), default=100.0, show_default=True, help="Of those, a second."
     ),
     seed(0, "Of the waypoints."),
 )  # fmt: skip

@@ -2,6 +2,7 @@
 
 __all__ = [
     "air_planner",
+    "beside",
     "certified_flight",
     "compiled_calls",
     "export_flight",

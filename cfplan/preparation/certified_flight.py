@@ -5,10 +5,9 @@ rest too, and takes as little time to certify as the beginning is short. More of
 vehicle gets there.
 """
 
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import encode_certified_stops
 from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
+from cfplan.preparation.beside import Work, beside
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
 from cfplan.preparation.local_slowing import Assessment
 from cfplan.safety.limits import Limits
@@ -31,7 +31,6 @@ from cfplan.vehicle.joint import JoinedTrajectory
 
 STOP = round(DURATION * RATE)  # setpoints from the place where a stop begins to where it rests
 BEHIND = STOP + 1 + round(HOLD * RATE)  # setpoints of a beginning behind those that follow the motion
-_BESIDE = ThreadPoolExecutor(1, "checks")
 _FORESEEN = 0.05  # m beyond a wall, from which on link loss that is only foreseen counts
 
 
@@ -58,11 +57,11 @@ def certify_whole(flown: JoinedTrajectory, limits: Limits, starts: NDArray | Non
     encoded = encode_trajectory(flown, gains=gains_under(limits), space=limits.space)
     believed = None if starts is None else as_believed(starts, limits)
 
-    def rehearse() -> None:
+    def check() -> None:
         check_bytes(encoded, flown, limits.plan)
         dry_run(encoded, flown, limits.airframe, limits.flight, snapshot=believed).require_passed()
 
-    stops, lost = _certified(encoded, encoded.payloads, limits, starts, rehearse)
+    stops, lost = _certified(encoded, encoded.payloads, limits, starts, check)
     return CertifiedFlight(encoded.payloads, stops, lost.snapshots, None)
 
 
@@ -77,25 +76,22 @@ def certify_beginning(
     if following + STOP >= flown.duration * RATE:
         return certify_whole(flown, limits, starts)
     gains, space = gains_under(limits), limits.space
-    encoded = encode_trajectory(flown, gains=gains, space=space, count=following + STOP)  # stops lead half as far on
+    foresee = foresee and not limits.link_loss.only_warn
+    beginning = following + STOP  # stops lead half as far on
+    encoded = encode_trajectory(flown, gains=gains, space=space, count=None if foresee else beginning)
+    whole, encoded = encoded.payloads if foresee else None, _first_rows(encoded, beginning)
     last = np.array([following])
     stop = encode_stops(encoded.motion, RATE, rows=last, gains=gains, space=space)[0]
     payloads = np.concatenate([encoded.payloads[:following], stop, np.repeat(stop[-1:], BEHIND - len(stop), axis=0)])
     begun = _first_rows(encoded, following + 1)
 
-    def foresee_link_loss() -> None:
-        if foresee and not limits.link_loss.only_warn:
-            payloads = encode_trajectory(flown, gains=gains, space=space).payloads
-            foreseen = foreseen_link_loss(payloads, limits, starts=starts).worst
-            if foreseen.beyond > _FORESEEN:
-                raise EndsBadlyError(str(foreseen), where="link loss", hint=OUTSIDE_HINT)
-
-    def rehearse() -> None:
+    def check() -> None:
         check_setpoints(begun, flown, limits.plan)
         believed = as_believed(starts, limits)
         rehearse_setpoints(payloads, limits.airframe, limits.flight, snapshot=believed).require_passed()
 
-    stops, lost = _certified(begun, payloads, limits, starts, rehearse, encoded.motion, foresee_link_loss)
+    foreseen = [] if whole is None else [partial(_foresee_link_loss, whole, limits, starts)]
+    stops, lost = _certified(begun, payloads, limits, starts, check, encoded.motion, foreseen)
     rest = rest_behind(encoded.motion, following, RATE)
     behind = left_of(stop, BEHIND - 1)
     return CertifiedFlight(payloads, np.concatenate([stops, behind]), lost.snapshots, following, rest)
@@ -118,20 +114,22 @@ def _certified(
     payloads: NDArray,
     limits: Limits,
     starts: NDArray | None,
-    rehearse: Callable[[], None],
+    check: Callable[[], None],
     motion: FullStateSetpoints | None = None,
-    foresee: Callable[[], None] = lambda: None,
+    foreseen: Sequence[Work] = (),
 ) -> tuple[NDArray, LinkLossMoments]:
     """Return a stop from each setpoint of `encoded`, and link loss of `payloads`, which begin with those setpoints.
 
     `motion` is that of the setpoints behind them too, where the stops lead along it. Raises as certify_whole() does,
-    and first what `foresee` raises.
+    and what `check` raises, and first what is `foreseen`.
     """
 
-    # What is mostly compiled loops runs beside what is mostly Python: two threads of that would hinder each other.
-    losing = _BESIDE.submit(link_loss_at_walls, payloads, limits, starts=starts)
-    gaps = _BESIDE.submit(meet_gaps, payloads, limits, starts)
-    foreseen = _BESIDE.submit(foresee)
+    # What is mostly compiled loops goes on beside what is mostly Python: two threads of that would hinder each other.
+    losing, *others = beside().begin(
+        partial(link_loss_at_walls, payloads, limits, starts=starts),
+        partial(meet_gaps, payloads, limits, starts),
+        *foreseen,
+    )
     refused: CfplanError | None = None
     within: Assessment | None = None
     try:
@@ -139,17 +137,17 @@ def _certified(
         count = len(encoded.payloads)
         stops, passed = encode_certified_stops(along, limits, RATE, encoded.gains, encoded.space, count=count)
         passed.require(limits)
-        rehearse()
+        check()
         lost = losing.result()
         if lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
             within = assess_link_loss_of_stops(encoded, limits, lost, margin=0.0, stops=stops)
     except CfplanError as error:
         refused = error
     finally:
-        beside: list[Future[Any]] = [losing, gaps, foreseen]
-        wait(beside)  # nothing goes on behind the caller's back
-    foreseen.result()
-    gaps.result()
+        for each in (losing, *others):
+            each.exception()  # nothing goes on behind the caller's back
+    for each in reversed(others):
+        each.result()
     if refused is not None:
         raise refused
     require_inside(lost, limits)
@@ -163,6 +161,13 @@ def require_inside(lost: LinkLossMoments, limits: Limits) -> None:
     """Raise EndsBadlyError where link loss ends outside the walls."""
     if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
         raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
+
+
+def _foresee_link_loss(payloads: NDArray, limits: Limits, starts: NDArray) -> None:
+    """Raise EndsBadlyError where link loss is foreseen to end outside the walls by far."""
+    foreseen = foreseen_link_loss(payloads, limits, starts=starts).worst
+    if foreseen.beyond > _FORESEEN:
+        raise EndsBadlyError(str(foreseen), where="link loss", hint=OUTSIDE_HINT)
 
 
 def meet_gaps(payloads: NDArray, limits: Limits, starts: NDArray | None) -> None:

@@ -45,6 +45,7 @@ from cfplan.preparation.air_planner import (
     presses,
     wants_more,
 )
+from cfplan.preparation.beside import BesideByProcess, work_beside
 from cfplan.preparation.replan import (
     AnswerAttempt,
     HeldFlight,
@@ -61,7 +62,7 @@ from cfplan.safety.limits import Limits
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 LEARNED_FROM = 15  # plans, by which one knows how long the next may take
-IN_TIME = 0.6  # share of them for which what is taken to be needed was enough: one that comes late is planned again
+IN_TIME = 0.9  # share of them for which what is taken to be needed was enough: one that comes late is planned again
 AGAIN = 1.2  # by how much longer than the first the next one is taken to need where that came late, at least
 TRIES = 4  # of a request whose proposal comes late
 ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
@@ -155,10 +156,9 @@ class _Lead:
         """Return how long plans took, s."""
         return float(np.median([took for took, _ in self._took]))
 
-    @property
-    def ahead(self) -> float:
-        """Return what the next plan is taken to need, s, with its way to the pilot."""
-        return float(np.quantile([took - left_out for took, left_out in self._took], IN_TIME)) + SLACK
+    def ahead(self, in_time: float = IN_TIME) -> float:
+        """Return what the next plan is taken to need, s, with its way to the pilot: so much that this share has it."""
+        return float(np.quantile([took - left_out for took, left_out in self._took], in_time)) + SLACK
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,6 +184,8 @@ class _Worker:
         self._equal: deque[int] = deque([0], maxlen=LEARNED_FROM)  # setpoints that proposals left out as equal
         self._waiting: tuple[PathRequest, float] | None = None
         self._asked = -math.inf  # s, when the last request came
+        self._pressed = False  # whether requests come faster than they can be planned
+        self._done = -math.inf  # s, when the last one was planned
         self._busy = False  # whether something was done since garbage was looked for
         self._proposed: _Proposed | None = None
         self._accepted = 0  # number of the request whose plan is flown
@@ -234,7 +236,9 @@ class _Worker:
         if self._waiting is None:
             return None
         (request, since), self._waiting = self._waiting, None
+        self._pressed = since < self._done
         answer = self._answer(request, since)
+        self._done = REAL_CLOCK.now()
         return None if answer is None else replace(answer, seconds=REAL_CLOCK.now() - since)
 
     def _wants_more(self) -> bool:
@@ -244,7 +248,7 @@ class _Worker:
     def _next(self, lead: _Lead, least: float = 0.0) -> tuple[int, float]:
         """Return the setpoint from which on one may plan now, and how far ahead it is, s, `least` at least."""
         assert self._begun is not None
-        ahead = max(lead.ahead, least)
+        ahead = max(lead.ahead(1.0 if self._pressed else IN_TIME), least)
         arrives = REAL_CLOCK.now() - self._begun + ahead
         return math.ceil((arrives + LOOKS_UNTIL) * RATE) - 1 + LEAST_AHEAD, ahead
 
@@ -280,9 +284,11 @@ class _Worker:
         """
         if self._begun is None:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
-        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways())
+        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), self._pressed)
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for _ in range(TRIES):
+            if attempt.ways.found is not None:  # one that is known needs less time than it took to find it
+                took = min(took, lead.median)
             begun, (first, ahead), held = REAL_CLOCK.now(), self._next(lead, AGAIN * took), self._held
             made: Replanned | HeldFlight | None
             try:
@@ -290,8 +296,6 @@ class _Worker:
             except TooLateError as error:
                 took = REAL_CLOCK.now() - begun + self._checking
                 lead.note(took, self._left_out)
-                if attempt.ways.found is not None:  # a way that is known needs less time than it took to find it
-                    took = min(took, lead.median)
                 reason = str(error)
                 continue
             except CfplanError as error:
@@ -483,14 +487,20 @@ def _run(held: HeldFlight, limits: Limits, requests: Connection, pilot: Connecti
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP):
         signal.signal(number, signal.SIG_IGN)
     sys.setswitchinterval(_SWITCH_INTERVAL)
+    work_beside(BesideByProcess(_hasten))
     worker = _Worker(held, limits, requests, pilot)
     worker.warm_up()
+    _hasten()
+    with contextlib.suppress(EOFError, OSError):
+        requests.send("ready")
+        worker.serve()
+
+
+def _hasten() -> None:
+    """Let this process be held up by as little as may be: what it has already is no garbage, and others have time."""
     gc.collect()
     gc.freeze()  # what was imported is not looked through again in flight
     gc.set_threshold(_GARBAGE)  # the worker looks when nothing is asked for
     with contextlib.suppress(OSError, AttributeError):  # not everybody may; other systems have other ways
         for thread in map(int, os.listdir("/proc/self/task")):
             os.setpriority(os.PRIO_PROCESS, thread, PRIORITY)
-    with contextlib.suppress(EOFError, OSError):
-        requests.send("ready")
-        worker.serve()

@@ -119,6 +119,7 @@ class AnswerAttempt:
 
     too_late: Callable[[int], bool]  # whether a plan from a setpoint on, not certified yet, will come too late for it
     ways: Ways
+    pressed: bool = False  # whether others wait for it, so that what lies far ahead will be replaced
     too_fast: set[float] = field(default_factory=set)  # m/s, at which it would end badly; written as speeds are tried
 
 
@@ -361,7 +362,11 @@ def _replan_at(
         raise TooLateError("the plan was not made in time", where="request", hint=LATE_HINT)
     flown = held.flown.continued(joint, planned.trajectory)
     since, starts = flown.since(splice / RATE), snapshots_at(held, splice)
-    passed = certify_whole(since, limits, starts) if part is None else certify_beginning(since, part, limits, starts)
+    if part is None:
+        passed = certify_whole(since, limits, starts)
+    else:
+        foresee = attempt is None or not attempt.pressed
+        passed = certify_beginning(since, part, limits, starts, foresee=foresee)
     return _proposed(replace(held, flown=flown, ahead=points, reached=reached), splice, passed, planned, joint)
 
 

@@ -126,7 +126,7 @@ def latency(
     *,
     requests: int = 100,
     seconds: float = 60.0,
-    rate: float = 50.0,
+    rate: float = 100.0,
     first_seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StudyResult:

@@ -8,6 +8,7 @@ import threading
 from dataclasses import replace
 
 import numpy as np
+import psutil
 import pytest
 from waiting import a_moment, until
 
@@ -15,6 +16,7 @@ from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.proposals import _ANSWER, _BEGUN, ReceivedProposals
 from cfplan.flight.setpoints.commitment import (
     LEAST_AHEAD,
+    QUANTUM,
     SPLICE_AHEAD,
     Commitment,
     Fault,
@@ -23,12 +25,12 @@ from cfplan.flight.setpoints.commitment import (
     propose,
     splice,
 )
-from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.encoding import LEAD, RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.preparation.air_planner import PathAnswer, PathRequest, PathVerdict, Wish
-from cfplan.preparation.planner_process import AirPlanner, _Worker
+from cfplan.preparation.air_planner import SLACK, PathAnswer, PathRequest, PathVerdict, Wish
+from cfplan.preparation.planner_process import LEARNED_FROM, AirPlanner, _Lead, _Worker
 from cfplan.preparation.replan import hold, replan
 
 LATE = 1.5  # s, longer than a planner waits for an answer
@@ -124,8 +126,13 @@ def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(b
     assert answer.verdict is PathVerdict.ACCEPTED, answer
     assert isinstance(pilot.given[-1], Commitment)
     assert answer.splice in pilot.commitment.splices
-    ahead = round(answer.joint * RATE) - answer.splice
-    assert 0 < ahead <= SPLICE_AHEAD  # less by the setpoints that are the committed ones
+    joint = round(answer.joint * RATE)
+    assert 0 < joint - answer.splice <= SPLICE_AHEAD  # less by the setpoints that are the committed ones
+    numbers = np.arange(joint, joint + 20)
+    committed = decode(pilot.commitment.payloads[numbers - pilot.commitment.first])
+    planned = answer.plan.trajectory.at(numbers / RATE + LEAD - answer.joint)
+    np.testing.assert_allclose(committed.position, planned.position, atol=QUANTUM)
+    np.testing.assert_allclose(committed.velocity, planned.velocity, atol=QUANTUM)
     again = answer_to(planner.request(Wish.EXTEND, [(0.5, -0.5, 1.0)]), planner, pilot)
     assert again.verdict is PathVerdict.ACCEPTED, again
 
@@ -299,3 +306,32 @@ def test_what_is_committed_far_ahead_of_the_vehicle_is_replaced_from_near(both):
     second = answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)]), planner, pilot)
     assert second.verdict is PathVerdict.ACCEPTED, second
     assert second.joint < ends
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+def test_plans_are_checked_all_the_same_where_the_process_beside_the_planner_has_died(both, how):
+    planner, pilot = both
+    begin(planner, pilot)
+    for child in psutil.Process(planner.process_id).children():
+        child.send_signal(how)
+    for place in ((0.0, 0.5, 1.0), (0.5, -0.5, 1.0)):
+        answer = answer_to(planner.request(Wish.REPLACE, [place]), planner, pilot)
+        assert answer.verdict is PathVerdict.ACCEPTED, answer
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+def test_nothing_of_a_planner_that_was_killed_goes_on(both, how):
+    planner, _ = both
+    beside = psutil.Process(planner.process_id).children()
+    assert beside
+    psutil.Process(planner.process_id).send_signal(how)
+    assert not psutil.wait_procs(beside, timeout=10.0)[1]
+
+
+def test_how_far_ahead_is_planned_follows_how_long_plans_took():
+    lead = _Lead(1.0)
+    for number in range(LEARNED_FROM):
+        lead.note(0.020 + 0.001 * number)
+    assert 0.030 < lead.ahead() < lead.ahead(1.0) == pytest.approx(0.034 + SLACK)
+    lead.note(0.5, 0.45)  # it took long, but began where nothing changed for as long
+    assert lead.ahead(1.0) == pytest.approx(0.050 + SLACK)
