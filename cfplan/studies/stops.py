@@ -1,7 +1,8 @@
 """Stops of several durations from full speed, straight on: what each asks of the vehicle, and what refuses it.
 
 The vehicle flies along the longest side of the room, and stops where it flies at a constant speed. From there every
-duration is tried that a request to stop tries, and shorter ones.
+duration is tried that a request to stop tries, and shorter ones. Beside them stands the hardest braking of the fastest
+plan along that side, which keeps every limit of plans.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,6 +28,8 @@ from cfplan.studies.result import Column, StudyResult, Table
 SHORTER = (0.36, 0.4, 0.42, 0.43, 0.44)  # s, besides those that a request tries
 LONGEST = 0.6  # s
 _FROM_WALLS = 0.5  # m beyond the margin
+_FINE = 300  # intervals of a grid that brakes as late as it may
+_FULL = 0.99  # share of the highest speed from which on a plan brakes
 _NEXT = np.array([1])  # row of a motion
 
 COLUMNS = (
@@ -36,6 +39,15 @@ COLUMNS = (
     Column("tilt", "tilt", "°", ".1f"),
     Column("turning", "angular acceleration", "rad/s²", ".0f", meaning="that the setpoints ask for"),
     Column("refused", "refused, as"),
+)
+
+BRAKING_COLUMNS = (
+    Column("speed", "from", "m/s", ".2f"),
+    Column("distance", "way to rest", "m", ".2f"),
+    Column("duration", "within", "s", ".2f"),
+    Column("acceleration", "acceleration", "m/s²", ".1f"),
+    Column("tilt", "tilt", "°", ".1f"),
+    Column("turning", "angular acceleration", "rad/s²", ".0f"),
 )
 
 
@@ -58,16 +70,47 @@ def stops(
         rows.append(_row(held, number, motion, duration, limits))
     speed, tilt = float(np.linalg.norm(motion.velocity[0])), np.degrees(limits.flight.stop_tilt)
     title = f"Stops from {speed:.2f} m/s, straight on, at a tilt of {tilt:.0f}° at most"
-    return StudyResult("stops", {"durations": list(tried)}, (Table("stops", title, COLUMNS, tuple(rows)),))
+    braking = Table("braking", "How the fastest plan brakes, straight on", BRAKING_COLUMNS, (_braking(limits),))
+    settings = {"durations": list(tried)}
+    return StudyResult("stops", settings, (Table("stops", title, COLUMNS, tuple(rows)), braking))
 
 
-def _straight_flight(limits: Limits) -> HeldFlight:
-    """Return a flight along the longest side of the room, through its middle, from rest to rest."""
+def _braking(limits: Limits) -> dict[str, Any]:
+    """Return a row about the end of the fastest plan along that side, from where it has all but its highest speed.
+
+    Its waypoints are a metre apart, so that its path leaves the speed free nearly until the end.
+    """
+    first, last = _ends(limits)
+    path = min_snap(np.linspace(first, last, 1 + round(float(np.linalg.norm(last - first)))))
+    flown = plan(path, limits.airframe, limits, planner="expert", nodes=_FINE).trajectory
+    times = np.arange(0.0, flown.duration, 1e-3)
+    state = flown.at(times)
+    speed = np.linalg.norm(state.velocity, axis=1)
+    begin = int(np.flatnonzero(speed >= _FULL * speed.max())[-1])
+    lean = np.degrees(np.arccos(np.clip(state.thrust_axis[begin:, 2], -1.0, 1.0)))
+    return {
+        "speed": float(speed[begin]),
+        "distance": _way(state.position[begin:]),
+        "duration": flown.duration - float(times[begin]),
+        "acceleration": float(np.linalg.norm(state.acceleration[begin:], axis=1).max()),
+        "tilt": float(lean.max()),
+        "turning": float(np.linalg.norm(state.angular_acceleration[begin:], axis=1).max()),
+    }
+
+
+def _ends(limits: Limits) -> NDArray:
+    """Return (2, 3) m: both ends of a line along the longest side of the room, through its middle."""
     space = limits.space
     low, high = np.array(space.low), np.array(space.high)
     along = int(np.argmax((high - low)[:2]))
     ends = np.repeat([(low + high) / 2.0], 2, axis=0)
     ends[:, along] = low[along] + space.margin + _FROM_WALLS, high[along] - space.margin - _FROM_WALLS
+    return ends
+
+
+def _straight_flight(limits: Limits) -> HeldFlight:
+    """Return a flight along that line, from rest to rest."""
+    ends = _ends(limits)
     path = min_snap(ends, times=centripetal_times(ends))
     return hold(plan(path, limits.airframe, limits, planner="expert"), ends)
 

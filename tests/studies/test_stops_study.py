@@ -7,6 +7,15 @@ from cfplan.studies.stops import stops
 ROOT = Path(__file__).parents[2]
 
 
+def test_the_stop_that_is_flown_takes_hardly_more_way_than_the_fastest_plan_to_brake():
+    """Though it is certified from any moment on, without a search; 10 % is what it may take more."""
+    result = stops(ROOT / "safety.yaml", durations=(0.54,))
+    [stop], [braking] = result.table("stops").rows, result.table("braking").rows
+    assert braking["acceleration"] <= 5.0
+    assert braking["turning"] <= 35.0
+    assert stop["distance"] < 1.1 * braking["distance"] * 2.0 / braking["speed"]
+
+
 def test_shorter_stops_from_full_speed_lean_too_far():
     rows = stops(ROOT / "safety.yaml", durations=(0.43, 0.54)).table("stops").rows
     short, flown = rows
