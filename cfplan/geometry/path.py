@@ -31,7 +31,7 @@ class Path:
     breaks: NDArray  # (M+1,) ascending from 0
     coefficients: NDArray  # (M, D, 3) m, ascending powers of s - breaks[i]; of s - breaks[-1] in the last piece
     origins: NDArray = field(init=False, repr=False)  # (M,) the s about which each piece is expanded
-    _tables: list[NDArray] = field(init=False, repr=False)  # (M, D - order, 3) of each derivative asked for so far
+    _tables: list[NDArray | None] = field(init=False, repr=False)  # see _table(); None where nobody has asked yet
     _length: float = field(init=False, repr=False, default=math.nan)  # m, once it was asked for
 
     def __post_init__(self) -> None:
@@ -61,18 +61,19 @@ class Path:
             )
         for array in (breaks, origins, table):
             array.setflags(write=False)
-        for name, value in (("breaks", breaks), ("coefficients", table), ("origins", origins), ("_tables", [table])):
+        tables = [table, *[None] * MAX_ORDER]
+        for name, value in (("breaks", breaks), ("coefficients", table), ("origins", origins), ("_tables", tables)):
             object.__setattr__(self, name, value)
 
     def _table(self, order: int) -> NDArray:
         """Return (M, D - order, 3), the coefficients of a derivative."""
-        while len(self._tables) <= order:
-            before = self._tables[-1]
+        if (table := self._tables[order]) is None:
+            before = self._table(order - 1)
             powers = np.arange(1, before.shape[1])
-            derivative = before[:, 1:] * powers[:, None] if len(powers) else np.zeros((len(before), 1, 3))
-            derivative.setflags(write=False)
-            self._tables.append(derivative)
-        return self._tables[order]
+            table = before[:, 1:] * powers[:, None] if len(powers) else np.zeros((len(before), 1, 3))
+            table.setflags(write=False)
+            self._tables[order] = table
+        return table
 
     @property
     def end(self) -> float:

@@ -43,7 +43,7 @@ from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
 
 # Nominal times of the first segment that are tried, in its own: where s goes on as it was, where it is time, and behind
-# what is still flown of the path left, for so long, s. Of 1,100 continuations these find a way for all but 0.5 %.
+# what is still flown of the path left, for so long, s. Of 390 times that all ahead was dropped a way was found for 386.
 FIRST_TIMES, FIRST_TIMES_TIMED, FIRST_TIMES_LATER = (0.7, 1.0, 1.4, 2.0, 3.0), (1.0, 1.4, 2.0), (1.0, 1.4, 2.0)
 LATER = (0.1, 0.35)
 GUIDES = (0.15, 0.3, 0.08, 0.5)  # m from waypoints, at which guides lie, in the order in which they are tried

@@ -155,7 +155,7 @@ def _highest(
 
 def interval_of(segment: Segment, coefficients: NDArray) -> float:
     """Return how long an interval takes about, s, with these coefficients, (N+3, 1 or 2)."""
-    slowness = float(((segment.unit * np.maximum(coefficients[:, 0], FLOOR)) ** -0.5).sum()) / len(coefficients)
+    slowness = float((1.0 / np.sqrt(segment.unit * np.maximum(coefficients[:, 0], FLOOR))).sum()) / len(coefficients)
     return segment.path.end / segment.layout.shape.nodes * slowness
 
 
