@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from random import Random
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -424,7 +424,7 @@ class _Driver(CRTPDriver):
 
     needs_resending = True
     spoil = staticmethod(lambda packet: packet)  # of what comes from the vehicle
-    opened: "list[_Driver]" = []  # noqa: RUF012  the drivers that cflib has made
+    opened: ClassVar["list[_Driver]"] = []  # the drivers that cflib has made
 
     def connect(self, uri: str, statistics: object, error: object) -> None:
         if not uri.startswith("fuzz://"):
