@@ -63,7 +63,8 @@ FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 LEARNED_FROM = 15  # plans, by which one knows how long the next may take
 IN_TIME = 0.9  # share of them for which what is taken to be needed was enough: one that comes late is planned again
-AGAIN = 1.2  # by how much longer than the first the next one is taken to need where that came late, at least
+ALONG_A_WAY = 0.3  # share of plans that take less than those whose first way leads on
+AGAIN = 1.2  # by how much longer than the one before the next one is taken to need where that came late, at least
 TRIES = 4  # of a request whose proposal comes late
 ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
 _GARBAGE = 100_000  # objects, after which it is looked through in any case
@@ -180,6 +181,7 @@ class _Worker:
         self._held, self._limits, self._requests, self._pilot = held, limits, requests, pilot
         self._begun: float | None = None  # s, when setpoint 0 was due
         self._plans, self._stops, self._parts = _Lead(FIRST_TIME), _Lead(FIRST_STOP), _Lead(FIRST_STOP)
+        self._planned_in: deque[float] = deque([0.0], maxlen=LEARNED_FROM)  # s of plans, with their searches
         self._checks: deque[float] = deque([0.0], maxlen=LEARNED_FROM)  # s from a plan to its proposal
         self._equal: deque[int] = deque([0], maxlen=LEARNED_FROM)  # setpoints that proposals left out as equal
         self._waiting: tuple[PathRequest, float] | None = None
@@ -247,10 +249,14 @@ class _Worker:
 
     def _next(self, lead: _Lead, least: float = 0.0) -> tuple[int, float]:
         """Return the setpoint from which on one may plan now, and how far ahead it is, s, `least` at least."""
-        assert self._begun is not None
         ahead = max(lead.ahead(1.0 if self._pressed else IN_TIME), least)
+        return self._in_time_for(ahead), ahead
+
+    def _in_time_for(self, ahead: float) -> int:
+        """Return the setpoint from which on one may plan who needs so long, s."""
+        assert self._begun is not None
         arrives = REAL_CLOCK.now() - self._begun + ahead
-        return math.ceil((arrives + LOOKS_UNTIL) * RATE) - 1 + LEAST_AHEAD, ahead
+        return math.ceil((arrives + LOOKS_UNTIL) * RATE) - 1 + LEAST_AHEAD
 
     def _read(self, patience: float) -> PilotAnswer | None:
         """Take what has come; return the pilot's answer to a proposal if there is one, waiting for it if asked to.
@@ -286,15 +292,20 @@ class _Worker:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
         reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), self._pressed)
         lead = self._stops if request.wish is Wish.STOP else self._plans
-        for _ in range(TRIES):
-            if attempt.ways.found is not None:  # one that is known needs less time than it took to find it
-                took = min(took, lead.median)
-            begun, (first, ahead), held = REAL_CLOCK.now(), self._next(lead, AGAIN * took), self._held
+        for tried in range(TRIES):
+            begun, held = REAL_CLOCK.now(), self._held
+            if attempt.ways.found is None:
+                first, ahead = self._next(lead, AGAIN * took)
+            else:  # one that is known needs less time than it took to find it
+                ahead = AGAIN**tried * (self._finding + self._checking) - self._left_out / tried + SLACK
+                first = self._in_time_for(ahead)
             made: Replanned | HeldFlight | None
             try:
                 made = self._planned(request, first, part_within(ahead), attempt)
             except TooLateError as error:
                 took = REAL_CLOCK.now() - begun + self._checking
+                if attempt.ways.found is None:
+                    took += self._finding
                 lead.note(took, self._left_out)
                 reason = str(error)
                 continue
@@ -314,6 +325,7 @@ class _Worker:
                 self._held = made
                 return answer_held(request, made)
             if made.plan is not None:
+                self._planned_in.append(made.plan.seconds)
                 self._checks.append(took - made.plan.seconds)
                 self._equal.append(made.equal)
             sent = _Proposed(made, request, received, begun, proposed)
@@ -361,15 +373,21 @@ class _Worker:
             self._requests.send(told)
         return self._held is held
 
-    def _too_late(self, splice: int) -> bool:
-        """Return whether what is planned from a setpoint on, and must be checked still, comes to the pilot too late."""
-        return self._late_by(splice) + self._checking - self._left_out > 0.0
+    def _too_late(self, splice: int, planned: bool) -> bool:
+        """Return whether what begins at a setpoint, and must be checked or even planned still, comes too late."""
+        needed = self._checking + (0.0 if planned else self._finding)
+        return self._late_by(splice) + needed - self._left_out > 0.0
 
     def _late_by(self, splice: int) -> float:
         """Return how much too late, s, what is sent now comes to the pilot, where it begins at a setpoint."""
         assert self._begun is not None
         looks_until = self._begun + (splice - LEAST_AHEAD + 1) / RATE - LOOKS_UNTIL
         return REAL_CLOCK.now() + ON_THE_WAY - looks_until
+
+    @property
+    def _finding(self) -> float:
+        """Return how long the plan along a way takes, s, with no search before it."""
+        return float(np.quantile(self._planned_in, ALONG_A_WAY))
 
     @property
     def _checking(self) -> float:
