@@ -137,6 +137,8 @@ def continue_plan(
             check_endurance(found.trajectory.duration, limits)
             return Continuation(_plan(found, task, limits, time.perf_counter() - begun), way.reached)
         ways.failed.add(number)
+        if ways.found == number:  # not from here, or not as slowly
+            ways.found = None
         failure = found
     failure = failure or _unsound(_made(straight)[0][1].path, limits)
     speed = float(np.linalg.norm(trajectory.at(leave).velocity))

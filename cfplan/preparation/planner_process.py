@@ -65,6 +65,7 @@ LEARNED_FROM = 15  # plans, by which one knows how long the next may take
 IN_TIME = 0.9  # share of them for which what is taken to be needed was enough: one that comes late is planned again
 ALONG_A_WAY = 0.3  # share of plans that take less than those whose first way leads on
 AGAIN = 1.2  # by how much longer than the one before the next one is taken to need where that came late, at least
+SEARCHING = 1.5  # likewise, where no way has been found by then
 TRIES = 4  # of a request whose proposal comes late
 ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
 _GARBAGE = 100_000  # objects, after which it is looked through in any case
@@ -294,8 +295,8 @@ class _Worker:
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for tried in range(TRIES):
             begun, held = REAL_CLOCK.now(), self._held
-            if attempt.ways.found is None:
-                first, ahead = self._next(lead, AGAIN * took)
+            if attempt.ways.found is None:  # the ways that are left may be many
+                first, ahead = self._next(lead, SEARCHING**tried * took)
             else:  # one that is known needs less time than it took to find it
                 ahead = AGAIN**tried * (self._finding + self._checking) - self._left_out / tried + SLACK
                 first = self._in_time_for(ahead)
@@ -304,8 +305,6 @@ class _Worker:
                 made = self._planned(request, first, part_within(ahead), attempt)
             except TooLateError as error:
                 took = REAL_CLOCK.now() - begun + self._checking
-                if attempt.ways.found is None:
-                    took += self._finding
                 lead.note(took, self._left_out)
                 reason = str(error)
                 continue
@@ -373,10 +372,9 @@ class _Worker:
             self._requests.send(told)
         return self._held is held
 
-    def _too_late(self, splice: int, planned: bool) -> bool:
-        """Return whether what begins at a setpoint, and must be checked or even planned still, comes too late."""
-        needed = self._checking + (0.0 if planned else self._finding)
-        return self._late_by(splice) + needed - self._left_out > 0.0
+    def _too_late(self, splice: int) -> bool:
+        """Return whether what is planned from a setpoint on, and must be checked still, comes to the pilot too late."""
+        return self._late_by(splice) + self._checking - self._left_out > 0.0
 
     def _late_by(self, splice: int) -> float:
         """Return how much too late, s, what is sent now comes to the pilot, where it begins at a setpoint."""

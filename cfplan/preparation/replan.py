@@ -117,8 +117,7 @@ class Replanned:
 class AnswerAttempt:
     """One try to answer a request; another is made where it comes too late, with the ways that are known by then."""
 
-    too_late: Callable[[int, bool], bool]
-    """Whether what is not certified yet will come too late for a setpoint; the bool is whether it is planned."""
+    too_late: Callable[[int], bool]  # whether a plan from a setpoint on, not certified yet, will come too late for it
     ways: Ways
     pressed: bool = False  # whether others wait for it, so that what lies far ahead will be replaced
     too_fast: set[float] = field(default_factory=set)  # m/s, at which it would end badly; written as speeds are tried
@@ -297,7 +296,7 @@ def _replan_within(
                 refused = error
                 if at_once is not None:
                     at_once.too_fast.add(speed)
-                    if at_once.too_late(splice, False) and speed != speeds[-1]:
+                    if at_once.too_late(splice) and speed != speeds[-1]:
                         raise TooLateError("it is to be flown slower", where="request", hint=LATE_HINT) from error
                 break  # slower
             except NoWayError as error:
@@ -327,8 +326,8 @@ def _replan_at(
     joint = (splice + SPLICE_AHEAD) / RATE
     leave, trajectory = joint - held.flown.starts[left], held.flown.trajectories[left]
 
-    def too_late(planned: bool = False) -> bool:
-        return attempt is not None and attempt.too_late(splice, planned)
+    def too_late() -> bool:
+        return attempt is not None and attempt.too_late(splice)
 
     if leave >= trajectory.duration:
         place = held.flown.at(joint)
@@ -359,7 +358,7 @@ def _replan_at(
             ways=None if attempt is None else attempt.ways, too_late=too_late,
         )  # fmt: skip
         planned, reached = made.plan, made.reached
-    if too_late(planned=True):
+    if too_late():
         raise TooLateError("the plan was not made in time", where="request", hint=LATE_HINT)
     flown = held.flown.continued(joint, planned.trajectory)
     since, starts = flown.since(splice / RATE), snapshots_at(held, splice)

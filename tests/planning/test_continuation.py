@@ -8,7 +8,7 @@ import pytest
 from cfplan.errors import InfeasibleError, InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
-from cfplan.planning.continuation import continue_plan, path_from_rest
+from cfplan.planning.continuation import TooLateError, Ways, continue_plan, path_from_rest
 from cfplan.planning.plan import plan
 from cfplan.safety.certificate import certify
 from cfplan.vehicle.joint import JoinedTrajectory
@@ -161,6 +161,21 @@ def test_who_must_turn_back_brakes_along_the_path_left_and_then_turns(flown, lim
             later = made.plan.trajectory.time_at(begun)
             assert np.linalg.norm(made.plan.trajectory.at(later).velocity) <= limits.plan.speed
     assert braked >= 3
+
+
+def test_a_way_that_does_not_lead_on_any_more_is_forgotten(flown, limits):
+    """Else a planner that comes too late after it would take it to be known, and come too late again."""
+    leave = 0.5 * flown.trajectory.duration
+    state = flown.trajectory.at(leave)
+    behind = state.position - 0.05 * state.velocity / np.linalg.norm(state.velocity)
+    ways = Ways()
+    continue_plan(flown.trajectory, leave, [behind], limits, ways=ways)
+    assert ways.failed
+    known = Ways(found=next(iter(sorted(ways.failed))))
+    with pytest.raises(TooLateError):
+        continue_plan(flown.trajectory, leave, [behind], limits, ways=known, too_late=lambda: True)
+    assert known.found is None
+    assert len(known.failed) == 1
 
 
 @pytest.mark.parametrize("waypoints", [[], [[1, 2]], [[np.nan, 0, 1]], [[0.5, 0, 1], [0.5, 0, 1]]])

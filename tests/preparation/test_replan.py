@@ -249,7 +249,7 @@ def test_a_plan_that_would_end_badly_and_is_late_is_made_slower_at_once_the_next
         return certify(flown, limits, starts)
 
     monkeypatch.setattr(replanning, "certify_whole", ends_badly_if_fast)
-    attempt = AnswerAttempt(lambda splice, planned: late and bool(tried), Ways())
+    attempt = AnswerAttempt(lambda splice: late and bool(tried), Ways())
     far = [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0], [-0.8, -1.8, 1.0]]
     with pytest.raises(TooLateError):
         replan(held, NOW, far, limits, attempt=attempt)
