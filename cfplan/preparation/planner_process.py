@@ -153,11 +153,6 @@ class _Lead:
             self._took.clear()
         self._took.append((seconds, left_out))
 
-    @property
-    def median(self) -> float:
-        """Return how long plans took, s."""
-        return float(np.median([took for took, _ in self._took]))
-
     def ahead(self, in_time: float = IN_TIME) -> float:
         """Return what the next plan is taken to need, s, with its way to the pilot: so much that this share has it."""
         return float(np.quantile([took - left_out for took, left_out in self._took], in_time)) + SLACK
@@ -291,7 +286,7 @@ class _Worker:
         """
         if self._begun is None:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
-        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), self._pressed)
+        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), self._another_waits)
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for tried in range(TRIES):
             begun, held = REAL_CLOCK.now(), self._held

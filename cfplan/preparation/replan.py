@@ -119,7 +119,7 @@ class AnswerAttempt:
 
     too_late: Callable[[int], bool]  # whether a plan from a setpoint on, not certified yet, will come too late for it
     ways: Ways
-    pressed: bool = False  # whether others wait for it, so that what lies far ahead will be replaced
+    another_waits: Callable[[], bool] = lambda: False  # whether another request will replace what lies far ahead
     too_fast: set[float] = field(default_factory=set)  # m/s, at which it would end badly; written as speeds are tried
 
 
@@ -365,7 +365,7 @@ def _replan_at(
     if part is None:
         passed = certify_whole(since, limits, starts)
     else:
-        foresee = attempt is None or not attempt.pressed
+        foresee = attempt is None or not attempt.another_waits()
         passed = certify_beginning(since, part, limits, starts, foresee=foresee)
     return _proposed(replace(held, flown=flown, ahead=points, reached=reached), splice, passed, planned, joint)
 

@@ -11,6 +11,7 @@ from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.continuation import TooLateError, Ways, continue_plan
 from cfplan.planning.plan import plan
+from cfplan.preparation import certified_flight
 from cfplan.preparation import replan as replanning
 from cfplan.preparation.certified_flight import EndsBadlyError
 from cfplan.preparation.replan import (
@@ -257,6 +258,29 @@ def test_a_plan_that_would_end_badly_and_is_late_is_made_slower_at_once_the_next
     made = replan(held, NOW + 10, far, limits, attempt=attempt)
     assert len(tried) == 2
     assert made.plan is not None
+
+
+@pytest.mark.parametrize("another_waits", [False, True])
+def test_what_would_end_badly_far_ahead_is_flown_slower_unless_it_will_be_replaced(
+    held, limits, monkeypatch, another_waits
+):
+    """Link loss is foreseen to end outside only in plans faster than 1.3 m/s; the first part is certified anyway."""
+    foreseen = []
+
+    def foresee(payloads, limits, starts):
+        foreseen.append(np.linalg.norm(decode(payloads).velocity, axis=1)[200:].max())
+        if foreseen[-1] > 1.3:
+            raise EndsBadlyError("it ends outside", where="link loss")
+
+    monkeypatch.setattr(certified_flight, "_foresee_link_loss", foresee)
+    attempt = AnswerAttempt(lambda splice: False, Ways(), lambda: another_waits)
+    made = replan(held, NOW + 5, FAR, limits, part=PART, attempt=attempt)
+    after(held, limits, made)
+    speeds = np.linalg.norm(
+        made.plan.trajectory.at(np.arange(2.0, made.plan.trajectory.duration, 0.02)).velocity, axis=1
+    )
+    assert bool(speeds.max() > 1.3) is another_waits
+    assert len(foreseen) == (0 if another_waits else 2)
 
 
 def test_a_part_that_comes_too_late_goes_on_from_rest(held, limits):
