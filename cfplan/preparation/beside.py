@@ -4,7 +4,9 @@ A thread does it unless this process has begun another for that. Where that has 
 """
 
 import contextlib
+import ctypes
 import multiprocessing
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
@@ -29,6 +31,9 @@ class Beside(Protocol):
     def begin(self, *works: Work) -> list[Pending]:
         """Begin to do one after another, once what was begun before is done."""
 
+    def wake(self) -> None:
+        """Get ready, as there will be work soon."""
+
 
 class BesideByThread:
     """A thread of this process."""
@@ -38,6 +43,9 @@ class BesideByThread:
 
     def begin(self, *works: Work) -> list[Pending]:
         return [self._pool.submit(work) for work in works]
+
+    def wake(self) -> None:
+        pass  # a thread shares the caches of whoever asks
 
 
 class BesideByProcess:
@@ -50,11 +58,13 @@ class BesideByProcess:
         process = context.Process(target=_serve, args=(other, prepare), name="beside", daemon=True)
         process.start()
         other.close()  # so that the pipe ends with the process
+        self._elsewhere = _Elsewhere(process.pid)
         self._last: _Answer | None = None
 
     def begin(self, *works: Work) -> list[Pending]:
         if self._last is not None:
             self._last.exception()  # else both might wait until the other reads
+        self._elsewhere.keep()
         with contextlib.suppress(OSError):
             self._pipe.send(works)
         answers: list[Pending] = []
@@ -64,6 +74,35 @@ class BesideByProcess:
             answers.append(before)
         self._last = before
         return answers
+
+    def wake(self) -> None:
+        """Let it do once more, for nobody, what it did last: where it has slept that takes half as long again."""
+        self._elsewhere.keep()
+        with contextlib.suppress(OSError):
+            self._pipe.send(())
+
+
+class _Elsewhere:
+    """Keeps a process off the processor that this thread runs on.
+
+    The scheduler likes to wake a process where the one that called it runs, although that goes on. There they take
+    turns of some ms each, and such work takes hardly longer.
+    """
+
+    def __init__(self, process_id: int | None):
+        self._process_id = process_id
+        self._all: set[int] = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
+        self._off = -1
+
+    def keep(self) -> None:
+        """Let it run on any other processor, if there is one and the system lets one choose."""
+        if len(self._all) < 2 or _libc is None or self._process_id is None:
+            return
+        here = _libc.sched_getcpu()
+        if here != self._off:
+            self._off = here
+            with contextlib.suppress(OSError):  # it has ended
+                os.sched_setaffinity(self._process_id, self._all - {here})
 
 
 class _Answer:
@@ -106,11 +145,18 @@ def _serve(pipe: Connection, prepare: Callable[[], None]) -> None:
     """Do what comes until the other process has ended."""
     with contextlib.suppress(EOFError, OSError):
         prepare()
+        last: tuple[Work, ...] = ()
         while True:
-            for work in pipe.recv():
-                pipe.send(_done(work))
+            if works := pipe.recv():
+                last = works
+                for work in works:
+                    pipe.send(_done(work))
+            else:
+                for work in last:
+                    _done(work)
 
 
+_libc = ctypes.CDLL(None) if hasattr(os, "sched_setaffinity") else None
 _beside: Beside = BesideByThread()
 
 

@@ -45,7 +45,7 @@ from cfplan.preparation.air_planner import (
     presses,
     wants_more,
 )
-from cfplan.preparation.beside import BesideByProcess, work_beside
+from cfplan.preparation.beside import BesideByProcess, beside, work_beside
 from cfplan.preparation.replan import (
     AnswerAttempt,
     HeldFlight,
@@ -286,6 +286,8 @@ class _Worker:
         """
         if self._begun is None:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
+        if not self._pressed:
+            beside().wake()
         reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), self._another_waits)
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for tried in range(TRIES):

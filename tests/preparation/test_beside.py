@@ -36,6 +36,11 @@ def fill(value: float, count: int) -> np.ndarray:
     return np.full(count, value)
 
 
+def append(file: Path, text: str) -> None:
+    with file.open("a") as out:
+        out.write(text)
+
+
 @pytest.fixture(params=[BesideByThread, partial(BesideByProcess, int)], ids=["thread", "process"])
 def other(request):
     return request.param()
@@ -72,6 +77,40 @@ def test_answers_that_nobody_asks_for_do_not_hold_up_the_next(other):
     np.testing.assert_array_equal(last.result(), np.full(1_000_000, 2.0))
     [answer] = other.begin(partial(len, np.zeros(1_000_000)))
     assert answer.result() == 1_000_000
+
+
+def test_what_is_done_for_nobody_changes_no_answer(other):
+    other.wake()  # nothing was done yet
+    for value in range(3):
+        [answer] = other.begin(partial(fill, value, 4))
+        np.testing.assert_array_equal(answer.result(), np.full(4, value))
+        other.wake()
+        other.wake()
+
+
+def test_waking_does_what_was_done_last_once_more(tmp_path):
+    other, seen = BesideByProcess(int), tmp_path / "seen"
+    for number in (1, 2):
+        [answer] = other.begin(partial(append, seen, str(number)))
+        answer.result()
+    other.wake()
+    assert until(lambda: seen.read_text() == "122")
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="processors cannot be chosen on this system")
+def test_the_process_keeps_off_the_processor_that_asks():
+    processors = os.sched_getaffinity(0)
+    if len(processors) < 2:
+        pytest.skip("one processor alone")
+    other = BesideByProcess(int)
+    try:
+        for mine in processors:
+            os.sched_setaffinity(0, {mine})
+            [answer] = other.begin(partial(os.sched_getaffinity, 0))
+            assert answer.result() == processors - {mine}
+    finally:
+        os.sched_setaffinity(0, processors)
+    assert os.sched_getaffinity(0) == processors
 
 
 def test_where_the_process_has_died_the_work_is_done_here():
