@@ -80,14 +80,15 @@ def solve_definite(matrix: NDArray, right: NDArray) -> NDArray:
 
     Raises LinAlgError where the matrix is not positive definite, or so nearly not that rounding decides.
     """
-    solution, definite = _solve_columns(np.ascontiguousarray(matrix), np.ascontiguousarray(right))
+    solution, definite = solve_columns(np.ascontiguousarray(matrix), np.ascontiguousarray(right))
     if not definite:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
     return np.asarray(solution)
 
 
 @njit(error_model="numpy")
-def _solve_columns(matrix, right):
+def solve_columns(matrix, right):
+    """Return the solution for right sides, (size, K), and whether the matrix is positive definite beyond rounding."""
     factor, definite = factorise(matrix, 0.0, _LEAST_PIVOT * matrix[:, 0].max())
     solution = np.empty_like(right)
     for k in range(right.shape[1]):

@@ -43,13 +43,20 @@ def continued_min_snap(start: ArrayLike, waypoints: ArrayLike, times: ArrayLike 
         InputError: two points in a row closer than MIN_SPACING, numbers that are not finite, times that are not
             positive.
     """
-    begin, points = _checked(start, waypoints)
-    spans = centripetal_times(points) if times is None else check_times(points, times)
-    return _fitted(begin, spans, pieces_through(points, spans, start=begin[1:4], rest_end=True))
+    begin, points = check_continued(start, waypoints)
+    return continued_through(begin, points, centripetal_times(points) if times is None else check_times(points, times))
 
 
-def _checked(start: ArrayLike, waypoints: ArrayLike) -> tuple[NDArray, NDArray]:
-    """Return the start, (5, 3), and the points, (K+1, 3), the first of which is the start's."""
+def continued_through(start: NDArray, points: NDArray, times: NDArray) -> Path:
+    """Return the same for a start, points and times of segments, (K,) s, that are checked already."""
+    return _fitted(start, times, pieces_through(points, times, start=start[1:4], rest_end=True))
+
+
+def check_continued(start: ArrayLike, waypoints: ArrayLike) -> tuple[NDArray, NDArray]:
+    """Return the start, (5, 3), and the points, (K+1, 3), the first of which is the start's.
+
+    Raises InputError as continued_min_snap() does.
+    """
     begin, ahead = np.asarray(start, dtype=float), np.asarray(waypoints, dtype=float)
     if begin.shape != (ORDERS, 3) or not np.isfinite(begin).all():
         raise InputError(

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
-from cfplan.geometry.banded import solve_definite
+from cfplan.geometry.banded import solve_columns
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import hermite
 from cfplan.geometry.rest import rest_path, with_rest_ends
+from cfplan.machine_code import njit
 
 MIN_SPACING = 0.01  # m, two waypoints in a row that are closer are one point mistyped
 MIN_DENSE_SPACING = 0.001  # m, the same for lists of points
@@ -135,67 +136,101 @@ def pieces_through(points: NDArray, times: NDArray, start: NDArray | None, rest_
     Segment i goes from points[i] to points[i + 1], (K, 3) m, in times[i], s. `start`, (3, 3), is γ', γ'', γ''' at the
     first point, None where they are free; the end rests or is free.
     """
-    derivatives = _waypoint_derivatives(points, times, start, rest_end)
-    powers = times[:, None] ** np.arange(4)
-    left = np.concatenate([np.zeros((len(times), 1, 3)), derivatives[:-1]], axis=1)  # (K-1, 4, 3)
-    right = np.concatenate([np.diff(points, axis=0)[:, None], derivatives[1:]], axis=1)
-    ends = np.concatenate([left * powers[..., None], right * powers[..., None]], axis=1)
-    table = (_HERMITE @ ends) / times[:, None, None] ** np.arange(8)[:, None]
-    table[:, 0] = points[:-1]  # added last: far from the origin it would cost the short segments their digits
-    return table
-
-
-def _waypoint_derivatives(points: NDArray, times: NDArray, start: NDArray | None, rest_end: bool) -> NDArray:
-    """Return (K, 3, 3), γ', γ'', γ''' at each waypoint with the least snap."""
-    count = len(points)
-    # In units of each segment's time T the energy is a constant matrix; T^-7 and powers of T scale it back.
-    powers = times[:, None] ** np.tile(np.arange(4), 2)
-    energy = _ENERGY * powers[:, :, None] * powers[:, None, :] / times[:, None, None] ** 7
-
-    diagonal = np.zeros((count, 3, 3))
-    diagonal[:-1] += energy[:, 1:4, 1:4]
-    diagonal[1:] += energy[:, 5:8, 5:8]
-    beside = energy[:, 1:4, 5:8]
-    force = np.zeros((count, 3, 3))
-    ends = np.stack([points[:-1] - points[:-1], points[1:] - points[:-1]], axis=1)  # moving a segment costs nothing
-    force[:-1] -= energy[:, 1:4][:, :, [0, 4]] @ ends
-    force[1:] -= energy[:, 5:8][:, :, [0, 4]] @ ends
-
-    first, last = 0 if start is None else 1, count - 1 if rest_end else count
-    solution = np.zeros((count, 3, 3))
+    derivatives = np.zeros((len(points), 3, 3))
     if start is not None:
-        solution[0] = start
-        force[1] -= beside[0].T @ start
-    if last > first:
-        try:
-            solution[first:last] = _solve_block_tridiagonal(
-                diagonal[first:last], beside[first : last - 1], force[first:last]
-            )
-        except np.linalg.LinAlgError:
-            far = int(np.argmax(times))
-            raise InputError(
-                f"from the point before it is {np.linalg.norm(points[far + 1] - points[far]):g} m, others are "
-                f"{np.linalg.norm(np.diff(points, axis=0), axis=1).min():g} m apart: no smooth path joins these",
-                where=f"waypoint {far + 2}",
-                hint="correct the coordinate that slipped, or add points between",
-            ) from None
-    return solution
+        derivatives[0] = start
+    first, last = 0 if start is None else 1, len(points) - 1 if rest_end else len(points)
+    if last > first and not _find_derivatives(derivatives, points, times, first, last, _ENERGY):
+        far = int(np.argmax(times))
+        raise InputError(
+            f"from the point before it is {np.linalg.norm(points[far + 1] - points[far]):g} m, others are "
+            f"{np.linalg.norm(np.diff(points, axis=0), axis=1).min():g} m apart: no smooth path joins these",
+            where=f"waypoint {far + 2}",
+            hint="correct the coordinate that slipped, or add points between",
+        )
+    return np.asarray(_pieces(derivatives, points, times, _HERMITE))
 
 
-def _solve_block_tridiagonal(diagonal: NDArray, beside: NDArray, force: NDArray) -> NDArray:
-    """Solve a symmetric positive definite system of 3 × 3 blocks.
+@njit(error_model="numpy")
+def _find_derivatives(
+    derivatives: NDArray, points: NDArray, times: NDArray, first: int, last: int, unit_energy: NDArray
+) -> bool:
+    """Write γ', γ'', γ''' with the least snap, (K, 3, 3), at waypoints from `first` on, before `last`; others stay.
 
-    The diagonal is (n, 3, 3), the blocks right of it (n-1, 3, 3), the right-hand side `force` (n, 3, 3).
+    Return whether the equations could be solved.
     """
-    count = 3 * len(diagonal)
-    scale = 1.0 / np.sqrt(np.diagonal(diagonal, axis1=1, axis2=2))  # (n, 3)
-    diagonal = diagonal * scale[:, :, None] * scale[:, None, :]
-    beside = beside * scale[:-1, :, None] * scale[1:, None, :]
-    matrix = np.zeros((count, 6))
-    for row in range(3):
-        for column in range(3):
-            if column >= row:
-                matrix[column::3, column - row] = diagonal[:, row, column]
-            matrix[3 + column :: 3, 3 + column - row] = beside[:, row, column]
-    flat = solve_definite(matrix, (force * scale[..., None]).reshape(count, 3))
-    return flat.reshape(-1, 3, 3) * scale[..., None]
+    size = 3 * (last - first)
+    matrix, force = np.zeros((size, 6)), np.zeros((size, 3))
+    power = np.ones(4)
+    for i in range(len(times)):
+        # In units of each segment's time T the energy is a constant matrix; T^-7 and powers of T scale it back.
+        for order in range(1, 4):
+            power[order] = power[order - 1] * times[i]
+        unit = 1.0 / (power[3] * power[3] * times[i])
+        left, right = 3 * (i - first), 3 * (i + 1 - first)
+        left_free, right_free = first <= i, i + 1 < last
+        for a in range(3):
+            for b in range(3):
+                scale = power[a + 1] * power[b + 1] * unit
+                if left_free and a >= b:
+                    matrix[left + a, a - b] += unit_energy[a + 1, b + 1] * scale
+                if right_free and a >= b:
+                    matrix[right + a, a - b] += unit_energy[a + 5, b + 5] * scale
+                beside = unit_energy[a + 5, b + 1] * scale
+                if left_free and right_free:
+                    matrix[right + a, 3 + a - b] += beside
+                elif right_free:  # the left end is given; a right end that is not free rests
+                    for axis in range(3):
+                        force[right + a, axis] -= beside * derivatives[i, b, axis]
+            for axis in range(3):
+                moved = (points[i + 1, axis] - points[i, axis]) * power[a + 1] * unit
+                if left_free:
+                    force[left + a, axis] -= unit_energy[a + 1, 4] * moved
+                if right_free:
+                    force[right + a, axis] -= unit_energy[a + 5, 4] * moved
+    solution, definite = _solve_scaled(matrix, force)
+    for n in range(size):
+        for axis in range(3):
+            derivatives[first + n // 3, n % 3, axis] = solution[n, axis]
+    return definite
+
+
+@njit(error_model="numpy")
+def _solve_scaled(matrix: NDArray, force: NDArray) -> tuple[NDArray, bool]:
+    """Solve with the diagonal scaled to 1; both arrays are changed. Return the solution, and whether there is one."""
+    scale = 1.0 / np.sqrt(matrix[:, 0])
+    for row in range(len(matrix)):
+        for off in range(min(row, matrix.shape[1] - 1) + 1):
+            matrix[row, off] *= scale[row] * scale[row - off]
+        for axis in range(3):
+            force[row, axis] *= scale[row]
+    solution, definite = solve_columns(matrix, force)
+    for row in range(len(matrix)):
+        for axis in range(3):
+            solution[row, axis] *= scale[row]
+    return solution, definite
+
+
+@njit(error_model="numpy")
+def _pieces(derivatives: NDArray, points: NDArray, times: NDArray, hermite: NDArray) -> NDArray:
+    """Return (K-1, 8, 3), the polynomials that join points with these derivatives, each about its left end."""
+    table = np.zeros((len(times), 8, 3))
+    ends = np.zeros(8)
+    for i in range(len(times)):
+        for axis in range(3):
+            ends[4] = points[i + 1, axis] - points[i, axis]
+            power = 1.0
+            for order in range(3):
+                power *= times[i]
+                ends[order + 1] = derivatives[i, order, axis] * power
+                ends[order + 5] = derivatives[i + 1, order, axis] * power
+            power = 1.0
+            for row in range(1, 8):
+                power *= times[i]
+                value = 0.0
+                for column in range(8):
+                    value += hermite[row, column] * ends[column]
+                table[i, row, axis] = value / power
+            # Added last: far from the origin it would cost the short segments their digits.
+            table[i, 0, axis] = points[i, axis]
+    return table

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import CfplanError, InfeasibleError
-from cfplan.geometry.continued import continued_min_snap
+from cfplan.geometry.continued import check_continued, continued_through
 from cfplan.geometry.guides import with_guides
-from cfplan.geometry.min_snap import centripetal_times, min_snap
+from cfplan.geometry.min_snap import centripetal_times, check_times, min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.features import REFERENCE, ScaledLimits, node_features, scaled_limits
@@ -111,8 +111,7 @@ def continue_plan(
     """
     begun, ways = time.perf_counter(), Ways() if ways is None else ways
     joint = joint_at(trajectory, leave)
-    points = np.asarray(waypoints, dtype=float)
-    continued_min_snap(joint.derivatives, points)  # refuses what are no waypoints
+    points = check_continued(joint.derivatives, waypoints)[1][1:]
     check_waypoints(points, limits)
     known = scaled_limits(limits.airframe, limits.plan)
     failure = ""
@@ -222,7 +221,8 @@ def _straight(begins: Sequence[_Begin | None], points: NDArray, times: ArrayLike
     """Return what makes the paths of least snap through the waypoints; first the rest of the path left, if it stays."""
     made: list[_Maker] = []
     if times is not None and begins[0] is not None:
-        made.append(partial(_way, begins[0], points, np.asarray(times, dtype=float)))
+        through = np.concatenate([begins[0].derivatives[:1], points])
+        made.append(partial(_way, begins[0], through, check_times(through, times)))
     for begin, factors in zip(begins[:2], (FIRST_TIMES, FIRST_TIMES_TIMED), strict=True):
         made += _ways(begin, points, factors)
     return made
@@ -247,12 +247,14 @@ def _ways(begin: _Begin | None, points: NDArray, factors: Sequence[float], guide
         rows = [row - 1 for row in at[1:]]
     times = centripetal_times(through)
     ahead = [np.concatenate([[factor * times[0]], times[1:]]) for factor in factors]
-    return [partial(_way, begin, through[1:], each, rows) for each in ahead]
+    return [partial(_way, begin, through, each, rows) for each in ahead]
 
 
 def _way(begin: _Begin, points: NDArray, times: NDArray, rows: Sequence[int] | None = None) -> _Way:
-    """Return the path through points, of which those of the `rows`, or all, are waypoints."""
-    path, reached = continued_min_snap(begin.derivatives, points, times), np.cumsum(times)
+    """Return the path through points, first that where it begins; of the others those of the `rows`, or all, are
+    waypoints.
+    """
+    path, reached = continued_through(begin.derivatives, points, times), np.cumsum(times)
     if begin.before is not None:
         path, reached = begin.before.followed_by(path), reached + begin.before.end
     return _Way(path, begin.state, tuple((reached if rows is None else reached[list(rows)]).tolist()))
