@@ -62,9 +62,9 @@ from cfplan.safety.limits import Limits
 FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 LEARNED_FROM = 15  # plans, by which one knows how long the next may take
-IN_TIME = 0.9  # share of them for which what is taken to be needed was enough: one that comes late is planned again
+IN_TIME = 0.6  # share of them for which what is taken to be needed was enough: one that comes late is planned again
 ALONG_A_WAY = 0.3  # share of plans that take less than those whose first way leads on
-AGAIN = 1.2  # by how much longer than the one before the next one is taken to need where that came late, at least
+AGAIN = 1.15  # by how much longer each time a request is taken to need that came late, and has a known way
 SEARCHING = 1.5  # likewise, where no way has been found by then
 TRIES = 4  # of a request whose proposal comes late
 ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
@@ -292,11 +292,12 @@ class _Worker:
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for tried in range(TRIES):
             begun, held = REAL_CLOCK.now(), self._held
-            if attempt.ways.found is None:  # the ways that are left may be many
-                first, ahead = self._next(lead, SEARCHING**tried * took)
-            else:  # one that is known needs less time than it took to find it
-                ahead = AGAIN**tried * (self._finding + self._checking) - self._left_out / tried + SLACK
+            along = AGAIN**tried * (self._finding + self._checking)
+            if attempt.ways.found is not None:  # it needs less time than it took to find it
+                ahead = along - self._equal[-1] / RATE / tried + SLACK
                 first = self._in_time_for(ahead)
+            else:  # the next is mostly one; if not, the ways that are left may be many
+                first, ahead = self._next(lead, SEARCHING ** (tried - 1) * took if tried > 1 else tried * along)
             made: Replanned | HeldFlight | None
             try:
                 made = self._planned(request, first, part_within(ahead), attempt)
@@ -323,7 +324,6 @@ class _Worker:
             if made.plan is not None:
                 self._planned_in.append(made.plan.seconds)
                 self._checks.append(took - made.plan.seconds)
-                self._equal.append(made.equal)
             sent = _Proposed(made, request, received, begun, proposed)
             if made.stop is not None:
                 answer = self._propose(replace(sent, made=made.stop))
@@ -369,9 +369,15 @@ class _Worker:
             self._requests.send(told)
         return self._held is held
 
-    def _too_late(self, splice: int) -> bool:
-        """Return whether what is planned from a setpoint on, and must be checked still, comes to the pilot too late."""
-        return self._late_by(splice) + self._checking - self._left_out > 0.0
+    def _too_late(self, splice: int, equal: int | None) -> bool:
+        """Return whether what is planned from a setpoint on, and must be checked still, comes to the pilot too late.
+
+        So many setpoints stay `equal`, which is learned; None where that is not known.
+        """
+        if equal is not None:
+            self._equal.append(equal)
+        left_out = self._left_out if equal is None else equal / RATE
+        return self._late_by(splice) + self._checking - left_out > 0.0
 
     def _late_by(self, splice: int) -> float:
         """Return how much too late, s, what is sent now comes to the pilot, where it begins at a setpoint."""

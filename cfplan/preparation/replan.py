@@ -117,7 +117,9 @@ class Replanned:
 class AnswerAttempt:
     """One try to answer a request; another is made where it comes too late, with the ways that are known by then."""
 
-    too_late: Callable[[int], bool]  # whether a plan from a setpoint on, not certified yet, will come too late for it
+    too_late: Callable[[int, int | None], bool]
+    """Whether a plan from a setpoint on, not certified yet, will come too late for it: so many setpoints stay as they
+    are committed, None where that is not known."""
     ways: Ways
     another_waits: Callable[[], bool] = lambda: False  # whether another request will replace what lies far ahead
     too_fast: set[float] = field(default_factory=set)  # m/s, at which it would end badly; written as speeds are tried
@@ -296,7 +298,7 @@ def _replan_within(
                 refused = error
                 if at_once is not None:
                     at_once.too_fast.add(speed)
-                    if at_once.too_late(splice) and speed != speeds[-1]:
+                    if at_once.too_late(splice, None) and speed != speeds[-1]:
                         raise TooLateError("it is to be flown slower", where="request", hint=LATE_HINT) from error
                 break  # slower
             except NoWayError as error:
@@ -326,8 +328,8 @@ def _replan_at(
     joint = (splice + SPLICE_AHEAD) / RATE
     leave, trajectory = joint - held.flown.starts[left], held.flown.trajectories[left]
 
-    def too_late() -> bool:
-        return attempt is not None and attempt.too_late(splice)
+    def too_late(equal: int | None = None) -> bool:
+        return attempt is not None and attempt.too_late(splice, equal)
 
     if leave >= trajectory.duration:
         place = held.flown.at(joint)
@@ -358,10 +360,12 @@ def _replan_at(
             ways=None if attempt is None else attempt.ways, too_late=too_late,
         )  # fmt: skip
         planned, reached = made.plan, made.reached
-    if too_late():
-        raise TooLateError("the plan was not made in time", where="request", hint=LATE_HINT)
     flown = held.flown.continued(joint, planned.trajectory)
     since, starts = flown.since(splice / RATE), snapshots_at(held, splice)
+    if attempt is not None:
+        first = encode_trajectory(since, gains=gains_under(limits), space=limits.space, count=SPLICE_AHEAD)
+        if too_late(_equal(held.commitment, splice, first.payloads)):
+            raise TooLateError("the plan was not made in time", where="request", hint=LATE_HINT)
     if part is None:
         passed = certify_whole(since, limits, starts)
     else:

@@ -250,7 +250,7 @@ def test_a_plan_that_would_end_badly_and_is_late_is_made_slower_at_once_the_next
         return certify(flown, limits, starts)
 
     monkeypatch.setattr(replanning, "certify_whole", ends_badly_if_fast)
-    attempt = AnswerAttempt(lambda splice: late and bool(tried), Ways())
+    attempt = AnswerAttempt(lambda splice, equal: late and bool(tried), Ways())
     far = [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0], [-0.8, -1.8, 1.0]]
     with pytest.raises(TooLateError):
         replan(held, NOW, far, limits, attempt=attempt)
@@ -273,7 +273,7 @@ def test_what_would_end_badly_far_ahead_is_flown_slower_unless_it_will_be_replac
             raise EndsBadlyError("it ends outside", where="link loss")
 
     monkeypatch.setattr(certified_flight, "_foresee_link_loss", foresee)
-    attempt = AnswerAttempt(lambda splice: False, Ways(), lambda: another_waits)
+    attempt = AnswerAttempt(lambda splice, equal: False, Ways(), lambda: another_waits)
     made = replan(held, NOW + 5, FAR, limits, part=PART, attempt=attempt)
     after(held, limits, made)
     speeds = np.linalg.norm(
