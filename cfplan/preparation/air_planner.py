@@ -26,6 +26,7 @@ from cfplan.preparation.replan import (
     pace,
     replan,
     replan_behind_stop,
+    slowed_ahead,
 )
 from cfplan.safety.limits import Limits
 
@@ -163,6 +164,11 @@ def plan_behind_stop(
 def plan_next_part(held: HeldFlight, first: int, limits: Limits, part: int) -> Replanned | HeldFlight:
     """Return the proposal, from setpoint `first` on, of the next part of the plan that is held. Raises as go_on()."""
     return go_on(held, first, limits, part, yaw_angle=float(held.flown.at(held.ends).yaw))
+
+
+def plan_slower(held: HeldFlight, first: int, limits: Limits, part: int, attempt: AnswerAttempt) -> Replanned | None:
+    """Return the proposal, from setpoint `first` on, to fly slower where that must be. As slowed_ahead()."""
+    return slowed_ahead(held, first, limits, part, attempt, yaw_angle=float(held.flown.at(held.ends).yaw))
 
 
 def answer_accepted(

@@ -90,7 +90,7 @@ def certify_beginning(
         believed = as_believed(starts, limits)
         rehearse_setpoints(payloads, limits.airframe, limits.flight, snapshot=believed).require_passed()
 
-    foreseen = [] if whole is None else [partial(_foresee_link_loss, whole, limits, starts)]
+    foreseen = [] if whole is None else [partial(foresee_link_loss, whole, limits, starts)]
     stops, lost = _certified(begun, payloads, limits, starts, check, encoded.motion, foreseen)
     rest = rest_behind(encoded.motion, following, RATE)
     behind = left_of(stop, BEHIND - 1)
@@ -163,7 +163,7 @@ def require_inside(lost: LinkLossMoments, limits: Limits) -> None:
         raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
 
 
-def _foresee_link_loss(payloads: NDArray, limits: Limits, starts: NDArray) -> None:
+def foresee_link_loss(payloads: NDArray, limits: Limits, starts: NDArray) -> None:
     """Raise EndsBadlyError where link loss is foreseen to end outside the walls by far."""
     foreseen = foreseen_link_loss(payloads, limits, starts=starts).worst
     if foreseen.beyond > _FORESEEN:

@@ -1,7 +1,8 @@
 """The planner's process, beside the pilot: it makes certified proposals of what is asked for while the vehicle flies.
 
 It plans from the earliest setpoint that it can make, by how long its last plans took. The latest request wins: one that
-waits is dropped when another comes. It may die, hang or be killed; then the vehicle ends on what is committed.
+waits is dropped when another comes. What a plan leads to far ahead is looked at once its beginning is committed, and
+flown slower where it must be. The planner may die, hang or be killed; then the vehicle ends on what is committed.
 """
 
 import contextlib
@@ -42,6 +43,7 @@ from cfplan.preparation.air_planner import (
     plan_behind_stop,
     plan_next_part,
     plan_request,
+    plan_slower,
     presses,
     wants_more,
 )
@@ -66,6 +68,7 @@ IN_TIME = 0.6  # share of them for which what is taken to be needed was enough: 
 ALONG_A_WAY = 0.3  # share of plans that take less than those whose first way leads on
 AGAIN = 1.15  # by how much longer each time a request is taken to need that came late, and has a known way
 SEARCHING = 1.5  # likewise, where no way has been found by then
+UNHURRIED = 3.0  # times what a plan needs, that one lies ahead which nobody waits for
 TRIES = 4  # of a request whose proposal comes late
 ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
 _GARBAGE = 100_000  # objects, after which it is looked through in any case
@@ -187,6 +190,7 @@ class _Worker:
         self._busy = False  # whether something was done since garbage was looked for
         self._proposed: _Proposed | None = None
         self._accepted = 0  # number of the request whose plan is flown
+        self._unforeseen = 0  # how often it may be tried still to look far ahead on that
 
     @property
     def _middle(self) -> list[tuple[float, ...]]:
@@ -222,7 +226,7 @@ class _Worker:
 
     def _serve_next(self) -> PathAnswer | None:
         """Wait for something to do, and do it; return what there is to tell."""
-        if self._waiting is None and not self._wants_more():
+        if self._waiting is None and not self._wants_more() and not self._unforeseen:
             if self._busy:
                 gc.collect()
             self._busy = False
@@ -232,7 +236,7 @@ class _Worker:
         if self._wants_more() and (self._waiting is None or presses(self._held, *self._next(self._plans))):
             return self._go_on() if self._proposed is None else self._settle()
         if self._waiting is None:
-            return None
+            return self._foresee() if self._unforeseen and self._proposed is None else None
         (request, since), self._waiting = self._waiting, None
         self._pressed = since < self._done
         answer = self._answer(request, since)
@@ -288,7 +292,7 @@ class _Worker:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
         if not self._pressed:
             beside().wake()
-        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), self._another_waits)
+        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), foresee=False)
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for tried in range(TRIES):
             begun, held = REAL_CLOCK.now(), self._held
@@ -424,6 +428,26 @@ class _Worker:
         answer = self._propose(_Proposed(made, None))
         return None if answer is None else self._gone_on(made, answer)
 
+    def _foresee(self) -> PathAnswer | None:
+        """Look far ahead on the plan that is flown, and propose to fly slower where it must be; as _go_on()."""
+        self._unforeseen -= 1
+        first, ahead = self._next(self._plans, UNHURRIED * (self._finding + self._checking))
+        try:
+            made = plan_slower(
+                self._held, first, self._limits, part_within(ahead), AnswerAttempt(self._too_late, Ways())
+            )
+        except TooLateError:
+            return None
+        except Exception:  # what is committed stays; its next part is certified in any case, and says so if it fails
+            made = None
+        if made is None or self._waiting is not None:
+            self._unforeseen = 0
+            return None
+        answer = self._propose(_Proposed(made, None))
+        if answer is None or answer.commitment is None:
+            return None
+        return answer_changed(self._accepted, made)
+
     def _gone_on(self, made: Replanned, answer: PilotAnswer) -> PathAnswer | None:
         """Return what there is to tell of the next part of a plan that the pilot has answered."""
         if answer.commitment is not None:
@@ -479,6 +503,8 @@ class _Worker:
         """Take the pilot's answer to a proposal."""
         proposed, self._proposed = self._proposed, None
         assert proposed is not None
+        if answer.commitment is not None and made.plan is not None:
+            self._unforeseen = TRIES if proposed.request is not None else 0
         if proposed.before is not None:  # nobody waits for it
             self._plans.note(max(answer.came, proposed.proposed) - proposed.begun, made.equal / RATE)
             told = self._outcome(proposed, answer)

@@ -41,6 +41,7 @@ from cfplan.preparation.certified_flight import (
     EndsBadlyError,
     certify_beginning,
     certify_whole,
+    foresee_link_loss,
     meet_gaps,
     require_inside,
 )
@@ -121,7 +122,7 @@ class AnswerAttempt:
     """Whether a plan from a setpoint on, not certified yet, will come too late for it: so many setpoints stay as they
     are committed, None where that is not known."""
     ways: Ways
-    another_waits: Callable[[], bool] = lambda: False  # whether another request will replace what lies far ahead
+    foresee: bool = True  # whether link loss far ahead counts at once; else it is for slowed_ahead() to look at that
     too_fast: set[float] = field(default_factory=set)  # m/s, at which it would end badly; written as speeds are tried
 
 
@@ -228,6 +229,27 @@ def go_on(
             following = certify_beginning(since, part, limits, starts, foresee=False)
             return _proposed(held, splice, following, None, math.nan)
     return _replan_within(held, splice, np.empty((0, 3)), limits, True, yaw_angle, part)
+
+
+def slowed_ahead(
+    held: HeldFlight, splice: int, limits: Limits, part: int, attempt: AnswerAttempt, *, yaw_angle: float = 0.0
+) -> Replanned | None:
+    """Return the proposal to fly slower from setpoint `splice` on, where link loss is foreseen to end badly far ahead.
+
+    None where it is not, where it is flown as slowly as may be, and where all of the plan is committed by then, as all
+    of that is certified. Raises as replan() does; then no slower plan passes either.
+    """
+    fastest = min(held.speed, limits.plan.speed)
+    if held.stops_from is None or splice >= held.stops_from or limits.link_loss.only_warn or fastest <= SLOWER[-1]:
+        return None
+    ahead = held.stops_from - 1  # what is before that is certified
+    encoded = _encoded_from(held, ahead, limits)
+    try:
+        foresee_link_loss(encoded.payloads, limits, snapshots_at(held, ahead))
+    except EndsBadlyError:
+        attempt.too_fast.add(fastest)
+        return _replan_within(held, splice, np.empty((0, 3)), limits, True, yaw_angle, part, attempt)
+    return None
 
 
 def given_up(held: HeldFlight, limits: Limits) -> HeldFlight:
@@ -369,8 +391,7 @@ def _replan_at(
     if part is None:
         passed = certify_whole(since, limits, starts)
     else:
-        foresee = attempt is None or not attempt.another_waits()
-        passed = certify_beginning(since, part, limits, starts, foresee=foresee)
+        passed = certify_beginning(since, part, limits, starts, foresee=attempt is None or attempt.foresee)
     return _proposed(replace(held, flown=flown, ahead=points, reached=reached), splice, passed, planned, joint)
 
 

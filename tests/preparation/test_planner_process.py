@@ -30,7 +30,7 @@ from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
 from cfplan.preparation.air_planner import SLACK, PathAnswer, PathRequest, PathVerdict, Wish
-from cfplan.preparation.planner_process import LEARNED_FROM, AirPlanner, _Lead, _Worker
+from cfplan.preparation.planner_process import IN_TIME, LEARNED_FROM, AirPlanner, _Lead, _Worker
 from cfplan.preparation.replan import hold, replan
 
 LATE = 1.5  # s, longer than a planner waits for an answer
@@ -332,6 +332,7 @@ def test_how_far_ahead_is_planned_follows_how_long_plans_took():
     lead = _Lead(1.0)
     for number in range(LEARNED_FROM):
         lead.note(0.020 + 0.001 * number)
-    assert 0.030 < lead.ahead() < lead.ahead(1.0) == pytest.approx(0.034 + SLACK)
+    assert lead.ahead() == pytest.approx(0.020 + IN_TIME * 0.014 + SLACK)
+    assert lead.ahead() < lead.ahead(1.0) == pytest.approx(0.034 + SLACK)
     lead.note(0.5, 0.45)  # it took long, but began where nothing changed for as long
     assert lead.ahead(1.0) == pytest.approx(0.050 + SLACK)

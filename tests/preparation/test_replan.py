@@ -29,6 +29,7 @@ from cfplan.preparation.replan import (
     hold_hover,
     replan,
     replan_behind_stop,
+    slowed_ahead,
     snapshots_at,
 )
 from cfplan.safety.certificate import certify
@@ -260,27 +261,67 @@ def test_a_plan_that_would_end_badly_and_is_late_is_made_slower_at_once_the_next
     assert made.plan is not None
 
 
-@pytest.mark.parametrize("another_waits", [False, True])
-def test_what_would_end_badly_far_ahead_is_flown_slower_unless_it_will_be_replaced(
-    held, limits, monkeypatch, another_waits
-):
-    """Link loss is foreseen to end outside only in plans faster than 1.3 m/s; the first part is certified anyway."""
-    foreseen = []
+FAST = 1.3  # m/s, faster than which link loss far ahead is foreseen to end outside in the next two tests
+
+
+def in_time(splice, equal):
+    return False
+
+
+@pytest.fixture
+def foreseen(monkeypatch):
+    """Return the highest speed, m/s, of each flight that was looked at from 2 s on."""
+    speeds = []
 
     def foresee(payloads, limits, starts):
-        foreseen.append(np.linalg.norm(decode(payloads).velocity, axis=1)[200:].max())
-        if foreseen[-1] > 1.3:
+        speeds.append(np.linalg.norm(decode(payloads).velocity, axis=1)[150:].max())
+        if speeds[-1] > FAST:
             raise EndsBadlyError("it ends outside", where="link loss")
 
-    monkeypatch.setattr(certified_flight, "_foresee_link_loss", foresee)
-    attempt = AnswerAttempt(lambda splice, equal: False, Ways(), lambda: another_waits)
-    made = replan(held, NOW + 5, FAR, limits, part=PART, attempt=attempt)
+    for module in (certified_flight, replanning):
+        monkeypatch.setattr(module, "foresee_link_loss", foresee)
+    return speeds
+
+
+def fastest_after(made, seconds=2.0):
+    times = np.arange(seconds, made.plan.trajectory.duration, 0.02)
+    return np.linalg.norm(made.plan.trajectory.at(times).velocity, axis=1).max()
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_what_would_end_badly_far_ahead_is_flown_slower_at_once_or_later(held, limits, foreseen, at_once):
+    """The first part is certified in any case."""
+    made = replan(held, NOW + 5, FAR, limits, part=PART, attempt=AnswerAttempt(in_time, Ways(), foresee=at_once))
     after(held, limits, made)
-    speeds = np.linalg.norm(
-        made.plan.trajectory.at(np.arange(2.0, made.plan.trajectory.duration, 0.02)).velocity, axis=1
-    )
-    assert bool(speeds.max() > 1.3) is another_waits
-    assert len(foreseen) == (0 if another_waits else 2)
+    assert bool(fastest_after(made) < FAST) is at_once
+    assert len(foreseen) == (2 if at_once else 0)
+
+
+def test_what_is_committed_is_flown_slower_before_it_would_end_badly(held, limits, foreseen):
+    made = replan(held, NOW + 5, FAR, limits, part=PART, attempt=AnswerAttempt(in_time, Ways(), foresee=False))
+    fast = after(held, limits, made)
+    slower = slowed_ahead(fast, NOW + 20, limits, PART, AnswerAttempt(in_time, Ways()))
+    assert slower.joint > made.joint
+    assert fastest_after(slower) < FAST < fastest_after(made)
+    slow = after(fast, limits, slower, NOW + 15)
+    np.testing.assert_allclose(slow.ahead, FAR)
+    assert len(foreseen) == 2
+    assert slowed_ahead(slow, NOW + 30, limits, PART, AnswerAttempt(in_time, Ways())) is None
+    assert slowed_ahead(held, NOW + 30, limits, PART, AnswerAttempt(in_time, Ways())) is None  # all of it is certified
+    assert len(foreseen) == 3
+
+
+def test_what_ends_badly_far_ahead_however_slowly_it_is_flown_is_refused(held, limits, monkeypatch):
+    made = replan(held, NOW + 5, FAR, limits, part=PART, attempt=AnswerAttempt(in_time, Ways(), foresee=False))
+    fast = after(held, limits, made)
+
+    def foresee(*_):
+        raise EndsBadlyError("it ends outside", where="link loss")
+
+    for module in (certified_flight, replanning):
+        monkeypatch.setattr(module, "foresee_link_loss", foresee)
+    with pytest.raises(EndsBadlyError):
+        slowed_ahead(fast, NOW + 20, limits, PART, AnswerAttempt(in_time, Ways()))
 
 
 def test_a_part_that_comes_too_late_goes_on_from_rest(held, limits):
