@@ -124,7 +124,7 @@ def continue_plan(
         lambda: _guided(begins[:2], points, FIRST_TIMES_GUIDED),
     )
     for number, way in islice(_sound(kinds, limits, known, ways), MOST_TRIES):
-        if ways.failed and too_late():
+        if ways.failed and number != ways.found and too_late():
             raise TooLateError("no way has been found in time", where="request", hint=LATE_HINT)
         task = PlanningTask(
             way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,

@@ -256,7 +256,7 @@ class _Worker:
         """Return the setpoint from which on one may plan who needs so long, s."""
         assert self._begun is not None
         arrives = REAL_CLOCK.now() - self._begun + ahead
-        return math.ceil((arrives + LOOKS_UNTIL) * RATE) - 1 + LEAST_AHEAD
+        return max(math.ceil((arrives + LOOKS_UNTIL) * RATE) - 1 + LEAST_AHEAD, self._held.begin)
 
     def _read(self, patience: float) -> PilotAnswer | None:
         """Take what has come; return the pilot's answer to a proposal if there is one, waiting for it if asked to.
@@ -301,7 +301,7 @@ class _Worker:
                 ahead = along - self._equal[-1] / RATE / tried + SLACK
                 first = self._in_time_for(ahead)
             else:  # the next is mostly one; if not, the ways that are left may be many
-                first, ahead = self._next(lead, SEARCHING ** (tried - 1) * took if tried > 1 else tried * along)
+                first, ahead = self._next(lead, SEARCHING ** (tried - 2) * took if tried > 1 else tried * along)
             made: Replanned | HeldFlight | None
             try:
                 made = self._planned(request, first, part_within(ahead), attempt)
