@@ -440,13 +440,12 @@ class _Worker:
             return None
         except Exception:  # what is committed stays; its next part is certified in any case, and says so if it fails
             made = None
-        if made is None or self._waiting is not None:
+        if made is None:
             self._unforeseen = 0
+        if made is None or self._another_waits():
             return None
         answer = self._propose(_Proposed(made, None))
-        if answer is None or answer.commitment is None:
-            return None
-        return answer_changed(self._accepted, made)
+        return None if answer is None or answer.commitment is None else answer_changed(self._accepted, made)
 
     def _gone_on(self, made: Replanned, answer: PilotAnswer) -> PathAnswer | None:
         """Return what there is to tell of the next part of a plan that the pilot has answered."""

@@ -29,12 +29,16 @@ from cfplan.flight.setpoints.encoding import LEAD, RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
+from cfplan.preparation import certified_flight
+from cfplan.preparation import replan as replanning
 from cfplan.preparation.air_planner import SLACK, PathAnswer, PathRequest, PathVerdict, Wish
+from cfplan.preparation.certified_flight import EndsBadlyError
 from cfplan.preparation.planner_process import IN_TIME, LEARNED_FROM, AirPlanner, _Lead, _Worker
 from cfplan.preparation.replan import hold, replan
 
 LATE = 1.5  # s, longer than a planner waits for an answer
 NOT_FLOWN = "the plan is not flown yet"
+FAR = ((-0.5, 0.8, 1.0), (0.5, 2.0, 1.0), (-0.8, 0.4, 1.2), (0.8, -1.5, 0.9), (-0.8, 1.5, 1.0), (0.0, -2.0, 1.0))
 WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
 
 
@@ -276,6 +280,49 @@ def refused(pilot: PilotSide, proposal: Proposal) -> bool:
     return True
 
 
+def test_what_ends_badly_far_ahead_is_accepted_and_flown_slower_soon(held, limits, monkeypatch):
+    """Link loss is foreseen to end outside where the vehicle is fast 1 s or more behind what is certified."""
+    (main, requests), (theirs, ours) = multiprocessing.Pipe(), multiprocessing.Pipe()
+    worker, pilot = _Worker(held, limits, requests, ours), PilotSide(held.commitment, limits, theirs)
+    worker.warm_up()
+
+    def foresee(payloads, limits, starts):
+        if np.linalg.norm(decode(payloads).velocity, axis=1)[100:].max(initial=0.0) > 1.3:
+            raise EndsBadlyError("it ends outside", where="link loss")
+
+    for module in (certified_flight, replanning):
+        monkeypatch.setattr(module, "foresee_link_loss", foresee)
+
+    def serve() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            worker.serve()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    pilot.begin()
+    assert until(lambda: worker._begun is not None)
+    main.send(PathRequest(1, Wish.REPLACE, FAR))
+    answers: list[PathAnswer] = []
+
+    def both_are_told() -> bool:
+        pilot.tick()
+        while main.poll():
+            answers.append(main.recv())
+        return len(answers) == 2
+
+    assert until(both_are_told)
+    main.close()
+    theirs.close()
+    thread.join()
+    assert [(each.number, each.verdict) for each in answers] == [(1, PathVerdict.ACCEPTED), (1, PathVerdict.CHANGED)]
+    first, slower = (fastest(each.plan.trajectory, 2.0) for each in answers)
+    assert slower < 1.3 < first
+
+
+def fastest(trajectory, begin):
+    return np.linalg.norm(trajectory.at(np.arange(begin, trajectory.duration, 0.02)).velocity, axis=1).max()
+
+
 def test_a_fault_in_planning_is_an_answer_and_what_is_held_stays(held, limits):
     """The process would else be gone for the rest of the flight."""
     (_main, requests), (pilot, proposals) = multiprocessing.Pipe(), multiprocessing.Pipe()
@@ -292,14 +339,13 @@ def test_what_is_committed_far_ahead_of_the_vehicle_is_replaced_from_near(both):
     """A plan is committed in parts, the last of them long before it is flown; then another one replaces it."""
     planner, pilot = both
     begin(planner, pilot)
-    far = [(-0.5, 0.8, 1.0), (0.5, 2.0, 1.0), (-0.8, 0.4, 1.2), (0.8, -1.5, 0.9), (-0.8, 1.5, 1.0), (0.0, -2.0, 1.0)]
-    first = answer_to(planner.request(Wish.REPLACE, far), planner, pilot)
+    first = answer_to(planner.request(Wish.REPLACE, FAR), planner, pilot)
     assert first.verdict is PathVerdict.ACCEPTED, first
 
     def all_of_it() -> bool:
         pilot.tick()
         end = decode(pilot.commitment.payloads[-1:]).position[0]
-        return bool(np.abs(end - far[-1]).max() < 2e-3)
+        return bool(np.abs(end - FAR[-1]).max() < 2e-3)
 
     assert until(all_of_it)
     ends = len(pilot.commitment.payloads) / RATE
