@@ -46,15 +46,20 @@ def other(request):
     return request.param()
 
 
+def children():
+    """Return the processes beside; other tests may have left others."""
+    return [child for child in multiprocessing.active_children() if child.name == "beside"]
+
+
 def the_child():
-    [child] = multiprocessing.active_children()
+    [child] = children()
     return child
 
 
 @pytest.fixture(autouse=True)
 def _no_process_stays():
     yield
-    for child in multiprocessing.active_children():
+    for child in children():
         child.kill()
         child.join()
 
