@@ -350,8 +350,8 @@ def _replan_at(
     joint = (splice + SPLICE_AHEAD) / RATE
     leave, trajectory = joint - held.flown.starts[left], held.flown.trajectories[left]
 
-    def too_late(equal: int | None = None) -> bool:
-        return attempt is not None and attempt.too_late(splice, equal)
+    def too_late() -> bool:
+        return attempt is not None and attempt.too_late(splice, None)
 
     if leave >= trajectory.duration:
         place = held.flown.at(joint)
@@ -386,7 +386,7 @@ def _replan_at(
     since, starts = flown.since(splice / RATE), snapshots_at(held, splice)
     if attempt is not None:
         first = encode_trajectory(since, gains=gains_under(limits), space=limits.space, count=SPLICE_AHEAD)
-        if too_late(_equal(held.commitment, splice, first.payloads)):
+        if attempt.too_late(splice, _equal(held.commitment, splice, first.payloads)):
             raise TooLateError("the plan was not made in time", where="request", hint=LATE_HINT)
     if part is None:
         passed = certify_whole(since, limits, starts)

@@ -5,7 +5,9 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
+from multiprocessing.connection import Connection
 
 import numpy as np
 import psutil
@@ -239,6 +241,37 @@ def test_of_the_stops_within_a_stop_only_that_is_sent(held, limits):
     assert Proposal.of_bytes(few) is None  # it would ask for any memory
 
 
+@contextlib.contextmanager
+def served(worker: _Worker, main: Connection, pilot: Connection) -> Iterator[None]:
+    """Let a thread do the worker's work until the ends of the main process and the pilot are closed."""
+
+    def serve() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            worker.serve()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield
+    finally:
+        main.close()
+        pilot.close()
+        thread.join()
+
+
+def two_answers(main: Connection, pilot: PilotSide) -> list[PathAnswer]:
+    answers: list[PathAnswer] = []
+
+    def both_are_told() -> bool:
+        pilot.tick()
+        while main.poll():
+            answers.append(main.recv())
+        return len(answers) == 2
+
+    assert until(both_are_told)
+    return answers
+
+
 @pytest.mark.parametrize("accepted", [True, False])
 def test_another_request_is_planned_while_the_pilot_looks_at_the_last_proposal(held, limits, accepted):
     (main, requests), (theirs, ours) = multiprocessing.Pipe(), multiprocessing.Pipe()
@@ -251,25 +284,8 @@ def test_another_request_is_planned_while_the_pilot_looks_at_the_last_proposal(h
     if not accepted:
         assert until(lambda: (proposal := pilot.proposals.newest()) is not None and refused(pilot, proposal))
 
-    def serve() -> None:
-        with contextlib.suppress(EOFError, OSError):
-            worker.serve()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    answers: list[PathAnswer] = []
-
-    def both_are_answered() -> bool:
-        pilot.tick()
-        while main.poll():
-            answers.append(main.recv())
-        return len(answers) == 2
-
-    assert until(both_are_answered)
-    main.close()
-    theirs.close()
-    thread.join()
-    first, second = answers
+    with served(worker, main, theirs):
+        first, second = two_answers(main, pilot)
     assert (first.number, first.verdict) == (1, PathVerdict.ACCEPTED if accepted else PathVerdict.REFUSED), first
     assert (second.number, second.verdict) == (2, PathVerdict.ACCEPTED), second
     assert worker._held.commitment.checksum == pilot.commitment.checksum
@@ -293,27 +309,11 @@ def test_what_ends_badly_far_ahead_is_accepted_and_flown_slower_soon(held, limit
     for module in (certified_flight, replanning):
         monkeypatch.setattr(module, "foresee_link_loss", foresee)
 
-    def serve() -> None:
-        with contextlib.suppress(EOFError, OSError):
-            worker.serve()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    pilot.begin()
-    assert until(lambda: worker._begun is not None)
-    main.send(PathRequest(1, Wish.REPLACE, FAR))
-    answers: list[PathAnswer] = []
-
-    def both_are_told() -> bool:
-        pilot.tick()
-        while main.poll():
-            answers.append(main.recv())
-        return len(answers) == 2
-
-    assert until(both_are_told)
-    main.close()
-    theirs.close()
-    thread.join()
+    with served(worker, main, theirs):
+        pilot.begin()
+        assert until(lambda: worker._begun is not None)
+        main.send(PathRequest(1, Wish.REPLACE, FAR))
+        answers = two_answers(main, pilot)
     assert [(each.number, each.verdict) for each in answers] == [(1, PathVerdict.ACCEPTED), (1, PathVerdict.CHANGED)]
     first, slower = (fastest(each.plan.trajectory, 2.0) for each in answers)
     assert slower < 1.3 < first
