@@ -65,9 +65,7 @@ FIRST_TIME = 1.0  # s that a plan is taken to need before any was made
 FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 LEARNED_FROM = 15  # plans, by which one knows how long the next may take
 IN_TIME = 0.6  # share of them for which what is taken to be needed was enough: one that comes late is planned again
-ALONG_A_WAY = 0.3  # share of plans that take less than those whose first way leads on
 AGAIN = 1.15  # by how much longer each time a request is taken to need that came late, and has a known way
-SEARCHING = 1.5  # likewise, where no way has been found by then
 UNHURRIED = 3.0  # times what a plan needs, that one lies ahead which nobody waits for
 TRIES = 4  # of a request whose proposal comes late
 ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
@@ -180,9 +178,12 @@ class _Worker:
         self._held, self._limits, self._requests, self._pilot = held, limits, requests, pilot
         self._begun: float | None = None  # s, when setpoint 0 was due
         self._plans, self._stops, self._parts = _Lead(FIRST_TIME), _Lead(FIRST_STOP), _Lead(FIRST_STOP)
-        self._planned_in: deque[float] = deque([0.0], maxlen=LEARNED_FROM)  # s of plans, with their searches
+        self._planned_in: deque[float] = deque([0.0], maxlen=LEARNED_FROM)  # s of plans, once a way was known
         self._checks: deque[float] = deque([0.0], maxlen=LEARNED_FROM)  # s from a plan to its proposal
         self._equal: deque[int] = deque([0], maxlen=LEARNED_FROM)  # setpoints that proposals left out as equal
+        # When last asked whether something comes too late, s: what was to be done still, by how much later than where
+        # it might it begins, as setpoints before are equal.
+        self._to_do = self._left_out = 0.0
         self._waiting: tuple[PathRequest, float] | None = None
         self._asked = -math.inf  # s, when the last request came
         self._pressed = False  # whether requests come faster than they can be planned
@@ -296,17 +297,17 @@ class _Worker:
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for tried in range(TRIES):
             begun, held = REAL_CLOCK.now(), self._held
-            along = AGAIN**tried * (self._finding + self._checking)
+            along = AGAIN**tried * (self._planning + self._checking)
             if attempt.ways.found is not None:  # it needs less time than it took to find it
-                ahead = along - self._equal[-1] / RATE / tried + SLACK
+                ahead = along + SLACK
                 first = self._in_time_for(ahead)
-            else:  # the next is mostly one; if not, the ways that are left may be many
-                first, ahead = self._next(lead, SEARCHING ** (tried - 2) * took if tried > 1 else tried * along)
+            else:
+                first, ahead = self._next(lead, AGAIN * took)
             made: Replanned | HeldFlight | None
             try:
                 made = self._planned(request, first, part_within(ahead), attempt)
             except TooLateError as error:
-                took = REAL_CLOCK.now() - begun + self._checking
+                took = REAL_CLOCK.now() - begun + self._to_do
                 lead.note(took, self._left_out)
                 reason = str(error)
                 continue
@@ -326,7 +327,7 @@ class _Worker:
                 self._held = made
                 return answer_held(request, made)
             if made.plan is not None:
-                self._planned_in.append(made.plan.seconds)
+                self._planned_in.append(made.plan.seconds - attempt.ways.searched)
                 self._checks.append(took - made.plan.seconds)
             sent = _Proposed(made, request, received, begun, proposed)
             if made.stop is not None:
@@ -376,12 +377,16 @@ class _Worker:
     def _too_late(self, splice: int, equal: int | None) -> bool:
         """Return whether what is planned from a setpoint on, and must be checked still, comes to the pilot too late.
 
-        So many setpoints stay `equal`, which is learned; None where that is not known.
+        So many setpoints stay `equal`, which is learned; None where that is not known, as it must be planned still.
         """
-        if equal is not None:
+        self._to_do = self._checking
+        if equal is None:
+            self._to_do += self._planning
+            self._left_out = float(np.median(self._equal)) / RATE
+        else:
             self._equal.append(equal)
-        left_out = self._left_out if equal is None else equal / RATE
-        return self._late_by(splice) + self._checking - left_out > 0.0
+            self._left_out = equal / RATE
+        return self._late_by(splice) + self._to_do > self._left_out
 
     def _late_by(self, splice: int) -> float:
         """Return how much too late, s, what is sent now comes to the pilot, where it begins at a setpoint."""
@@ -390,19 +395,14 @@ class _Worker:
         return REAL_CLOCK.now() + ON_THE_WAY - looks_until
 
     @property
-    def _finding(self) -> float:
-        """Return how long the plan along a way takes, s, with no search before it."""
-        return float(np.quantile(self._planned_in, ALONG_A_WAY))
+    def _planning(self) -> float:
+        """Return how long the plan along a way takes, s."""
+        return float(np.median(self._planned_in))
 
     @property
     def _checking(self) -> float:
         """Return how long the checks of a plan take, s."""
         return float(np.median(self._checks))
-
-    @property
-    def _left_out(self) -> float:
-        """Return by how much later than where they might most proposals begin, s, as setpoints before are equal."""
-        return float(np.median(self._equal)) / RATE
 
     def _planned(self, request: PathRequest, first: int, part: int, attempt: AnswerAttempt) -> Replanned | HeldFlight:
         """Return what is to be proposed, from rest where no plan leads there from the motion."""
@@ -431,7 +431,7 @@ class _Worker:
     def _foresee(self) -> PathAnswer | None:
         """Look far ahead on the plan that is flown, and propose to fly slower where it must be; as _go_on()."""
         self._unforeseen -= 1
-        first, ahead = self._next(self._plans, UNHURRIED * (self._finding + self._checking))
+        first, ahead = self._next(self._plans, UNHURRIED * (self._planning + self._checking))
         try:
             made = plan_slower(
                 self._held, first, self._limits, part_within(ahead), AnswerAttempt(self._too_late, Ways())

@@ -52,7 +52,11 @@ from cfplan.vehicle.hover import hover_at
 from cfplan.vehicle.joint import JoinedTrajectory
 
 SLOWER = (1.2, 0.7)  # m/s, at which a flight is tried that would end badly at full speed
-LATER = (0, 15, 35)  # setpoints by which the vehicle may fly on before it turns off, where it cannot do so at once
+# Setpoints by which the vehicle may fly on before it turns off, where it cannot do so at once. Where waypoints ahead
+# stay, a little later only ways lead on that lose more time than waiting does.
+LATER, LATER_KEEPING = (0, 3, 8, 15, 35), (0, 15, 35)
+NEARBY = 3  # setpoints of that, within which the ways that are known count
+SOON = 3  # setpoints by which the vehicle slows down later than the next part needs, which was planned in vain by then
 LEAST_SPEED = 0.2  # m/s, to which requests may lower the speed
 PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
 LOOKS_BACK = math.ceil(RATE_LEAD * RATE)  # setpoints before one, of whose motion it is made too
@@ -215,20 +219,30 @@ def go_on(
 ) -> Replanned | HeldFlight:
     """Return the proposal of the next part of a plan that is committed in parts, for one who plans from `splice` on.
 
-    Where that would end badly, the vehicle flies slower from there on. Where it stops by then, as this comes too late,
-    it goes on from rest; where it rests there as all was flown, that is held and nothing need be proposed. Raises as
-    replan() does; then it rests behind the last part.
+    Where that would end badly, the vehicle flies slower, from soon on if that helps, else from the part on. Where it
+    stops by then, as this comes too late, it goes on from rest; where it rests there as all was flown, that is held and
+    nothing need be proposed. Raises as replan() does; then it rests behind the last part.
     """
     held = at_rest_from(held, splice, limits)
     if not held.unfinished:
         return held
+    nothing_more = np.empty((0, 3))
     if held.stops_from is not None:
-        splice = held.stops_from - 1  # what is before that is committed already
-        since, starts = held.flown.since(splice / RATE), snapshots_at(held, splice)
+        ahead = held.stops_from - 1  # what is before that is committed already
+        since, starts = held.flown.since(ahead / RATE), snapshots_at(held, ahead)
         with suppress(EndsBadlyError, NotCertifiedError):
             following = certify_beginning(since, part, limits, starts, foresee=False)
-            return _proposed(held, splice, following, None, math.nan)
-    return _replan_within(held, splice, np.empty((0, 3)), limits, True, yaw_angle, part)
+            return _proposed(held, ahead, following, None, math.nan)
+        with suppress(InfeasibleError, NotCertifiedError):  # the sooner it slows down the better
+            soon, slower = min(splice + SOON, ahead), _slower(held, limits)
+            return _replan_within(held, soon, nothing_more, limits, True, yaw_angle, part, slower)
+        splice = ahead
+    return _replan_within(held, splice, nothing_more, limits, True, yaw_angle, part)
+
+
+def _slower(held: HeldFlight, limits: Limits) -> AnswerAttempt:
+    """Return the attempt that leaves out the speed at which the plan is flown."""
+    return AnswerAttempt(lambda splice, equal: False, Ways(), too_fast={min(held.speed, limits.plan.speed)})
 
 
 def slowed_ahead(
@@ -310,11 +324,11 @@ def _replan_within(
     speeds = (fastest, *(slower for slower in SLOWER if slower < fastest))
     refused: InfeasibleError | None = None
     for speed in [one for one in speeds[:-1] if attempt is None or one not in attempt.too_fast] + [speeds[-1]]:
-        for later in LATER:
+        for later in LATER_KEEPING if keep else LATER:
             if later and held.stops_from is not None and splice + later >= held.stops_from:
                 break
             try:
-                at_once = None if later else attempt  # ways are known of that alone
+                at_once = attempt if later <= NEARBY else None
                 return _replan_at(speed, held, splice + later, points, limits, keep, yaw_angle, part, at_once)
             except EndsBadlyError as error:
                 refused = error

@@ -324,6 +324,22 @@ def test_what_ends_badly_far_ahead_however_slowly_it_is_flown_is_refused(held, l
         slowed_ahead(fast, NOW + 20, limits, PART, AnswerAttempt(in_time, Ways()))
 
 
+def test_where_the_next_part_would_end_badly_the_vehicle_slows_down_before_it(held, limits, monkeypatch):
+    made = replan(held, NOW + 5, FAR, limits, part=PART)
+    fast = after(held, limits, made)
+
+    def certify(flown, *given, **options):
+        if flown.trajectories[-1] is made.plan.trajectory:
+            raise EndsBadlyError("it ends outside", where="link loss")
+        return certified_flight.certify_beginning(flown, *given, **options)
+
+    monkeypatch.setattr(replanning, "certify_beginning", certify)
+    slower = go_on(fast, NOW + 20, limits, PART)
+    assert slower.joint < fast.stops_from / RATE
+    assert fastest_after(slower) < fastest_after(made)
+    np.testing.assert_allclose(after(fast, limits, slower, NOW + 15).ahead, FAR)
+
+
 def test_a_part_that_comes_too_late_goes_on_from_rest(held, limits):
     made = replan(held, NOW + 5, FAR, limits, part=PART)
     first = after(held, limits, made)
