@@ -82,6 +82,7 @@ class Ways:
     found: tuple[int, int] | None = None
     failed: set[tuple[int, int]] = field(default_factory=set)
     searched: float = 0.0  # s that it took to find it
+    only: bool = False  # whether no other way is tried than the one found
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,6 +291,8 @@ def _sound(
         maker = makers[first[1]] if first[1] < len(makers) else None
         if maker is not None and not _unsound((way := maker()).path, limits):
             yield first, way
+    if ways.only:
+        return
     for kind, make in enumerate(kinds):
         tried = {k for at, k in ways.failed | ({first} if first else set()) if at == kind}
         fastest_first = sorted(_made(make(), tried), key=lambda each: _least_time(each[1].path, known))

@@ -293,7 +293,7 @@ class _Worker:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
         if not self._pressed:
             beside().wake()
-        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), foresee=False)
+        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), self._in_time, foresee=False)
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for tried in range(TRIES):
             begun, held = REAL_CLOCK.now(), self._held
@@ -387,6 +387,10 @@ class _Worker:
             self._equal.append(equal)
             self._left_out = equal / RATE
         return self._late_by(splice) + self._to_do > self._left_out
+
+    def _in_time(self) -> int:
+        """Return the number of the first setpoint that is in time for a plan that is made and must be checked."""
+        return self._in_time_for(AGAIN * self._checking + SLACK)
 
     def _late_by(self, splice: int) -> float:
         """Return how much too late, s, what is sent now comes to the pilot, where it begins at a setpoint."""

@@ -12,11 +12,12 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
+from cfplan.errors import CfplanError, InfeasibleError, InputError, NotCertifiedError
 from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, propose
 from cfplan.flight.setpoints.encoding import HOLD, LEAD, RATE, RATE_LEAD, EncodedFlight, encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
@@ -56,6 +57,9 @@ SLOWER = (1.2, 0.7)  # m/s, at which a flight is tried that would end badly at f
 # stay, a little later only ways lead on that lose more time than waiting does.
 LATER, LATER_KEEPING = (0, 3, 8, 15, 35), (0, 15, 35)
 NEARBY = 3  # setpoints of that, within which the ways that are known count
+CLOSE = 2  # setpoints by which a plan may change the motion later than it might, without other joints being tried
+NEARBY_FIRST = (-1, -2, 0, 1, -3, 2, 3)  # joints that are tried, in setpoints from the first that is in time
+OTHER_JOINTS = len(NEARBY_FIRST) - 1  # that are tried at most; one of them may have been already
 SOON = 3  # setpoints by which the vehicle slows down later than the next part needs, which was planned in vain by then
 LEAST_SPEED = 0.2  # m/s, to which requests may lower the speed
 PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
@@ -126,6 +130,9 @@ class AnswerAttempt:
     """Whether a plan from a setpoint on, not certified yet, will come too late for it: so many setpoints stay as they
     are committed, None where that is not known."""
     ways: Ways
+    in_time: Callable[[], int] | None = None
+    """Number of the first setpoint that is in time for a plan that is made and must be checked. With it, other joints
+    are tried while a plan would change the motion later than that."""
     foresee: bool = True  # whether link loss far ahead counts at once; else it is for slowed_ahead() to look at that
     too_fast: set[float] = field(default_factory=set)  # m/s, at which it would end badly; written as speeds are tried
 
@@ -359,14 +366,55 @@ def _replan_at(
     attempt: AnswerAttempt | None,
 ) -> Replanned:
     """Return what replan() does, at that speed, m/s, or less."""
+    ways = Ways() if attempt is None else attempt.ways
+
+    def too_late(splice: int) -> bool:
+        return attempt is not None and attempt.too_late(splice, None)
+
+    made = _plan_at(speed, held, splice, points, limits, keep, yaw_angle, ways, too_late)
+    if attempt is not None and attempt.too_late(made.splice, made.equal):
+        raise TooLateError("the plan was not made in time", where="request", hint=LATE_HINT)
+    if attempt is not None and attempt.in_time is not None and ways.found is not None:
+        same_way = Ways(found=ways.found, only=True)
+
+        def from_joint(splice: int) -> _Unchecked:
+            return _plan_at(speed, held, splice, points, limits, keep, yaw_angle, replace(same_way))
+
+        made = _sooner(made, from_joint, attempt.in_time)
+    since, starts = made.held.flown.since(made.splice / RATE), snapshots_at(made.held, made.splice)
+    if part is None:
+        passed = certify_whole(since, limits, starts)
+    else:
+        passed = certify_beginning(since, part, limits, starts, foresee=attempt is None or attempt.foresee)
+    return _proposed(made.held, made.splice, passed, made.plan, made.joint)
+
+
+class _Unchecked(NamedTuple):
+    """A plan that leaves what is held, before its setpoints are certified."""
+
+    held: HeldFlight  # with it
+    splice: int
+    joint: float  # s from setpoint 0
+    plan: Plan
+    equal: int  # see _equal()
+
+
+def _plan_at(
+    speed: float,
+    held: HeldFlight,
+    splice: int,
+    points: NDArray,
+    limits: Limits,
+    keep: bool,
+    yaw_angle: float,
+    ways: Ways,
+    too_late: Callable[[int], bool] = lambda splice: False,
+) -> _Unchecked:
+    """Return the plan that leaves what is held at a setpoint, or as soon as it can behind that."""
     held = at_rest_from(held, splice, limits)
     splice, left = _leaving(held, splice, keep)
     joint = (splice + SPLICE_AHEAD) / RATE
     leave, trajectory = joint - held.flown.starts[left], held.flown.trajectories[left]
-
-    def too_late() -> bool:
-        return attempt is not None and attempt.too_late(splice, None)
-
     if leave >= trajectory.duration:
         place = held.flown.at(joint)
         points = np.concatenate([place.position[None], held.left, points] if keep else [place.position[None], points])
@@ -392,21 +440,38 @@ def _replan_at(
                     hint="ask for waypoints instead; they are flown so",
                 )
         made = continue_plan(
-            trajectory, leave, points, limits, times=times, yaw_angle=yaw_angle, speed=speed,
-            ways=None if attempt is None else attempt.ways, too_late=too_late,
+            trajectory, leave, points, limits, times=times, yaw_angle=yaw_angle, speed=speed, ways=ways,
+            too_late=lambda: too_late(splice),
         )  # fmt: skip
         planned, reached = made.plan, made.reached
     flown = held.flown.continued(joint, planned.trajectory)
-    since, starts = flown.since(splice / RATE), snapshots_at(held, splice)
-    if attempt is not None:
-        first = encode_trajectory(since, gains=gains_under(limits), space=limits.space, count=SPLICE_AHEAD)
-        if attempt.too_late(splice, _equal(held.commitment, splice, first.payloads)):
-            raise TooLateError("the plan was not made in time", where="request", hint=LATE_HINT)
-    if part is None:
-        passed = certify_whole(since, limits, starts)
-    else:
-        passed = certify_beginning(since, part, limits, starts, foresee=attempt is None or attempt.foresee)
-    return _proposed(replace(held, flown=flown, ahead=points, reached=reached), splice, passed, planned, joint)
+    first = encode_trajectory(
+        flown.since(splice / RATE), gains=gains_under(limits), space=limits.space, count=SPLICE_AHEAD
+    )
+    equal = _equal(held.commitment, splice, first.payloads)
+    return _Unchecked(replace(held, flown=flown, ahead=points, reached=reached), splice, joint, planned, equal)
+
+
+def _sooner(best: _Unchecked, from_joint: Callable[[int], _Unchecked], in_time: Callable[[], int]) -> _Unchecked:
+    """Return the plan from a joint nearby that changes the motion sooner and is in time, or the best one so far.
+
+    On some ways the vehicle first flies as it would anyway, for longer than it takes to plan again. By how long the
+    motion stays as it is, to the byte, differs from joint to joint.
+    """
+    tried = {best.splice}
+    for _ in range(OTHER_JOINTS):
+        first = in_time()
+        if best.splice + best.equal <= first + CLOSE:
+            break
+        near = [first + off for off in NEARBY_FIRST if first + off not in tried]
+        tried.add(near[0])
+        if near[0] < best.held.begin:
+            continue
+        with suppress(CfplanError):  # no plan from there
+            other = from_joint(near[0])
+            if in_time() <= other.splice + other.equal < best.splice + best.equal:
+                best = other
+    return best
 
 
 def _proposed(held: HeldFlight, splice: int, made: CertifiedFlight, planned: Plan | None, joint: float) -> Replanned:

@@ -15,6 +15,7 @@ from cfplan.preparation import certified_flight
 from cfplan.preparation import replan as replanning
 from cfplan.preparation.certified_flight import EndsBadlyError
 from cfplan.preparation.replan import (
+    CLOSE,
     LOOKS_BACK,
     AnswerAttempt,
     accepted,
@@ -238,6 +239,25 @@ def test_a_proposal_leaves_out_what_is_committed_to_the_byte_and_its_first_setpo
         np.testing.assert_array_equal(proposal.payloads, whole[proposal.splice :])
         left_out.append(made.equal)
     assert max(left_out) > 0
+
+
+def test_a_plan_that_changes_the_motion_late_begins_at_another_joint_if_that_is_sooner(held, limits):
+    """But in time, and with a committed setpoint as every proposal does."""
+    sooner = []
+    for waypoint in ([-1.2, 2.5, 1.0], [0.0, -3.0, 1.0], [-1.5, -1.0, 0.8]):
+        for begin in range(NOW - 20, NOW + 120, 5):
+            plain, made = (
+                replan(held, begin, [waypoint], limits, part=PART, attempt=AnswerAttempt(in_time, Ways(), first))
+                for first in (None, lambda begin=begin: begin + 1)
+            )
+            if plain.proposal.splice <= begin + 1 + CLOSE:
+                assert made.proposal.checksum == plain.proposal.checksum
+            else:
+                assert begin + 1 <= made.proposal.splice <= plain.proposal.splice
+            np.testing.assert_array_equal(made.proposal.payloads[0], held.commitment.payloads[made.proposal.splice])
+            after(held, limits, made, now=begin - 5)
+            sooner.append(plain.proposal.splice - made.proposal.splice)
+    assert np.count_nonzero(sooner) >= 3
 
 
 def test_a_plan_that_would_end_badly_and_is_late_is_made_slower_at_once_the_next_time(held, limits, monkeypatch):
