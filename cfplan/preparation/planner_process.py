@@ -293,7 +293,8 @@ class _Worker:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
         if not self._pressed:
             beside().wake()
-        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), self._in_time, foresee=False)
+        in_time = None if self._pressed else self._in_time  # where others wait they are worth more than joints nearby
+        reason, took, attempt = "", 0.0, AnswerAttempt(self._too_late, Ways(), in_time, foresee=False)
         lead = self._stops if request.wish is Wish.STOP else self._plans
         for tried in range(TRIES):
             begun, held = REAL_CLOCK.now(), self._held
