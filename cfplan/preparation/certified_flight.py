@@ -66,19 +66,27 @@ def certify_whole(flown: JoinedTrajectory, limits: Limits, starts: NDArray | Non
 
 
 def certify_beginning(
-    flown: JoinedTrajectory, following: int, limits: Limits, starts: NDArray, *, foresee: bool = True
+    flown: JoinedTrajectory,
+    following: int,
+    limits: Limits,
+    starts: NDArray,
+    *,
+    foresee: bool = True,
+    encoded: EncodedFlight | None = None,
 ) -> CertifiedFlight:
     """Certify so many setpoints of a flight, and the stop behind them; all of it where that is hardly more.
 
     As certify_whole(). With `foresee`, an estimate of link loss in all of the flight counts besides: what it says to
-    end outside by far is refused before any of it is flown.
+    end outside by far is refused before any of it is flown; without, setpoints that are `encoded` already, as many as
+    encoded_for() says, are not encoded again.
     """
     if following + STOP >= flown.duration * RATE:
         return certify_whole(flown, limits, starts)
     gains, space = gains_under(limits), limits.space
     foresee = foresee and not limits.link_loss.only_warn
-    beginning = following + STOP  # stops lead half as far on
-    encoded = encode_trajectory(flown, gains=gains, space=space, count=None if foresee else beginning)
+    beginning = encoded_for(following)
+    if encoded is None or foresee:
+        encoded = encode_trajectory(flown, gains=gains, space=space, count=None if foresee else beginning)
     whole, encoded = encoded.payloads if foresee else None, _first_rows(encoded, beginning)
     last = np.array([following])
     stop = encode_stops(encoded.motion, RATE, rows=last, gains=gains, space=space)[0]
@@ -95,6 +103,11 @@ def certify_beginning(
     rest = rest_behind(encoded.motion, following, RATE)
     behind = left_of(stop, BEHIND - 1)
     return CertifiedFlight(payloads, np.concatenate([stops, behind]), lost.snapshots, following, rest)
+
+
+def encoded_for(following: int) -> int:
+    """Return how many setpoints of a flight are encoded, where so many are to be certified."""
+    return following + STOP  # stops lead half as far on
 
 
 def _first_rows(encoded: EncodedFlight, count: int) -> EncodedFlight:

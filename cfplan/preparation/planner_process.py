@@ -23,7 +23,7 @@ import numpy as np
 from cfplan.errors import CfplanError
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.proposals import LOOKS_UNTIL, PilotAnswer, read_answer
-from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Commitment, Fault, splice
+from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Fault, spliced
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
 from cfplan.planning.continuation import TooLateError, Ways
@@ -524,9 +524,7 @@ class _Worker:
         assert self._begun is not None
         due = math.floor((REAL_CLOCK.now() - self._begun) * RATE)  # the pilot looked a little earlier
         now = min(due, made.proposal.splice - LEAST_AHEAD)
-        committed = splice(self._held.commitment, made.proposal, now, self._limits.space)
-        assert isinstance(committed, Commitment)
-        return accepted(made, committed)
+        return accepted(made, spliced(self._held.commitment, made.proposal, now))
 
 
 def _run(held: HeldFlight, limits: Limits, requests: Connection, pilot: Connection) -> None:

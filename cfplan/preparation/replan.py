@@ -42,6 +42,7 @@ from cfplan.preparation.certified_flight import (
     EndsBadlyError,
     certify_beginning,
     certify_whole,
+    encoded_for,
     foresee_link_loss,
     meet_gaps,
     require_inside,
@@ -198,7 +199,7 @@ def replan(
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
         raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint="give rows of x, y, z in metres")
     check_waypoints(points, limits)
-    return _replan_within(held, splice, points, limits, keep, yaw_angle, part, attempt)
+    return _replan_within(held, splice, _Wanted(points, limits, keep, yaw_angle, part, attempt))
 
 
 def pace(
@@ -218,7 +219,7 @@ def pace(
     nothing_ahead = held.exact_from > 0 and not len(held.left)  # but to come to rest
     if nothing_ahead or (splice + SPLICE_AHEAD) / RATE >= held.ends:
         return None
-    return _replan_within(at_pace(held, speed), splice, np.empty((0, 3)), limits, True, yaw_angle, part, attempt)
+    return _replan_within(at_pace(held, speed), splice, _ahead(limits, yaw_angle, part, attempt))
 
 
 def go_on(
@@ -233,7 +234,6 @@ def go_on(
     held = at_rest_from(held, splice, limits)
     if not held.unfinished:
         return held
-    nothing_more = np.empty((0, 3))
     if held.stops_from is not None:
         ahead = held.stops_from - 1  # what is before that is committed already
         since, starts = held.flown.since(ahead / RATE), snapshots_at(held, ahead)
@@ -242,9 +242,9 @@ def go_on(
             return _proposed(held, ahead, following, None, math.nan)
         with suppress(InfeasibleError, NotCertifiedError):  # the sooner it slows down the better
             soon, slower = min(splice + SOON, ahead), _slower(held, limits)
-            return _replan_within(held, soon, nothing_more, limits, True, yaw_angle, part, slower)
+            return _replan_within(held, soon, _ahead(limits, yaw_angle, part, slower))
         splice = ahead
-    return _replan_within(held, splice, nothing_more, limits, True, yaw_angle, part)
+    return _replan_within(held, splice, _ahead(limits, yaw_angle, part))
 
 
 def _slower(held: HeldFlight, limits: Limits) -> AnswerAttempt:
@@ -264,12 +264,12 @@ def slowed_ahead(
     if held.stops_from is None or splice >= held.stops_from or limits.link_loss.only_warn or fastest <= SLOWER[-1]:
         return None
     ahead = held.stops_from - 1  # what is before that is certified
-    encoded = _encoded_from(held, ahead, limits)
+    encoded = _encoded_from(held.flown, ahead, limits)
     try:
         foresee_link_loss(encoded.payloads, limits, snapshots_at(held, ahead))
     except EndsBadlyError:
         attempt.too_fast.add(fastest)
-        return _replan_within(held, splice, np.empty((0, 3)), limits, True, yaw_angle, part, attempt)
+        return _replan_within(held, splice, _ahead(limits, yaw_angle, part, attempt))
     return None
 
 
@@ -315,28 +315,36 @@ def at_pace(held: HeldFlight, speed: float) -> HeldFlight:
     return replace(held, speed=max(speed, LEAST_SPEED))
 
 
-def _replan_within(
-    held: HeldFlight,
-    splice: int,
-    points: NDArray,
-    limits: Limits,
-    keep: bool,
-    yaw_angle: float,
-    part: int | None,
-    attempt: AnswerAttempt | None = None,
-) -> Replanned:
+class _Wanted(NamedTuple):
+    """What is to be planned, see replan()."""
+
+    points: NDArray  # (K, 3) m
+    limits: Limits
+    keep: bool
+    yaw_angle: float  # rad
+    part: int | None  # setpoints
+    attempt: AnswerAttempt | None
+
+
+def _ahead(limits: Limits, yaw_angle: float, part: int | None, attempt: AnswerAttempt | None = None) -> _Wanted:
+    """Return that what is ahead is to be planned anew, and no more."""
+    return _Wanted(np.empty((0, 3)), limits, True, yaw_angle, part, attempt)
+
+
+def _replan_within(held: HeldFlight, splice: int, wanted: _Wanted) -> Replanned:
     """Return what replan() does, at the speed that is asked for, or slower where it must be."""
-    splice, _ = _leaving(at_rest_from(held, splice, limits), splice, keep)  # from there on it may be later
+    limits, attempt = wanted.limits, wanted.attempt
+    splice, _ = _leaving(at_rest_from(held, splice, limits), splice, wanted.keep)  # from there on it may be later
     fastest = min(held.speed, limits.plan.speed)
     speeds = (fastest, *(slower for slower in SLOWER if slower < fastest))
     refused: InfeasibleError | None = None
     for speed in [one for one in speeds[:-1] if attempt is None or one not in attempt.too_fast] + [speeds[-1]]:
-        for later in LATER_KEEPING if keep else LATER:
+        for later in LATER_KEEPING if wanted.keep else LATER:
             if later and held.stops_from is not None and splice + later >= held.stops_from:
                 break
             try:
                 at_once = attempt if later <= NEARBY else None
-                return _replan_at(speed, held, splice + later, points, limits, keep, yaw_angle, part, at_once)
+                return _replan_at(speed, held, splice + later, wanted._replace(attempt=at_once))
             except EndsBadlyError as error:
                 refused = error
                 if at_once is not None:
@@ -354,38 +362,30 @@ def _replan_within(
     raise refused
 
 
-def _replan_at(
-    speed: float,
-    held: HeldFlight,
-    splice: int,
-    points: NDArray,
-    limits: Limits,
-    keep: bool,
-    yaw_angle: float,
-    part: int | None,
-    attempt: AnswerAttempt | None,
-) -> Replanned:
+def _replan_at(speed: float, held: HeldFlight, splice: int, wanted: _Wanted) -> Replanned:
     """Return what replan() does, at that speed, m/s, or less."""
+    attempt, limits, part = wanted.attempt, wanted.limits, wanted.part
     ways = Ways() if attempt is None else attempt.ways
 
     def too_late(splice: int) -> bool:
         return attempt is not None and attempt.too_late(splice, None)
 
-    made = _plan_at(speed, held, splice, points, limits, keep, yaw_angle, ways, too_late)
+    made = _plan_at(speed, held, splice, wanted, ways, too_late)
     if attempt is not None and attempt.too_late(made.splice, made.equal):
         raise TooLateError("the plan was not made in time", where="request", hint=LATE_HINT)
     if attempt is not None and attempt.in_time is not None and ways.found is not None:
         same_way = Ways(found=ways.found, only=True)
 
         def from_joint(splice: int) -> _Unchecked:
-            return _plan_at(speed, held, splice, points, limits, keep, yaw_angle, replace(same_way))
+            return _plan_at(speed, held, splice, wanted, replace(same_way))
 
         made = _sooner(made, from_joint, attempt.in_time)
     since, starts = made.held.flown.since(made.splice / RATE), snapshots_at(made.held, made.splice)
     if part is None:
         passed = certify_whole(since, limits, starts)
     else:
-        passed = certify_beginning(since, part, limits, starts, foresee=attempt is None or attempt.foresee)
+        foresee = attempt is None or attempt.foresee
+        passed = certify_beginning(since, part, limits, starts, foresee=foresee, encoded=made.encoded)
     return _proposed(made.held, made.splice, passed, made.plan, made.joint)
 
 
@@ -396,6 +396,7 @@ class _Unchecked(NamedTuple):
     splice: int
     joint: float  # s from setpoint 0
     plan: Plan
+    encoded: EncodedFlight  # its first setpoints, from the splice on
     equal: int  # see _equal()
 
 
@@ -403,14 +404,12 @@ def _plan_at(
     speed: float,
     held: HeldFlight,
     splice: int,
-    points: NDArray,
-    limits: Limits,
-    keep: bool,
-    yaw_angle: float,
+    wanted: _Wanted,
     ways: Ways,
     too_late: Callable[[int], bool] = lambda splice: False,
 ) -> _Unchecked:
     """Return the plan that leaves what is held at a setpoint, or as soon as it can behind that."""
+    points, limits, keep, yaw_angle = wanted.points, wanted.limits, wanted.keep, wanted.yaw_angle
     held = at_rest_from(held, splice, limits)
     splice, left = _leaving(held, splice, keep)
     joint = (splice + SPLICE_AHEAD) / RATE
@@ -445,11 +444,11 @@ def _plan_at(
         )  # fmt: skip
         planned, reached = made.plan, made.reached
     flown = held.flown.continued(joint, planned.trajectory)
-    first = encode_trajectory(
-        flown.since(splice / RATE), gains=gains_under(limits), space=limits.space, count=SPLICE_AHEAD
-    )
-    equal = _equal(held.commitment, splice, first.payloads)
-    return _Unchecked(replace(held, flown=flown, ahead=points, reached=reached), splice, joint, planned, equal)
+    count = SPLICE_AHEAD if wanted.part is None else encoded_for(wanted.part)
+    encoded = _encoded_from(flown, splice, limits, count)
+    equal = _equal(held.commitment, splice, encoded.payloads)
+    later = replace(held, flown=flown, ahead=points, reached=reached)
+    return _Unchecked(later, splice, joint, planned, encoded, equal)
 
 
 def _sooner(best: _Unchecked, from_joint: Callable[[int], _Unchecked], in_time: Callable[[], int]) -> _Unchecked:
@@ -503,9 +502,11 @@ def held_with(held: HeldFlight, splice: int, made: CertifiedFlight, since: int =
     """
     rows = np.arange(min(max(splice - _SNAPSHOTS_KEPT, held.begin, since), splice), splice) - held.begin
     before = held.snapshots[:, np.minimum(rows, held.snapshots.shape[1] - 1)]  # behind the last the vehicle waits
+    begin = splice - len(rows)
     return replace(
         held,
-        begin=splice - len(rows),
+        begin=begin,
+        flown=held.flown.kept_from(begin / RATE),
         snapshots=np.concatenate([before, made.snapshots], axis=1),
         exact_from=0,
         stops_from=None if made.following is None else splice + made.following,
@@ -531,7 +532,7 @@ def halt(held: HeldFlight, splice: int, limits: Limits) -> Replanned | HeldFligh
     splice, _ = _leaving(held, splice, keep=False)
     ends = _rests_next(held, splice)
     if sooner := [duration for duration in STOPS if duration < ends - splice / RATE]:
-        encoded = _encoded_from(held, splice, limits)
+        encoded = _encoded_from(held.flown, splice, limits)
         for duration in sooner:
             with suppress(InfeasibleError, NotCertifiedError):
                 return _stop_along(encoded, held, splice, duration, limits)
@@ -582,12 +583,12 @@ def stop_within(held: HeldFlight, splice: int, duration: float, limits: Limits) 
     Raises NotCertifiedError where the stop exceeds what stops may reach or its dry run does not pass, InfeasibleError
     where link loss or a gap within it would end badly.
     """
-    return _stop_along(_encoded_from(held, splice, limits), held, splice, duration, limits)
+    return _stop_along(_encoded_from(held.flown, splice, limits), held, splice, duration, limits)
 
 
-def _encoded_from(held: HeldFlight, splice: int, limits: Limits) -> EncodedFlight:
-    """Return the setpoints of what is held, from one on."""
-    return encode_trajectory(held.flown.since(splice / RATE), gains=gains_under(limits), space=limits.space)
+def _encoded_from(flown: JoinedTrajectory, splice: int, limits: Limits, count: int | None = None) -> EncodedFlight:
+    """Return the setpoints of a flight, from one on; so many, or all."""
+    return encode_trajectory(flown.since(splice / RATE), gains=gains_under(limits), space=limits.space, count=count)
 
 
 def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration: float, limits: Limits) -> Replanned:

@@ -133,7 +133,7 @@ def test_in_flight_it_slows_down_to_that(held, limits):
 def test_a_flight_replanned_again_and_again_keeps_every_limit_in_what_was_sent(held, limits):
     """Random waypoints, some 0.4 s apart: the sequence that was sent is the encoding of one motion without a jump."""
     random = np.random.default_rng(4)
-    now, sent, replanned = 20, [held.commitment.payloads[:20]], 0
+    now, sent, replanned, flown = 20, [held.commitment.payloads[:20]], 0, held.flown
     for _ in range(14):
         points = random.uniform([-1.0, -2.2, 0.8], [1.0, 2.2, 1.2], (3, 3))
         try:
@@ -142,6 +142,7 @@ def test_a_flight_replanned_again_and_again_keeps_every_limit_in_what_was_sent(h
             made = None
         if made is not None:
             held, replanned = after(held, limits, made, now), replanned + 1
+            flown = flown.continued(made.joint, made.plan.trajectory)
             assert certify(made.plan.trajectory, limits.plan, limits.space).passed
         span = int(random.integers(25, 55))
         rows = np.minimum(np.arange(now, now + span), held.commitment.last) - held.commitment.first
@@ -150,12 +151,13 @@ def test_a_flight_replanned_again_and_again_keeps_every_limit_in_what_was_sent(h
     assert replanned >= 8
     rows = np.arange(now, held.commitment.last + 1) - held.commitment.first
     sequence = np.concatenate([*sent, held.commitment.payloads[rows]])
-    whole = encode_trajectory(held.flown, space=limits.space)
-    check_bytes(whole, held.flown, limits.plan)
+    whole = encode_trajectory(flown, space=limits.space)
+    check_bytes(whole, flown, limits.plan)
     assert len(sequence) == len(whole.payloads)
     np.testing.assert_allclose(decode(sequence).position, decode(whole.payloads).position, atol=1.001e-3)
     np.testing.assert_allclose(decode(sequence).velocity, decode(whole.payloads).velocity, atol=1.001e-3)
-    assert dry_run(whole, held.flown, limits.airframe, limits.flight).passed
+    assert dry_run(whole, flown, limits.airframe, limits.flight).passed
+    assert len(held.flown.trajectories) < len(flown.trajectories)  # what is behind is forgotten
 
 
 @pytest.mark.parametrize(

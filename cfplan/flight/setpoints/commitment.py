@@ -197,6 +197,11 @@ def splice(commitment: Commitment, proposal: Proposal, now: int, space: Space) -
         or _unfit_stops(asked, proposal.stops, proposal.splice, space)
     ):
         return refusal
+    return spliced(commitment, proposal, now)
+
+
+def spliced(commitment: Commitment, proposal: Proposal, now: int) -> Commitment:
+    """Return what splice() does of a proposal that the pilot has accepted, or that was made to be: without a look."""
     first = max(min(proposal.splice, now) - KEPT_BEHIND, commitment.first)
     behind = np.minimum(np.arange(first, proposal.splice), commitment.last) - commitment.first
     payloads = np.concatenate([commitment.payloads[behind], proposal.payloads])
