@@ -219,7 +219,7 @@ def pace(
     nothing_ahead = held.exact_from > 0 and not len(held.left)  # but to come to rest
     if nothing_ahead or (splice + SPLICE_AHEAD) / RATE >= held.ends:
         return None
-    return _replan_within(at_pace(held, speed), splice, _ahead(limits, yaw_angle, part, attempt))
+    return _replan_within(at_pace(held, speed), splice, _nothing_new(limits, yaw_angle, part, attempt))
 
 
 def go_on(
@@ -242,9 +242,9 @@ def go_on(
             return _proposed(held, ahead, following, None, math.nan)
         with suppress(InfeasibleError, NotCertifiedError):  # the sooner it slows down the better
             soon, slower = min(splice + SOON, ahead), _slower(held, limits)
-            return _replan_within(held, soon, _ahead(limits, yaw_angle, part, slower))
+            return _replan_within(held, soon, _nothing_new(limits, yaw_angle, part, slower))
         splice = ahead
-    return _replan_within(held, splice, _ahead(limits, yaw_angle, part))
+    return _replan_within(held, splice, _nothing_new(limits, yaw_angle, part))
 
 
 def _slower(held: HeldFlight, limits: Limits) -> AnswerAttempt:
@@ -269,7 +269,7 @@ def slowed_ahead(
         foresee_link_loss(encoded.payloads, limits, snapshots_at(held, ahead))
     except EndsBadlyError:
         attempt.too_fast.add(fastest)
-        return _replan_within(held, splice, _ahead(limits, yaw_angle, part, attempt))
+        return _replan_within(held, splice, _nothing_new(limits, yaw_angle, part, attempt))
     return None
 
 
@@ -326,8 +326,8 @@ class _Wanted(NamedTuple):
     attempt: AnswerAttempt | None
 
 
-def _ahead(limits: Limits, yaw_angle: float, part: int | None, attempt: AnswerAttempt | None = None) -> _Wanted:
-    """Return that what is ahead is to be planned anew, and no more."""
+def _nothing_new(limits: Limits, yaw_angle: float, part: int | None, attempt: AnswerAttempt | None = None) -> _Wanted:
+    """Return that the waypoints ahead are to be planned anew, and no others."""
     return _Wanted(np.empty((0, 3)), limits, True, yaw_angle, part, attempt)
 
 

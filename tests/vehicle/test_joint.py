@@ -88,6 +88,17 @@ def test_later_on_the_same_clock_runs_from_there(trajectory):
     assert joined.at(1.0).position.shape == (3,)
 
 
+def test_what_is_kept_from_a_time_on_is_the_same_flight_from_there(trajectory):
+    node = 15
+    leave = float(trajectory.time_at(trajectory.profile.s[node]))
+    joined = JoinedTrajectory((trajectory,), (0.0,)).continued(leave, rest_of(trajectory, node))
+    assert len(joined.kept_from(leave).trajectories) == 2  # setpoints are made of the motion just before, too
+    kept = joined.kept_from(leave + 0.1)
+    assert (kept.starts, kept.duration) == (joined.starts[1:], joined.duration)
+    times = np.linspace(leave, joined.duration, 50)
+    np.testing.assert_array_equal(kept.at(times).position, joined.at(times).position)
+
+
 def test_what_is_flown_from_an_earlier_joint_replaces_all_after_it(trajectory):
     later = rest_of(trajectory, 20)
     joined = JoinedTrajectory((trajectory,), (0.0,)).continued(3.0, later).continued(2.0, later)

@@ -201,7 +201,7 @@ def splice(commitment: Commitment, proposal: Proposal, now: int, space: Space) -
 
 
 def spliced(commitment: Commitment, proposal: Proposal, now: int) -> Commitment:
-    """Return what splice() does of a proposal that the pilot has accepted, or that was made to be: without a look."""
+    """Return what is committed with a proposal that the pilot accepts, as splice() does, but without verifying it."""
     first = max(min(proposal.splice, now) - KEPT_BEHIND, commitment.first)
     behind = np.minimum(np.arange(first, proposal.splice), commitment.last) - commitment.first
     payloads = np.concatenate([commitment.payloads[behind], proposal.payloads])
