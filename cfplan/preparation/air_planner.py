@@ -56,7 +56,7 @@ class PathVerdict(StrEnum):
     REFUSED = "refused"  # no plan, or the pilot did not verify it
     LATE = "late"  # planned, but not in time
     CUT_SHORT = "cut short"  # accepted, but what follows did not pass later: the vehicle rests before its end
-    SUPERSEDED = "superseded"  # another request came before it was planned
+    SUPERSEDED = "superseded"  # another request came before it was planned, or before its plan had passed
 
 
 @dataclass(frozen=True, slots=True)

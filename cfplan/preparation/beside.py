@@ -18,6 +18,9 @@ Work = Callable[[], Any]  # as functools.partial makes it, which goes from proce
 class Pending(Protocol):
     """What is done beside."""
 
+    def done(self) -> bool:
+        """Return whether it is, without waiting."""
+
     def result(self) -> Any:
         """Wait for what it returns or raises."""
 
@@ -122,6 +125,13 @@ class _Answer:
             except (EOFError, OSError):
                 self._outcome = _done(self._work)
         return self._outcome
+
+    def done(self) -> bool:
+        if self._outcome is None and (self._before is None or self._before.done()):
+            with contextlib.suppress(OSError):  # it has ended; what is left to do is done where it is asked for
+                if self._pipe.poll():
+                    self._received()
+        return self._outcome is not None
 
     def result(self) -> Any:
         returned, raised = self._received()

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -40,7 +41,9 @@ from cfplan.preparation.certified_flight import (
     STOP,
     CertifiedFlight,
     EndsBadlyError,
+    Simulated,
     certify_beginning,
+    certify_meanwhile,
     certify_whole,
     encoded_for,
     foresee_link_loss,
@@ -85,7 +88,7 @@ class HeldFlight:
     ahead: NDArray  # (K, 3) m, waypoints of the last plan, in order
     reached: tuple[float, ...]  # s on the last plan's path, of each of them
     begin: int  # number of the setpoint of the first snapshot
-    snapshots: NDArray  # (L, N, 31) of the simulated vehicle at each setpoint, for each motor lag
+    simulated: Simulated  # at each setpoint
     speed: float = math.inf  # m/s, at which new plans fly at most, as was asked for; the limits' counts besides
     exact_from: int = 0
     """Number of the setpoint from which on the trajectories are those behind the bytes: in a stop before it they are
@@ -99,6 +102,11 @@ class HeldFlight:
     halts: tuple[tuple[int, int], ...] = ()
     """Of each stop on the way, the setpoints from which on and before which the trajectories are not those behind the
     bytes."""
+
+    @property
+    def snapshots(self) -> NDArray:
+        """Return (L, N, 31), the simulated vehicle at each setpoint, as Simulated.snapshots."""
+        return self.simulated.snapshots
 
     @property
     def ends(self) -> float:
@@ -135,6 +143,10 @@ class AnswerAttempt:
     """Number of the first setpoint that is in time for a plan that is made and must be checked. With it, other joints
     are tried while a plan would change the motion later than that."""
     foresee: bool = True  # whether link loss far ahead counts at once; else it is for slowed_ahead() to look at that
+    meanwhile: bool = False
+    """Whether what is simulated of a plan's beginning goes on beside when it is returned. Before it is proposed, that
+    must have passed; what is planned on it by then raises UnfoundedError where it has not. Link loss far ahead does not
+    count then."""
     too_fast: set[float] = field(default_factory=set)  # m/s, at which it would end badly; written as speeds are tried
 
 
@@ -148,7 +160,7 @@ def hold(planned: Plan, waypoints: ArrayLike) -> HeldFlight:
     flown = JoinedTrajectory((planned.trajectory,), (0.0,))
     made = certify_whole(flown, planned.limits, None)
     reached = tuple(np.cumsum(centripetal_times(points)).tolist())
-    return HeldFlight(Commitment(0, made.payloads, made.stops), flown, points[1:], reached, 0, made.snapshots)
+    return HeldFlight(Commitment(0, made.payloads, made.stops), flown, points[1:], reached, 0, made.simulated)
 
 
 def hold_hover(position: Triple, yaw: float, limits: Limits) -> HeldFlight:
@@ -167,7 +179,7 @@ def hold_hover(position: Triple, yaw: float, limits: Limits) -> HeldFlight:
     flown = JoinedTrajectory((hover_at(position, yaw, HOVER, limits.airframe),), (0.0,))
     made = certify_whole(flown, limits, None)
     place = np.array([position], dtype=float)
-    return HeldFlight(Commitment(0, made.payloads, made.stops), flown, place, (HOVER,), 0, made.snapshots)
+    return HeldFlight(Commitment(0, made.payloads, made.stops), flown, place, (HOVER,), 0, made.simulated)
 
 
 def replan(
@@ -380,12 +392,14 @@ def _replan_at(speed: float, held: HeldFlight, splice: int, wanted: _Wanted) -> 
             return _plan_at(speed, held, splice, wanted, replace(same_way))
 
         made = _sooner(made, from_joint, attempt.in_time)
-    since, starts = made.held.flown.since(made.splice / RATE), snapshots_at(made.held, made.splice)
+    since, starts = made.held.flown.since(made.splice / RATE), partial(snapshots_at, made.held, made.splice)
     if part is None:
-        passed = certify_whole(since, limits, starts)
+        passed = certify_whole(since, limits, starts())
+    elif attempt is not None and attempt.meanwhile:
+        passed = certify_meanwhile(since, part, limits, starts, made.encoded)
     else:
         foresee = attempt is None or attempt.foresee
-        passed = certify_beginning(since, part, limits, starts, foresee=foresee, encoded=made.encoded)
+        passed = certify_beginning(since, part, limits, starts(), foresee=foresee, encoded=made.encoded)
     return _proposed(made.held, made.splice, passed, made.plan, made.joint)
 
 
@@ -507,7 +521,7 @@ def held_with(held: HeldFlight, splice: int, made: CertifiedFlight, since: int =
         held,
         begin=begin,
         flown=held.flown.kept_from(begin / RATE),
-        snapshots=np.concatenate([before, made.snapshots], axis=1),
+        simulated=made.simulated.behind(before),
         exact_from=0,
         stops_from=None if made.following is None else splice + made.following,
         rest=made.rest,
@@ -611,7 +625,7 @@ def _stop_along(encoded: EncodedFlight, held: HeldFlight, splice: int, duration:
     require_inside(lost, limits)
     meet_gaps(payloads, limits, starts)
     resting = _resting(held, rest_behind(motion, 1, RATE, duration), splice + 1, splice + len(rows), limits)
-    later = replace(resting, begin=splice, snapshots=lost.snapshots)
+    later = replace(resting, begin=splice, simulated=Simulated(lost.snapshots))
     proposal = propose(held.commitment, splice, payloads, stops, len(stops) - 2)
     return Replanned(proposal, later, None, splice / RATE)
 

@@ -217,7 +217,7 @@ def _vehicle(limits: Limits) -> list[TimeOut]:
 
 def _planner() -> list[TimeOut]:
     commitment, proposals, planner, steered = (
-        "flight/setpoints/commitment.py", "flight/pilot/proposals.py", "preparation/planner_process.py",
+        "flight/setpoints/commitment.py", "flight/pilot/proposals.py", "preparation/proposal_chain.py",
         "steering/steered_vehicle.py",
     )  # fmt: skip
     return [

@@ -75,6 +75,17 @@ def test_each_piece_of_work_has_its_answer_whichever_is_asked_for_first(other):
     np.testing.assert_array_equal(first.result(), np.full(4, 1.5))
 
 
+def test_whether_work_is_done_is_told_without_waiting(other, tmp_path):
+    goes_on = tmp_path / "goes on"
+    first, second = other.begin(partial(until, goes_on.exists), partial(refuse, "there"))
+    assert not first.done()
+    assert not second.done()
+    goes_on.touch()
+    assert until(second.done)
+    assert first.done()
+    assert isinstance(second.exception(), InfeasibleError)
+
+
 def test_answers_that_nobody_asks_for_do_not_hold_up_the_next(other):
     """They, and what is asked next, are more than a pipe holds."""
     for value in range(3):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cfplan.errors import CfplanError, InfeasibleError, InputError
-from cfplan.flight.setpoints.commitment import Commitment, splice
+from cfplan.flight.setpoints.commitment import Commitment, splice, spliced
 from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.rate_trade import gains_under
@@ -13,7 +13,7 @@ from cfplan.planning.continuation import TooLateError, Ways, continue_plan
 from cfplan.planning.plan import plan
 from cfplan.preparation import certified_flight
 from cfplan.preparation import replan as replanning
-from cfplan.preparation.certified_flight import EndsBadlyError
+from cfplan.preparation.certified_flight import EndsBadlyError, UnfoundedError
 from cfplan.preparation.replan import (
     CLOSE,
     LOOKS_BACK,
@@ -210,6 +210,35 @@ def test_a_plan_that_is_committed_in_parts_is_the_whole_plan_in_the_end(held, li
     for name in ("payloads", "stops"):
         np.testing.assert_array_equal(getattr(last.commitment, name), getattr(whole.commitment, name))
     np.testing.assert_array_equal(last.snapshots[:, -len(whole.snapshots[0]) :], whole.snapshots)
+
+
+def test_what_is_simulated_meanwhile_is_what_is_simulated_at_once(held, limits):
+    """To the byte, stops too; and the simulated vehicle at each setpoint."""
+    at_once = replan(held, NOW + 5, FAR, limits, part=PART)
+    meanwhile = replan(held, NOW + 5, FAR, limits, part=PART, attempt=AnswerAttempt(in_time, Ways(), meanwhile=True))
+    assert meanwhile.held.simulated.coming is not None
+    assert meanwhile.proposal.checksum == at_once.proposal.checksum
+    np.testing.assert_array_equal(meanwhile.proposal.stops, at_once.proposal.stops)
+    np.testing.assert_array_equal(meanwhile.held.snapshots, at_once.held.snapshots)
+    assert meanwhile.held.simulated.coming.exception() is None
+
+
+@pytest.mark.parametrize(
+    "fails", ["link_loss_at_walls", "meet_gaps", "rehearse_setpoints", "assess_link_loss_of_stops"]
+)
+def test_on_what_does_not_pass_in_its_simulation_nothing_can_be_planned(held, limits, monkeypatch, fails):
+    def ends_badly(*_, **__):
+        raise EndsBadlyError("it ends outside", where="link loss")
+
+    monkeypatch.setattr(certified_flight, fails, ends_badly)
+    attempt = AnswerAttempt(in_time, Ways(), meanwhile=True)
+    made = replan(held, NOW + 5, FAR, limits, part=PART, attempt=attempt)
+    on_that = accepted(made, spliced(held.commitment, made.proposal, NOW))
+    assert isinstance(made.held.simulated.coming.exception(), EndsBadlyError)
+    with pytest.raises(UnfoundedError):
+        replan(on_that, NOW + 10, FAR[::-1], limits, part=PART, attempt=attempt)
+    with pytest.raises(UnfoundedError):
+        halt(on_that, NOW + 10, limits)
 
 
 def test_each_part_ends_at_rest_inside_and_its_beginning_is_the_plan(held, limits):
