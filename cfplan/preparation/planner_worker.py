@@ -23,6 +23,8 @@ from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Fault
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.planning.continuation import TooLateError, Ways
 from cfplan.preparation.air_planner import (
+    FIRST_PART,
+    HASTY_PART,
     NEXT_PART,
     SLACK,
     PathAnswer,
@@ -63,6 +65,7 @@ FIRST_STOP = 0.1  # s that a stop is taken to need before any was made
 AGAIN = 1.15  # by how much longer each time a request is taken to need that came late, and has a known way
 UNHURRIED = 3.0  # times what a plan needs, that one lies ahead which nobody waits for
 TRIES = 4  # of a request whose proposal comes late
+HASTE = 0.05  # s without a request, until which others are about to come where they came faster than plans
 ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
 _LOOK_AGAIN = 0.05  # s, until the planner sees whether more of a plan is to be made
 
@@ -155,8 +158,12 @@ class PlannerWorker:
         return None if answer is None else replace(answer, seconds=REAL_CLOCK.now() - came)
 
     def _wants_more(self) -> bool:
-        quiet = REAL_CLOCK.now() - self._requests.asked
-        return self._chain.held.unfinished and wants_more(self._chain.held, self._next(self._parts)[0], quiet)
+        held, quiet = self._chain.held, REAL_CLOCK.now() - self._requests.asked
+        if not held.unfinished:
+            return False
+        if self._pressed and quiet < HASTE:
+            return presses(held, *self._next(self._plans))
+        return wants_more(held, self._next(self._parts)[0], quiet)
 
     def _next(self, lead: Lead, least: float = 0.0) -> tuple[int, float]:
         """Return the setpoint from which on one may plan now, and how far ahead it is, s, `least` at least."""
@@ -193,8 +200,9 @@ class PlannerWorker:
                 first = self._in_time_for(ahead)
             else:
                 first, ahead = self._next(lead, AGAIN * took)
+            part = part_within(ahead, HASTY_PART if meanwhile else FIRST_PART)
             try:
-                made = self._planned(request, first, part_within(ahead), attempt)
+                made = self._planned(request, first, part, attempt)
             except TooLateError as error:
                 took = REAL_CLOCK.now() - begun + self._to_do
                 lead.note(took, self._left_out)

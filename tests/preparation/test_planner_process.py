@@ -33,7 +33,7 @@ from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
 from cfplan.preparation import certified_flight
 from cfplan.preparation import replan as replanning
-from cfplan.preparation.air_planner import SLACK, PathAnswer, PathRequest, PathVerdict, Wish
+from cfplan.preparation.air_planner import HASTY_PART, SLACK, PathAnswer, PathRequest, PathVerdict, Wish
 from cfplan.preparation.certified_flight import EndsBadlyError
 from cfplan.preparation.lead import IN_TIME, LEARNED_FROM, Lead
 from cfplan.preparation.planner_process import AirPlanner
@@ -373,6 +373,22 @@ def test_three_on_their_way_are_accepted_in_order(in_flight):
     assert [each.splice for each in told] == sorted(each.splice for each in told)
     assert worker._chain.held.commitment.checksum == pilot.commitment.checksum
     theirs.close()
+
+
+def test_what_was_committed_in_haste_is_committed_to_its_end_once_nobody_presses(in_flight):
+    worker, main, pilot, theirs = in_flight
+    assert pressed(worker, main, FIRST) is None
+    first = worker._chain.held
+    with served(worker, main, theirs):
+
+        def to_its_end() -> bool:
+            pilot.tick()
+            end = decode(pilot.commitment.payloads[-1:]).position[0]
+            return bool(np.abs(end - FAR[-1]).max() < 2e-3)
+
+        assert until(to_its_end)
+    assert first.stops_from - pilot.commitment.splices[0] <= round(HASTY_PART * RATE)
+    assert worker._chain.held.commitment.checksum == pilot.commitment.checksum
 
 
 @pytest.mark.parametrize("falls", ["in its simulation", "as the pilot refuses it"])
