@@ -6,6 +6,7 @@ be those that the pilot verified, to the byte, and each setpoint streamed the on
 committed in parts, each part is.
 """
 
+from collections import defaultdict, deque
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -93,12 +94,13 @@ def recertify(record: Record) -> Recertified:
                 hint="the record was changed since, or made by another version",
             )
     limits = next(plan.limits for plan in (first, *plans) if plan is not None)
-    joints = dict(zip(record.answers.splice.tolist(), record.answers.joint.tolist(), strict=True))
+    joints = _joints_told(record)
     jump, stops, setpoints = 0.0, 0, len(held.commitment.payloads)
     for number, plan in enumerate(plans, 1):
         splice = int(commitments.splice[number])
-        joint = float(joints.get(splice, (splice + SPLICE_AHEAD) / RATE))
+        joint = (splice + SPLICE_AHEAD) / RATE
         if plan is not None:
+            joint = joints[splice].popleft() if joints[splice] else joint
             resting = at_rest_from(held, round(joint * RATE) - SPLICE_AHEAD, limits)
             jump, limits = max(jump, _jump(resting, splice, joint, plan)), plan.limits
         told, checksum = commitments.payloads[number], int(commitments.checksum[number])
@@ -111,6 +113,18 @@ def recertify(record: Record) -> Recertified:
     worst_of_all = certificates[-1] if certificates else None
     count = sum(plan is not None for plan in plans)
     return Recertified(len(found), stops, worst_of_all, count, jump, setpoints, streamed, left_after)
+
+
+def _joints_told(record: Record) -> defaultdict[int, deque[float]]:
+    """Return the joints of the plans that were answered, s, by the splices of their proposals, in order.
+
+    A plan may replace another, or a stop, from the same splice on. A stop has its joint there.
+    """
+    joints: defaultdict[int, deque[float]] = defaultdict(deque)
+    for splice, joint in zip(record.answers.splice.tolist(), record.answers.joint.tolist(), strict=True):
+        if joint > splice / RATE:
+            joints[splice].append(joint)
+    return joints
 
 
 def _plan_of(record: Record, checksum: int) -> Plan | None:
@@ -195,8 +209,10 @@ def _committed(
 def _goes_on(flown: JoinedTrajectory, splice: int, told: NDArray, limits: Limits) -> bool:
     """Return whether setpoints are more of the plan that is flown, and no stop."""
     encoded = encode_trajectory(flown.since(splice / RATE), gains=gains_under(limits), space=limits.space)
-    same = min(max(len(told) - BEHIND, 2), len(encoded.payloads))
-    return np.array_equal(told[:same], encoded.payloads[:same])
+    following = len(told) - BEHIND
+    if following < 2:  # a stop is as long, and begins like the plan; what is left of a plan is all of it
+        return np.array_equal(told, encoded.payloads)
+    return np.array_equal(told[:following], encoded.payloads[:following])
 
 
 def _stopped(held: HeldFlight, splice: int, told: NDArray, checksum: int, where: str, limits: Limits) -> HeldFlight:
