@@ -32,6 +32,7 @@ REAL_TIME_TESTS = {
     "test_a_fault_in_real_time_comes_to_its_rung_and_the_vehicle_to_the_ground": "drivers and sockets, a stopped pilot",
     "test_without_its_planner_a_flight_ends_on_what_is_committed": "a planner's process that dies or hangs",
     "test_a_vehicle_is_steered_by": "programs and pipes that request waypoints in flight",
+    "test_what_requests_in_bursts_lead_to_is_certified_again": "a planner's process that is asked faster than it plans",
     "test_a_flight_ends_disarmed_and_recorded_whatever_is_done_from_outside": "terminals, and a ground station",
     "test_poses_are_where_and_when_the_body_was": "how late poses of the driver's process are",
     "test_a_link_fails_or_closes_soon": "how long a person waits",
