@@ -420,9 +420,7 @@ def refused(pilot: PilotSide, proposal: Proposal) -> bool:
 
 def test_what_ends_badly_far_ahead_is_accepted_and_flown_slower_soon(held, limits, monkeypatch):
     """Link loss is foreseen to end outside where the vehicle is fast 3 s or more behind what is certified."""
-    monkeypatch.setattr(
-        PlannerWorker, "_late_by", lambda *_: -1.0
-    )  # as for the pilot's side, however slow this computer is
+    monkeypatch.setattr(PlannerWorker, "_late_by", lambda *_: -1.0)  # however slow this computer is
     (main, requests), (theirs, ours) = multiprocessing.Pipe(), multiprocessing.Pipe()
     worker, pilot = PlannerWorker(held, limits, requests, ours), PilotSide(held.commitment, limits, theirs)
     worker.warm_up()
