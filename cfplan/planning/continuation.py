@@ -61,7 +61,8 @@ ROOM = 0.005  # share of each limit that plans leave to whoever continues them
 LATE_HINT = "ask again; a computer with less to do answers sooner"
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
 _NODES = 60  # where a path's time is estimated
-_ON_PATH_LEFT = (2, 3)  # kinds of path that go on along the path left first
+KINDS = range(5)  # of path, in the order in which they are tried
+_ON_PATH_LEFT = (2, 3)  # kinds that go on along the path left first
 
 
 class NoWayError(InfeasibleError):
@@ -82,7 +83,7 @@ class Ways:
     found: tuple[int, int] | None = None
     failed: set[tuple[int, int]] = field(default_factory=set)
     searched: float = 0.0  # s that it took to find it
-    only: bool = False  # whether no other way is tried than the one found
+    kinds: Sequence[int] = KINDS  # that are tried, besides the way found
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,14 +127,14 @@ def continue_plan(
     failure = ""
     begins = _begins(joint, trajectory, points, times)
     straight = _straight(begins, points, times)
-    kinds = (
+    makers = (
         lambda: straight,
         lambda: _guided(begins[:1], points, FIRST_TIMES_GUIDED, GUIDES_IN_MOTION[:1]),
         lambda: [way for begin in begins[2:] for way in _ways(begin, points, FIRST_TIMES_LATER)],
         lambda: _guided(begins[2:], points, FIRST_TIMES_GUIDED_LATER, GUIDES_IN_MOTION),
         lambda: _guided(begins[:2], points, FIRST_TIMES_GUIDED, GUIDES_IN_MOTION[1:]),
     )
-    for number, way in islice(_sound(kinds, limits, known, ways), MOST_TRIES):
+    for number, way in islice(_sound(makers, limits, known, ways), MOST_TRIES):
         task = _with_room(PlanningTask(
             way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,
             speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,
@@ -291,11 +292,9 @@ def _sound(
         maker = makers[first[1]] if first[1] < len(makers) else None
         if maker is not None and not _unsound((way := maker()).path, limits):
             yield first, way
-    if ways.only:
-        return
-    for kind, make in enumerate(kinds):
+    for kind in ways.kinds:
         tried = {k for at, k in ways.failed | ({first} if first else set()) if at == kind}
-        fastest_first = sorted(_made(make(), tried), key=lambda each: _least_time(each[1].path, known))
+        fastest_first = sorted(_made(kinds[kind](), tried), key=lambda each: _least_time(each[1].path, known))
         sound = (((kind, k), way) for k, way in fastest_first if not _unsound(way.path, limits))
         yield from islice(sound, TRIES)
 

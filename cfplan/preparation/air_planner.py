@@ -30,8 +30,7 @@ from cfplan.preparation.replan import (
 )
 from cfplan.safety.limits import Limits
 
-FIRST_PART, NEXT_PART = 0.5, 0.8  # s of a plan committed at once, at least: its beginning, and more of it
-HASTY_PART = 0.3  # s of its beginning where the next request is about to replace it
+FIRST_PART, NEXT_PART = 0.3, 0.8  # s of a plan committed at once, at least: its beginning, and more of it
 PART = 4.0  # likewise, for each s that planning looks ahead
 SLACK = 0.001  # s more than that
 NEAR = 0.5  # s before one must plan the next part of a plan, from when on that is done

@@ -23,8 +23,6 @@ from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Fault
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.planning.continuation import TooLateError, Ways
 from cfplan.preparation.air_planner import (
-    FIRST_PART,
-    HASTY_PART,
     NEXT_PART,
     SLACK,
     PathAnswer,
@@ -86,6 +84,7 @@ class PlannerWorker:
         # it might it begins, as setpoints before are equal.
         self._to_do = self._left_out = 0.0
         self._pressed = False  # whether requests come faster than they can be planned
+        self._made = -math.inf  # s, when the last plan was made, and its checks began
         self._done = -math.inf  # s, when the last one was planned
         self._busy = False  # whether something was done since garbage was looked for
         self._accepted = 0  # number of the request whose plan is flown
@@ -187,20 +186,21 @@ class PlannerWorker:
             beside().wake()
         in_time = None if self._pressed else self._in_time  # where others wait they are worth more than joints nearby
         ways, too_fast = Ways(), set[float]()
-        chain, reason, took = self._chain, "", 0.0
+        chain, reason, took, checked = self._chain, "", 0.0, 0.0
         for tried in range(TRIES):
-            begun, held = REAL_CLOCK.now(), chain.held
+            begun = self._made = REAL_CLOCK.now()
+            held = chain.held
             meanwhile = self._pressed and not chain.fell_back
             lead = self._stops if request.wish is Wish.STOP else self._meanwhile if meanwhile else self._plans
             attempt = AnswerAttempt(
                 partial(self._too_late, lead), ways, in_time, foresee=False, meanwhile=meanwhile, too_fast=too_fast
             )
             if ways.found is not None:  # it needs less time than it took to find it
-                ahead = AGAIN**tried * (self._planning + lead.checking) + SLACK
+                ahead = max(AGAIN**tried * (self._planning + lead.checking), self._planning + checked) + SLACK
                 first = self._in_time_for(ahead)
             else:
                 first, ahead = self._next(lead, AGAIN * took)
-            part = part_within(ahead, HASTY_PART if meanwhile else FIRST_PART)
+            part = part_within(ahead)
             try:
                 made = self._planned(request, first, part, attempt)
             except TooLateError as error:
@@ -238,7 +238,7 @@ class PlannerWorker:
                 if answer is not None and answer.commitment is not None:
                     answer = chain.propose(replace(proposed, made=following(made, chain.held.commitment)))
             elif self._late_by(made.proposal.splice) > 0.0:
-                reason = Fault.LATE.value
+                reason, checked = Fault.LATE.value, done - self._made
                 lead.note(took, made.equal / RATE)
                 continue
             elif made.plan is not None and self._another_waits():
@@ -270,12 +270,14 @@ class PlannerWorker:
             self._to_do += self._planning
             self._left_out = float(np.median(self._equal)) / RATE
         else:
+            self._made = REAL_CLOCK.now()
             self._equal.append(equal)
             self._left_out = equal / RATE
         return self._late_by(splice) + self._to_do > self._left_out
 
     def _in_time(self) -> int:
         """Return the number of the first setpoint that is in time for a plan that is made and must be checked."""
+        self._made = REAL_CLOCK.now()
         return self._in_time_for(AGAIN * self._plans.checking + SLACK)
 
     def _late_by(self, splice: int) -> float:

@@ -27,6 +27,7 @@ from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times
 from cfplan.planning.continuation import (
+    KINDS,
     LATE_HINT,
     NoWayError,
     TooLateError,
@@ -59,11 +60,12 @@ from cfplan.vehicle.joint import JoinedTrajectory
 SLOWER = (1.2, 0.7)  # m/s, at which a flight is tried that would end badly at full speed
 # Setpoints by which the vehicle may fly on before it turns off, where it cannot do so at once. Where waypoints ahead
 # stay, a little later only ways lead on that lose more time than waiting does.
-LATER, LATER_KEEPING = (0, 3, 8, 15, 35), (0, 15, 35)
-NEARBY = 3  # setpoints of that, within which the ways that are known count
-CLOSE = 2  # setpoints by which a plan may change the motion later than it might, without other joints being tried
+LATER, LATER_KEEPING = (0, 3, 5, 8, 15, 35), (0, 15, 35)
+NEARBY = 5  # setpoints of that, within which the ways that are known count
+CLOSE = 2  # setpoints by which a plan may change the motion later than it might, without others being tried
+OTHERS = 6  # plans that are tried at most to change it sooner
 NEARBY_FIRST = (-1, -2, 0, 1, -3, 2, 3)  # joints that are tried, in setpoints from the first that is in time
-OTHER_JOINTS = len(NEARBY_FIRST) - 1  # that are tried at most; one of them may have been already
+LOSES = 0.02  # share of its time that a plan may take longer, if it changes the motion sooner
 SOON = 3  # setpoints by which the vehicle slows down later than the next part needs, which was planned in vain by then
 LEAST_SPEED = 0.2  # m/s, to which requests may lower the speed
 PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
@@ -386,12 +388,7 @@ def _replan_at(speed: float, held: HeldFlight, splice: int, wanted: _Wanted) -> 
     if attempt is not None and attempt.too_late(made.splice, made.equal):
         raise TooLateError("the plan was not made in time", where="request", hint=LATE_HINT)
     if attempt is not None and attempt.in_time is not None and ways.found is not None:
-        same_way = Ways(found=ways.found, only=True)
-
-        def from_joint(splice: int) -> _Unchecked:
-            return _plan_at(speed, held, splice, wanted, replace(same_way))
-
-        made = _sooner(made, from_joint, attempt.in_time)
+        made = _sooner(made, ways, partial(_plan_at, speed, held, wanted=wanted), attempt.in_time)
     since, starts = made.held.flown.since(made.splice / RATE), partial(snapshots_at, made.held, made.splice)
     if part is None:
         passed = certify_whole(since, limits, starts())
@@ -465,25 +462,36 @@ def _plan_at(
     return _Unchecked(later, splice, joint, planned, encoded, equal)
 
 
-def _sooner(best: _Unchecked, from_joint: Callable[[int], _Unchecked], in_time: Callable[[], int]) -> _Unchecked:
-    """Return the plan from a joint nearby that changes the motion sooner and is in time, or the best one so far.
+def _sooner(best: _Unchecked, ways: Ways, planned: Callable[..., _Unchecked], in_time: Callable[[], int]) -> _Unchecked:
+    """Return a plan that changes the motion sooner than the best one so far and is in time, or that.
 
     On some ways the vehicle first flies as it would anyway, for longer than it takes to plan again. By how long the
-    motion stays as it is, to the byte, differs from joint to joint.
+    motion stays as it is, to the byte, differs from joint to joint and from way to way. So by turns the way found is
+    tried from joints nearby, and other kinds of ways from the first joint in time. `planned` is _plan_at() of a splice.
     """
-    tried = {best.splice}
-    for _ in range(OTHER_JOINTS):
-        first = in_time()
-        if best.splice + best.equal <= first + CLOSE:
+    assert ways.found is not None
+    joints, kinds = {best.splice}, KINDS[ways.found[0] + 1 :]
+    for number in range(OTHERS):
+        first, change = in_time(), best.splice + best.equal
+        if change <= first + CLOSE:
             break
-        near = [first + off for off in NEARBY_FIRST if first + off not in tried]
-        tried.add(near[0])
-        if near[0] < best.held.begin:
+        if number % 2 and kinds:
+            splice, tried = first, Ways(failed=ways.failed, kinds=kinds)
+        else:
+            splice = next(first + off for off in NEARBY_FIRST if first + off not in joints)
+            tried = Ways(ways.found, kinds=())
+            joints.add(splice)
+        if splice < best.held.begin:
             continue
         with suppress(CfplanError):  # no plan from there
-            other = from_joint(near[0])
-            if in_time() <= other.splice + other.equal < best.splice + best.equal:
-                best = other
+            other = planned(splice=splice, ways=tried, too_late=lambda _, change=change: in_time() + CLOSE >= change)
+            if other.splice > splice:  # sooner the vehicle cannot turn off
+                break
+            soon_over = other.held.ends <= best.held.ends + LOSES * best.plan.trajectory.duration
+            if in_time() <= other.splice + other.equal < change and soon_over:
+                best, ways.found = other, tried.found
+        if tried.kinds:
+            kinds = KINDS[len(KINDS) if tried.found is None else tried.found[0] + 1 :]
     return best
 
 

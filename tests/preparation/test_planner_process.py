@@ -31,9 +31,9 @@ from cfplan.flight.setpoints.encoding import LEAD, RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.preparation import certified_flight
+from cfplan.preparation import certified_flight, planner_worker
 from cfplan.preparation import replan as replanning
-from cfplan.preparation.air_planner import HASTY_PART, SLACK, PathAnswer, PathRequest, PathVerdict, Wish
+from cfplan.preparation.air_planner import FIRST_PART, SLACK, PathAnswer, PathRequest, PathVerdict, Wish
 from cfplan.preparation.certified_flight import EndsBadlyError
 from cfplan.preparation.lead import IN_TIME, LEARNED_FROM, Lead
 from cfplan.preparation.planner_process import AirPlanner
@@ -136,7 +136,7 @@ def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(b
     assert answer.splice in pilot.commitment.splices
     joint = round(answer.joint * RATE)
     assert 0 < joint - answer.splice <= SPLICE_AHEAD  # less by the setpoints that are the committed ones
-    numbers = np.arange(joint, joint + 20)
+    numbers = np.arange(joint, joint + 10)  # as far as its first part goes
     committed = decode(pilot.commitment.payloads[numbers - pilot.commitment.first])
     planned = answer.plan.trajectory.at(numbers / RATE + LEAD - answer.joint)
     np.testing.assert_allclose(committed.position, planned.position, atol=QUANTUM)
@@ -353,21 +353,30 @@ def test_while_requests_press_one_is_planned_on_what_is_simulated_still(in_fligh
     assert worker._chain.held.commitment.checksum == pilot.commitment.checksum
 
 
+@contextlib.contextmanager
+def looking(pilot: PilotSide) -> Iterator[None]:
+    """Let a thread look for the pilot at what is proposed."""
+    ended = threading.Event()
+
+    def look() -> None:
+        while not ended.wait(0.001):
+            pilot.tick()
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
 def test_three_on_their_way_are_accepted_in_order(in_flight):
     worker, main, pilot, theirs = in_flight
     third = PathRequest(3, Wish.REPLACE, FAR[2:])
-    looks = threading.Event()
-
-    def look() -> None:
-        while not looks.wait(0.001):
-            pilot.tick()
-
-    looking = threading.Thread(target=look)
-    looking.start()
-    assert [pressed(worker, main, each) for each in (FIRST, SECOND, third)] == [None] * 3
-    worker._chain.settle()
-    looks.set()
-    looking.join()
+    with looking(pilot):
+        assert [pressed(worker, main, each) for each in (FIRST, SECOND, third)] == [None] * 3
+        worker._chain.settle()
     told = [main.recv() for _ in range(3)]
     assert [(each.number, each.verdict) for each in told] == [(n, PathVerdict.ACCEPTED) for n in (1, 2, 3)]
     assert [each.splice for each in told] == sorted(each.splice for each in told)
@@ -384,11 +393,40 @@ def test_what_was_committed_in_haste_is_committed_to_its_end_once_nobody_presses
         def to_its_end() -> bool:
             pilot.tick()
             end = decode(pilot.commitment.payloads[-1:]).position[0]
-            return bool(np.abs(end - FAR[-1]).max() < 2e-3)
+            heard = worker._chain.held.commitment.checksum == pilot.commitment.checksum
+            return heard and bool(np.abs(end - FAR[-1]).max() < 2e-3)
 
         assert until(to_its_end)
-    assert first.stops_from - pilot.commitment.splices[0] <= round(HASTY_PART * RATE)
-    assert worker._chain.held.commitment.checksum == pilot.commitment.checksum
+    assert first.stops_from - pilot.commitment.splices[0] <= round(FIRST_PART * RATE)
+
+
+def test_who_came_late_plans_as_far_ahead_as_the_checks_took(in_flight, monkeypatch):
+    """They may take longer than those of most plans, and do so again."""
+    worker, _, pilot, theirs = in_flight
+    checks, begun, firsts, planned = 0.2, REAL_CLOCK.now(), [], worker._planned
+    now = begun
+    worker._plans.note(0.05, only=True)
+
+    class Standing:
+        def now(self):
+            return now
+
+    monkeypatch.setattr(planner_worker, "REAL_CLOCK", Standing())
+    monkeypatch.setattr(worker, "_late_by", lambda splice: 1.0 if len(firsts) == 1 and now > begun else -1.0)
+
+    def takes_long(request, first, part, attempt):
+        nonlocal now
+        firsts.append(first - worker._in_time_for(0.0))
+        made = planned(request, first, part, attempt)
+        now += checks
+        return made
+
+    monkeypatch.setattr(worker, "_planned", takes_long)
+    with looking(pilot):
+        answer = worker._answer(FIRST, now)
+    assert answer.verdict is PathVerdict.ACCEPTED, answer
+    assert firsts[0] < firsts[1] == pytest.approx(checks * RATE, abs=2)
+    theirs.close()
 
 
 @pytest.mark.parametrize("falls", ["in its simulation", "as the pilot refuses it"])

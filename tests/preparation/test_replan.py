@@ -17,6 +17,7 @@ from cfplan.preparation.certified_flight import EndsBadlyError, UnfoundedError
 from cfplan.preparation.replan import (
     CLOSE,
     LOOKS_BACK,
+    LOSES,
     AnswerAttempt,
     accepted,
     after_failure,
@@ -289,6 +290,40 @@ def test_a_plan_that_changes_the_motion_late_begins_at_another_joint_if_that_is_
             after(held, limits, made, now=begin - 5)
             sooner.append(plain.proposal.splice - made.proposal.splice)
     assert np.count_nonzero(sooner) >= 3
+
+
+def test_a_plan_that_changes_the_motion_late_goes_another_way_if_that_is_sooner(held, limits):
+    """A way of another kind, that takes hardly longer; the next try of the same request takes that first."""
+    others = 0
+    for waypoint in ([-1.2, 2.5, 1.0], [0.0, -3.0, 1.0], [-1.5, -1.0, 0.8]):
+        for begin in range(NOW - 20, NOW + 120, 5):
+            plain, attempt = Ways(), AnswerAttempt(in_time, Ways(), lambda begin=begin: begin + 1)
+            one, made = (
+                replan(held, begin, [waypoint], limits, part=PART, attempt=each)
+                for each in (AnswerAttempt(in_time, plain), attempt)
+            )
+            if attempt.ways.found != plain.found:
+                others += 1
+                assert attempt.ways.found[0] > plain.found[0]
+                assert begin + 1 <= made.proposal.splice < one.proposal.splice
+                assert made.held.ends <= one.held.ends + 1.01 * LOSES * one.plan.trajectory.duration
+    assert others >= 2
+
+
+def test_within_a_stop_no_other_joint_is_looked_for(held, limits, monkeypatch):
+    """From none of them the vehicle would turn off sooner than where it rests."""
+    stopped, tried = after(held, limits, halt(held, NOW + 5, limits)), []
+    plan_at = replanning._plan_at
+
+    def counted(*given, **named):
+        tried.append(given)
+        return plan_at(*given, **named)
+
+    monkeypatch.setattr(replanning, "_plan_at", counted)
+    attempt = AnswerAttempt(in_time, Ways(), lambda: NOW + 10)
+    made = replan(stopped, NOW + 10, [[-0.5, 0.8, 1.0]], limits, part=PART, attempt=attempt)
+    assert made.proposal.splice > NOW + 10 + CLOSE
+    assert len(tried) <= 2
 
 
 def test_a_plan_that_would_end_badly_and_is_late_is_made_slower_at_once_the_next_time(held, limits, monkeypatch):
