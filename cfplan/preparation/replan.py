@@ -65,7 +65,7 @@ NEARBY = 5  # setpoints of that, within which the ways that are known count
 CLOSE = 2  # setpoints by which a plan may change the motion later than it might, without others being tried
 OTHERS = 6  # plans that are tried at most to change it sooner
 NEARBY_FIRST = (-1, -2, 0, 1, -3, 2, 3)  # joints that are tried, in setpoints from the first that is in time
-LOSES = 0.02  # share of its time that a plan may take longer, if it changes the motion sooner
+LOSES = 0.005  # share of its time that a plan may take longer, if it changes the motion sooner
 SOON = 3  # setpoints by which the vehicle slows down later than the next part needs, which was planned in vain by then
 LEAST_SPEED = 0.2  # m/s, to which requests may lower the speed
 PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
@@ -471,6 +471,7 @@ def _sooner(best: _Unchecked, ways: Ways, planned: Callable[..., _Unchecked], in
     """
     assert ways.found is not None
     joints, kinds = {best.splice}, KINDS[ways.found[0] + 1 :]
+    ends = best.held.ends + LOSES * best.plan.trajectory.duration
     for number in range(OTHERS):
         first, change = in_time(), best.splice + best.equal
         if change <= first + CLOSE:
@@ -487,8 +488,7 @@ def _sooner(best: _Unchecked, ways: Ways, planned: Callable[..., _Unchecked], in
             other = planned(splice=splice, ways=tried, too_late=lambda _, change=change: in_time() + CLOSE >= change)
             if other.splice > splice:  # sooner the vehicle cannot turn off
                 break
-            soon_over = other.held.ends <= best.held.ends + LOSES * best.plan.trajectory.duration
-            if in_time() <= other.splice + other.equal < change and soon_over:
+            if in_time() <= other.splice + other.equal < change and other.held.ends <= ends:
                 best, ways.found = other, tried.found
         if tried.kinds:
             kinds = KINDS[len(KINDS) if tried.found is None else tried.found[0] + 1 :]
