@@ -200,9 +200,8 @@ class PlannerWorker:
                 first = self._in_time_for(ahead)
             else:
                 first, ahead = self._next(lead, AGAIN * took)
-            part = part_within(ahead)
             try:
-                made = self._planned(request, first, part, attempt)
+                made = self._planned(request, first, part_within(ahead), attempt)
             except TooLateError as error:
                 took = REAL_CLOCK.now() - begun + self._to_do
                 lead.note(took, self._left_out)
