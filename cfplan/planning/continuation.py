@@ -62,7 +62,7 @@ LATE_HINT = "ask again; a computer with less to do answers sooner"
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
 _NODES = 60  # where a path's time is estimated
 KINDS = range(5)  # of path, in the order in which they are tried
-_ON_PATH_LEFT = (2, 3)  # kinds that go on along the path left first
+ON_PATH_LEFT = (2, 3)  # kinds that go on along the path left first, where no waypoints of that stay
 
 
 class NoWayError(InfeasibleError):
@@ -84,6 +84,16 @@ class Ways:
     failed: set[tuple[int, int]] = field(default_factory=set)
     searched: float = 0.0  # s that it took to find it
     kinds: Sequence[int] = KINDS  # that are tried, besides the way found
+
+    def restrict_to(self, kinds: Sequence[int]) -> None:
+        """Try these kinds alone from now on."""
+        self.kinds = kinds
+        if self.found is not None and self.found[0] not in kinds:
+            self.found = None
+
+    def kinds_behind(self, way: tuple[int, int]) -> Sequence[int]:
+        """Return the kinds that are tried once that of a way has been."""
+        return [kind for kind in self.kinds if kind > way[0]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +159,7 @@ def continue_plan(
                 check_endurance(found.trajectory.duration, limits)
                 return Continuation(_plan(found, task, limits, time.perf_counter() - begun), way.reached)
             failure, ways.found = found, None  # not from here, or not as slowly
-        if number[0] not in _ON_PATH_LEFT:
+        if number[0] not in ON_PATH_LEFT:
             ways.failed.add(number)
     failure = failure or _unsound(_made(straight)[0][1].path, limits)
     speed = float(np.linalg.norm(trajectory.at(leave).velocity))

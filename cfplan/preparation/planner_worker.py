@@ -48,6 +48,7 @@ from cfplan.preparation.proposal_chain import NO_ANSWER, ProposalChain, Proposed
 from cfplan.preparation.replan import (
     AnswerAttempt,
     HeldFlight,
+    Manner,
     Replanned,
     after_failure,
     following,
@@ -185,7 +186,7 @@ class PlannerWorker:
         if not self._pressed:
             beside().wake()
         in_time = None if self._pressed else self._in_time  # where others wait they are worth more than joints nearby
-        ways, too_fast = Ways(), set[float]()
+        ways, bad = Ways(), set[Manner]()
         chain, reason, took, checked = self._chain, "", 0.0, 0.0
         for tried in range(TRIES):
             begun = self._made = REAL_CLOCK.now()
@@ -193,8 +194,9 @@ class PlannerWorker:
             meanwhile = self._pressed and not chain.fell_back
             lead = self._stops if request.wish is Wish.STOP else self._meanwhile if meanwhile else self._plans
             attempt = AnswerAttempt(
-                partial(self._too_late, lead), ways, in_time, foresee=False, meanwhile=meanwhile, too_fast=too_fast
+                partial(self._too_late, lead), ways, in_time, foresee=False, meanwhile=meanwhile, bad=bad
             )
+            badly = len(bad)
             if ways.found is not None:  # it needs less time than it took to find it
                 ahead = max(AGAIN**tried * (self._planning + lead.checking), self._planning + checked) + SLACK
                 first = self._in_time_for(ahead)
@@ -205,6 +207,8 @@ class PlannerWorker:
             except TooLateError as error:
                 took = REAL_CLOCK.now() - begun + self._to_do
                 lead.note(took, self._left_out)
+                if len(bad) > badly:  # it was not for want of a way
+                    took = 0.0
                 reason = str(error)
                 continue
             except UnfoundedError:
@@ -231,7 +235,7 @@ class PlannerWorker:
                 chain.hold_back(proposed)
                 return None
             if made.plan is not None:
-                lead.note_checks(took - made.plan.seconds)
+                lead.note_checks(done - self._made)
             if made.stop is not None:
                 answer = chain.propose(replace(proposed, made=made.stop))
                 if answer is not None and answer.commitment is not None:

@@ -9,7 +9,7 @@ go_on(), one part after another before the vehicle comes to the stop. A planner 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -29,6 +29,7 @@ from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times
 from cfplan.planning.continuation import (
     KINDS,
     LATE_HINT,
+    ON_PATH_LEFT,
     NoWayError,
     TooLateError,
     Ways,
@@ -133,6 +134,13 @@ class Replanned:
     equal: int = 0  # setpoints by which the proposal begins later than it might, as so many are the committed ones
 
 
+class Manner(NamedTuple):
+    """How a plan is flown."""
+
+    speed: float  # m/s, at most
+    kinds: Sequence[int] = KINDS  # of path
+
+
 @dataclass(frozen=True, slots=True)
 class AnswerAttempt:
     """One try to answer a request; another is made where it comes too late, with the ways that are known by then."""
@@ -149,7 +157,7 @@ class AnswerAttempt:
     """Whether what is simulated of a plan's beginning goes on beside when it is returned. Before it is proposed, that
     must have passed; what is planned on it by then raises UnfoundedError where it has not. Link loss far ahead does not
     count then."""
-    too_fast: set[float] = field(default_factory=set)  # m/s, at which it would end badly; written as speeds are tried
+    bad: set[Manner] = field(default_factory=set)  # in which it would end badly; written as they are tried
 
 
 def hold(planned: Plan, waypoints: ArrayLike) -> HeldFlight:
@@ -263,7 +271,7 @@ def go_on(
 
 def _slower(held: HeldFlight, limits: Limits) -> AnswerAttempt:
     """Return the attempt that leaves out the speed at which the plan is flown."""
-    return AnswerAttempt(lambda splice, equal: False, Ways(), too_fast={min(held.speed, limits.plan.speed)})
+    return AnswerAttempt(lambda splice, equal: False, Ways(), bad={Manner(min(held.speed, limits.plan.speed))})
 
 
 def slowed_ahead(
@@ -282,7 +290,7 @@ def slowed_ahead(
     try:
         foresee_link_loss(encoded.payloads, limits, snapshots_at(held, ahead))
     except EndsBadlyError:
-        attempt.too_fast.add(fastest)
+        attempt.bad.add(Manner(fastest))
         return _replan_within(held, splice, _nothing_new(limits, yaw_angle, part, attempt))
     return None
 
@@ -349,37 +357,50 @@ def _replan_within(held: HeldFlight, splice: int, wanted: _Wanted) -> Replanned:
     """Return what replan() does, at the speed that is asked for, or slower where it must be."""
     limits, attempt = wanted.limits, wanted.attempt
     splice, _ = _leaving(at_rest_from(held, splice, limits), splice, wanted.keep)  # from there on it may be later
-    fastest = min(held.speed, limits.plan.speed)
-    speeds = (fastest, *(slower for slower in SLOWER if slower < fastest))
     refused: InfeasibleError | None = None
-    for speed in [one for one in speeds[:-1] if attempt is None or one not in attempt.too_fast] + [speeds[-1]]:
-        for later in LATER_KEEPING if wanted.keep else LATER:
+    turns_off = not wanted.keep and (splice + SPLICE_AHEAD) / RATE < held.ends
+    *manners, slowest = _manners(held, limits, turns_off=turns_off)
+    for manner in [one for one in manners if attempt is None or one not in attempt.bad] + [slowest]:
+        for later in LATER_KEEPING if wanted.keep else LATER if manner.kinds == KINDS else (0,):
             if later and held.stops_from is not None and splice + later >= held.stops_from:
                 break
             try:
                 at_once = attempt if later <= NEARBY else None
-                return _replan_at(speed, held, splice + later, wanted._replace(attempt=at_once))
+                return _replan_at(manner, held, splice + later, wanted._replace(attempt=at_once))
             except EndsBadlyError as error:
                 refused = error
                 if at_once is not None:
-                    at_once.too_fast.add(speed)
-                    if at_once.too_late(splice, None) and speed != speeds[-1]:
-                        raise TooLateError("it is to be flown slower", where="request", hint=LATE_HINT) from error
-                break  # slower
+                    at_once.bad.add(manner)
+                    if at_once.too_late(splice, None) and manner != slowest:
+                        raise TooLateError("it is to be flown otherwise", where="request", hint=LATE_HINT) from error
+                break
             except NoWayError as error:
                 refused = refused or error
                 if (splice + later + SPLICE_AHEAD) / RATE > held.ends:
                     break
         else:
-            break
+            if manner.kinds == KINDS:
+                break
     assert refused is not None
     raise refused
 
 
-def _replan_at(speed: float, held: HeldFlight, splice: int, wanted: _Wanted) -> Replanned:
-    """Return what replan() does, at that speed, m/s, or less."""
+def _manners(held: HeldFlight, limits: Limits, *, turns_off: bool) -> list[Manner]:
+    """Return how plans are tried, one after another where link loss or a gap would end badly.
+
+    What is flown ends well: where the vehicle `turns_off` from that, a plan that goes on along it first mostly ends
+    well too, and takes less time than a slower one.
+    """
+    fastest = min(held.speed, limits.plan.speed)
+    along = [Manner(fastest, ON_PATH_LEFT)] if turns_off else []
+    return [Manner(fastest), *along, *(Manner(slower) for slower in SLOWER if slower < fastest)]
+
+
+def _replan_at(manner: Manner, held: HeldFlight, splice: int, wanted: _Wanted) -> Replanned:
+    """Return what replan() does, in that manner."""
     attempt, limits, part = wanted.attempt, wanted.limits, wanted.part
-    ways = Ways() if attempt is None else attempt.ways
+    ways, speed = Ways() if attempt is None else attempt.ways, manner.speed
+    ways.restrict_to(manner.kinds)
 
     def too_late(splice: int) -> bool:
         return attempt is not None and attempt.too_late(splice, None)
@@ -470,7 +491,7 @@ def _sooner(best: _Unchecked, ways: Ways, planned: Callable[..., _Unchecked], in
     tried from joints nearby, and other kinds of ways from the first joint in time. `planned` is _plan_at() of a splice.
     """
     assert ways.found is not None
-    joints, kinds = {best.splice}, KINDS[ways.found[0] + 1 :]
+    joints, kinds = {best.splice}, ways.kinds_behind(ways.found)
     ends = best.held.ends + LOSES * best.plan.trajectory.duration
     for number in range(OTHERS):
         first, change = in_time(), best.splice + best.equal
@@ -491,7 +512,7 @@ def _sooner(best: _Unchecked, ways: Ways, planned: Callable[..., _Unchecked], in
             if in_time() <= other.splice + other.equal < change and other.held.ends <= ends:
                 best, ways.found = other, tried.found
         if tried.kinds:
-            kinds = KINDS[len(KINDS) if tried.found is None else tried.found[0] + 1 :]
+            kinds = () if tried.found is None else tried.kinds_behind(tried.found)
     return best
 
 

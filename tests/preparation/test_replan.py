@@ -326,8 +326,28 @@ def test_within_a_stop_no_other_joint_is_looked_for(held, limits, monkeypatch):
     assert len(tried) <= 2
 
 
-def test_a_plan_that_would_end_badly_and_is_late_is_made_slower_at_once_the_next_time(held, limits, monkeypatch):
-    """By then it is too late to fly it slower from the same joint, and at full speed it would end badly again."""
+def test_where_turning_off_at_once_would_end_badly_the_vehicle_first_flies_on_as_it_did(held, limits, monkeypatch):
+    """At full speed, as on what it would fly anyway it ends well; and the next try of the request begins with that."""
+    certify, tried = certified_flight.certify_beginning, []
+    left = held.flown.at(np.arange(NOW / RATE, NOW / RATE + 0.5, 1e-6)).position  # 2 µm apart
+
+    def ends_badly_if_it_turns_off(flown, *given, **options):
+        there = flown.at(flown.starts[-1] + 0.095).position
+        tried.append(np.linalg.norm(left - there, axis=1).min())
+        if tried[-1] > 2e-6:
+            raise EndsBadlyError("it ends outside", where="link loss")
+        return certify(flown, *given, **options)
+
+    monkeypatch.setattr(replanning, "certify_beginning", ends_badly_if_it_turns_off)
+    attempt = AnswerAttempt(in_time, Ways())
+    for tries in (2, 3):
+        made = replan(held, NOW, FAR, limits, part=PART, attempt=attempt)
+        assert len(tried) == tries
+        assert fastest_after(made) > 1.5
+
+
+def test_a_plan_that_would_end_badly_and_is_late_is_made_otherwise_at_once_the_next_time(held, limits, monkeypatch):
+    """By then it is too late to fly it otherwise from the same joint, and as it was it would end badly again."""
     certify, tried, late = replanning.certify_whole, [], True
 
     def ends_badly_if_fast(flown, limits, starts):
@@ -343,7 +363,8 @@ def test_a_plan_that_would_end_badly_and_is_late_is_made_slower_at_once_the_next
         replan(held, NOW, far, limits, attempt=attempt)
     late = False
     made = replan(held, NOW + 10, far, limits, attempt=attempt)
-    assert len(tried) == 2
+    assert len(tried) == 3
+    assert tried[1] > 1.5 > tried[2]
     assert made.plan is not None
 
 
@@ -380,7 +401,7 @@ def test_what_would_end_badly_far_ahead_is_flown_slower_at_once_or_later(held, l
     made = replan(held, NOW + 5, FAR, limits, part=PART, attempt=AnswerAttempt(in_time, Ways(), foresee=at_once))
     after(held, limits, made)
     assert bool(fastest_after(made) < FAST) is at_once
-    assert len(foreseen) == (2 if at_once else 0)
+    assert len(foreseen) == (3 if at_once else 0)
 
 
 def test_what_is_committed_is_flown_slower_before_it_would_end_badly(held, limits, foreseen):
