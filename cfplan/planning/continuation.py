@@ -60,6 +60,10 @@ OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
 ROOM = 0.005  # share of each limit that plans leave to whoever continues them
 LATE_HINT = "ask again; a computer with less to do answers sooner"
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
+# Share of the usual intervals on which it is planned, where all ahead was dropped: such plans take 0.05 % longer, and
+# are made in nine tenths of the time. Where waypoints stay, the grid is as fine as that of the path left: at their
+# limits motions can often not be continued on another.
+COARSER = 0.85
 _NODES = 60  # where a path's time is estimated
 KINDS = range(5)  # of path, in the order in which they are tried
 ON_PATH_LEFT = (2, 3)  # kinds that go on along the path left first, where no waypoints of that stay
@@ -134,7 +138,7 @@ def continue_plan(
     points = check_continued(joint.derivatives, waypoints)[1][1:]
     check_waypoints(points, limits)
     known = scaled_limits(limits.airframe, limits.plan)
-    failure = ""
+    failure, grid = "", COARSER if times is None else _grid_of(trajectory)
     begins = _begins(joint, trajectory, points, times)
     straight = _straight(begins, points, times)
     makers = (
@@ -146,7 +150,8 @@ def continue_plan(
     )
     for number, way in islice(_sound(makers, limits, known, ways), MOST_TRIES):
         task = _with_room(PlanningTask(
-            way.path, limits.airframe, limits.plan, default_nodes(way.path, PLANNER), yaw, yaw_angle, start=way.start,
+            way.path, limits.airframe, limits.plan, round(grid * default_nodes(way.path, PLANNER)), yaw, yaw_angle,
+            start=way.start,
             speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,
         ))  # fmt: skip
         failure = _why_not(task.refusal or Solution(Status.NOT_CONVERGED, None))
@@ -307,6 +312,12 @@ def _sound(
         fastest_first = sorted(_made(kinds[kind](), tried), key=lambda each: _least_time(each[1].path, known))
         sound = (((kind, k), way) for k, way in fastest_first if not _unsound(way.path, limits))
         yield from islice(sound, TRIES)
+
+
+def _grid_of(trajectory: Trajectory) -> float:
+    """Return the share of the usual intervals on which a trajectory was planned."""
+    own = (len(trajectory.profile.s) - 1) / default_nodes(trajectory.path, PLANNER)
+    return min(max(own, COARSER), 1.0)
 
 
 def _unsound(path: Path, limits: Limits) -> str:

@@ -60,8 +60,8 @@ class PilotSide:
         self.silent_for: float | None = None  # s, for which the next answer is kept back
         self.told: list[PathAnswer] = []  # by the planner, and not looked at yet
 
-    def begin(self) -> None:
-        self.begun = REAL_CLOCK.now()
+    def begin(self, ago: float = 0.0) -> None:
+        self.begun = REAL_CLOCK.now() - ago
         self.proposals.begin(self.begun)
 
     def tick(self) -> None:
@@ -478,7 +478,7 @@ def test_what_ends_badly_far_ahead_is_accepted_and_flown_slower_soon(held, limit
         monkeypatch.setattr(module, "foresee_link_loss", foresee)
 
     with served(worker, main, theirs):
-        pilot.begin()
+        pilot.begin(ago=0.5)  # as soon as it has begun, now and then no way leads on
         assert until(lambda: worker._chain.begun > 0.0)
         main.send(PathRequest(1, Wish.REPLACE, FAR))
         answers = two_answers(main, pilot)
