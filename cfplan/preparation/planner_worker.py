@@ -21,7 +21,7 @@ from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.proposals import LOOKS_UNTIL, PilotAnswer
 from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Fault
 from cfplan.flight.setpoints.encoding import RATE
-from cfplan.planning.continuation import TooLateError, Ways
+from cfplan.planning.continuation import ON_PATH_LEFT, TooLateError, Ways
 from cfplan.preparation.air_planner import (
     NEXT_PART,
     SLACK,
@@ -80,7 +80,8 @@ class PlannerWorker:
         self._plans, self._stops, self._parts = Lead(FIRST_TIME), Lead(FIRST_STOP), Lead(FIRST_STOP)
         self._meanwhile = Lead(FIRST_TIME)  # of plans that are simulated while the next one is planned
         self._planned_in: deque[float] = deque([0.0], maxlen=LEARNED_FROM)  # s of plans, once a way was known
-        self._equal: deque[int] = deque([0], maxlen=LEARNED_FROM)  # setpoints that proposals left out as equal
+        # Setpoints that proposals left out as equal, by whether plans first go on along the path left.
+        self._equal = {along: deque([0], maxlen=LEARNED_FROM) for along in (False, True)}
         # When last asked whether something comes too late, s: what was to be done still, by how much later than where
         # it might it begins, as setpoints before are equal.
         self._to_do = self._left_out = 0.0
@@ -187,24 +188,26 @@ class PlannerWorker:
             beside().wake()
         in_time = None if self._pressed else self._in_time  # where others wait they are worth more than joints nearby
         ways, bad = Ways(), set[Manner]()
-        chain, reason, took, checked = self._chain, "", 0.0, 0.0
+        chain, reason, took, solved, checked = self._chain, "", 0.0, 0.0, 0.0
         for tried in range(TRIES):
             begun = self._made = REAL_CLOCK.now()
             held = chain.held
             meanwhile = self._pressed and not chain.fell_back
             lead = self._stops if request.wish is Wish.STOP else self._meanwhile if meanwhile else self._plans
             attempt = AnswerAttempt(
-                partial(self._too_late, lead), ways, in_time, foresee=False, meanwhile=meanwhile, bad=bad
+                partial(self._too_late, lead, ways), ways, in_time, foresee=False, meanwhile=meanwhile, bad=bad
             )
             badly = len(bad)
             if ways.found is not None:  # it needs less time than it took to find it
-                ahead = max(AGAIN**tried * (self._planning + lead.checking), self._planning + checked) + SLACK
+                needed = max(self._planning, solved) + max(lead.checking, checked)
+                ahead = max(AGAIN**tried * (self._planning + lead.checking), needed) + SLACK
                 first = self._in_time_for(ahead)
             else:
                 first, ahead = self._next(lead, AGAIN * took)
             try:
                 made = self._planned(request, first, part_within(ahead), attempt)
             except TooLateError as error:
+                solved = REAL_CLOCK.now() - begun - ways.searched
                 took = REAL_CLOCK.now() - begun + self._to_do
                 lead.note(took, self._left_out)
                 if len(bad) > badly:  # it was not for want of a way
@@ -261,20 +264,21 @@ class PlannerWorker:
         self._chain.read()
         return self._requests.waiting is not None
 
-    def _too_late(self, lead: Lead, splice: int, equal: int | None) -> bool:
+    def _too_late(self, lead: Lead, ways: Ways, splice: int, equal: int | None) -> bool:
         """Return whether what is planned from a setpoint on, and must be checked still, comes to the pilot too late.
 
-        So many setpoints stay `equal`, which is learned; None where that is not known, as it must be planned still.
-        `lead` knows how long the checks take.
+        So many setpoints stay `equal`, which is learned; None where that is not known, as it must be planned still,
+        along what was found of the `ways`. `lead` knows how long the checks take.
         """
         self._chain.release_if_ready()
+        of_kind = self._equal[ways.found is not None and ways.found[0] in ON_PATH_LEFT]
         self._to_do = lead.checking
         if equal is None:
             self._to_do += self._planning
-            self._left_out = float(np.median(self._equal)) / RATE
+            self._left_out = float(np.median(of_kind)) / RATE
         else:
             self._made = REAL_CLOCK.now()
-            self._equal.append(equal)
+            of_kind.append(equal)
             self._left_out = equal / RATE
         return self._late_by(splice) + self._to_do > self._left_out
 
@@ -321,7 +325,8 @@ class PlannerWorker:
         """Look far ahead on the plan that is flown, and propose to fly slower where it must be; as _go_on()."""
         self._unforeseen -= 1
         first, ahead = self._next(self._plans, UNHURRIED * (self._planning + self._plans.checking))
-        attempt = AnswerAttempt(partial(self._too_late, self._plans), Ways())
+        ways = Ways()
+        attempt = AnswerAttempt(partial(self._too_late, self._plans, ways), ways)
         try:
             made = plan_slower(self._chain.held, first, self._limits, part_within(ahead), attempt)
         except TooLateError:

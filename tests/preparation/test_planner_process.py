@@ -30,6 +30,7 @@ from cfplan.flight.setpoints.commitment import (
 from cfplan.flight.setpoints.encoding import LEAD, RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
+from cfplan.planning.continuation import TooLateError, Ways
 from cfplan.planning.plan import plan
 from cfplan.preparation import certified_flight, planner_worker
 from cfplan.preparation import replan as replanning
@@ -407,10 +408,11 @@ def test_what_was_committed_in_haste_is_committed_to_its_end_once_nobody_presses
     assert first.stops_from - pilot.commitment.splices[0] <= round(FIRST_PART * RATE)
 
 
-def test_who_came_late_plans_as_far_ahead_as_the_checks_took(in_flight, monkeypatch):
+@pytest.mark.parametrize("what", ["plan", "checks"])
+def test_who_came_late_plans_as_far_ahead_as_plan_or_checks_took(in_flight, monkeypatch, what):
     """They may take longer than those of most plans, and do so again."""
     worker, _, pilot, theirs = in_flight
-    checks, begun, firsts, planned = 0.2, REAL_CLOCK.now(), [], worker._planned
+    long, begun, firsts, planned = 0.2, REAL_CLOCK.now(), [], worker._planned
     now = begun
     worker._plans.note(0.05, only=True)
 
@@ -425,15 +427,29 @@ def test_who_came_late_plans_as_far_ahead_as_the_checks_took(in_flight, monkeypa
         nonlocal now
         firsts.append(first - worker._in_time_for(0.0))
         made = planned(request, first, part, attempt)
-        now += checks
+        now += long
+        if what == "plan" and len(firsts) == 1:
+            raise TooLateError("the plan was not made in time")
         return made
 
     monkeypatch.setattr(worker, "_planned", takes_long)
     with looking(pilot):
         answer = worker._answer(FIRST, now)
     assert answer.verdict is PathVerdict.ACCEPTED, answer
-    assert firsts[0] < firsts[1] == pytest.approx(checks * RATE, abs=2)
+    assert firsts[0] < firsts[1] == pytest.approx(long * RATE, abs=2)
     theirs.close()
+
+
+def test_a_plan_along_the_path_left_has_the_time_that_such_plans_leave_the_motion_as_it_is(in_flight, monkeypatch):
+    worker, *_ = in_flight
+    at_once, along = Ways((0, 1)), Ways((2, 0))
+    for ways, equal in ((at_once, 1), (along, 5)):
+        for _ in range(20):
+            worker._too_late(worker._plans, ways, 100, equal)
+    for late_by in (0.0, 0.04):
+        monkeypatch.setattr(worker, "_late_by", lambda splice, late_by=late_by: late_by)
+        assert worker._too_late(worker._plans, at_once, 100, None) is (late_by > 0.01)
+        assert not worker._too_late(worker._plans, along, 100, None)
 
 
 @pytest.mark.parametrize("falls", ["in its simulation", "as the pilot refuses it"])
