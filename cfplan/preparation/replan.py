@@ -361,7 +361,8 @@ def _replan_within(held: HeldFlight, splice: int, wanted: _Wanted) -> Replanned:
     turns_off = not wanted.keep and (splice + SPLICE_AHEAD) / RATE < held.ends
     *manners, slowest = _manners(held, limits, turns_off=turns_off)
     for manner in [one for one in manners if attempt is None or one not in attempt.bad] + [slowest]:
-        for later in LATER_KEEPING if wanted.keep else LATER if manner.kinds == KINDS else (0,):
+        everywhere = manner.kinds == KINDS  # else it is one more try from where the others end badly
+        for later in LATER_KEEPING if wanted.keep else LATER if everywhere else LATER[:1]:
             if later and held.stops_from is not None and splice + later >= held.stops_from:
                 break
             try:
@@ -379,7 +380,7 @@ def _replan_within(held: HeldFlight, splice: int, wanted: _Wanted) -> Replanned:
                 if (splice + later + SPLICE_AHEAD) / RATE > held.ends:
                     break
         else:
-            if manner.kinds == KINDS:
+            if everywhere:  # nor does a way lead on more slowly
                 break
     assert refused is not None
     raise refused
