@@ -130,6 +130,19 @@ def test_waypoints_anywhere_in_the_space_are_flown_from_rest(limits):
     assert plan(last, limits.airframe, limits, planner="expert").certificate.passed
 
 
+@pytest.mark.parametrize("end", [[-0.8, 0.5, 1.0], [-0.8, 0.55, 1.1]], ids=["straight back", "almost straight back"])
+def test_who_is_to_fly_there_and_back_turns_round_in_a_loop(flown, limits, end):
+    """Of a path through such waypoints alone there is none but through a stop, or far outside."""
+    wall = limits.space.high[0] - limits.space.margin
+    there = [wall - 0.05, 0.5, 1.0]
+    path, reached = path_from_rest([[0.0, 0.5, 1.0], there, end], limits)
+    np.testing.assert_allclose(path(np.array(reached)), [there, end], atol=1e-9)
+    assert plan(path, limits.airframe, limits, planner="expert").certificate.passed
+    leave = 0.3 * flown.trajectory.duration
+    made = continue_plan(flown.trajectory, leave, [[0.0, 0.5, 1.0], there, end], limits)
+    assert certify(made.plan.trajectory, limits.plan, limits.space).passed
+
+
 def test_most_waypoints_anywhere_in_the_space_are_flown_in_motion(flown, limits):
     random, made, tried = np.random.default_rng(5), 0, 24
     low, high = np.array(limits.space.low) + limits.space.margin, np.array(limits.space.high) - limits.space.margin
