@@ -58,6 +58,7 @@ SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², and s before that, with which the vehicl
 STOPPING = 0.6  # s of the way left, on which a vehicle that stops comes to rest
 OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
 ROOM = 0.005  # share of each limit that plans leave to whoever continues them
+BETWEEN = 0.6  # of that, which limits may use up between points: so much less is done to the plan
 LATE_HINT = "ask again; a computer with less to do answers sooner"
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
 # Share of the usual intervals on which it is planned, where all ahead was dropped: such plans take 0.05 % longer, and
@@ -383,7 +384,8 @@ def _with_room(task: PlanningTask) -> PlanningTask:
 
 def _solve(task: PlanningTask, limits: Limits) -> _Found | str:
     """Return a certified trajectory, or why there is none."""
-    solution = plan_early(task)
+    leaves_room = task.limits is not limits.plan
+    solution = plan_early(task, BETWEEN * ROOM) if leaves_room else plan_early(task)
     if solution.profile is None:
         return _why_not(solution)
     trajectory = Trajectory(task.path, solution.profile, task.airframe)

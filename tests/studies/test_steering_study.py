@@ -56,7 +56,7 @@ def test_the_same_seed_flies_the_same(flown, limits):
     ("change", "words"),
     [
         (lambda one: {"position": (one.position[0] + 0.001, *one.position[1:])}, "not committed: 1"),
-        (lambda one: {"velocity": (one.velocity[0] + 0.2, *one.velocity[1:])}, "acceleration by differences"),
+        (lambda one: {"velocity": (one.velocity[0] + 0.4, *one.velocity[1:])}, "acceleration by differences"),
         (lambda one: {"velocity": (2.5, 0.0, 0.0)}, "speed: 2.5"),
     ],
 )

@@ -248,6 +248,15 @@ def test_a_plan_that_stops_early_is_certified_and_nearly_as_fast(yaw):
     assert early.stats["iterations"] < 0.75 * best.stats["iterations"]
 
 
+@pytest.mark.parametrize("yaw", YawMode)
+def test_where_limits_leave_room_a_plan_is_made_in_fewer_rounds(yaw):
+    path = min_snap(CORNERED)
+    task = PlanningTask(path, HARDWARE.airframe, HARDWARE.limits, yaw=yaw)
+    kept, early = plan_early(task), plan_early(task, 0.003)
+    assert early.stats["rounds"] < kept.stats["rounds"]
+    assert certify(Trajectory(path, solved(early), HARDWARE.airframe), HARDWARE.limits).worst.share < 1.003
+
+
 def test_what_cannot_be_braked_for_is_given_up_early():
     """A little before a sharp corner; plan_expert's first search takes 60 steps to see that."""
     corner = min_snap([[0, 0, 1], [1, 0, 1], [1, 0.4, 1], [0.3, 0.4, 1]])
