@@ -186,7 +186,6 @@ class PlannerWorker:
             return PathAnswer(request.number, PathVerdict.REFUSED, "the plan is not flown yet")
         if not self._pressed:
             beside().wake()
-        in_time = None if self._pressed else self._in_time  # where others wait they are worth more than joints nearby
         ways, bad = Ways(), set[Manner]()
         chain, reason, took, solved, checked = self._chain, "", 0.0, 0.0, 0.0
         for tried in range(TRIES):
@@ -194,12 +193,14 @@ class PlannerWorker:
             held = chain.held
             meanwhile = self._pressed and not chain.fell_back
             lead = self._stops if request.wish is Wish.STOP else self._meanwhile if meanwhile else self._plans
-            attempt = AnswerAttempt(
-                partial(self._too_late, lead, ways), ways, in_time, foresee=False, meanwhile=meanwhile, bad=bad
-            )
+            checking = max(lead.checking, checked)
+            # Where others wait, they are worth more than joints nearby.
+            in_time = None if self._pressed else partial(self._in_time, checking)
+            too_late = partial(self._too_late, checking, ways)
+            attempt = AnswerAttempt(too_late, ways, in_time, foresee=False, meanwhile=meanwhile, bad=bad)
             badly = len(bad)
             if ways.found is not None:  # it needs less time than it took to find it
-                needed = max(self._planning, solved) + max(lead.checking, checked)
+                needed = max(self._planning, solved) + checking
                 ahead = max(AGAIN**tried * (self._planning + lead.checking), needed) + SLACK
                 first = self._in_time_for(ahead)
             else:
@@ -264,15 +265,15 @@ class PlannerWorker:
         self._chain.read()
         return self._requests.waiting is not None
 
-    def _too_late(self, lead: Lead, ways: Ways, splice: int, equal: int | None) -> bool:
-        """Return whether what is planned from a setpoint on, and must be checked still, comes to the pilot too late.
+    def _too_late(self, checking: float, ways: Ways, splice: int, equal: int | None) -> bool:
+        """Return whether what is planned from a setpoint on comes to the pilot too late, as `checking`, s, comes first.
 
         So many setpoints stay `equal`, which is learned; None where that is not known, as it must be planned still,
-        along what was found of the `ways`. `lead` knows how long the checks take.
+        along what was found of the `ways`.
         """
         self._chain.release_if_ready()
         of_kind = self._equal[ways.found is not None and ways.found[0] in ON_PATH_LEFT]
-        self._to_do = lead.checking
+        self._to_do = checking
         if equal is None:
             self._to_do += self._planning
             self._left_out = float(np.median(of_kind)) / RATE
@@ -282,10 +283,10 @@ class PlannerWorker:
             self._left_out = equal / RATE
         return self._late_by(splice) + self._to_do > self._left_out
 
-    def _in_time(self) -> int:
-        """Return the number of the first setpoint that is in time for a plan that is made and must be checked."""
+    def _in_time(self, checking: float) -> int:
+        """Return the number of the first setpoint in time for a plan that is made, as `checking`, s, comes first."""
         self._made = REAL_CLOCK.now()
-        return self._in_time_for(AGAIN * self._plans.checking + SLACK)
+        return self._in_time_for(AGAIN * checking + SLACK)
 
     def _late_by(self, splice: int) -> float:
         """Return how much too late, s, what is sent now comes to the pilot, where it begins at a setpoint."""
@@ -326,7 +327,7 @@ class PlannerWorker:
         self._unforeseen -= 1
         first, ahead = self._next(self._plans, UNHURRIED * (self._planning + self._plans.checking))
         ways = Ways()
-        attempt = AnswerAttempt(partial(self._too_late, self._plans, ways), ways)
+        attempt = AnswerAttempt(partial(self._too_late, self._plans.checking, ways), ways)
         try:
             made = plan_slower(self._chain.held, first, self._limits, part_within(ahead), attempt)
         except TooLateError:

@@ -63,7 +63,7 @@ SLOWER = (1.2, 0.7)  # m/s, at which a flight is tried that would end badly at f
 # stay, a little later only ways lead on that lose more time than waiting does.
 LATER, LATER_KEEPING = (0, 3, 5, 8, 15, 35), (0, 15, 35)
 NEARBY = 5  # setpoints of that, within which the ways that are known count
-CLOSE = 2  # setpoints by which a plan may change the motion later than it might, without others being tried
+CLOSE = 1  # setpoint by which a plan may change the motion later than it might, without others being tried
 OTHERS = 6  # plans that are tried at most to change it sooner
 NEARBY_FIRST = (-2, -3, -1, 0, 1, 2, 3)  # joints that are tried, in setpoints from the first that is in time
 LOSES = 0.005  # share of its time that a plan may take longer, if it changes the motion sooner

@@ -412,7 +412,7 @@ def test_what_was_committed_in_haste_is_committed_to_its_end_once_nobody_presses
 def test_who_came_late_plans_as_far_ahead_as_plan_or_checks_took(in_flight, monkeypatch, what):
     """They may take longer than those of most plans, and do so again."""
     worker, _, pilot, theirs = in_flight
-    long, begun, firsts, planned = 0.2, REAL_CLOCK.now(), [], worker._planned
+    long, begun, firsts, others, planned = 0.2, REAL_CLOCK.now(), [], [], worker._planned
     now = begun
     worker._plans.note(0.05, only=True)
 
@@ -426,6 +426,7 @@ def test_who_came_late_plans_as_far_ahead_as_plan_or_checks_took(in_flight, monk
     def takes_long(request, first, part, attempt):
         nonlocal now
         firsts.append(first - worker._in_time_for(0.0))
+        others.append(attempt.in_time() - worker._in_time_for(0.0))
         made = planned(request, first, part, attempt)
         now += long
         if what == "plan" and len(firsts) == 1:
@@ -437,6 +438,7 @@ def test_who_came_late_plans_as_far_ahead_as_plan_or_checks_took(in_flight, monk
         answer = worker._answer(FIRST, now)
     assert answer.verdict is PathVerdict.ACCEPTED, answer
     assert firsts[0] < firsts[1] == pytest.approx(long * RATE, abs=2)
+    assert (others[1] > long * RATE) is (what == "checks")  # other joints must leave time for these too
     theirs.close()
 
 
@@ -445,11 +447,11 @@ def test_a_plan_along_the_path_left_has_the_time_that_such_plans_leave_the_motio
     at_once, along = Ways((0, 1)), Ways((2, 0))
     for ways, equal in ((at_once, 1), (along, 5)):
         for _ in range(20):
-            worker._too_late(worker._plans, ways, 100, equal)
+            worker._too_late(0.0, ways, 100, equal)
     for late_by in (0.0, 0.04):
         monkeypatch.setattr(worker, "_late_by", lambda splice, late_by=late_by: late_by)
-        assert worker._too_late(worker._plans, at_once, 100, None) is (late_by > 0.01)
-        assert not worker._too_late(worker._plans, along, 100, None)
+        assert worker._too_late(0.0, at_once, 100, None) is (late_by > 0.01)
+        assert not worker._too_late(0.0, along, 100, None)
 
 
 @pytest.mark.parametrize("falls", ["in its simulation", "as the pilot refuses it"])
