@@ -140,9 +140,18 @@ def rehearse_setpoints(
 
     As dry_run() does, of a motion that is known by its setpoints alone; only what decides is looked at.
     """
+    loop = fly_on(payloads, airframe, snapshot, rate)
     decoded, times = decode(payloads), np.arange(len(payloads)) / rate
-    loop = fly_setpoints(
-        decoded,
+    moments = loop.time[::_STRIDE]
+    wanted = np.stack([np.interp(moments, times + LEAD, along) for along in decoded.position.T], axis=1)
+    return _rehearsed(loop, _away(loop, wanted), limits)
+
+
+def fly_on(payloads: NDArray, airframe: Airframe, snapshot: NDArray, rate: float = RATE) -> ClosedLoop:
+    """Return the flight of payloads, (N, 29) uint8 at `rate`, Hz, from a snapshot, (31,), on; the last one is kept."""
+    times = np.arange(len(payloads)) / rate
+    return fly_setpoints(
+        decode(payloads),
         times,
         airframe,
         snapshot[:MEMORY],
@@ -151,9 +160,6 @@ def rehearse_setpoints(
         floor=NO_FLOOR,
         memory=snapshot[MEMORY:THRUSTS],
     )
-    moments = loop.time[::_STRIDE]
-    wanted = np.stack([np.interp(moments, times + LEAD, along) for along in decoded.position.T], axis=1)
-    return _rehearsed(loop, _away(loop, wanted), limits)
 
 
 def fly_and_judge(

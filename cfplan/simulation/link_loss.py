@@ -267,6 +267,11 @@ def as_believed(snapshots: NDArray, limits: Limits) -> NDArray:
     return np.asarray(snapshots[_lags(limits).index(limits.airframe.motor_time_constant)])
 
 
+def as_most_sluggish(snapshots: NDArray, limits: Limits) -> tuple[Airframe, NDArray]:
+    """Return the airframe with the longest motor lag that is simulated, and of snapshots (L, ...) those with it."""
+    return replace(limits.airframe, motor_time_constant=_lags(limits)[-1]), np.asarray(snapshots[-1])
+
+
 def link_loss_within_stops(
     stops: NDArray, starts: NDArray, limits: Limits, forks: NDArray, rate: float = RATE, *, coarsely: bool = False
 ) -> LinkLossMoments:

@@ -5,6 +5,7 @@ duration is tried that a request to stop tries, and shorter ones. Beside them st
 plan along that side, which keeps every limit of plans.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,16 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import CfplanError
-from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
-from cfplan.flight.setpoints.packets import FullStateSetpoints
+from cfplan.flight.setpoints.encoding import LEAD, RATE, encode_trajectory
+from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import encode_stops, stop_motion
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.preparation.replan import STOPS, HeldFlight, hold, stop_within
+from cfplan.preparation.replan import STOPS, HeldFlight, hold, snapshots_at, stop_within
 from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.dry_run import fly_on
+from cfplan.simulation.link_loss import as_believed
 from cfplan.studies.result import Column, StudyResult, Table
 
 SHORTER = (0.36, 0.4, 0.42, 0.43, 0.44)  # s, besides those that a request tries
@@ -35,6 +38,9 @@ _NEXT = np.array([1])  # row of a motion
 COLUMNS = (
     Column("duration", "within", "s", ".2f"),
     Column("distance", "way to rest", "m", ".2f", meaning="of the setpoints, from full speed"),
+    Column(
+        "flown", "as flown", "m", ".2f", meaning="the farthest that the vehicle comes from where they begin to brake"
+    ),
     Column("acceleration", "acceleration", "m/s²", ".1f"),
     Column("tilt", "tilt", "°", ".1f"),
     Column("turning", "angular acceleration", "rad/s²", ".0f", meaning="that the setpoints ask for"),
@@ -44,6 +50,7 @@ COLUMNS = (
 BRAKING_COLUMNS = (
     Column("speed", "from", "m/s", ".2f"),
     Column("distance", "way to rest", "m", ".2f"),
+    Column("flown", "as flown", "m", ".2f"),
     Column("duration", "within", "s", ".2f"),
     Column("acceleration", "acceleration", "m/s²", ".1f"),
     Column("tilt", "tilt", "°", ".1f"),
@@ -82,15 +89,18 @@ def _braking(limits: Limits) -> dict[str, Any]:
     """
     first, last = _ends(limits)
     path = min_snap(np.linspace(first, last, 1 + round(float(np.linalg.norm(last - first)))))
-    flown = plan(path, limits.airframe, limits, planner="expert", nodes=_FINE).trajectory
+    planned = plan(path, limits.airframe, limits, planner="expert", nodes=_FINE)
+    flown, held = planned.trajectory, hold(planned, np.array([first, last]))
     times = np.arange(0.0, flown.duration, 1e-3)
     state = flown.at(times)
     speed = np.linalg.norm(state.velocity, axis=1)
     begin = int(np.flatnonzero(speed >= _FULL * speed.max())[-1])
+    number = math.ceil((times[begin] - LEAD) * RATE)  # of the setpoint for then
     lean = np.degrees(np.arccos(np.clip(state.thrust_axis[begin:, 2], -1.0, 1.0)))
     return {
         "speed": float(speed[begin]),
         "distance": _way(state.position[begin:]),
+        "flown": _flown(held.commitment.payloads[number:], 0, held, number, limits),
         "duration": flown.duration - float(times[begin]),
         "acceleration": float(np.linalg.norm(state.acceleration[begin:], axis=1).max()),
         "tilt": float(lean.max()),
@@ -127,19 +137,31 @@ def _row(held: HeldFlight, number: int, motion: FullStateSetpoints, duration: fl
     payloads = encode_stops(motion, RATE, duration, _NEXT, gains, space)
     reached = certify_stops(payloads, motion, limits, RATE, _NEXT, gains, space).worst
     made, _ = stop_motion(motion, _NEXT, RATE, duration)
-    refused = ""
+    refused, flown = "", math.nan
     try:
-        stop_within(held, number, duration, limits)
+        stop = stop_within(held, number, duration, limits)
+        flown = _flown(stop.proposal.payloads, 1, held, number, limits)
     except CfplanError as error:
         refused = error.what
     return {
         "duration": duration,
         "distance": _way(made.position),
+        "flown": flown,
         "acceleration": reached["acceleration"],
         "tilt": float(np.degrees(reached["tilt"])),
         "turning": float(np.linalg.norm(np.diff(made.body_rate, axis=0), axis=1).max() * RATE),
         "refused": refused,
     }
+
+
+def _flown(payloads: NDArray, brakes: int, held: HeldFlight, number: int, limits: Limits) -> float:
+    """Return how far, m, the vehicle comes from the place of the one of the payloads at which it begins to brake.
+
+    They replace what is held from setpoint `number` on.
+    """
+    loop = fly_on(payloads, limits.airframe, as_believed(snapshots_at(held, number), limits))
+    ahead = loop.position[loop.time >= brakes / RATE] - decode(payloads).position[brakes]
+    return float(np.linalg.norm(ahead, axis=1).max())
 
 
 def _way(places: NDArray) -> float:
