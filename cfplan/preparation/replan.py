@@ -81,8 +81,8 @@ STRAYS = 0.025  # m, that a stop shorter than others may add to how far the vehi
 """Where it adds as much, motors are at their ends, and a little noise makes it more: of two stops that strayed by 2.8
 and 4.0 cm in the dry run, the flights strayed by 8.9 and 6.1 cm."""
 STRAYS_SLUGGISH = 0.16  # m, likewise with the longest motor lag
-"""That shows it more clearly. Of 440 stops the two that strayed farthest in flight, by 8.3 and 4.6 cm, did so by 0.24 and
-0.22 m in this dry run; the 437 that did so by less than 0.16 m strayed by 4.0 cm at most in flight."""
+"""That shows it more clearly. Of 440 stops the two that strayed farthest in flight, by 8.3 and 4.6 cm, did so by 0.24
+and 0.22 m in this dry run; the 437 that did so by less than 0.16 m strayed by 4.0 cm at most in flight."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
