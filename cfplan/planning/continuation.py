@@ -51,6 +51,7 @@ LATER = (0.1, 0.35)
 GUIDES = (0.15, 0.3, 0.08, 0.5)  # m from waypoints, at which guides lie, in the order in which they are tried
 GUIDES_IN_MOTION = (0.3, 0.1)  # m likewise; and nominal times of the first segment with them
 FIRST_TIMES_GUIDED, FIRST_TIMES_GUIDED_LATER = (1.6, 2.5), (1.6,)
+FIRST_TIMES_GUIDED_AT_LAST = (1.1, 1.6, 2.5)  # the longer ones swing below the floor where the vehicle sinks fast
 NEAR = 0.05  # m from waypoint 1, nearer than which the path left is not left later
 RATE = 1.0  # units of s a second, where it is time: about the speed in m/s
 TRIES, MOST_TRIES = 5, 14  # paths of a kind that are planned, and of all
@@ -147,7 +148,7 @@ def continue_plan(
         lambda: _guided(begins[:1], points, FIRST_TIMES_GUIDED, GUIDES_IN_MOTION[:1]),
         lambda: [way for begin in begins[2:] for way in _ways(begin, points, FIRST_TIMES_LATER)],
         lambda: _guided(begins[2:], points, FIRST_TIMES_GUIDED_LATER, GUIDES_IN_MOTION),
-        lambda: _guided(begins[:2], points, FIRST_TIMES_GUIDED, GUIDES_IN_MOTION[1:]),
+        lambda: _guided(begins[:2], points, FIRST_TIMES_GUIDED_AT_LAST, GUIDES_IN_MOTION[1:]),
     )
     for number, way in islice(_sound(makers, limits, known, ways), MOST_TRIES):
         task = _with_room(PlanningTask(

@@ -143,6 +143,25 @@ def test_who_is_to_fly_there_and_back_turns_round_in_a_loop(flown, limits, end):
     assert certify(made.plan.trajectory, limits.plan, limits.space).passed
 
 
+@pytest.mark.parametrize(
+    ("down", "share", "waypoints"),
+    [
+        (
+            [[-0.4, 0.5, 1.7], [-0.5, -0.5, 0.3]],
+            0.42,
+            [[1.9, -1.1, 1.3], [0.9, -1.7, 0.3], [1.6, 3.4, 0.5], [-1.4, -0.5, 1.1]],
+        ),
+        ([[-1.6, -0.1, 1.7], [-0.8, -0.4, 0.3]], 0.55, [[1.8, 3.5, 0.7], [0.8, 0.1, 1.7], [0.4, -0.7, 0.3]]),
+        ([[0.2, 0.6, 1.7], [1.2, 1.2, 0.3]], 0.35, [[-0.8, -1.3, 0.5], [-1.5, 1.2, 0.8], [2.0, 0.6, 0.7]]),
+    ],
+)
+def test_who_sinks_fast_turns_off_above_the_floor(limits, down, share, waypoints):
+    """On a first segment that takes longer the path would swing below it."""
+    sinking = plan(min_snap(down), limits.airframe, limits, planner="expert").trajectory
+    made = continue_plan(sinking, share * sinking.duration, waypoints, limits)
+    assert certify(made.plan.trajectory, limits.plan, limits.space).passed
+
+
 def test_most_waypoints_anywhere_in_the_space_are_flown_in_motion(flown, limits):
     random, made, tried = np.random.default_rng(5), 0, 24
     low, high = np.array(limits.space.low) + limits.space.margin, np.array(limits.space.high) - limits.space.margin
