@@ -580,7 +580,7 @@ def test_a_stop_that_is_asked_for_adds_little_to_how_far_the_vehicle_strays(limi
     path = min_snap(points, times=centripetal_times(points))
     held = hold(plan(path, limits.airframe, limits, planner="expert"), points)
     sluggish = replace(limits.airframe, motor_time_constant=max(limits.link_loss.motor_lags))
-    for begins in (*range(100, 200, 12), 164, 192):
+    for begins in (*range(100, 200, 12), 144, 164, 180, 192):
         stop, starts = halt(held, begins, limits), snapshots_at(held, begins)
         as_one_believes = limits.airframe, as_believed(starts, limits), 0.026
         for airframe, start, most in (as_one_believes, (sluggish, starts[-1], 0.161)):
