@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cfplan.cli.measured import EARLIER, JOBS, MINUTES, PATH, PATHS, Study, measured, safety_file_of, seed
+from cfplan.cli.measured import JOBS, MINUTES, PATH, PATHS, Study, measured, safety_file_of, seed
 
 if TYPE_CHECKING:
     from cfplan.studies.result import StudyResult
@@ -93,7 +93,7 @@ def faults() -> Study:
         "--random-paths", type=click.IntRange(0), default=0, show_default=True,
         help="Small paths of two or three waypoints, beside those given.",
     ),
-    MINUTES, EARLIER, JOBS,
+    MINUTES, JOBS,
 )  # fmt: skip
 def random_faults() -> Study:
     """Fly along each PATH in turn with one to three random faults, in two of five flights also a death, by seeds.
@@ -117,7 +117,7 @@ def random_faults() -> Study:
         "--seconds", type=click.FloatRange(1), default=90.0, show_default=True,
         help="Of each flight, in which they are asked for.",
     ),
-    seed(0, "Of the first flight."), MINUTES, EARLIER, JOBS,
+    seed(0, "Of the first flight."), MINUTES, JOBS,
 )  # fmt: skip
 def steering() -> Study:
     """Steer the virtual Crazyflie by random requests, and judge every setpoint that was streamed.
@@ -132,14 +132,9 @@ def steering() -> Study:
     return run
 
 
-def _by_seeds(
-    count: int, first_seed: int, earlier_files: tuple[Path, ...] = (), minutes: float = math.inf, **rest: Any
-) -> dict[str, Any]:
-    """Return the options of flights drawn by seeds as their studies take them. Raises InputError: no such result."""
-    from cfplan.studies.result import read_result
-
-    earlier = [read_result(file) for file in earlier_files]
-    return {"seeds": range(first_seed, first_seed + count), "earlier": earlier, "minutes": minutes, **rest}
+def _by_seeds(count: int, first_seed: int, minutes: float = math.inf, **rest: Any) -> dict[str, Any]:
+    """Return the options of flights drawn by seeds as their studies take them."""
+    return {"seeds": range(first_seed, first_seed + count), "minutes": minutes, **rest}
 
 
 @measured(

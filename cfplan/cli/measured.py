@@ -34,10 +34,6 @@ WORKERS = click.option(
     "--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine."
 )
 SCHEDULER = click.option("--scheduler", help="Work on a Dask cluster instead: tcp://host:port.")
-EARLIER = click.option(
-    "--add", "earlier_files", type=click.Path(path_type=Path), multiple=True,
-    help="A result of other seeds, which the tables then count as well; may be given several times.",
-)  # fmt: skip
 _OUTPUT = click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the result here, as JSON.")
 
 

@@ -60,6 +60,7 @@ class Timeouts:
     level_out: float = 0.5  # after the last setpoint: x and y are given up, and the vehicle levels out
     motors_off: float = 2.0  # after the last setpoint: motors off, then locked until restarted
     keep_alive: float = 1.0  # after the last keep-alive packet, once there was one: motors off
+    connection: float = 1.0  # after the last packet of any kind: all log blocks are deleted
     still_flying: float = 2.0  # after the last thrust, for which the vehicle counts as flying
     period: float = 0.04  # between two looks at all that: each comes up to this much later
 

@@ -51,7 +51,8 @@ class Scenario:
     @property
     def leaves_alone(self) -> bool:
         """Return whether nobody can end the flight: the pilot or the radio dies for good."""
-        dead = (fault.kind is RadioFaultKind.DEAD and fault.duration >= FOR_GOOD for fault in self.faults)
+        deaths = (RadioFaultKind.DEAD, RadioFaultKind.UNACKNOWLEDGED)
+        dead = (fault.kind in deaths and fault.duration >= FOR_GOOD for fault in self.faults)
         return self.pilot_killed or any(dead)
 
 

@@ -1,8 +1,8 @@
 """Fly with random faults in the stepped lab, death among them. None may leave the walls, each must end disarmed.
 
-By the seed of a flight are drawn: the path, the phase and moment at which things begin to go wrong, one to three faults
-at once with their lengths and sizes, and whether the pilot or the radio dies for good. Then the vehicle is alone and
-comes down by its own time-outs; its last setpoint must have been harmless.
+The seed of a flight draws the path, the phase and moment at which things begin to go wrong, one to three faults at once
+with their lengths and sizes, whether logs or acknowledgements fall silent besides, and whether the pilot or the radio
+dies for good. Then the vehicle is alone and comes down by its own time-outs; its last setpoint must have been harmless.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
+from cfplan.errors import InfeasibleError, NotCertifiedError
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase
@@ -59,6 +59,17 @@ _PHASES: tuple[tuple[Phase, float], ...] = (
     (Phase.HOLD, 1.0),
     *((Phase.LAND, 2.5),) * 2,
     (Phase.LAND, 6.0),  # until it lies on the floor
+)
+
+_SHARE_SILENT = 0.35  # of the flights: logs or acknowledgements fall silent
+_SHARE_FLAPPING = 0.4  # of those: they come back for a moment
+_BACK_FOR = 0.1  # s
+# What falls silent together.
+_SILENCES: tuple[tuple[Any, ...], ...] = (
+    (VehicleFaultKind.SILENT_ESTIMATE,),
+    (VehicleFaultKind.SILENT_STATUS,),
+    (VehicleFaultKind.SILENT_ESTIMATE, VehicleFaultKind.SILENT_STATUS),
+    (RadioFaultKind.UNACKNOWLEDGED,),
 )
 
 _STALL, _MAIN, _PILOT = "stall", "main process killed", "pilot killed"
@@ -202,6 +213,25 @@ def random_scenario(seed: int, mission: Mission) -> Scenario:
     )
 
 
+def with_silence(scenario: Scenario, seed: int) -> Scenario:
+    """Return a scenario in which, in a share of the flights, logs or acknowledgements fall silent besides."""
+    chance = np.random.default_rng((seed, 1))
+    if chance.random() > _SHARE_SILENT:
+        return scenario
+    kinds = _SILENCES[chance.integers(len(_SILENCES))]
+    start = float(chance.uniform(0.0, _APART))
+    length = FOR_GOOD if chance.random() < 0.5 else float(_LENGTH * np.exp(_SPREAD * chance.normal()))
+    spans = [(start, length)]
+    if chance.random() < _SHARE_FLAPPING:
+        spans = [(start, 2.0 * _LENGTH), (start + 2.0 * _LENGTH + _BACK_FOR, length)]
+    silences = [(kind, *span) for span in spans for kind in kinds]
+    return replace(
+        scenario,
+        name=" + ".join([scenario.name, *(_text(kind, begin, lasts, None) for kind, begin, lasts in silences)]),
+        faults=(*scenario.faults, *(_fault(kind, begin, lasts, None) for kind, begin, lasts in silences)),
+    )
+
+
 def _beside_start(mission: Mission, chance: np.random.Generator) -> tuple[float, float, float]:
     space = mission.limits.space
     inside = space.margin + _INSIDE
@@ -231,7 +261,7 @@ def fly_random(seed: int, missions: Mapping[str, Mission]) -> RandomFlight:
     """Fly flight number `seed` along one of the paths, with a record."""
     names = sorted(missions)
     name = names[seed % len(names)]
-    scenario = random_scenario(seed, missions[name])
+    scenario = with_silence(random_scenario(seed, missions[name]), seed)
     flown = fly_scenario(scenario, missions[name], seed)
     return RandomFlight(
         seed=seed,
@@ -254,22 +284,12 @@ def random_flights(
     seeds: Sequence[int],
     jobs: int = 1,
     minutes: float = math.inf,
-    earlier: Iterable[StudyResult] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StudyResult:
-    """Fly with random faults for each seed, on `jobs` processes; begin no flight once `minutes` have passed.
-
-    The tables are of these flights and of those in `earlier` results. Raises InputError if a seed is in two of them.
-    """
-    before = [flight for result in earlier for flight in _flights_of(result)]
-    _refuse_twice([*(flight.seed for flight in before), *seeds])
+    """Fly with random faults for each seed, on `jobs` processes; begin no flight once `minutes` have passed."""
     flown, interrupted = collect(_fly_all(missions, seeds, jobs, minutes, progress))
-    settings = {
-        "paths": sorted(missions),
-        "seeds": [[seeds[0], seeds[len(flown) - 1]]] if flown else [],
-        "commits_of_earlier": [result.provenance.commit for result in earlier],
-    }
-    flights = sorted([*before, *flown], key=lambda flight: flight.seed)
+    settings = {"paths": sorted(missions), "seeds": [seeds[0], seeds[len(flown) - 1]] if flown else []}
+    flights = sorted(flown, key=lambda flight: flight.seed)
     detail = detail_table("flights", [_kept(flight) for flight in flights])
     return StudyResult("random-faults", settings, fault_tables(flights), (detail,), interrupted)
 
@@ -302,7 +322,8 @@ def fault_tables(flights: Sequence[RandomFlight]) -> tuple[Table, ...]:
     by_kind = [_row(kind, [flight for flight in flights if kind in flight.kinds]) for kind in sorted(kinds)]
     phases = [phase for phase in map(str, Phase) if any(flight.phase == phase for flight in flights)]
     by_phase = [_row(phase, [flight for flight in flights if flight.phase == phase]) for phase in phases]
-    many = {count: [flight for flight in flights if flight.faults.count(" + ") + 1 == count] for count in range(1, 5)}
+    counts = sorted({flight.faults.count(" + ") + 1 for flight in flights})
+    many = {count: [flight for flight in flights if flight.faults.count(" + ") + 1 == count] for count in counts}
     by_count = [_row(f"{count} faults" if count > 1 else "1 fault", of) for count, of in many.items() if of]
     worst = sorted(flights, key=lambda flight: flight.to_wall)[:_WORST]
     bad = [flight for flight in flights if flight.bad]
@@ -333,18 +354,3 @@ def _kept(flight: RandomFlight) -> dict[str, Any]:
     """Return a flight's fields for the JSON, the reason only where it went wrong: there are thousands."""
     row = {field.name: getattr(flight, field.name) for field in fields(flight)}
     return row | {"reason": flight.reason if flight.bad else ""}
-
-
-def _flights_of(result: StudyResult) -> list[RandomFlight]:
-    try:
-        return [RandomFlight(**row) for row in result.table("flights").rows]
-    except TypeError:
-        raise InputError(
-            f"a result of the study {result.study} of another version", hint="name a result of random-faults"
-        ) from None
-
-
-def _refuse_twice(seeds: Sequence[int]) -> None:
-    if len(set(seeds)) < len(seeds):
-        twice = next(seed for seed in seeds if seeds.count(seed) > 1)
-        raise InputError(f"flight {twice} would count twice", hint="choose --seed beyond the seeds of earlier results")

@@ -10,7 +10,7 @@ import itertools
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -337,26 +337,16 @@ def steering(
     seconds: float = SECONDS,
     jobs: int = 1,
     minutes: float = math.inf,
-    earlier: Iterable[StudyResult] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StudyResult:
-    """Fly with random requests for each seed, on `jobs` processes; begin no flight once `minutes` have passed.
-
-    The tables are of these flights and of those in `earlier` results. Raises InputError if a seed is in two of them.
-    """
-    earlier = tuple(earlier)
-    before = [flight for result in earlier for flight in _flights_of(result)]
-    known = {flight.seed for flight in before}
-    if twice := sorted(known & set(seeds)):
-        raise InputError(f"flight {twice[0]} would count twice", hint="choose --seed beyond those of earlier results")
+    """Fly with random requests for each seed, on `jobs` processes; begin no flight once `minutes` have passed."""
     limits = load_limits(safety_file)
     flown, interrupted = collect(_fly_all(limits, seeds, requests, seconds, jobs, minutes, progress))
-    flights = sorted([*before, *flown], key=lambda flight: flight.seed)
+    flights = sorted(flown, key=lambda flight: flight.seed)
     settings = {
         "requests": requests,
         "seconds": seconds,
-        "seeds": [[flown[0].seed, flown[-1].seed]] if flown else [],
-        "commits_of_earlier": [result.provenance.commit for result in earlier],
+        "seeds": [flown[0].seed, flown[-1].seed] if flown else [],
     }
     return StudyResult("steering", settings, steering_tables(flights), (detail_table("flights", flights),), interrupted)
 
@@ -413,12 +403,3 @@ def _row(group: str, flights: Sequence[SteeredFlight]) -> dict[str, Any]:
         "to_wall": min(flight.to_wall for flight in flights),
         "bad": sum(flight.bad for flight in flights),
     }
-
-
-def _flights_of(result: StudyResult) -> list[SteeredFlight]:
-    try:
-        return [SteeredFlight(**row) for row in result.table("flights").rows]
-    except TypeError:
-        raise InputError(
-            f"a result of the study {result.study} of another version", hint="name a result of steering"
-        ) from None

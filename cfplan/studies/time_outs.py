@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from cfplan.errors import InputError
 from cfplan.flight.firmware import Timeouts
+from cfplan.flight.pilot.health import LOG_GONE, UPLINK_GONE
 from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.virtual_crazyflie.supervisor import Settings
@@ -116,23 +117,29 @@ def _alone() -> list[TimeOut]:
 
 
 def _link() -> list[TimeOut]:
-    monitor, perishable = "flight/pilot/abort_monitor.py", "flight/radio/perishable.py"
+    health, perishable, loop = "flight/pilot/health.py", "flight/radio/perishable.py", "flight/pilot/flight_loop.py"
     return [
         TimeOut(
             "a setpoint or pose on its way, in a radio that repeats it", _read(perishable, "KEEPS_FOR"),
             "it is dropped, as a newer one is there", "the pilot's radio link", perishable,
         ),
         TimeOut(
-            "the vehicle's log: the way back is dead", _read(monitor, "OLDEST_LOG"),
-            "the vehicle brakes along its path and lands", "the pilot", monitor,
+            "a log of the vehicle, estimate or status, while the vehicle acknowledges", LOG_GONE,
+            "the vehicle brakes along its path and lands by poses; the log is created anew meanwhile",
+            "the pilot", health,
         ),
         TimeOut(
-            "setpoints, and then the vehicle is heard again before its motors stop", Timeouts().level_out,
-            "it hovers where it is, then lands there; nothing old is sent", "the pilot", "flight/pilot/flight_loop.py",
+            "packets of any kind, at the vehicle", Timeouts().connection,
+            "it deletes its log blocks; once it acknowledges again, the pilot creates them anew",
+            "the vehicle's firmware", "firmware",
         ),
         TimeOut(
-            "the vehicle's log, for good", _read(monitor, "LINK_GONE"),
-            "the link counts as lost: exit code 8, the record is closed", "the pilot", monitor,
+            "acknowledgements, which then come again before its motors stop", UPLINK_GONE,
+            "it hovers where it is, then lands there; nothing old is sent", "the pilot", health,
+        ),
+        TimeOut(
+            "acknowledgements, for good", _read(loop, "LINK_LOST_AFTER"),
+            "the link counts as lost: exit code 8, the record is closed", "the pilot", loop,
         ),
     ]  # fmt: skip
 
@@ -293,7 +300,6 @@ _Row = tuple[str, list[tuple[float, str]]]  # what breaks at 0 s, and from when 
 
 def _rows(limits: Limits) -> list[_Row]:
     known, stop = Timeouts(), _read("flight/setpoints/stops.py", "DURATION")
-    unheard = _read("flight/pilot/abort_monitor.py", "OLDEST_LOG")
     blind = _read("flight/pilot/landing.py", "_BLIND_FOR")
     pose = limits.pose
     return [
@@ -302,7 +308,7 @@ def _rows(limits: Limits) -> list[_Row]:
         ("the same,\nwatchdog switched off", [
             (0.0, "flies on"), (known.level_out, "levels out"), (known.motors_off, "falls")]),
         ("poses stop", [(0.0, "flies on"), (pose.age_brake, "brakes"), (pose.age_land, "lands"), (blind, "falls")]),
-        ("the vehicle is not heard,\nbut hears", [(0.0, "flies on"), (unheard, "brakes"), (unheard + stop, "lands")]),
+        ("the vehicle is not heard,\nbut hears", [(0.0, "flies on"), (LOG_GONE, "brakes"), (LOG_GONE + stop, "lands")]),
         ("the command is killed", [(0.0, "brakes"), (stop, "lands")]),
         ("the planner dies", [(0.0, "flies on")]),
     ]  # fmt: skip

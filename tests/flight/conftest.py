@@ -17,7 +17,7 @@ from cfplan.flight.pilot.pilot import Pilot
 from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
-from cfplan.flight.telemetry import Estimate, Event, Phase, PhaseEntered, Telemetry, VehicleStatus
+from cfplan.flight.telemetry import Estimate, Event, Phase, PhaseEntered, SetpointSent, Telemetry, VehicleStatus
 from cfplan.safety.limits import (
     BatteryLimits,
     FirmwareSettings,
@@ -98,7 +98,10 @@ class World:
     pose_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     poses_frozen: bool = False
     poses_stopped: bool = False
-    logs_stopped: bool = False
+    estimate_silent: bool = False
+    status_silent: bool = False
+    uplink_dead: bool = False
+    revived: list[str] = field(default_factory=list)  # logs that the pilot created anew
     restarts: bool = True
     push: tuple[float, float, float] = (0.0, 0.0, 0.0)
     messages: list[Telemetry] = field(default_factory=list)
@@ -121,6 +124,7 @@ class World:
         self.estimate: Estimate | None = None
         self.status: VehicleStatus | None = None
         self.position_variance = (1e-5, 1e-5, 1e-5)
+        self.acknowledged = self.now
         self._logging = False
 
     # The clock.
@@ -154,6 +158,9 @@ class World:
     def said(self) -> str:
         return "\n".join(message.text for message in self.messages if isinstance(message, Event))
 
+    def sent(self) -> list[SetpointSent]:
+        return [message for message in self.messages if isinstance(message, SetpointSent)]
+
     def _move(self, step: float) -> None:
         flying = self.position[2] > self.floor + 0.03
         if self.motors_on:
@@ -180,13 +187,17 @@ class World:
         if not self.poses_stopped:
             self._poses.append(Pose(self.now - 0.005, self.now, place, turn))
             self._poses_last = place
-        if self._logging and not self.logs_stopped:
+        if not self.uplink_dead:
+            self.acknowledged = self.now
+        if self._logging:
             flying = self.motors_on or self.now - self.motors_off_since < 2.0
             bits = (ARMED if self.armed else 0) | (FLYING if flying else 0) | self.extra_bits
             bits |= CAN_FLY if self.can_fly else 0
-            self.estimate = Estimate(self.now, self.position, self.velocity, (0.0, 0.0, 0.0), turn)
             motor = 4 * (40000 if self.motors_on else 0,)
-            self.status = VehicleStatus(self.now, (0.0, 0.0, 0.0), motor, self.voltage, bits)
+            if not self.estimate_silent:
+                self.estimate = Estimate(self.now, self.position, self.velocity, (0.0, 0.0, 0.0), turn)
+            if not self.status_silent:
+                self.status = VehicleStatus(self.now, (0.0, 0.0, 0.0), motor, self.voltage, bits)
 
     # The pose source.
 
@@ -203,7 +214,7 @@ class World:
     # The link.
 
     def send(self, packet) -> None:
-        if self.deaf or self.stopped:
+        if self.deaf or self.stopped or self.uplink_dead:
             return
         self.motors_on = True
         state = decode(np.frombuffer(bytes(packet.data), dtype=np.uint8))
@@ -233,17 +244,21 @@ class World:
     def release_priority(self) -> None:
         self._note_once("release")
 
+    def revive_log(self, name: str) -> None:
+        if name not in self.revived:
+            self.revived.append(name)
+
     def arm(self, do_arm: bool) -> None:
         self.calls.append("arm" if do_arm else "disarm")
-        if self.arms_lost:
-            self.arms_lost -= 1
+        if self.arms_lost or self.uplink_dead:
+            self.arms_lost = max(self.arms_lost - 1, 0)
             return
         self.armed = do_arm
 
     def emergency_stop(self) -> None:
         self.calls.append("emergency stop")
-        if self.cuts_lost:
-            self.cuts_lost -= 1
+        if self.cuts_lost or self.uplink_dead:
+            self.cuts_lost = max(self.cuts_lost - 1, 0)
             return
         self.stopped, self.armed, self.motors_on = True, False, False
         self.extra_bits |= LOCKED
@@ -258,8 +273,8 @@ class World:
 
     def stop_setpoint(self) -> None:
         self._note_once("stop setpoint")
-        if self.stops_lost:
-            self.stops_lost -= 1
+        if self.stops_lost or self.uplink_dead:
+            self.stops_lost = max(self.stops_lost - 1, 0)
             return
         self.motors_on = False
 

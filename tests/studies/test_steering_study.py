@@ -1,13 +1,11 @@
 """The study of random requests: a flight passes, and what is wrong with a flown sequence is found."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cfplan.errors import InputError
 from cfplan.flight.setpoints.packets import decode
 from cfplan.preparation.air_planner import Wish
 from cfplan.preparation.stepped_planner import PlannerFault
@@ -15,7 +13,6 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.steering.steered_vehicle import SteeredVehicle
 from cfplan.studies import steering as study
 from cfplan.studies.flown_sequence import judge_sequence
-from cfplan.studies.result import read_result
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"
 
@@ -121,15 +118,3 @@ def test_what_is_flown_later_than_proposed_is_judged_without_what_it_replaced(li
     splices = [each.splice for each in flight.commitments]
     assert splices[later.index(3)] < splices[later.index(3) - 1]
     assert judge_sequence(flight.sent, flight.commitments, limits).faults == ()
-
-
-def test_results_are_added_up_and_a_seed_counts_once(tmp_path):
-    first = study.steering(SAFETY, seeds=[7], requests=2, seconds=1.0)
-    first.write(tmp_path / "first.json")
-    earlier = [read_result(tmp_path / "first.json")]
-    both = study.steering(SAFETY, seeds=[8], requests=2, seconds=1.0, earlier=earlier)
-    assert [row["seed"] for row in both.table("flights").rows] == [7, 8]
-    assert both.table("requests").rows[0]["flights"] == 2
-    json.dumps(both.to_json(), allow_nan=False)
-    with pytest.raises(InputError, match="count twice"):
-        study.steering(SAFETY, seeds=[8], earlier=[both])

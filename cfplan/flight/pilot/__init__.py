@@ -2,6 +2,7 @@
 
 __all__ = [
     "deadlines",
+    "health",
     "keys",
     "mission",
     "outcome",

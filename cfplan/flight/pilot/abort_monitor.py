@@ -1,4 +1,4 @@
-"""The abort monitor: every trigger of the abort ladder in one place, checked a hundred times a second."""
+"""The abort monitor: every trigger of the abort ladder in one place, checked a hundred times a second in the air."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 from cfplan.errors import ExitCode
 from cfplan.flight.mocap.poses import Pose
+from cfplan.flight.pilot.health import FRESH, GONE, LOG_GONE, UPLINK_GONE, Health
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.radio.supervisor_bits import FAULTS
@@ -15,21 +16,8 @@ from cfplan.safety.limits import Ladder, Limits
 from cfplan.safety.quantities import ON_LADDER
 
 LATEST_SETPOINT = 0.25  # s that a setpoint may be late; the vehicle stops following after 0.5 s
-OLDEST_LOG = 0.5  # s without the vehicle's log
-LINK_GONE = 10.0  # s without a log, after which the link counts as lost; until then it may come back
 DISAGREEMENT_FACTOR = 5.0  # times preflight's limit that estimate and pose may be apart in the air
-# m/s, horizontally and lasting, that the poses may move otherwise than the vehicle believes, while it flies slowly:
-# 0.05 in the virtual lab, where the wind blows 0.15, and 0.4 once the vehicle cannot be held any more.
-MOVES_OTHERWISE = Ladder(brake=0.2, land=0.2, cut=0.3)
 FALLEN = 0.15  # m below its setpoint, of a vehicle on the floor that got there without being asked
-# By what a quantity of the table with a ladder is measured.
-MEASURED: Mapping[str, Callable[[Estimate, VehicleStatus], Triple]] = MappingProxyType(
-    {
-        "speed": lambda estimate, _: estimate.velocity,
-        "acceleration": lambda estimate, _: estimate.acceleration,
-        "angular_velocity": lambda _, status: status.body_rate,
-    }
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,21 +34,26 @@ class Observation:
     """What the pilot knows at one moment, in s on the clock of time.monotonic(), m, and radians."""
 
     now: float  # s
-    order: Order | None = None
-    main_gone: bool = False
-    link_lost: str = ""
     pose: Pose | None = None  # the last good one
     pose_fault: str = ""  # why none has come since
-    without_pose: float = 0.0  # s since the last pose that went to the vehicle: late ones do not
+    health: Health = Health()  # noqa: RUF009  it is frozen
     wanted: Triple | None = None
     """m, where the vehicle should have been when the pose was taken; None where no setpoint says so."""
-    estimate: Estimate | None = None
+    estimate: Estimate | None = None  # None while its log is gone
     asked: Triple | None = None
     """m, where the vehicle should have been at the time of its estimate; None where no setpoint says so."""
-    status: VehicleStatus | None = None
-    otherwise: float = 0.0
-    """m/s, horizontally, between the motion of the poses and that of the estimate; 0 where that is not looked at."""
+    status: VehicleStatus | None = None  # None while its log is gone
     late: float = 0.0  # s, by which the last setpoint missed its deadline
+
+
+# How a quantity of the table with a ladder is measured; None while the log that tells it is gone.
+MEASURED: Mapping[str, Callable[[Observation], Triple | None]] = MappingProxyType(
+    {
+        "speed": lambda seen: seen.estimate.velocity if seen.estimate is not None else None,
+        "acceleration": lambda seen: seen.estimate.acceleration if seen.estimate is not None else None,
+        "angular_velocity": lambda seen: seen.status.body_rate if seen.status is not None else None,
+    }
+)
 
 
 class AbortMonitor:
@@ -72,52 +65,39 @@ class AbortMonitor:
         self._voltage_time = 0.0
         self._since: dict[str, float] = {}
 
-    def ordered(self, observation: Observation) -> Abort | None:
-        """Return an abort for an operator command or the loss of the main process; also checked on the ground."""
-        if observation.order is Order.CUT:
-            return Abort(Rung.CUT, ExitCode.ENDED_BY_OPERATOR, "the operator cut the motors")
-        if observation.order is Order.LAND:
-            return Abort(Rung.LAND, ExitCode.ENDED_BY_OPERATOR, "the operator ended the flight")
-        if observation.main_gone:
-            return Abort(Rung.LAND, ExitCode.ENDED_BY_SAFETY, "the main process is gone")
-        return None
-
     def gravest(self, observation: Observation) -> Abort | None:
-        """Return the gravest abort of all, None where there is no reason for one; checked in the air."""
+        """Return the gravest abort of all, None where there is no reason for one."""
         aborts = [abort for abort in self._aborts(observation) if abort.rung]
-        ordered = self.ordered(observation)
-        if ordered is not None:
-            aborts.insert(0, ordered)
         return max(aborts, key=lambda abort: abort.rung, default=None)
 
     def _aborts(self, observation: Observation) -> Iterator[Abort]:
-        yield from self._pose(observation)
+        yield self._silence(observation)
         yield from self._vehicle(observation)
         yield from self._motion(observation)
         yield from self._fallen(observation)
         if observation.late > LATEST_SETPOINT:
             yield safety_abort(Rung.BRAKE, f"a setpoint was {observation.late:.2f} s late")
 
-    def _pose(self, observation: Observation) -> Iterator[Abort]:
-        limits = self._limits.pose
-        if observation.pose is None:
-            yield safety_abort(Rung.LAND, "there is no pose")
-            return
-        age = observation.now - observation.pose.time
-        if age > limits.age_brake:
-            rung = Rung.LAND if age > limits.age_land else Rung.BRAKE
-            why = f" ({observation.pose_fault})" if observation.pose_fault else ""
-            yield safety_abort(rung, f"the last good pose is {age:.2f} s old{why}")
-        without = observation.without_pose
-        if without > limits.age_land >= age:
-            yield safety_abort(Rung.LAND, f"no pose for {without:.2f} s: they come {age:.2f} s late")
+    def _silence(self, observation: Observation) -> Abort:
+        """Return the abort of the present health, which names the source that matters most."""
+        health, pose = observation.health, observation.pose
+        rung, age_brake = health.reaction.rung, self._limits.pose.age_brake
+        if health.uplink is GONE:
+            return safety_abort(rung, f"the vehicle has acknowledged nothing for {UPLINK_GONE:g} s")
+        if health.poses is not FRESH and pose is None:
+            return safety_abort(rung, "there is no pose")
+        if health.poses is not FRESH and pose is not None:
+            age, why = observation.now - pose.time, observation.pose_fault
+            if age <= age_brake:
+                return safety_abort(rung, f"no pose goes to the vehicle: {why or f'they come {age:.2f} s late'}")
+            bracket = f" ({why})" if why else ""
+            return safety_abort(rung, f"the last good pose is {age:.2f} s old{bracket}")
+        silent = " and ".join(name for name in ("estimate", "status") if getattr(health, name) is GONE)
+        return safety_abort(rung, f"the vehicle's log of its {silent} has been silent for {LOG_GONE:g} s")
 
     def _vehicle(self, observation: Observation) -> Iterator[Abort]:
-        if observation.estimate is None or observation.status is None:
+        if observation.status is None:
             return
-        silent = observation.now - max(observation.estimate.time, observation.status.time)
-        if silent > OLDEST_LOG:
-            yield safety_abort(Rung.LAND, f"the vehicle's log has been silent for {silent:.1f} s")
         for bit, fault in FAULTS.items():
             if observation.status.supervisor & bit:
                 yield safety_abort(Rung.CUT, f"the vehicle {fault}")
@@ -143,32 +123,27 @@ class AbortMonitor:
             if observation.wanted is not None:
                 deviation = math.dist(observation.pose.position, observation.wanted)
                 yield _rung(limits.deviation, deviation, "{:.2f} m from the setpoint")
-        if observation.estimate is None or observation.status is None:
-            return
-        newest = self._limits.pose.age_warning
+        estimate = observation.estimate
         if (
             observation.pose is not None
-            and observation.now - min(observation.pose.time, observation.estimate.time) <= newest
+            and estimate is not None
+            and observation.health.estimate is FRESH
+            and observation.now - observation.pose.time <= self._limits.pose.age_warning
         ):
-            apart = math.dist(observation.pose.position, observation.estimate.position)
+            apart = math.dist(observation.pose.position, estimate.position)
             if apart > DISAGREEMENT_FACTOR * self._limits.pose.agreement:
                 yield safety_abort(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")
-        moves = _rung(
-            MOVES_OTHERWISE,
-            observation.otherwise,
-            "the tracked body moves by {:.2f} m/s otherwise than the vehicle believes: are its axes the vehicle's?",
-        )
-        yield self._lasting("moves otherwise", observation.now, moves)
         for quantity in ON_LADDER:
-            value = math.hypot(*MEASURED[quantity.ladder](observation.estimate, observation.status))
-            text = f"{quantity.name} of {{:.1f}} {quantity.unit}"
-            measured = _rung(getattr(limits, quantity.ladder), value, text)
-            yield self._lasting(quantity.name, observation.now, measured)
+            measured, exceeded = MEASURED[quantity.ladder](observation), _NO_ABORT
+            if measured is not None:
+                text = f"{quantity.name} of {{:.1f}} {quantity.unit}"
+                exceeded = _rung(getattr(limits, quantity.ladder), math.hypot(*measured), text)
+            yield self._lasting(quantity.name, observation.now, exceeded)
 
     def _fallen(self, observation: Observation) -> Iterator[Abort]:
         """Yield that a vehicle without poses lies on the floor: what it believes after that is worth nothing."""
         estimate, asked = observation.estimate, observation.asked
-        if estimate is None or asked is None or observation.without_pose <= self._limits.pose.age_brake:
+        if estimate is None or asked is None or observation.health.poses is FRESH:
             return
         floor, below = self._limits.space.low[2], asked[2] - estimate.position[2]
         if estimate.position[2] < floor < asked[2] and below > FALLEN:  # landings ask for places beneath the floor
@@ -189,9 +164,23 @@ class AbortMonitor:
         return abort if now - since >= self._limits.flight.patience else Abort(Rung.NONE, abort.exit_code, abort.text)
 
 
+def ordered(order: Order | None, *, main_gone: bool) -> Abort | None:
+    """Return an abort for an operator command or the loss of the main process; on the ground they count, too."""
+    if order is Order.CUT:
+        return Abort(Rung.CUT, ExitCode.ENDED_BY_OPERATOR, "the operator cut the motors")
+    if order is Order.LAND:
+        return Abort(Rung.LAND, ExitCode.ENDED_BY_OPERATOR, "the operator ended the flight")
+    return safety_abort(Rung.LAND, "the main process is gone") if main_gone else None
+
+
 def safety_abort(rung: Rung, text: str) -> Abort:
     """Return an abort that counts as ended by a safety rule."""
     return Abort(rung, ExitCode.ENDED_BY_SAFETY, text)
+
+
+def fault_abort(error: Exception, rung: Rung = Rung.LAND) -> Abort:
+    """Return the abort for a fault of this program, or an error that it did not expect in the air."""
+    return safety_abort(rung, f"fault in the pilot: {error!r}")
 
 
 _NO_ABORT = safety_abort(Rung.NONE, "")

@@ -4,6 +4,8 @@ Everything happens in ticks at the rate of the setpoints. A tick waits for its d
 forwards the newest good pose, and looks for reasons to end the flight. Whatever the pilot waits for, it waits in ticks,
 so poses flow and the abort monitor watches meanwhile. A reason to leave the plan arrives as `AbortRaised` out of any
 wait.
+
+Each step of a tick is guarded: a fault of this program lands the vehicle, and while it lands the other steps go on.
 """
 
 import math
@@ -14,15 +16,15 @@ from typing import Protocol
 from numpy.typing import NDArray
 
 from cfplan.flight.clock import REAL_CLOCK, Clock
-from cfplan.flight.firmware import Timeouts
 from cfplan.flight.mocap.dead_reckoning import SensedMotion
 from cfplan.flight.mocap.pose_gate import PoseGate
 from cfplan.flight.mocap.pose_predictor import FARTHEST, PosePredictor
 from cfplan.flight.mocap.pose_steps import SMALLEST, PoseSteps
 from cfplan.flight.mocap.poses import Pose, PoseSource
-from cfplan.flight.pilot.abort_monitor import LINK_GONE, Abort, AbortMonitor, Observation
+from cfplan.flight.pilot.abort_monitor import Abort, AbortMonitor, Observation, fault_abort, ordered
 from cfplan.flight.pilot.deadlines import Deadlines
 from cfplan.flight.pilot.flight_history import FlightHistory
+from cfplan.flight.pilot.health import FRESH, GONE, UPLINK_GONE, Descent, Health, HealthMonitor
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Rung
@@ -33,13 +35,16 @@ from cfplan.flight.setpoints.commitment import Commitment, splice
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.rate_trade import gains_under
-from cfplan.flight.telemetry import Estimate, Level, PlanCommitted, PoseReceived, Triple
+from cfplan.flight.telemetry import Estimate, Level, PlanCommitted, PoseReceived, Triple, VehicleStatus
 from cfplan.vehicle.rotations import yaw_of
 
 TRIES = 3
 _KEEP_ALIVE_PERIOD = 0.1  # s; the vehicle's watchdog stops the motors after 1 s without a keep-alive packet
 _RECENT = 1.0  # s of good poses that are kept
-_LEFT_ALONE_AFTER = Timeouts().level_out  # s without a setpoint
+# m/s, horizontally and lasting, that the poses may move otherwise than the vehicle believes, while it flies slowly:
+# 0.05 in the virtual lab, where the wind blows 0.15, and 0.4 once the vehicle cannot be held any more.
+MOVES_OTHERWISE = 0.2
+LINK_LOST_AFTER = 10.0  # s without an acknowledgement, in flight; until then the link may come back
 _BRAKES_IN = 0.2  # s of its speed, by which a vehicle that levels out stops beyond where it is
 _STREAMS = 8  # that are remembered: a pose that comes late is judged by the stream of its time
 
@@ -82,6 +87,7 @@ class FlightLoop:
         self.mission, self.limits, self.history, self.now = mission, mission.limits, history, clock.now
         self._source, self._orders, self._proposals, self._clock = source, orders, proposals, clock
         self._monitor, self._pose_gate = AbortMonitor(mission.limits), PoseGate(mission.limits.pose.jump)
+        self._health_monitor, self.health = HealthMonitor(mission.limits.pose), Health()
         self._predictor, self._sensed = PosePredictor(), SensedMotion()
         self._steps = PoseSteps(mission.limits.pose.jump)
         self._deadlines = Deadlines(mission.rate, clock)
@@ -93,13 +99,16 @@ class FlightLoop:
         self.commitment = Commitment(0, mission.payloads, mission.stops)
         self.plan = stream_of(self.commitment, mission.rate, on_board=mission.on_board is not None)
         self.stream: Stream | None = None  # what each tick sends
-        self.left_alone = False
+        self._left_alone = False
         """The vehicle had no setpoint for so long that it left its stream by itself; until `hold_where_it_is`."""
         self._sent_at = math.inf  # s, when the last setpoint was sent
+        self._faults = set[str]()  # steps of a tick that have failed
         self._just_sent = -1  # number of the last setpoint of the plan that was sent; -1 before the first
         self._begun: deque[Stream] = deque(maxlen=_STREAMS)  # the last streams, each with its start
         self.pose_fault = ""  # why the last pose was not good
         self._forwarded = math.inf  # s, the time of the last pose that was forwarded
+        self._otherwise_since = math.inf  # s, since when the poses have moved otherwise than the vehicle believes
+        self.distrusted = ""  # why poses are not believed for the rest of the flight; it is slow until that is seen
         self._source_fault = ""
         self._log_since = -math.inf  # s, since when the vehicle's log has come without a gap, in flight
         self._kept_alive = -math.inf  # s, when the vehicle's watchdog was last sent a keep-alive packet
@@ -187,7 +196,7 @@ class FlightLoop:
         while self.stream is self.plan and (left := due - LOOKS_UNTIL - self.now()) > 0.0:
             if not self._proposals.wait(left):
                 return
-            self._consider_proposal(self.now(), self._just_sent)
+            self._guard("proposals", lambda: self._consider_proposal(self.now(), self._just_sent))
 
     def _consider_proposal(self, now: float, sent: int) -> None:
         """Fly what a planner proposes from its splice on if it verifies; answer the planner.
@@ -225,17 +234,21 @@ class FlightLoop:
 
     # A vehicle that was left alone: its radio was dead, or this computer stood still.
 
-    def hold_where_it_is(self) -> bool:
-        """Send a hover near where the vehicle is; return whether it is heard, so that this reaches it.
+    @property
+    def descent(self) -> Descent:
+        """Return how the vehicle comes down now."""
+        return Descent.HELD if self._left_alone else self.health.reaction.descent
+
+    def hold_where_it_is(self) -> None:
+        """Send a hover near where the vehicle is; once it acknowledges, this reaches it, and it is left alone no more.
 
         That is by the poses, by its own estimate if those do not come, or else where it was seen last.
         """
-        now, estimate, space = self.now(), self.link.estimate, self.limits.space
+        estimate, space = self.link.estimate, self.limits.space
         position, velocity, yaw = self.seen()
-        heard = estimate is not None and now - estimate.time < self.limits.pose.age_warning
-        if now - self.pose().time > self.limits.pose.age_brake:
+        if self.health.poses is not FRESH:
             velocity = 0.0, 0.0, 0.0
-            if estimate is not None and heard:
+            if estimate is not None and self.health.estimate is FRESH:
                 position, velocity, yaw = estimate.position, estimate.velocity, yaw_of(estimate.quaternion)
         inside, (x, y, z) = space.margin, position
         x = min(max(x + _BRAKES_IN * velocity[0], space.low[0] + inside), space.high[0] - inside)
@@ -243,56 +256,102 @@ class FlightLoop:
         place, rate = (x, y, min(z, space.high[2] - inside)), self.mission.rate
         motion = hover_to_hover(place, yaw, place, yaw, 1.0 / rate, rate)
         self.begin(Stream(encode_motion(motion, motion.acceleration, gains_under(self.limits), space=space), rate))
-        self.left_alone = not heard
-        return heard
-
-    def _note_left_alone(self, now: float) -> None:
-        link = self.link
-        sent = self.stream is not None and not self.stream.on_board
-        if self.airborne and sent and link.estimate is not None and link.status is not None:
-            silent = now - max(link.estimate.time, link.status.time)
-            self.left_alone |= max(silent, now - self._sent_at) > _LEFT_ALONE_AFTER
+        self._left_alone = self.health.uplink is not FRESH
 
     # Ticks.
 
     def tick(self) -> float:
-        """Serve one deadline: the setpoint, then the pose, then the abort monitor. Return the time after it, s."""
+        """Serve one deadline: the setpoint, then the poses, then the abort monitor. Return the time after it, s."""
         due = self._deadlines.wait(self._consider_meanwhile)
         now = self.now()
+        self.waking.append(now - due)
+        self._guard("setpoints", lambda: self._send_setpoint(now, due))
+        self._guard("watchdog", lambda: self._keep_alive(now))
+        self._take_poses()
+        self._guard("proposals", lambda: self._consider_due_proposal(now))
+        self._guard("logs", lambda: self._look(now))
+        self._obey_orders()
+        self._guard("abort monitor", lambda: self._monitor_flight(now, now - due))
+        return now
+
+    def _guard(self, step: str, act: Callable[[], None]) -> None:
+        """Take a step of a tick. A fault of it lands the vehicle, once; while it lands the steps that work go on."""
+        try:
+            act()
+        except (AbortRaised, LinkLost):
+            raise
+        except Exception as error:
+            if not self.airborne:
+                raise
+            if step not in self._faults:
+                self._faults.add(step)
+                self._leave_for(fault_abort(error))
+
+    def _send_setpoint(self, now: float, due: float) -> None:
         stream = self.stream
-        self._note_left_alone(now)
-        if stream is not None:
-            index = stream.index(now)
-            if not stream.on_board:
-                self.link.send(stream.packet(index))
-                self._sent_at = now
-            if self.history.first_setpoint:
-                self.history.report(stream.sent(index, due if stream.on_board else now, due))
-            if stream is self.plan and now < stream.end and not stream.on_board:
-                self.history.late.append(now - due)
+        if stream is None:
+            return
+        index = stream.index(now)
+        if not stream.on_board:
+            self._left_alone |= self.airborne and now - self._sent_at > UPLINK_GONE
+            self.link.send(stream.packet(index))
+            self._sent_at = now
+        if self.history.first_setpoint:
+            self.history.report(stream.sent(index, due if stream.on_board else now, due))
+        if stream is self.plan and now < stream.end and not stream.on_board:
+            self.history.late.append(now - due)
+
+    def _keep_alive(self, now: float) -> None:
         watched = self.airborne or self.watched  # to the end of the link: it locks 1 s later
         if watched and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
             self._kept_alive = now
             self.link.keep_alive()
-        self.waking.append(now - due)
-        if self._feeding:
-            self._forward_poses()
-        if stream is not None and stream is self.plan:
+
+    def _consider_due_proposal(self, now: float) -> None:
+        if self.stream is not None and self.stream is self.plan:
             self._just_sent = self.plan.number(now)
             self._consider_proposal(now, self._just_sent)
-        self._monitor_flight(now, now - due)
-        return now
+
+    def _look(self, now: float) -> None:
+        """Compute the health of this tick, and create logs anew that the vehicle sends no more."""
+        link = self.link
+        self.health = self._health_monitor.look(
+            now,
+            uplink=link.acknowledged,
+            poses=-math.inf if self.distrusted else self._forwarded,
+            estimate=link.estimate.time if link.estimate is not None else -math.inf,
+            status=link.status.time if link.status is not None else -math.inf,
+        )
+        streams = self.stream is not None and not self.stream.on_board
+        self._left_alone |= self.airborne and streams and self.health.uplink is GONE
+        if self.health.uplink is FRESH and (self.airborne or self.watched):
+            for log in ("estimate", "status"):
+                if getattr(self.health, log) is GONE:
+                    link.revive_log(log)
+
+    def _take_poses(self) -> None:
+        """Forward the poses that have come. In the air a fault of that means that none did: they grow old."""
+        if not self._feeding:
+            return
+        try:
+            self._forward_poses()
+        except Exception as error:
+            if not self.airborne:
+                raise
+            if not self.pose_fault:
+                self.pose_fault = f"fault in the pilot: {error!r}"
+                self.history.say(Level.ERROR, f"pose: {self.pose_fault}")
 
     def _forward_poses(self) -> None:
         newest, estimate = None, self.link.estimate
         self._sensed.note(estimate, self.link.status)
-        if not self.airborne or estimate is None or self.now() - estimate.time > self.limits.pose.age_warning:
+        if not self.airborne or estimate is None or self.health.estimate is not FRESH:
             estimate, self._log_since = None, self.now()
         else:
             self._source.tell_attitude(estimate.quaternion)
         for pose in self._source.poses():
             self.history.report(PoseReceived(pose.time, pose.received, pose.position, pose.quaternion))
-            fault = self._pose_gate.fault(pose, self._believed(estimate, pose.time))
+            fault = self.distrusted or self._pose_gate.fault(pose, self._believed(estimate, pose.time))
             if fault != self.pose_fault:
                 self.pose_fault = fault
                 self.history.say(Level.WARNING, f"pose: {fault}" if fault else "pose: good again")
@@ -307,6 +366,7 @@ class FlightLoop:
         now = self.now()
         if newest is not None and now - newest.time < self.limits.pose.age_brake:
             self._send_pose(newest, now)
+        self._compare_motion(now)
         while len(self.recent) > 1 and self.recent[0].time < self.recent[-1].time - _RECENT:
             self.recent.popleft()
 
@@ -354,54 +414,79 @@ class FlightLoop:
         distance = math.dist(pose.position, self.plan.position(moment))
         self.history.off_plan.append((pose.time - self.plan.start, distance))
 
+    @property
+    def estimate(self) -> Estimate | None:
+        """Return the vehicle's estimate, None while its log is gone."""
+        return self.link.estimate if self.health.estimate is not GONE else None
+
+    @property
+    def status(self) -> VehicleStatus | None:
+        """Return the vehicle's status, None while its log is gone."""
+        return self.link.status if self.health.status is not GONE else None
+
     def _monitor_flight(self, now: float, late: float) -> None:
-        """Raise LinkLost or AbortRaised where there is a reason to."""
-        link = self.link
-        if link.lost or (self.airborne and link.estimate is not None and now - link.estimate.time > LINK_GONE):
+        """Raise LinkLost or AbortRaised where there is a reason to; only in the air."""
+        link, estimate = self.link, self.estimate
+        if link.lost or (self.airborne and now - link.acknowledged > LINK_LOST_AFTER):
             raise LinkLost
+        if not self.airborne or self._stopped():
+            return
         pose = self._pose_gate.last
         observation = Observation(
             now=now,
-            order=self._orders.worst,
-            main_gone=self._orders.gone,
             pose=pose,
-            pose_fault=self._source.fault or self.pose_fault,
-            without_pose=self.blind_for,
+            pose_fault=self.distrusted or self._source.fault or self.pose_fault,
+            health=self.health,
             wanted=self.wanted(pose.time) if pose is not None else None,
-            estimate=link.estimate,
-            asked=self.wanted(link.estimate.time) if link.estimate is not None else None,
-            status=link.status,
-            otherwise=self._moves_otherwise(now),
+            estimate=estimate,
+            asked=self.wanted(estimate.time) if estimate is not None else None,
+            status=self.status,
             late=late if self.stream is not None and not self.stream.on_board else 0.0,
         )
-        watched = self.airborne and not self._stopped(link)
-        abort = self._monitor.gravest(observation) if watched else self._monitor.ordered(observation)
-        if abort is not None and abort.rung > self._tolerated:
+        abort = self._monitor.gravest(observation)
+        if abort is not None:
+            self._leave_for(abort)
+
+    def _leave_for(self, abort: Abort) -> None:
+        """Raise AbortRaised unless the abort is tolerated."""
+        if abort.rung > self._tolerated:
             raise AbortRaised(abort)
 
-    def _moves_otherwise(self, now: float) -> float:
-        """Return by how much, m/s, the body moves otherwise than the vehicle believes; 0 once the plan has begun.
+    def _compare_motion(self, now: float) -> None:
+        """Believe no pose any more of a body that lastingly moves otherwise than the vehicle believes.
 
-        Take-off and the way to the start are slow, so little else than axes that are not the vehicle's explains it. On
-        the floor nothing shows how the body is turned about the vertical.
+        Its axes are not the vehicle's then, or it is another body: by such poses no vehicle can be held, but by its own
+        sensors it still lands. Take-off and the way to the start are slow, so that little else explains it; later it is
+        not looked at. On the floor nothing shows how the body is turned about the vertical.
         """
         estimate, then = self.link.estimate, self._predictor.middle
-        if not self.airborne or self.history.first_setpoint or estimate is None or math.isnan(then):
-            return 0.0
-        if now - min(estimate.time, self.pose().time) > self.limits.pose.age_warning:
-            return 0.0
-        seen, believed = self._predictor.velocity(), estimate.velocity_at(then)
-        return math.dist(seen[:2], believed[:2])
+        off = 0.0
+        if (
+            self.airborne
+            and not self.history.first_setpoint
+            and estimate is not None
+            and self.health.estimate is FRESH
+            and now - self.pose().time <= self.limits.pose.age_warning
+            and not math.isnan(then)
+        ):
+            off = math.dist(self._predictor.velocity()[:2], estimate.velocity_at(then)[:2])
+        self._otherwise_since = min(self._otherwise_since, now) if off > MOVES_OTHERWISE else math.inf
+        if now - self._otherwise_since >= self.limits.flight.patience and not self.distrusted:
+            self.distrusted = (
+                f"the tracked body moves by {off:.2f} m/s otherwise than the vehicle believes: "
+                "are its axes the vehicle's?"
+            )
 
-    def _stopped(self, link: Link) -> bool:
+    def _stopped(self) -> bool:
         """Return whether the motors stand, as they are meant to."""
-        return link.status is not None and link.status.time > self._stop_expected and not any(link.status.motor)
+        status = self.link.status
+        return status is not None and status.time > self._stop_expected and not any(status.motor)
 
     def _obey_orders(self) -> None:
-        """Do what a tick does while there is no link: raise AbortRaised for an order."""
-        abort = self._monitor.ordered(Observation(self.now(), self._orders.worst, self._orders.gone))
+        """Raise AbortRaised for an operator command or the loss of the main process; while there is no link, too."""
+        abort = ordered(self._orders.worst, main_gone=self._orders.gone)
         if abort is not None:
-            raise AbortRaised(abort)
+            self._leave_for(abort)
 
     @property
     def watched(self) -> bool:
@@ -454,11 +539,6 @@ class FlightLoop:
     def blind_for(self) -> float:
         """Return how long, s, the vehicle has been without a pose: late ones are not forwarded."""
         return self.now() - self._forwarded
-
-    @property
-    def blind(self) -> bool:
-        """Return whether the vehicle has been without a pose for so long that it must land."""
-        return self.blind_for > self.limits.pose.age_land
 
     def bits(self, mask: int) -> int:
         """Return the bits of `mask` that are set in the log variable supervisor.info; 0 without a log."""

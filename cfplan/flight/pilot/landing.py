@@ -11,9 +11,11 @@ stop once its setpoint is on the floor, the motors stop at once: by an estimate 
 """
 
 import math
+from collections.abc import Callable
 
 from cfplan.flight.pilot.abort_monitor import safety_abort
 from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
+from cfplan.flight.pilot.health import FRESH, Descent
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.radio.supervisor_bits import FLYING
@@ -30,10 +32,9 @@ _SETTLE = 0.3  # s at the end of a descent before the motors stop
 _BLIND_BENEATH = 2.0  # m below the floor that setpoints sink to without poses, so that their time ends first
 _BLIND_FOR = 3.0  # s without poses after which the motors stop, as the estimate may be metres off
 _CLEAR = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
-_SEEN_FOR = 0.1  # s of good poses after which they are believed again
+_SEEN_FOR = 0.2  # s of fresh poses, so several of them, after which they are believed again
 MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
 _LOOK_AGAIN = 0.05  # s
-_LATEST_ESTIMATE = 0.1  # s
 _BENEATH = 0.3  # m below the floor: an estimate that has the vehicle there is worth nothing
 _IDLE_FOR = 0.2  # s without any thrust, which no descent asks for
 
@@ -67,22 +68,18 @@ class Landing:
         """Descend from where the vehicle is asked to be, and stop its motors. Raises AbortRaised if they do not."""
         self.begin()
         while not self._stands:
-            self._find()
-            if self._blind_on_floor():
+            if self._loop.descent is Descent.HELD:
+                self._loop.hold_where_it_is()
+                self._loop.pause(_LOOK_AGAIN)
+            elif self._blind_on_floor():
                 self._conclude(True)
-            elif self._loop.blind:
+            elif self._loop.descent is Descent.BLIND:
                 self._descend_blindly()
             else:
                 self._descend()
         if not stop_motors(self._loop):
             raise AbortRaised(safety_abort(Rung.CUT, "the vehicle does not land"))
         self._loop.touch_down()
-
-    def _find(self) -> None:
-        """Ask a vehicle that was left alone to stay where it is, until it is heard again."""
-        loop = self._loop
-        while loop.left_alone and not loop.hold_where_it_is():
-            loop.pause(_LOOK_AGAIN)
 
     def _descend(self) -> None:
         """Sink until the vehicle stands, or poses are gone; from the pose if those have only come back."""
@@ -92,11 +89,13 @@ class Landing:
         self._sink(loop.seen() if self._was_blind else loop.asked(), pace, lowest)
         self._was_blind = False
 
-        def over() -> bool:
-            return self._sunk() or self._blind_on_floor() or loop.blind or loop.left_alone
+        def interrupted() -> bool:
+            return self._blind_on_floor() or loop.descent is not Descent.BY_POSES
 
-        loop.until(lambda: stands_by_poses(self._loop, self._floor, _NOT_HELD) or over(), math.inf)
-        if not (self._blind_on_floor() or loop.blind or loop.left_alone):
+        loop.until(
+            lambda: stands_by_poses(self._loop, self._floor, _NOT_HELD) or self._sunk() or interrupted(), math.inf
+        )
+        if not interrupted():
             self._conclude(stands_by_poses(self._loop, self._floor, _NOT_HELD))
 
     def _descend_blindly(self) -> None:
@@ -109,15 +108,17 @@ class Landing:
 
         def seen() -> bool:
             nonlocal seen_since
-            good = loop.blind_for < loop.limits.pose.age_warning
-            seen_since = min(seen_since, loop.now()) if good else math.inf
+            seen_since = min(seen_since, loop.now()) if loop.health.poses is FRESH else math.inf
             return loop.now() - seen_since > _SEEN_FOR
 
         def over() -> bool:
             return self._sunk() or loop.blind_for > _BLIND_FOR or self._beneath_by_estimate()
 
-        loop.until(lambda: self._stands_by_estimate() or over() or seen() or loop.left_alone, math.inf)
-        if not (seen() or loop.left_alone):
+        def interrupted() -> bool:
+            return seen() or loop.descent is Descent.HELD
+
+        loop.until(lambda: self._stands_by_estimate() or over() or interrupted(), math.inf)
+        if not interrupted():
             self._conclude(self._stands_by_estimate())
 
     def _sink(
@@ -140,9 +141,9 @@ class Landing:
     def _blind_on_floor(self) -> bool:
         """Return whether no good poses come of a vehicle whose setpoint, led by those before, is on the floor."""
         loop = self._loop
-        if loop.stream is None or self._was_blind or loop.left_alone:
+        if loop.stream is None or self._was_blind or loop.descent is Descent.HELD:
             return False
-        return loop.blind_for > loop.limits.pose.age_brake and loop.asked()[0][2] < self._floor
+        return loop.health.poses is not FRESH and loop.asked()[0][2] < self._floor
 
     def _conclude(self, shown: bool) -> None:
         self._stands = True
@@ -154,7 +155,7 @@ class Landing:
 
         It stands then, after a fall that its sensors did not follow, or is as low as its estimate was wrong.
         """
-        estimate = self._loop.link.estimate
+        estimate = self._loop.estimate
         return estimate is not None and estimate.position[2] < self._floor - _BENEATH
 
     def _stands_by_estimate(self) -> bool:
@@ -162,12 +163,12 @@ class Landing:
 
         A vehicle that touches the floor leaning believes anything afterwards, but its controller gives up.
         """
-        loop, estimate, status = self._loop, self._loop.link.estimate, self._loop.link.status
+        loop, estimate, status = self._loop, self._loop.estimate, self._loop.status
         if status is not None:
             self._idle_since = min(self._idle_since, status.time) if not any(status.motor) else math.inf
             if status.time - self._idle_since > _IDLE_FOR:
                 return True
-        if estimate is None or loop.now() - estimate.time > _LATEST_ESTIMATE:
+        if estimate is None or loop.health.estimate is not FRESH:
             return False
         wanted = loop.wanted(estimate.time)
         return wanted is not None and estimate.position[2] - wanted[2] > _NOT_HELD
@@ -192,15 +193,28 @@ def stop_motors(loop: FlightLoop) -> bool:
 
     Then the vehicle's own null setpoints must count again: if none came, its supervisor would lock.
     """
-    loop.end_stream()
-    loop.expect_stop()
-    for _ in range(TRIES):
+
+    def send() -> None:
         for _ in range(TRIES):
             loop.link.stop_setpoint()
             loop.pause(0.02)
         for _ in range(TRIES):
             loop.link.release_priority()
             loop.pause(0.02)
-        if loop.until(lambda: not loop.bits(FLYING), MOTORS_STOP_WITHIN):
+
+    return stop_until_seen(loop, send)
+
+
+def stop_until_seen(loop: FlightLoop, send: Callable[[], object]) -> bool:
+    """Let `send` stop the motors, a few times until the vehicle says that it no longer flies; return whether they stop.
+
+    A vehicle that acknowledges but does not tell its status has had what was sent; then that counts.
+    """
+    loop.end_stream()
+    loop.expect_stop()
+    for _ in range(TRIES):
+        send()
+        loop.until(lambda: not loop.bits(FLYING) or loop.health.status_unknown, MOTORS_STOP_WITHIN)
+        if not loop.bits(FLYING):
             return True
-    return False
+    return loop.health.status_unknown

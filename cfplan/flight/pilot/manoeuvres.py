@@ -49,8 +49,10 @@ def _require_ready(loop: FlightLoop) -> None:
 
     Raises PreflightError if it does not say so.
     """
-    if loop.until(lambda: loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, _READY_WITHIN):
+    if loop.until(lambda: loop.status is not None and loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, _READY_WITHIN):
         return
+    if loop.status is None:
+        raise PreflightError("the vehicle does not tell its status", where="vehicle", hint="restart it and try again")
     faults = " and ".join(fault for bit, fault in FAULTS.items() if loop.bits(bit))
     armed = "is armed and not ready to fly" if loop.bits(ARMED) else "is no longer armed"
     raise PreflightError(

@@ -17,13 +17,14 @@ from cfplan.flight.on_board.go_to import STOP_DURATION, go_to_states, motion_of,
 from cfplan.flight.on_board.program import OnBoardProgram
 from cfplan.flight.pilot.abort_monitor import safety_abort
 from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
-from cfplan.flight.pilot.landing import MOTORS_STOP_WITHIN, stands_by_poses
+from cfplan.flight.pilot.health import GONE
+from cfplan.flight.pilot.landing import stands_by_poses, stop_until_seen
 from cfplan.flight.pilot.manoeuvres import begin_take_off, climb, settle_at
 from cfplan.flight.pilot.mission import manoeuvre_time
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.pilot.streamed_manoeuvres import BRAKE_HOLD
-from cfplan.flight.radio.supervisor_bits import FLYING, TRAJECTORY_FINISHED
+from cfplan.flight.radio.supervisor_bits import TRAJECTORY_FINISHED
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.flight.setpoints.rate_trade import gains_under
@@ -155,7 +156,7 @@ class OnBoardManoeuvres:
         self._stop()
         if not self._landing:
             self._history.enter(Phase.HOLD)
-            self._loop.until(lambda: self._loop.blind, BRAKE_HOLD)
+            self._loop.until(lambda: self._loop.health.poses is GONE, BRAKE_HOLD)
         self._descend()
 
     def stop_and_land(self) -> None:
@@ -222,10 +223,10 @@ class OnBoardManoeuvres:
             return
         (x, y, z), _, yaw = loop.asked()
         self._begin_landing()
-        lowest = self._floor - (_TOUCH_BLINDLY if loop.blind else _TOUCH)
+        lowest = self._floor - (_TOUCH_BLINDLY if loop.health.poses is GONE else _TOUCH)
         way = max(z - lowest, 0.0)
         quick = math.sqrt(7.513 * way / _QUICK_DESCENT)  # the peak of a septic's acceleration is 7.513 way / duration²
-        duration = max(quick if loop.blind else way / self._limits.ground.land_speed, _SHORTEST_LANDING)
+        duration = max(quick if loop.health.poses is GONE else way / self._limits.ground.land_speed, _SHORTEST_LANDING)
         down = self._way((x, y, z, yaw), (x, y, min(lowest, z), yaw), duration)
         down.stop_from = None
         self._require_landing(_ask(loop, commands.land(lowest, duration), lambda: loop.begin(down)))
@@ -245,11 +246,4 @@ class OnBoardManoeuvres:
 
     def _stop_motors(self) -> bool:
         """Stop the motors, and return whether the vehicle says so; its null setpoints count from then on."""
-        loop = self._loop
-        loop.end_stream()
-        loop.expect_stop()
-        for _ in range(TRIES):
-            _ask(loop, commands.stop())
-            if loop.until(lambda: not loop.bits(FLYING), MOTORS_STOP_WITHIN):
-                return True
-        return False
+        return stop_until_seen(self._loop, lambda: _ask(self._loop, commands.stop()))

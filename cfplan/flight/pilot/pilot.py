@@ -9,9 +9,9 @@ from collections.abc import Callable
 from cfplan.errors import CfplanError, ExitCode, LinkError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.poses import PoseSource
-from cfplan.flight.pilot.abort_monitor import Abort, safety_abort
+from cfplan.flight.pilot.abort_monitor import Abort, fault_abort
 from cfplan.flight.pilot.flight_history import FlightHistory
-from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop, LinkLost, OrderSource
+from cfplan.flight.pilot.flight_loop import LINK_LOST_AFTER, TRIES, AbortRaised, FlightLoop, LinkLost, OrderSource
 from cfplan.flight.pilot.manoeuvres import Manoeuvres
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.on_board_manoeuvres import OnBoardManoeuvres
@@ -53,7 +53,8 @@ class Pilot:
         try:
             exit_code, reason = self._fly()
         except LinkLost:
-            exit_code, reason = ExitCode.LINK_LOST, f"the link was lost: {loop.link.lost or 'the log fell silent'}"
+            why = loop.link.lost or f"nothing was acknowledged for {LINK_LOST_AFTER:g} s"
+            exit_code, reason = ExitCode.LINK_LOST, f"the link was lost: {why}"
             self._history.say(Level.ERROR, reason)
         finally:
             self._finish()
@@ -74,21 +75,20 @@ class Pilot:
             return self._leave_plan(raised.abort)
         except LinkLost:
             raise
-        except CfplanError as error:
-            if not self._history.checks:
+        except Exception as error:
+            if loop.airborne:  # whatever it is, it must not end in the air
+                return self._leave_plan(fault_abort(error))
+            if not isinstance(error, CfplanError) or not self._history.checks:
                 raise
             return error.exit_code, str(error)
-        except Exception as error:  # a fault of this program must not end in the air
-            if not loop.airborne:
-                raise
-            return self._leave_plan(safety_abort(Rung.LAND, f"fault in the pilot: {error!r}"))
         return ExitCode.OK, "landed"
 
     # The abort ladder.
 
     def _leave_plan(self, abort: Abort) -> tuple[ExitCode, str]:
         """Go down the ladder to the ground; return how the flight counts, and why."""
-        loop = self._loop
+        loop, flown = self._loop, self._manoeuvres
+        descents = [flown.land, flown.stop_and_land]  # the last one counts; one that breaks gives way to the other
         exit_code, reasons = abort.exit_code, [abort.text]
         while True:
             self._history.rung = max(self._history.rung, abort.rung)
@@ -97,17 +97,18 @@ class Pilot:
             self._history.say(level, f"{abort.rung.name.lower()}: {abort.text}")
             try:
                 if loop.airborne:
-                    flown = self._manoeuvres
-                    {Rung.BRAKE: flown.brake, Rung.LAND: flown.stop_and_land, Rung.CUT: self._cut}[abort.rung]()
+                    {Rung.BRAKE: flown.brake, Rung.LAND: descents[-1], Rung.CUT: self._cut}[abort.rung]()
                 return exit_code, ", then ".join(reasons)
             except AbortRaised as graver:
                 abort = graver.abort
             except LinkLost:
                 raise
-            except Exception as error:  # where landing breaks, only cutting is left
+            except Exception as error:
                 if abort.rung is Rung.CUT:
                     raise
-                abort = safety_abort(Rung.CUT, f"fault in the pilot: {error!r}")
+                if abort.rung is Rung.LAND:
+                    descents.pop()
+                abort = fault_abort(error, Rung.LAND if descents else Rung.CUT)
             reasons.append(abort.text)
 
     def _cut(self) -> None:

@@ -154,6 +154,7 @@ def _observe(loop: FlightLoop, read: dict[str, float], stood: Triple) -> Preflig
         stood=stood,
         estimate=link.estimate,
         variance=link.position_variance or (math.inf,),
+        health=loop.health,
         waking=Lateness.of(tuple(loop.waking), 0),
         uses_fifo_scheduling=uses_fifo_scheduling(),
     )

@@ -13,6 +13,7 @@ from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.on_board.fall import falls_from
 from cfplan.flight.on_board.go_to import go_to_states
 from cfplan.flight.pilot.deadlines import Lateness
+from cfplan.flight.pilot.health import GONE, LOG_GONE, Health
 from cfplan.flight.pilot.mission import Mission, manoeuvre_time
 from cfplan.flight.pilot.outcome import Check
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, ParameterRule, Traffic
@@ -47,6 +48,7 @@ class PreflightSnapshot:
     stood: Triple  # m, where the vehicle stood when its filter was set to its pose
     estimate: Estimate
     variance: Sequence[float]  # m², of position along x, y, z
+    health: Health
     waking: Lateness  # how late this computer met its deadlines in the last second
     uses_fifo_scheduling: bool = False
     """The stream has the processor ahead of ordinary programs, which the system must permit."""
@@ -81,6 +83,15 @@ def check_round_trip(snapshot: PreflightSnapshot) -> Check:
     return Check(
         "link round trip", f"{snapshot.round_trip * 1e3:.1f} ms", f"≤ {LARGEST_ROUND_TRIP * 1e3:.0f} ms",
         0.0 < snapshot.round_trip <= LARGEST_ROUND_TRIP, "move closer, or choose a freer channel",
+    )  # fmt: skip
+
+
+def check_logs(snapshot: PreflightSnapshot) -> Check:
+    silent = [name for name in ("estimate", "status") if getattr(snapshot.health, name) is GONE]
+    return Check(
+        "vehicle's logs", f"{' and '.join(silent)} silent" if silent else "estimate and status come",
+        f"heard within {LOG_GONE:g} s", not silent,
+        "end every other client of this vehicle, as a client that connects deletes all logs; then restart it",
     )  # fmt: skip
 
 
@@ -267,6 +278,7 @@ CHECKS: tuple[Callable[[PreflightSnapshot], Check], ...] = (
     check_firmware,
     check_timeouts,
     check_round_trip,
+    check_logs,
     check_supervisor,
     check_commanders,
     check_battery,

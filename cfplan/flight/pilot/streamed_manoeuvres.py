@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from cfplan.flight.pilot.flight_loop import FlightLoop
+from cfplan.flight.pilot.health import Descent
 from cfplan.flight.pilot.landing import Landing, stop_motors
 from cfplan.flight.pilot.manoeuvres import Place, begin_take_off, climb, settle_at
 from cfplan.flight.pilot.mission import manoeuvre_time
@@ -82,9 +83,9 @@ class StreamedManoeuvres:
         """Brake to a hover along the plan, hold it, and land."""
         loop = self._loop
         self._stop()
-        if not (self._landing.begun or loop.left_alone):
+        if not (self._landing.begun or loop.descent is Descent.HELD):
             self._history.enter(Phase.HOLD)
-            loop.until(lambda: loop.left_alone, BRAKE_HOLD)
+            loop.until(lambda: loop.descent is Descent.HELD, BRAKE_HOLD)
         self._landing.land()
 
     def stop_and_land(self) -> None:
@@ -95,10 +96,10 @@ class StreamedManoeuvres:
     def _stop(self) -> None:
         """Brake along the path to a hover, or finish a stop that has begun; sink besides where poses are gone.
 
-        A vehicle that was left alone is no longer on its path.
+        A vehicle that was left alone is no longer on its path, and one whose poses are not believed never was.
         """
         loop, left = self._loop, self._loop.stream
-        if left is None or self._landing.begun or loop.left_alone:
+        if left is None or self._landing.begun or loop.descent is Descent.HELD or loop.distrusted:
             return
         if left.stop_from is not None:
             stop = left.stop_from(self._present_index(left))
@@ -106,10 +107,10 @@ class StreamedManoeuvres:
             if left is loop.plan:
                 self._history.stopped_at = started.start
         end = loop.stream.end if loop.stream is not None else 0.0
-        loop.until(lambda: loop.now() > end or loop.blind or loop.left_alone, math.inf)
-        if loop.now() < end and not loop.left_alone:
+        loop.until(lambda: loop.now() > end or loop.descent is not Descent.BY_POSES, math.inf)
+        if loop.now() < end and loop.descent is Descent.BLIND:
             self._landing.sink_while_stopping()
-            loop.until(lambda: loop.now() > end or loop.left_alone, math.inf)
+            loop.until(lambda: loop.now() > end or loop.descent is Descent.HELD, math.inf)
 
     def _present_index(self, stream: Stream) -> int:
         """Return the setpoint to stop from: the present one, or the nearest before it if the vehicle fell behind."""

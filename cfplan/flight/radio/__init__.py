@@ -1,3 +1,3 @@
 """The link to the vehicle: URIs, Crazyradio, lock, connecting, perishable packets, parameters, logs, restart."""
 
-__all__ = ["connection", "crazyradio", "link", "perishable", "restart", "supervisor_bits", "uri"]
+__all__ = ["connection", "crazyradio", "link", "log_block", "perishable", "restart", "supervisor_bits", "uri"]

@@ -50,6 +50,7 @@ def connect(
     set_retries_before_disconnect(_RETRIES)
     answered, complete, failed = threading.Event(), threading.Event(), threading.Event()
     reasons: list[str] = []
+    made: list[Link] = []
 
     def fail(_: str, reason: str = "the link was closed") -> None:
         reasons.append(reason)
@@ -61,10 +62,14 @@ def connect(
     crazyflie.connection_failed.add_callback(fail)
     crazyflie.disconnected.callbacks.insert(0, fail)  # before cflib's own, one of which may never return
 
+    def acknowledged() -> None:
+        for link in made:
+            link.note_acknowledgement()
+
     def open_link() -> None:
         crazyflie.open_link(uri)
         if crazyflie.link is not None:
-            empty_air(crazyflie.link, clock.now)
+            empty_air(crazyflie.link, clock.now, acknowledged)
             crazyflie.link = _Serialized(crazyflie.link, clock)
 
     threading.Thread(target=open_link, daemon=True).start()
@@ -86,6 +91,7 @@ def connect(
         raise
 
     link = Link(crazyflie, uri, report, clock, radio_lock=lock)
+    made.append(link)
     crazyflie.disconnected.callbacks.insert(0, link.note_loss)
     crazyflie.connection_lost.add_callback(link.note_loss)
     link.release_priority()

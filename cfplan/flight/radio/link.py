@@ -7,13 +7,14 @@ driver: cflib's own sending holds a lock while a dying link joins the thread tha
 import math
 import struct
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import IO, Any
 
 import numpy as np
 
 from cfplan.errors import LinkError
 from cfplan.flight.clock import REAL_CLOCK, Clock
+from cfplan.flight.radio.log_block import LOG_PORT, SETTINGS_CHANNEL, LogBlock
 from cfplan.flight.radio.perishable import EXTERNAL_POSE, LOCALIZATION_PORT
 from cfplan.flight.radio.restart import restart_vehicle
 from cfplan.flight.radio.trajectory_upload import upload
@@ -54,6 +55,7 @@ class Link:
         self._crazyflie, self.uri, self._report, self._clock = crazyflie, uri, report, clock
         self._radio_lock = radio_lock
         self.lost = ""  # why the link is gone; empty while it stands
+        self.acknowledged = clock.now()  # s, when the vehicle last acknowledged that it had a packet
         self.estimate: Estimate | None = None
         self.status: VehicleStatus | None = None
         self.position_variance: Triple | None = None  # m² along x, y, z
@@ -61,8 +63,11 @@ class Link:
         self.replies: dict[int, int] = {}  # command of the on-board commander: the code that it answered, 0 for done
         self.firmware = ""
         self._preflight_blocks: list[Any] = []
+        self._revivals: dict[str, Iterator[bytes | None]] = {}  # of each log, by its name
         # s, when the vehicle's clock of ms was zero, according to the quickest messages; when the last message came
         self._log_zero, self._log_heard = math.inf, 0.0
+        # The radio tells of each packet; other drivers have nothing but cflib's pings, ten a second.
+        crazyflie.link_statistics.latency_updated.add_callback(lambda _: self.note_acknowledgement())
         crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
         crazyflie.add_port_callback(PLATFORM_PORT, self._on_platform)
 
@@ -120,6 +125,12 @@ class Link:
             self._send(SUPERVISOR_PORT, 1, b"\x04")
         else:
             self._send(LOCALIZATION_PORT, 1, b"\x04")
+
+    def revive_log(self, name: str) -> None:
+        """Send the next packet that creates `estimate` or `status` anew; called at each tick while that is silent."""
+        payload = next(self._revivals[name])
+        if payload is not None:
+            self._send(LOG_PORT, SETTINGS_CHANNEL, payload)
 
     # For the ground only: these wait for an answer.
 
@@ -216,6 +227,9 @@ class Link:
         except KeyError as error:
             raise LinkError(f"{error.args[0]}", where=self.uri, hint="update the vehicle's firmware") from error
         block.start()
+        table = self._crazyflie.log.toc
+        numbered = tuple((kind, int(table.get_element_id(variable))) for variable, kind in names)
+        self._revivals[name] = LogBlock(block.id, period_ms, numbered).revival()
         return block
 
     def ask_firmware(self) -> None:
@@ -233,6 +247,10 @@ class Link:
     def restart(self) -> None:
         """Restart the vehicle's main processor, after `close`; takes 2 s. Raises LinkError if it does not confirm."""
         restart_vehicle(self.uri, self._clock)
+
+    def note_acknowledgement(self) -> None:
+        """Remember that the vehicle has just acknowledged a packet; a callback of the radio."""
+        self.acknowledged = self._clock.now()
 
     def note_loss(self, _: str, reason: str = "the link was closed") -> None:
         """Remember why the link is gone; a callback of cflib."""

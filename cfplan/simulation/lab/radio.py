@@ -7,7 +7,7 @@ but setpoints and poses that wait for long do not come, as the pilot's link sees
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
@@ -29,6 +29,7 @@ class RadioFaultKind(StrEnum):
     LOSS = "loss"  # a share of `size` of the transmissions fails
     DELAY = "delay"  # packets take `size` s longer, either way
     DEAD = "dead"  # none gets through
+    UNACKNOWLEDGED = "unacknowledged"  # packets get through, and nothing comes back
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,9 @@ class Radio:
         self._down: deque[bytes] = deque()
         self._on_way_up: deque[tuple[float, bytes]] = deque()
         self._on_way_down: deque[tuple[float, bytes]] = deque()
+        self._repeated = False  # the vehicle has had the packet in the air, whose acknowledgement did not come
         self.dropped = 0  # packets dropped by a full queue
+        self.acknowledged: Callable[[], None] = lambda: None  # called with each acknowledgement
 
     def inject(self, fault: RadioFault, now: float) -> None:
         """Let something go wrong; its start counts from now."""
@@ -99,6 +102,7 @@ class Radio:
         if not (self._up or self._down):
             if now > self._next:
                 self._next = now
+                self._transact(now)  # an empty packet, as cflib sends where there is nothing else
             if not (self._on_way_up or self._on_way_down):
                 return [], []
         while self._next <= now and (self._up or self._down):
@@ -107,7 +111,7 @@ class Radio:
         return _arrived(self._on_way_up, now), _arrived(self._on_way_down, now)
 
     def _transact(self, time: float) -> None:
-        due = time
+        due, silent = time, False
         if self._faults:
             if self._acting(RadioFaultKind.DEAD, time) is not None:
                 return
@@ -115,10 +119,17 @@ class Radio:
             if loss is not None and self._chance.random() < loss.strength:
                 return
             due += delay.strength if delay is not None else 0.0
+            silent = self._acting(RadioFaultKind.UNACKNOWLEDGED, time) is not None
         if self._up:
-            sent, packet = self._up.popleft()
-            if not self._perished(sent, packet, time):
+            sent, packet = self._up[0]
+            if not self._repeated and not self._perished(sent, packet, time):
                 self._on_way_up.append((due, packet))
+            self._repeated = silent  # the vehicle takes what is repeated once
+            if not silent:
+                self._up.popleft()
+        if silent:
+            return
+        self.acknowledged()
         if self._down:
             self._on_way_down.append((due, self._down.popleft()))
 

@@ -11,6 +11,7 @@ from cfplan.flight.mocap.source import MocapSource
 from cfplan.flight.mocap.uri import parse_uri
 from cfplan.flight.radio.connection import PATIENCE
 from cfplan.flight.radio.link import PLATFORM_PORT, Link
+from cfplan.flight.radio.log_block import LogBlock
 from cfplan.flight.radio.restart import BOOT, POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
 from cfplan.flight.telemetry import Telemetry
 from cfplan.safety.limits import PoseLimits
@@ -26,9 +27,8 @@ _POWER_OFF = 1.0  # s, as long as cflib leaves it off
 _READ, _WRITE, _DATA = 1, 2, 2
 _INFO, _MEMORY_READ, _MEMORY_WRITE = range(3)
 _MEMORY_PART, _TRAJECTORY_MEMORY = 24, 0x12  # bytes in a packet; the type of memory, as cflib has it
-_CREATE_BLOCK, _APPEND_BLOCK, _RESET_LOG, _START_BLOCK, _STOP_BLOCK = 6, 7, 5, 8, 4
-_CREATED = 27  # bytes of variables that fit into the first packet
-_LOG_TYPES = {"uint8_t": (1, "B"), "int16_t": (5, "h"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "float": (7, "f")}
+_RESET_LOG, _STOP_BLOCK = 5, 4
+_LOG_LAYOUTS = {"uint8_t": "B", "int16_t": "h", "uint16_t": "H", "uint32_t": "I", "float": "f"}
 
 
 class SteppedLink(Link):
@@ -44,10 +44,14 @@ class SteppedLink(Link):
         endpoint = SimpleNamespace(
             link=self,
             platform=SimpleNamespace(get_protocol_version=lambda: lab.vehicle.settings.protocol),
-            link_statistics=SimpleNamespace(latency=SimpleNamespace(latency=_ROUND_TRIP_MS)),
+            link_statistics=SimpleNamespace(
+                latency=SimpleNamespace(latency=_ROUND_TRIP_MS),
+                latency_updated=SimpleNamespace(add_callback=lambda _: None),  # the radio tells of acknowledgements
+            ),
             add_port_callback=lambda port, note: self._callbacks.setdefault(port, []).append(note),
         )
         super().__init__(endpoint, URI, report, clock=lab.clock)
+        lab.radio.acknowledged = self.note_acknowledgement
 
     def send_soon(self, packet: Any) -> None:
         """Send a packet as the radio's driver does: wait briefly for its queue, then drop the packet."""
@@ -98,17 +102,12 @@ class SteppedLink(Link):
     def _log(self, name: str, variables: tuple[list[tuple[str, str]], int], note: Callable[..., None]) -> Any:
         entries, period = variables
         block = len(self._blocks)
-        kinds = [_LOG_TYPES[kind] for _, kind in entries]
-        wanted = b"".join(
-            struct.pack("<BH", code, self._variables[entry])
-            for (entry, _), (code, _) in zip(entries, kinds, strict=True)
-        )
-        self._blocks[block] = [entry for entry, _ in entries], "<" + "".join(layout for _, layout in kinds), note
-        first, others = wanted[:_CREATED], wanted[_CREATED:]
-        steps = [(_CREATE_BLOCK, first), (_APPEND_BLOCK, others), (_START_BLOCK, struct.pack("<H", period))]
-        for command, rest in steps:
-            head = bytes((command, block))
-            self._ask(Port.LOG, 1, head + rest, head, _PATIENCE)
+        layout = "<" + "".join(_LOG_LAYOUTS[kind] for _, kind in entries)
+        self._blocks[block] = [entry for entry, _ in entries], layout, note
+        made = LogBlock(block, period, tuple((kind, self._variables[entry]) for entry, kind in entries))
+        for payload in made.creation():
+            self._ask(Port.LOG, 1, payload, payload[:2], _PATIENCE)
+        self._revivals[name] = made.revival()
         stop = bytes((_STOP_BLOCK, block))
         return SimpleNamespace(stop=lambda: self._lab.radio.send(pack(Port.LOG, 1, stop)))
 
@@ -142,11 +141,9 @@ class SteppedLink(Link):
         port, channel, data = datagram[0] >> 4, datagram[0] & 3, datagram[1:]
         if port == Port.LOG and channel == _DATA:
             names, layout, note = self._blocks[data[0]]
-            note(
-                int.from_bytes(data[1:4], "little"),
-                dict(zip(names, struct.unpack(layout, data[4:]), strict=True)),
-                None,
-            )
+            if len(data) == 4 + struct.calcsize(layout):  # else it is only partly created, which cflib drops too
+                values = dict(zip(names, struct.unpack(layout, data[4:]), strict=True))
+                note(int.from_bytes(data[1:4], "little"), values, None)
             return
         for callback in self._callbacks.get(port, ()):
             callback(SimpleNamespace(port=port, channel=channel, data=data))

@@ -17,6 +17,15 @@ class VehicleFaultKind(StrEnum):
     BATTERY = "battery"  # the voltage under the present load falls to `size` V, and stays that much lower
     TUMBLE = "tumble"  # both left motors stop
     LOCK = "lock"  # the supervisor locks, for good
+    SILENT_ESTIMATE = "estimate log silent"  # blocks with the estimated position are not sent
+    SILENT_STATUS = "status log silent"  # blocks with the supervisor's state are not sent
+
+
+# The variable by which a block is known that a fault silences.
+SILENCED: Mapping[StrEnum, str] = {
+    VehicleFaultKind.SILENT_ESTIMATE: "stateEstimateZ.x",
+    VehicleFaultKind.SILENT_STATUS: "supervisor.info",
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,6 +43,7 @@ def log_toc(without: Collection[str] = ()) -> Toc:
 class _Block:
     layout: Struct = field(default_factory=lambda: Struct("<" + _HEAD))
     getters: list[Getter] = field(default_factory=list)  # of numbers that the layout takes, but for large floats
+    names: list[str] = field(default_factory=list)  # of its variables
     period: int = 0  # ms; 0 while it is stopped
     due: int = 0  # tick of the next packet
 
@@ -79,7 +80,7 @@ class LogBlocks:
 
     def _command(self, command: int, number: int, rest: bytes, tick: int) -> int:
         if command == _RESET:
-            self._blocks.clear()
+            self.clear()
             return 0
         if command == _CREATE_2:
             if number in self._blocks:
@@ -121,12 +122,19 @@ class LogBlocks:
             block.layout = Struct(block.layout.format + layout)
             largest = (1 << 8 * calcsize("<" + layout)) - 1
             block.getters.append(getter if layout in _FLOATING else partial(_bits, getter, largest))
+            block.names.append(self.toc.variables[number].full_name)
         return 0
 
-    def due(self, tick: int) -> list[bytes]:
-        """Return the payloads, on DATA_CHANNEL, of the blocks that are due."""
+    def clear(self) -> None:
+        """Delete all blocks."""
+        self._blocks.clear()
+
+    def due(self, tick: int, silent: Collection[str] = ()) -> list[bytes]:
+        """Return the payloads, on DATA_CHANNEL, of the blocks that are due, without those with a `silent` variable."""
         return [
-            self._sample(number, block, tick) for number, block in self._blocks.items() if self._is_due(block, tick)
+            self._sample(number, block, tick)
+            for number, block in self._blocks.items()
+            if self._is_due(block, tick) and not (silent and any(name in silent for name in block.names))
         ]
 
     @staticmethod

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.firmware import GAIN_PARAMETERS
+from cfplan.flight.firmware import GAIN_PARAMETERS, Timeouts
 from cfplan.flight.radio.restart import POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
 from cfplan.simulation.dynamics.body import MASS, MOTORS, THRUST_MAX
 from cfplan.simulation.virtual_crazyflie.battery import Battery
@@ -25,7 +25,7 @@ from cfplan.simulation.virtual_crazyflie.defaults import (
     PID_SPEED_PARAMETERS,
     PRIOR_PARAMETERS,
 )
-from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
+from cfplan.simulation.virtual_crazyflie.faults import SILENCED, VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.high_level import Goal, HighLevelCommander, PlannerState
 from cfplan.simulation.virtual_crazyflie.localization import Localization
 from cfplan.simulation.virtual_crazyflie.log_blocks import DATA_CHANNEL, LogBlocks
@@ -43,6 +43,7 @@ from cfplan.vehicle.rotations import yaw_of
 
 COMMANDER_PERIOD = 10  # ticks of 1 ms between runs of planner and log blocks
 _BOOT = 500  # ms from power on until it answers
+_CONNECTION_LASTS = round(1000 * Timeouts().connection)  # ms
 
 _SETPOINT_CHANNEL, _META_CHANNEL = 0, 1
 _NOTIFY_SETPOINT_STOP = 0
@@ -75,6 +76,8 @@ class VirtualCrazyflie:
         """Start the processor: everything is as after switching on."""
         airframe, without = self._airframe, lacking(self._version)
         self._commanded = -1  # the last tick at which the slower loops ran
+        self._heard = self.tick  # when the last packet came
+        self._silent: tuple[str, ...] = ()  # variables whose log blocks are not sent
         self.parameters = Parameters(DEFAULTS, without=without, stubborn=self.settings.stubborn)
         self.stabilizer = Stabilizer(
             airframe,
@@ -158,6 +161,7 @@ class VirtualCrazyflie:
         """Take a packet; its answer comes out of `sent`."""
         if not packet:
             return
+        self._heard = self.tick
         port, channel, payload = packet[0] >> 4, packet[0] & 3, packet[1 : 1 + LARGEST_PAYLOAD]
         answer: bytes | None = None
         if (port, channel) == (Port.LINK, POWER_CHANNEL) and payload[:1] == bytes((POWER,)) and len(payload) > 1:
@@ -224,7 +228,9 @@ class VirtualCrazyflie:
         while self._answers and self._answers[0][0] <= self.tick:
             _, answer = self._answers.pop(0)
             self._send(Port.PARAMETERS, answer[0], answer[1:])
-        for payload in self.log.due(self.tick):
+        if self.tick - self._heard > _CONNECTION_LASTS:
+            self.log.clear()
+        for payload in self.log.due(self.tick, self._silent):
             self._send(Port.LOG, DATA_CHANNEL, payload)
 
     def _apply_faults(self) -> None:
@@ -233,6 +239,7 @@ class VirtualCrazyflie:
             return
         loop, mass = self.stabilizer.loop, self._airframe.mass
         acting = {fault.kind: fault.strength for begin, end, fault in self._faults if begin <= self.tick < end}
+        self._silent = tuple(SILENCED[kind] for kind in acting if kind in SILENCED)
         loop.efficiency[:] = 1.0
         loop.efficiency[0] = acting.get(VehicleFaultKind.MOTOR, 1.0)
         if VehicleFaultKind.TUMBLE in acting:

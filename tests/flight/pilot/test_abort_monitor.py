@@ -6,7 +6,8 @@ import pytest
 
 from cfplan.errors import ExitCode
 from cfplan.flight.mocap.poses import Pose
-from cfplan.flight.pilot.abort_monitor import AbortMonitor, Observation
+from cfplan.flight.pilot.abort_monitor import AbortMonitor, Observation, ordered
+from cfplan.flight.pilot.health import FRESH, GONE, LATE, Health
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.outcome import Deviation, Rung, settle_time
 from cfplan.flight.telemetry import Estimate, VehicleStatus
@@ -37,32 +38,47 @@ def test_a_good_flight_gives_no_reason(monitor):
     assert monitor.gravest(observation(wanted=HERE)) is None
 
 
-@pytest.mark.parametrize(("age", "expected"), [(0.1, Rung.NONE), (0.2, Rung.BRAKE), (0.6, Rung.LAND)])
-def test_old_poses_brake_and_then_land(monitor, age, expected):
-    assert rung(monitor, observation(age=age)) is expected
+@pytest.mark.parametrize(("poses", "expected"), [(FRESH, Rung.NONE), (LATE, Rung.BRAKE), (GONE, Rung.LAND)])
+def test_old_poses_brake_and_then_land(monitor, poses, expected):
+    assert rung(monitor, observation(age=0.3, health=Health(poses=poses))) is expected
 
 
-def test_poses_that_stay_late_land_as_soon_as_none_at_all(monitor):
-    assert rung(monitor, observation(age=0.2, without_pose=0.45)) is Rung.BRAKE
-    late = monitor.gravest(observation(age=0.2, without_pose=0.55))
-    assert late.rung is Rung.LAND
-    assert "0.20 s late" in late.text
+def test_poses_that_stay_late_and_those_that_are_not_believed_say_so(monitor):
+    late = monitor.gravest(observation(age=0.12, health=Health(poses=GONE)))
+    assert "0.12 s late" in late.text
+    distrusted = monitor.gravest(observation(health=Health(poses=GONE), pose_fault="another body"))
+    assert "another body" in distrusted.text
+
+
+@pytest.mark.parametrize("log", ["estimate", "status"])
+def test_a_silent_log_lands_and_is_named(monitor, log):
+    abort = monitor.gravest(observation(health=Health(**{log: GONE})))
+    assert abort.rung is Rung.LAND
+    assert log in abort.text
+
+
+def test_what_a_log_that_is_gone_said_last_counts_no_more(monitor):
+    fast, turning, empty = (9.0, 0.0, 0.0), (0.0, 40.0, 0.0), 2.0
+    for now in (10.0, 10.2, 15.0):
+        seen = observation(now=now, velocity=fast, rate=turning, voltage=empty, bits=1 << 6)
+        seen.estimate = seen.status = None
+        assert rung(monitor, seen) is Rung.NONE
 
 
 @pytest.mark.parametrize(
-    ("height", "asked", "without", "expected"),
+    ("height", "asked", "poses", "expected"),
     [
-        (-0.01, 0.5, 0.2, Rung.CUT),
-        (-0.01, 0.5, 0.1, Rung.NONE),  # poses correct the estimate
-        (0.01, 0.5, 0.2, Rung.NONE),
-        (-0.01, 0.1, 0.2, Rung.NONE),  # it follows its setpoint
-        (-0.2, -0.3, 0.2, Rung.NONE),  # a landing without poses
+        (-0.01, 0.5, LATE, Rung.CUT),
+        (-0.01, 0.5, FRESH, Rung.NONE),  # poses correct the estimate
+        (0.01, 0.5, LATE, Rung.BRAKE),
+        (-0.01, 0.1, LATE, Rung.BRAKE),  # it follows its setpoint
+        (-0.2, -0.3, LATE, Rung.BRAKE),  # a landing without poses
     ],
 )
-def test_a_vehicle_that_fell_to_the_floor_without_poses_is_cut(monitor, height, asked, without, expected):
-    seen = observation(place=(0.0, 0.0, height), without_pose=without, asked=(0.0, 0.0, asked))
+def test_a_vehicle_that_fell_to_the_floor_without_poses_is_cut(monitor, height, asked, poses, expected):
+    seen = observation(place=(0.0, 0.0, height), health=Health(poses=poses), asked=(0.0, 0.0, asked))
     assert rung(monitor, seen) is expected
-    if expected:
+    if expected is Rung.CUT:
         assert "on the floor without poses, 0.51 m below its setpoint" in monitor.gravest(seen).text
 
 
@@ -92,12 +108,6 @@ def test_a_speed_counts_only_when_it_lasts(monitor):
     assert rung(monitor, observation(now=10.0, velocity=fast)) is Rung.NONE
     assert rung(monitor, observation(now=10.05, velocity=fast)) is Rung.NONE
     assert rung(monitor, observation(now=10.11, velocity=fast)) is Rung.BRAKE
-
-
-@pytest.mark.parametrize(("otherwise", "expected"), [(0.19, Rung.NONE), (0.25, Rung.LAND), (0.35, Rung.CUT)])
-def test_a_body_that_lastingly_moves_otherwise_than_the_vehicle_believes_ends_the_flight(monitor, otherwise, expected):
-    assert rung(monitor, observation(now=10.0, otherwise=otherwise)) is Rung.NONE
-    assert rung(monitor, observation(now=10.11, otherwise=otherwise)) is expected
 
 
 def test_a_single_noisy_value_is_forgotten(monitor):
@@ -146,16 +156,18 @@ def test_a_setpoint_far_too_late_brakes(monitor):
 
 
 def test_no_pose_at_all_lands(monitor):
-    assert rung(monitor, Observation(10.0)) is Rung.LAND
+    assert rung(monitor, Observation(10.0, health=Health(poses=GONE))) is Rung.LAND
 
 
-def test_the_operators_reason_is_told_before_others_of_its_rung(monitor):
-    abort = monitor.gravest(observation(order=Order.LAND, main_gone=True, age=0.6))
-    assert abort.exit_code is ExitCode.ENDED_BY_OPERATOR
+def test_an_operator_command_and_the_loss_of_the_main_process_end_the_flight():
+    assert ordered(Order.LAND, main_gone=True).exit_code is ExitCode.ENDED_BY_OPERATOR
+    assert ordered(Order.CUT, main_gone=False).rung is Rung.CUT
+    assert ordered(None, main_gone=True).rung is Rung.LAND
+    assert ordered(None, main_gone=False) is None
 
 
 def test_the_gravest_reason_wins(monitor):
-    abort = monitor.gravest(observation(order=Order.LAND, bits=1 << 6))
+    abort = monitor.gravest(observation(health=Health(poses=GONE), bits=1 << 6))
     assert abort.rung is Rung.CUT
     assert "locked" in abort.text
 

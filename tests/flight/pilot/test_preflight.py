@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from cfplan.flight.firmware import GAIN_PARAMETERS, NEWEST_KNOWN, Timeouts, version_of, version_text
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.deadlines import Lateness
+from cfplan.flight.pilot.health import GONE, Health
 from cfplan.flight.pilot.preflight import PreflightSnapshot, run_checks
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, PARAMETER_RULES, Action, Traffic
 from cfplan.flight.radio.supervisor_bits import CAN_FLY, FLYING, HIGH_LEVEL_ACTIVE, LOCKED, TUMBLED
@@ -50,6 +51,7 @@ def ground(mission):
         stood=PLACE,
         estimate=Estimate(1.0, PLACE, STILL, STILL, LEVEL),
         variance=(1e-5, 1e-5, 1e-5),
+        health=Health(),
         waking=Lateness(1e-4, 3e-4, 1e-3, 100, 0),
     )
 
@@ -71,6 +73,8 @@ def test_a_vehicle_in_order_passes_every_line(ground):
         ("firmware", {"firmware": "2025.09"}),
         ("link round trip", {"round_trip": 0.2}),
         ("link round trip", {"round_trip": 0.0}),
+        ("vehicle's logs", {"health": Health(status=GONE)}),
+        ("vehicle's logs", {"health": Health(estimate=GONE)}),
         ("supervisor", {"could_fly": False}),
         ("supervisor", {"status": status(bits=CAN_FLY | LOCKED)}),
         ("supervisor", {"status": status(bits=CAN_FLY | TUMBLED)}),

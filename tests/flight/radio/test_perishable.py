@@ -56,13 +56,19 @@ def dongle():
 
 
 @pytest.fixture
-def driver(dongle):
+def acknowledged():
+    """When acknowledgements came, s."""
+    return []
+
+
+@pytest.fixture
+def driver(dongle, acknowledged):
     driver = SimpleNamespace(out_queue=queue.Queue(1), needs_resending=False)
     driver._thread = _RadioDriverThread(
         dongle, queue.Queue(), driver.out_queue, lambda _: None, lambda _: None, driver, None
     )
     driver._thread._radio_link_statistics = SimpleNamespace(update=lambda *_: None)
-    empty_air(driver, lambda: dongle.now)
+    empty_air(driver, lambda: dongle.now, lambda: acknowledged.append(dongle.now))
     driver._thread.start()
     yield _Serialized(driver, SimpleNamespace(now=lambda: dongle.now))
     driver._thread.stop()

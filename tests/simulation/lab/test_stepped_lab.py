@@ -11,6 +11,7 @@ from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.vehicle.airframes import AIRFRAMES
@@ -62,13 +63,71 @@ def test_the_link_hears_logs_dated_when_they_were_written(lab):
 def test_what_a_dead_radio_held_is_known_to_be_old(lab):
     link = connect(lab, lambda message: None)
     link.start_logs()
-    lab.clock.sleep(1.0)
+    lab.clock.sleep(0.2)
     lab.disturb(RadioFault(RadioFaultKind.DEAD, 0.0, 0.6))
+    link.keep_alive()
     lab.clock.sleep(0.605)
     assert link.estimate is not None
     assert lab.now - link.estimate.time > 0.5  # it came just now
     lab.clock.sleep(0.5)
     assert lab.now - link.estimate.time < 0.05
+
+
+def test_a_vehicle_without_packets_for_a_second_deletes_its_logs_and_the_link_creates_them_anew(lab):
+    link = connect(lab, lambda message: None)
+    link.start_logs()
+    lab.disturb(RadioFault(RadioFaultKind.DEAD, 0.0, 1.1))
+    lab.clock.sleep(1.5)
+    assert lab.now - link.estimate.time > 0.3
+    assert lab.now - link.acknowledged < 0.01
+    for _ in range(10):
+        link.revive_log("estimate")
+        lab.clock.sleep(0.01)
+    lab.clock.sleep(0.2)
+    assert lab.now - link.estimate.time < 0.05
+    assert lab.now - link.status.time > 0.3  # another log is left alone
+
+
+def test_a_log_that_is_there_may_be_created_anew(lab):
+    link = connect(lab, lambda message: None)
+    link.start_logs()
+    heard = lab.now
+    for _ in range(10):
+        link.revive_log("status")
+        lab.clock.sleep(0.01)
+    lab.clock.sleep(0.1)
+    assert link.status.time > heard + 0.1
+
+
+def test_without_acknowledgements_the_vehicle_has_the_packet_in_the_air_once_and_no_other():
+    lab = SteppedLab(AIRFRAME, vehicle=VehicleSettings(auto_arming=False))
+    link = connect(lab, lambda message: None)
+    before = lab.now
+    lab.disturb(RadioFault(RadioFaultKind.UNACKNOWLEDGED, 0.0, 0.5))
+    link.arm(True)
+    link.arm(False)
+    lab.clock.sleep(0.4)
+    assert lab.vehicle.supervisor.armed
+    assert link.acknowledged <= before
+    lab.clock.sleep(0.2)
+    assert not lab.vehicle.supervisor.armed
+    assert lab.now - link.acknowledged < 0.01
+
+
+@pytest.mark.parametrize(("kind", "silent", "heard"), [
+    (VehicleFaultKind.SILENT_ESTIMATE, "estimate", "status"),
+    (VehicleFaultKind.SILENT_STATUS, "status", "estimate"),
+])  # fmt: skip
+def test_a_silent_log_leaves_the_other_alone(lab, kind, silent, heard):
+    link = connect(lab, lambda message: None)
+    link.start_logs()
+    lab.clock.sleep(0.1)
+    lab.disturb(VehicleFault(kind, 0.0, 0.4))
+    lab.clock.sleep(0.39)
+    assert lab.now - getattr(link, silent).time > 0.3
+    assert lab.now - getattr(link, heard).time < 0.05
+    lab.clock.sleep(0.1)
+    assert lab.now - getattr(link, silent).time < 0.05
 
 
 def test_parameters_are_set_and_read_back(lab):
