@@ -19,6 +19,7 @@ from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.flight.setpoints.stops import DURATION, encode_stops
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import TOLERANCE, inside
 from cfplan.simulation.link_loss import (
     ALLOWANCE,
     WALLS,
@@ -47,7 +48,7 @@ def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MAR
     return Assessment(
         what="link loss",
         time=encoded.times,
-        excess=moments.beyond + margin,
+        excess=moments.beyond + margin - TOLERANCE,
         reach=_reach(moments),
         describe=describe,
         near=lambda at: moments.name_of_wall(at, limits),
@@ -94,7 +95,7 @@ def assess_link_loss_of_stops(
     return Assessment(
         what="link loss within a stop",
         time=encoded.times,
-        excess=sampled.beyond + margin,
+        excess=sampled.beyond + margin - TOLERANCE,
         reach=sampled.reach,
         describe=describe,
         near=lambda at: moments.name_of_wall(at, limits),
@@ -182,4 +183,4 @@ def _reach(moments: LinkLossMoments) -> NDArray:
 
 
 def _how_far(beyond: float) -> str:
-    return f"{beyond:.2f} m beyond" if beyond > 0.0 else f"within {-beyond:.2f} m of"
+    return f"{beyond:.2f} m beyond" if not inside(beyond) else f"within {abs(beyond):.2f} m of"

@@ -31,6 +31,7 @@ from cfplan.flight.setpoints.motion_certificate import SPAN, MotionExtremes, exc
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, turns_for
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import rotations_of
 
@@ -329,7 +330,7 @@ def _wrong(worst: MotionExtremes, limits: Limits, *, in_stop: bool) -> tuple[Fau
     if not worst.jump <= _JUMP + chords:
         return Fault.MOTION, f"jumps by {worst.jump:.3f} m"
     beyond = float(limits.space.beyond(worst.corners).max())
-    if not beyond <= QUANTUM:
+    if not inside(beyond, QUANTUM):
         return Fault.SPACE, f"is {beyond:.3f} m too far out"
     exceeds = excess_of(worst, limits, in_stop=in_stop)
     return (Fault.LIMITS, exceeds) if exceeds else None
