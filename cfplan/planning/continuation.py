@@ -202,7 +202,7 @@ def path_from_rest(points: ArrayLike, limits: Limits) -> tuple[Path, tuple[float
 def check_waypoints(points: NDArray, limits: Limits) -> None:
     """Raise InfeasibleError where one of the waypoints, (K, 3) m, lies outside the space."""
     beyond = limits.space.beyond(points).max(axis=1)
-    if not (good := inside(beyond)).all():
+    if not (good := inside(beyond) | np.isnan(beyond)).all():  # what is no number is for whoever makes the path
         at = int(np.argmin(good))
         x, y, z = points[at]
         raise InfeasibleError(

@@ -19,7 +19,7 @@ from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.flight.setpoints.stops import DURATION, encode_stops
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss
 from cfplan.safety.limits import Limits
-from cfplan.safety.space import TOLERANCE, inside
+from cfplan.safety.space import inside
 from cfplan.simulation.link_loss import (
     ALLOWANCE,
     WALLS,
@@ -48,7 +48,7 @@ def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MAR
     return Assessment(
         what="link loss",
         time=encoded.times,
-        excess=moments.beyond + margin - TOLERANCE,
+        excess=moments.beyond + margin,
         reach=_reach(moments),
         describe=describe,
         near=lambda at: moments.name_of_wall(at, limits),
@@ -95,7 +95,7 @@ def assess_link_loss_of_stops(
     return Assessment(
         what="link loss within a stop",
         time=encoded.times,
-        excess=sampled.beyond + margin - TOLERANCE,
+        excess=sampled.beyond + margin,
         reach=sampled.reach,
         describe=describe,
         near=lambda at: moments.name_of_wall(at, limits),

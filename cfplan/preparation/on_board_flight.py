@@ -34,7 +34,7 @@ from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits
 from cfplan.safety.quantities import QUANTITIES
-from cfplan.safety.space import TOLERANCE, inside
+from cfplan.safety.space import inside
 from cfplan.simulation.dry_run import DryRun
 from cfplan.simulation.link_loss import LinkLoss
 from cfplan.vehicle.trajectory import Trajectory
@@ -114,7 +114,7 @@ def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
             Assessment(
                 what="the fall after link loss",
                 time=time,
-                excess=falls.beyond + _MARGIN - TOLERANCE,
+                excess=falls.beyond + _MARGIN,
                 reach=np.maximum(falls.reach, 1e-3),
                 describe=lambda at: f"ends {_beyond(falls.beyond[at])} {falls.name_of_wall(at, planned.limits)}",
                 near=lambda at: falls.name_of_wall(at, planned.limits),

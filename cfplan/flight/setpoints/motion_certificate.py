@@ -84,7 +84,7 @@ def motion_extremes(runs: NDArray, before: NDArray, airframe: Airframe, end: int
 def excess_of(worst: MotionExtremes, limits: Limits, *, in_stop: bool) -> str:
     """Return which limit of plans a motion exceeds, or `in_stop` which of stops, and by which value; empty if none."""
     if not worst.traded <= TRADED_RATE_MAX + TOLERANCES["rad/s"]:
-        return f"trades {worst.traded:.3g} rad/s; it may be at most {TRADED_RATE_MAX:.3g}"
+        return f"sends {worst.traded:.3g} rad/s as a turn of the thrust; it may be at most {TRADED_RATE_MAX:.3g}"
     for quantity in QUANTITIES:
         if quantity.measure == of.ANGULAR_ACCELERATION or (in_stop and quantity.in_stop is None):
             continue
@@ -95,7 +95,8 @@ def excess_of(worst: MotionExtremes, limits: Limits, *, in_stop: bool) -> str:
             side, unit = "at most" if quantity.side == AT_MOST else "at least", quantity.unit
             if unit == "rad":
                 value, limit, unit = math.degrees(value), math.degrees(limit), "°"
-            return f"reaches a {quantity.noun} of {value:.3g} {unit}; it may be {side} {limit:.3g}"
+            article = "an" if quantity.noun[0] in "aeiou" else "a"
+            return f"reaches {article} {quantity.noun} of {value:.3g} {unit}; it may be {side} {limit:.3g}"
     return ""
 
 

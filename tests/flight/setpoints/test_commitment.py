@@ -241,7 +241,7 @@ def test_a_proposal_that_exceeds_a_limit_of_plans_is_refused(committed, spliced,
     refused = splice(committed, proposal, 110, at_most(limits, **lowered(limits.plan)))
     assert isinstance(refused, Refusal)
     assert refused.fault is Fault.LIMITS
-    assert re.search(rf"^setpoint \d+ reaches a {noun} of", refused.detail)
+    assert re.search(rf"^setpoint \d+ reaches an? {noun} of", refused.detail)
     number = int(refused.detail.split()[1])
     assert 120 <= number < 120 + len(proposal.payloads)
 
@@ -262,7 +262,7 @@ def test_a_proposal_with_a_stop_that_exceeds_what_stops_may_reach_is_refused(com
     refused = splice(committed, spliced[1], 110, replace(limits, flight=lowered(limits.flight)))
     assert isinstance(refused, Refusal)
     assert refused.fault is Fault.LIMITS
-    assert re.search(rf"^setpoint \d+ of the stop from setpoint \d+ reaches a {noun} of", refused.detail)
+    assert re.search(rf"^setpoint \d+ of the stop from setpoint \d+ reaches an? {noun} of", refused.detail)
 
 
 # By how much a number in a packet is changed, in thousandths: places, velocities, thrusts and rates that no plan has.
