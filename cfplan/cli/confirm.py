@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from cfplan.errors import ExitCode, InputError
+from cfplan.safety.space import inside
 from cfplan.steering.starting_vehicle import SIMULATED
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def describe(prepared: "Prepared", uri: str) -> str:
         f"{axis} {low:.2f} to {high:.2f} m" for axis, low, high in zip("xyz", space.low, space.high, strict=True)
     )
     remedy = "a lower --speed" if mission.limits.firmware.watchdog else "a lower --speed, or firmware.watchdog,"
-    advice = f" With {remedy} it would not come so far." if lost.beyond > 0 else ""
+    advice = f" With {remedy} it would not come so far." if not inside(lost.beyond) else ""
     alone, lasts = "it stops its motors by itself", prepared.planned.duration
     if mission.on_board is not None:
         lasts = mission.motion_ends

@@ -36,7 +36,7 @@ from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import default_nodes
 from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import Limits, PlanLimits
-from cfplan.safety.space import check_space
+from cfplan.safety.space import check_space, inside
 from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.joint import Joint, joint_at
@@ -202,8 +202,8 @@ def path_from_rest(points: ArrayLike, limits: Limits) -> tuple[Path, tuple[float
 def check_waypoints(points: NDArray, limits: Limits) -> None:
     """Raise InfeasibleError where one of the waypoints, (K, 3) m, lies outside the space."""
     beyond = limits.space.beyond(points).max(axis=1)
-    if (beyond > 0.0).any():
-        at = int(np.argmax(beyond > 0.0))
+    if not (good := inside(beyond) | np.isnan(beyond)).all():  # what is no number is for whoever makes the path
+        at = int(np.argmin(good))
         x, y, z = points[at]
         raise InfeasibleError(
             f"({x:.3f}, {y:.3f}, {z:.3f}) m is {beyond[at]:.3f} m too far out",

@@ -136,7 +136,7 @@ def choose(policy: str, task: PlanningTask, nodes: int | None, space: Space) -> 
         hint = "loosen the plan's limits, or make the path gentler or longer"
         if task.deadline.passed:
             hint = "give planning more time (--budget), or the path fewer waypoints"
-        raise InfeasibleError(f"no plan. {'; '.join(notes)}", hint=hint)
+        raise InfeasibleError(f"no plan. {'; '.join(_by_reason(notes))}", hint=hint)
     best = min(found, key=lambda one: one.duration)
     return Choice(best, tuple(notes), _left_out(best, skipped) if task.deadline.passed else "")
 
@@ -166,6 +166,15 @@ def _take(step: Step, task: PlanningTask, nodes: int | None, space: Space) -> tu
         if found:
             return min(found, key=lambda one: one.duration), notes
     return None, notes
+
+
+def _by_reason(notes: Sequence[str]) -> list[str]:
+    """Return notes, "who: why" each, with each reason once, behind all whom it stopped."""
+    stopped: dict[str, list[str]] = {}
+    for note in notes:
+        who, _, why = note.partition(": ")
+        stopped.setdefault(why or note, []).append(who)
+    return [", ".join(who) + ("" if [why] == who else f": {why}") for why, who in stopped.items()]
 
 
 def ask(planner: str, task: PlanningTask, space: Space) -> Found | str:

@@ -24,6 +24,7 @@ from cfplan.flight.telemetry import Triple
 from cfplan.preparation.beside import Pending, Work, beside
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
 from cfplan.simulation.dry_run import dry_run, rehearse_setpoints
 from cfplan.simulation.glitches import glitch_where_nearly_lost
 from cfplan.simulation.link_loss import LinkLossMoments, as_believed, foreseen_link_loss, link_loss_at_walls
@@ -270,14 +271,14 @@ def _require_all_inside(encoded: EncodedFlight, stops: NDArray, limits: Limits, 
 
 def require_inside(lost: LinkLossMoments, limits: Limits) -> None:
     """Raise EndsBadlyError where link loss ends outside the walls."""
-    if not lost.worst.beyond <= 0.0 and not limits.link_loss.only_warn:
+    if not inside(lost.worst.beyond) and not limits.link_loss.only_warn:
         raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
 
 
 def foresee_link_loss(payloads: NDArray, limits: Limits, starts: NDArray) -> None:
     """Raise EndsBadlyError where link loss is foreseen to end outside the walls by far."""
     foreseen = foreseen_link_loss(payloads, limits, starts=starts).worst
-    if foreseen.beyond > _FORESEEN:
+    if not inside(foreseen.beyond, _FORESEEN):
         raise EndsBadlyError(str(foreseen), where="link loss", hint=OUTSIDE_HINT)
 
 

@@ -66,6 +66,11 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         for coarsely in (True, False):
             link_loss_within_stops(stop, lost.snapshots[:, first], limits, end, coarsely=coarsely)
         glitch_at_sampled_setpoints(begin, limits)
+        if last >= Stage.FLIGHT:  # before encoding a flight, which ends the noting of calls
+            from cfplan.flight.setpoints.commitment import Commitment, warm_up
+
+            at_rest = encode_stops(encoded.motion, RATE, rows=np.array([-1, -1]) % len(encoded.payloads))
+            warm_up(Commitment(0, encoded.payloads[-2:], at_rest), limits)
         if last >= Stage.REHEARSAL:
             from cfplan.preparation.plan_flight import PlannedFlight
             from cfplan.preparation.prepare_flight import encode_flight, make_mission, rehearse

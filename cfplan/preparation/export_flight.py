@@ -25,6 +25,7 @@ from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, PlannedFl
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
 from cfplan.safety.quantities import INSTANT
+from cfplan.safety.space import inside
 from cfplan.simulation.dry_run import DryRun
 from cfplan.simulation.on_board_run import on_board_run
 from cfplan.vehicle.measures import measures_of
@@ -233,7 +234,7 @@ def check_samples(rows: NDArray, trajectory: Trajectory, limits: Limits, where: 
     measured = measures_of(rows[:, 4:7], rows[:, 7:10], rows[:, 11:14], state.thrust_axis, state.specific_thrust)
     exceeded = [q.excess(q.worst(measured), q.allowed(limits.plan)) > slack for q in INSTANT]
     wrong = np.abs(rows[:, 1:] - np.column_stack(expected)).max(axis=1) > slack
-    bad = wrong | np.any(exceeded, axis=0) | (limits.space.beyond(rows[:, 1:4]) > slack).any(axis=1)
+    bad = wrong | np.any(exceeded, axis=0) | ~inside(limits.space.beyond(rows[:, 1:4]), slack).all(axis=1)
     if bad.any():
         raise NotCertifiedError(
             "the sample is not that of the plan, or exceeds a limit",

@@ -19,6 +19,7 @@ from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.flight.setpoints.stops import DURATION, encode_stops
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
 from cfplan.simulation.link_loss import (
     ALLOWANCE,
     WALLS,
@@ -182,4 +183,4 @@ def _reach(moments: LinkLossMoments) -> NDArray:
 
 
 def _how_far(beyond: float) -> str:
-    return f"{beyond:.2f} m beyond" if beyond > 0.0 else f"within {-beyond:.2f} m of"
+    return f"{beyond:.2f} m beyond" if not inside(beyond) else f"within {abs(beyond):.2f} m of"

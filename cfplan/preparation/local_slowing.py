@@ -16,6 +16,7 @@ from cfplan.errors import InfeasibleError
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan_result import LocalSlowing, Plan
 from cfplan.planning.repair import repair, slow
+from cfplan.safety.space import inside
 from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.simulation.link_loss import LinkLossMoments
 from cfplan.vehicle.profile import SpeedProfile
@@ -58,9 +59,14 @@ class Assessment:
         return int(np.argmax(np.where(np.isnan(self.excess), np.inf, self.excess)))
 
     @property
+    def at_fault(self) -> NDArray:
+        """Return (N,) which setpoints end beyond what is allowed."""
+        return ~np.asarray(inside(self.excess))
+
+    @property
     def passed(self) -> bool:
         """Return whether every setpoint ends well."""
-        return bool(np.all(self.excess <= 0.0))
+        return not self.at_fault.any()
 
 
 Assess = Callable[[Trajectory], Sequence[Assessment]]
@@ -135,7 +141,7 @@ def _passed(assessed: Sequence[Assessment]) -> bool:
 
 def _worst_of_arcs(assessment: Assessment) -> list[int]:
     """Return the worst setpoint of each run of setpoints at fault, the worst run first."""
-    at_fault = np.flatnonzero(~(assessment.excess <= 0.0))
+    at_fault = np.flatnonzero(assessment.at_fault)
     runs = np.split(at_fault, np.flatnonzero(np.diff(at_fault) > 1) + 1)
     worst = [int(run[np.argmax(assessment.excess[run])]) for run in runs if len(run)]
     return sorted(worst, key=lambda at: -assessment.excess[at])
@@ -145,7 +151,7 @@ def _lowered(trajectory: Trajectory, assessment: Assessment, caps: SpeedCaps, do
     """Return lower caps, that should do after `done` rounds that did not; None where they are the least already."""
     s = np.array(caps.s)
     speed, before = _speed_at(trajectory, s), np.array(caps.speed)
-    at_fault = np.flatnonzero(~(assessment.excess <= 0.0))
+    at_fault = np.flatnonzero(assessment.at_fault)
     excess, reach = np.nan_to_num(assessment.excess[at_fault], nan=np.inf), assessment.reach[at_fault]
     share = np.minimum(np.maximum(1.0 - excess / reach, 0.0) ** (1.0 / POWER), MOST_SHARE) ** (1 + 0.5 * done)
     first, last = _about(trajectory, assessment, s, (1 + 0.5 * done) * ABOUT)
@@ -161,7 +167,7 @@ def _lowered(trajectory: Trajectory, assessment: Assessment, caps: SpeedCaps, do
 
 def _about(trajectory: Trajectory, assessment: Assessment, s: NDArray, about: float) -> tuple[NDArray, NDArray]:
     """Return the first and the last of the places s, (K,), within `about` s of each setpoint at fault."""
-    time = assessment.time[~(assessment.excess <= 0.0)]
+    time = assessment.time[assessment.at_fault]
     first = np.searchsorted(s, trajectory.s_at(time - about), side="right") - 1
     return first, np.minimum(np.searchsorted(s, trajectory.s_at(time + about)), len(s) - 1)
 

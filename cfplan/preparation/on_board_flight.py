@@ -34,6 +34,7 @@ from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits
 from cfplan.safety.quantities import QUANTITIES
+from cfplan.safety.space import inside
 from cfplan.simulation.dry_run import DryRun
 from cfplan.simulation.link_loss import LinkLoss
 from cfplan.vehicle.trajectory import Trajectory
@@ -128,7 +129,7 @@ def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
 
 
 def _beyond(beyond: float) -> str:
-    return f"{beyond:.2f} m beyond" if beyond > 0.0 else f"{-beyond:.2f} m from"
+    return f"{beyond:.2f} m beyond" if not inside(beyond) else f"{abs(beyond):.2f} m from"
 
 
 def _require_harmless_fall(
@@ -145,8 +146,8 @@ def _require_harmless_fall(
         beyond = float(falls.beyond[at])
         lost = LinkLoss(float(time[at]), float(falls.distance[at]), beyond)
         where = f"{_beyond(beyond)} {falls.name_of_wall(at, limits)}"
-        (results.append if beyond <= 0.0 else results.warn)(f"its watchdog stops the motors, it falls {where} at most")
-        if not beyond <= 0.0 and not limits.link_loss.only_warn:
+        (results.append if inside(beyond) else results.warn)(f"its watchdog stops the motors, it falls {where} at most")
+        if not inside(beyond) and not limits.link_loss.only_warn:
             raise NotCertifiedError(
                 f"link loss at {time[at]:.2f} s ends {where}: it flies on, and its watchdog stops the motors after 1 s",
                 where="link loss on board",
@@ -200,7 +201,7 @@ def check_stops(stops: NDArray, limits: Limits) -> None:
                 where=f"stop at {at // count / RATE:.2f} s", hint="plan with a lower speed or acceleration",
             )  # fmt: skip
     beyond = limits.space.beyond(states[:, 0, :3]).max(axis=1)
-    if not (beyond <= 0.0).all():
+    if not inside(beyond).all():
         at = int(np.argmax(beyond))
         raise NotCertifiedError(
             f"a stop comes {beyond[at]:.2f} m nearer to the walls than the margin",

@@ -25,6 +25,7 @@ from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_fl
 from cfplan.preparation.slow_motion import require_harmless_slow_motion
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
 from cfplan.simulation.dry_run import DryRun, dry_run
 from cfplan.simulation.link_loss import LinkLoss, link_loss_at_every_setpoint, simulate_link_loss
 
@@ -132,8 +133,8 @@ def find_link_loss(
             lost = simulated.moments.worst
         else:
             lost = simulate_link_loss(encoded.payloads, limits)
-        (results.warn if lost.beyond > 0 else results.append)(str(lost))
-        if lost.beyond > 0 and not limits.link_loss.only_warn:
+        (results.append if inside(lost.beyond) else results.warn)(str(lost))
+        if not inside(lost.beyond) and not limits.link_loss.only_warn:
             raise NotCertifiedError(str(lost), where="link loss", hint=OUTSIDE_HINT)
     return lost
 

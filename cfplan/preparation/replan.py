@@ -53,6 +53,7 @@ from cfplan.preparation.certified_flight import (
     require_inside,
 )
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
 from cfplan.simulation.dry_run import Rehearsal, rehearse_setpoints
 from cfplan.simulation.link_loss import as_believed, as_most_sluggish, link_loss_at_walls
 from cfplan.vehicle.hover import hover_at
@@ -182,7 +183,7 @@ def hold_hover(position: Triple, yaw: float, limits: Limits) -> HeldFlight:
     Raises InfeasibleError where that lies outside the space, or link loss there would end outside the walls.
     """
     beyond = float(limits.space.beyond(np.array([position])).max())
-    if beyond > 0.0:
+    if not inside(beyond):
         x, y, z = position
         raise InfeasibleError(
             f"the hover at ({x:.2f}, {y:.2f}, {z:.2f}) m is {beyond:.2f} m too far out",

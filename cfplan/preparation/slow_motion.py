@@ -20,6 +20,7 @@ from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.rate_trade import ahead, gains_under
 from cfplan.flight.telemetry import Triple
 from cfplan.preparation.steps import OnStep, ignore_steps, step
+from cfplan.safety.space import inside
 from cfplan.simulation.link_loss import link_loss_of_slow_motion
 
 _TURN = np.pi / 2  # rad, of the vehicle on its way to the start
@@ -44,11 +45,11 @@ def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_step
             at = int(np.argmax(np.where(np.isnan(moments.beyond), np.inf, moments.beyond)))
             beyond = float(moments.beyond[at])
             if not beyond <= farthest:
-                side = "beyond" if not beyond <= 0.0 else "inside"
+                side = "inside" if inside(beyond) else "beyond"
                 farthest, worst = beyond, f"{what} ends {abs(beyond):.2f} m {side} {moments.name_of_wall(at, limits)}"
-            if not beyond <= 0.0 and not limits.link_loss.only_warn:
+            if not inside(beyond) and not limits.link_loss.only_warn:
                 raise NotCertifiedError(f"link loss {worst}", where="link loss", hint=hint)
-        (results.append if farthest <= 0.0 else results.warn)(f"link loss {worst}, at worst")
+        (results.append if inside(farthest) else results.warn)(f"link loss {worst}, at worst")
 
 
 def _motions(mission: Mission) -> Iterator[_Motion]:

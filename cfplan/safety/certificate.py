@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import AT_LEAST, QUANTITIES, Quantity
-from cfplan.safety.space import Space
+from cfplan.safety.space import Space, inside
 from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
@@ -183,8 +183,7 @@ def _margin(bound: _Bound, peak: float, time: float, s: float, position: Sequenc
     """Return the margin of a peak, which is the side times the measure."""
     quantity, limit, unused = bound
     worst = float(quantity.value(quantity.side * peak))
-    room = limit - unused
-    share = (worst - unused) / room if room * quantity.side > 0 else math.inf
+    share = share_of(quantity, worst, limit, unused)
     x, y, z = position
     return Margin(
         name=quantity.name,
@@ -196,6 +195,13 @@ def _margin(bound: _Bound, peak: float, time: float, s: float, position: Sequenc
         s=s,
         position=(x, y, z),
     )
+
+
+def share_of(quantity: Quantity, worst: float, limit: float, unused: float) -> float:
+    """Return the share of a limit that is used; of the walls' margin all of it at most, as long as it is kept."""
+    room = limit - unused
+    share = (worst - unused) / room if room * quantity.side > 0 else math.inf
+    return min(share, 1.0) if quantity.name == WALLS and inside(limit - worst) else share
 
 
 def _capped_speed(trajectory: Trajectory, caps: SpeedCaps, segments: Segments) -> Margin:

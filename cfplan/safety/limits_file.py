@@ -26,7 +26,7 @@ from cfplan.safety.limits import (
     within_reserve,
 )
 from cfplan.safety.quantities import ON_LADDER
-from cfplan.safety.space import Space
+from cfplan.safety.space import Space, inside
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.airframes import load_airframe
 
@@ -347,12 +347,12 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
             hint=f"write an age_warning above {1.0 / pose.rate:.3g} s, or a higher rate",
         )
     height = content.ground.take_off_height
-    if not content.space.low[2] + content.space.margin <= height <= content.space.high[2] - content.space.margin:
+    low, high, margin = content.space.low[2], content.space.high[2], content.space.margin
+    if not inside(max(low + margin - height, height - (high - margin))):
         raise InputError(
             f"a take-off to {height:g} m ends outside the space or within its margin",
             where=places.where("ground", "take_off_height"),
-            hint=f"write a height from {content.space.low[2] + content.space.margin:g} to "
-            f"{content.space.high[2] - content.space.margin:g} m",
+            hint=f"write a height from {low + margin:g} to {high - margin:g} m",
         )
 
 

@@ -1,6 +1,7 @@
 """The space to fly in, and the check that a path stays within it."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,7 +11,18 @@ from cfplan.geometry.path import Path
 
 _SAMPLES = 33  # of each piece of a path
 _AXES = ("x", "y", "z")
+TOLERANCE = 1e-6
+"""m by which a place may lie beyond a wall, or a margin before it, and count as inside: a thousandth of what packets
+round places by, and far above what sums and a path's equations round. A path drawn at the margin keeps it."""
 _MILLIMETRES = 30.0  # larger coordinates of a path that lies in the space when divided by 1000 are in millimetres
+
+
+def inside(beyond: ArrayLike, rounding: float = 0.0) -> Any:
+    """Return whether places so far beyond a wall, or a margin before it, in m, count as inside; not what is no number.
+
+    All comparisons with walls are this one. `rounding`, m, is what places were rounded by before.
+    """
+    return np.asarray(beyond) <= TOLERANCE + rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +38,10 @@ class Space:
         points = np.asarray(positions, dtype=float)
         return np.maximum(np.array(self.low) + self.margin - points, points - (np.array(self.high) - self.margin))
 
+    def holds(self, positions: ArrayLike, rounding: float = 0.0) -> bool:
+        """Return whether all positions, (..., 3) m, are inside the box less its margin; see inside()."""
+        return bool(np.all(inside(self.beyond(positions), rounding)))
+
 
 def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None, where: str = "") -> None:
     """Refuse a path that leaves the space or its margin anywhere, at waypoints or between them.
@@ -35,7 +51,7 @@ def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None,
     """
     if waypoints is not None:
         points = np.asarray(waypoints, dtype=float)
-        if np.abs(points).max(initial=0.0) > _MILLIMETRES and np.all(space.beyond(points / 1000.0) <= 0.0):
+        if np.abs(points).max(initial=0.0) > _MILLIMETRES and space.holds(points / 1000.0):
             x, y, z = points[0]
             raise InfeasibleError(
                 f"the waypoints are in millimetres: the first, ({x:g}, {y:g}, {z:g}), is to be in metres",
@@ -43,7 +59,7 @@ def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None,
                 hint=f"divide all coordinates by 1000: the first is then [{x / 1000:g}, {y / 1000:g}, {z / 1000:g}]",
             )
         for number, point in enumerate(points, start=1):
-            if not np.all(space.beyond(point) <= 0.0):
+            if not space.holds(point):
                 _refuse(space, point, f"waypoint {number}", where)
     s = (path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)).reshape(-1)
     points = path(s)
@@ -52,7 +68,7 @@ def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None,
     step = np.diff(path.breaks) / (_SAMPLES - 1)
     between = np.repeat(step[:, None] ** 2 / 8 * bend, _SAMPLES, axis=0)
     worst = int(np.argmax((space.beyond(points) + between).max(axis=1)))
-    if not np.all(space.beyond(points[worst]) + between[worst] <= 0.0):
+    if not np.all(inside(space.beyond(points[worst]) + between[worst])):
         _refuse(space, points[worst], f"the path at s = {s[worst]:.2f} of {path.end:.2f} m", where)
 
 

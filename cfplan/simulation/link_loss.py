@@ -32,6 +32,7 @@ from cfplan.flight.firmware import Timeouts, gains_for
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, decode
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
 from cfplan.simulation.dynamics.body import pack_body
 from cfplan.simulation.dynamics.branching import SNAPSHOT_SIZE, arrival_steps, hovering_snapshot, setpoint_rows
 from cfplan.simulation.dynamics.mellinger import SETPOINT_SIZE
@@ -66,7 +67,7 @@ class LinkLoss:
     beyond: float  # m beyond the walls or the ceiling; negative inside
 
     def __str__(self) -> str:
-        walls = f"{self.beyond:.1f} m beyond the walls" if self.beyond > 0 else "inside the walls"
+        walls = "inside the walls" if inside(self.beyond) else f"{self.beyond:.1f} m beyond the walls"
         comes_down = f"the vehicle comes down {self.distance:.1f} m farther on, {walls}"
         return f"lost at the worst moment, {self.moment:.1f} s, {comes_down}"
 

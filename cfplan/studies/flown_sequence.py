@@ -29,6 +29,7 @@ from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import SetpointSent
 from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
 from cfplan.vehicle.joint import JoinedTrajectory
 
 _FIELDS = ("position", "velocity", "acceleration", "body_rate")
@@ -173,8 +174,8 @@ def _without_stop(flown: FullStateSetpoints, stops: NDArray, limits: Limits) -> 
     off = np.maximum(
         np.abs(begin.position - flown.position).max(axis=1), np.abs(begin.velocity - flown.velocity).max(axis=1)
     )
-    inside = limits.space.beyond(end.position).max(axis=1) <= QUANTUM
-    return int((~((off <= 1.001 * QUANTUM) & inside & ~end.velocity.any(axis=1))).sum())
+    kept = inside(limits.space.beyond(end.position), QUANTUM).all(axis=1)
+    return int((~((off <= 1.001 * QUANTUM) & kept & ~end.velocity.any(axis=1))).sum())
 
 
 def _differentiated(velocity: NDArray, numbers: NDArray) -> NDArray:

@@ -27,7 +27,7 @@ from cfplan.planning.plan import plan
 from cfplan.preparation.plan_flight import give_way
 from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
-from cfplan.safety.space import Space, check_space
+from cfplan.safety.space import Space, check_space, inside
 from cfplan.simulation.link_loss import link_loss_at_every_setpoint
 from cfplan.studies.result import Column, StudyResult, Table, detail_table
 from cfplan.studies.trials import WAYPOINTS, quantile_values
@@ -142,8 +142,8 @@ def _row(name: str, trials: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "rates_beyond": max(trial["rates_beyond"] for trial in trials),
         "before_beyond": max(trial["before_beyond"] for trial in trials),
         "after_beyond": max((trial["after_beyond"] for trial in flown), default=None),
-        "outside_before": sum(trial["before_beyond"] > 0.0 for trial in trials),
-        "outside_after": sum(trial["after_beyond"] > 0.0 for trial in flown),
+        "outside_before": sum(not inside(trial["before_beyond"]) for trial in trials),
+        "outside_after": sum(not inside(trial["after_beyond"]) for trial in flown),
         "refused": len(trials) - len(flown),
         **quantile_values("lost", (trial["lost"] for trial in flown)),
         "lost_max": max((trial["lost"] for trial in flown), default=None),

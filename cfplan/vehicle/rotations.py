@@ -204,6 +204,13 @@ def dot(first: Vector, second: Vector) -> Scalar:
     return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
+@register_jitable(forceinline=True)
+def cross(first: Vector, second: Vector) -> Vector:
+    """Return the outer product."""
+    (a, b, c), (p, q, r) = first, second
+    return b * r - c * q, c * p - a * r, a * q - b * p
+
+
 @njit(error_model="numpy")
 def quaternions_of(matrices: NDArray) -> NDArray:
     """Return the (N, 4) quaternions of rotation matrices, (N, 3, 3)."""

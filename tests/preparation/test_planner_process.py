@@ -69,7 +69,7 @@ class PilotSide:
         proposal = self.proposals.newest()
         if proposal is not None:
             now = min(round((REAL_CLOCK.now() - self.begun) * RATE), proposal.splice - LEAST_AHEAD)
-            answer = splice(self.commitment, proposal, now, self.limits.space)
+            answer = splice(self.commitment, proposal, now, self.limits)
             if isinstance(answer, Commitment):
                 self.commitment = answer
             self.given.append(answer)
@@ -244,7 +244,7 @@ def test_of_the_stops_within_a_stop_only_that_is_sent(held, limits):
     np.testing.assert_array_equal(read.payloads, good.payloads)
     np.testing.assert_array_equal(read.stops, good.stops)
     assert len(message) < 0.3 * good.stops.nbytes
-    assert isinstance(splice(held.commitment, read, 90, limits.space), Commitment)
+    assert isinstance(splice(held.commitment, read, 90, limits), Commitment)
     stops = np.broadcast_to(good.stops[0], (20_000, *good.stops.shape[1:]))
     payloads = np.repeat(good.payloads[-1:], len(stops), axis=0)
     few = replace(good, payloads=payloads, stops=stops, ending=len(stops) - 1).to_bytes()

@@ -52,7 +52,7 @@ def held(limits):
 
 
 def after(held, limits, replanned, now=NOW):
-    committed = splice(held.commitment, replanned.proposal, now, limits.space)
+    committed = splice(held.commitment, replanned.proposal, now, limits)
     assert isinstance(committed, Commitment), str(committed)
     return accepted(replanned, committed)
 

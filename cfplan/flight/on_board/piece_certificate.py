@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.on_board.pieces import Pieces, body_rates, derivatives_of, goals_at
-from cfplan.safety.certificate import LEAST_POINTS, TIME_STEP, WALLS, Certificate, Margin
+from cfplan.safety.certificate import LEAST_POINTS, TIME_STEP, WALLS, Certificate, Margin, share_of
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import AT_LEAST, QUANTITIES, Quantity
 from cfplan.safety.space import Space
@@ -100,8 +100,7 @@ def _margin(samples: Samples, rows: NDArray, quantity: Quantity, limit: float, u
     at = int(np.argmax(bounds)) + 1
     peak = float(bounds[at - 1]) if math.isfinite(bounds[at - 1]) else math.nan
     worst = float(quantity.value(quantity.side * peak))
-    room = limit - unused
-    share = (worst - unused) / room if room * quantity.side > 0 else math.inf
+    share = share_of(quantity, worst, limit, unused)
     x, y, z = samples.derivatives[at, 0, :3].tolist()
     time = float(samples.time[at])
     return Margin(

@@ -14,6 +14,7 @@ from cfplan.flight.radio.supervisor_bits import FAULTS
 from cfplan.flight.telemetry import Estimate, Triple, VehicleStatus
 from cfplan.safety.limits import Ladder, Limits
 from cfplan.safety.quantities import ON_LADDER
+from cfplan.safety.space import inside
 
 LATEST_SETPOINT = 0.25  # s that a setpoint may be late; the vehicle stops following after 0.5 s
 DISAGREEMENT_FACTOR = 5.0  # times preflight's limit that estimate and pose may be apart in the air
@@ -119,7 +120,7 @@ class AbortMonitor:
         limits = self._limits.flight
         if observation.pose is not None:
             beyond = self._beyond_fence(observation.pose.position)
-            yield _rung(limits.fence, beyond, "{:.2f} m beyond the fence")
+            yield _rung(limits.fence, 0.0 if inside(beyond) else beyond, "{:.2f} m beyond the fence")
             if observation.wanted is not None:
                 deviation = math.dist(observation.pose.position, observation.wanted)
                 yield _rung(limits.deviation, deviation, "{:.2f} m from the setpoint")
@@ -151,9 +152,9 @@ class AbortMonitor:
 
     def _beyond_fence(self, position: Triple) -> float:
         """Return how far, m, a position is beyond the space less its margin; the floor does not count."""
-        space = self._limits.space
-        (x, y, z), low, high, margin = position, space.low, space.high, space.margin
-        return margin + max(low[0] - x, x - high[0], low[1] - y, y - high[1], z - high[2])
+        space, (x, y, z) = self._limits.space, position
+        above_middle = max(z, (space.low[2] + space.high[2]) / 2)
+        return float(space.beyond((x, y, above_middle)).max())
 
     def _lasting(self, name: str, now: float, abort: Abort) -> Abort:
         """Return the abort if its reason has lasted; a single noisy value is no reason."""

@@ -206,7 +206,7 @@ class FlightLoop:
         proposal = self._proposals.newest()
         if proposal is None:
             return
-        answer = splice(self.commitment, proposal, sent, self.limits.space)
+        answer = splice(self.commitment, proposal, sent, self.limits)
         if isinstance(answer, Commitment):
             if not self.commitment.splices:
                 self.history.report(committed(now, self.commitment.first, 0, self.commitment.payloads))

@@ -13,6 +13,7 @@ from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES, Action, Traffic
 from cfplan.flight.radio.link import Link
 from cfplan.flight.radio.supervisor_bits import ARMED, CAN_BE_ARMED, CAN_FLY
 from cfplan.flight.real_time import uses_fifo_scheduling
+from cfplan.flight.setpoints.commitment import warm_up
 from cfplan.flight.telemetry import Level, Phase, Triple
 from cfplan.vehicle.rotations import yaw_of
 
@@ -32,6 +33,7 @@ def prepare(
 
     Raises a CfplanError if the vehicle or its poses are not available, or a check fails, and what a tick raises.
     """
+    warm_up(loop.commitment, loop.mission.limits)
     loop.history.enter(Phase.CONNECT)
     loop.connect(connect)
     loop.history.enter(Phase.RELEASE)

@@ -18,9 +18,11 @@ from cfplan.flight.pilot.mission import Mission, manoeuvre_time
 from cfplan.flight.pilot.outcome import Check
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, ParameterRule, Traffic
 from cfplan.flight.radio.supervisor_bits import FAULTS, FLYING
+from cfplan.flight.setpoints.commitment import QUANTUM
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Estimate, Triple, VehicleStatus
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
 from cfplan.vehicle.rotations import tilt_of, yaw_of
 
 OLDEST_PROTOCOL = 8  # the first with go-to as it is sent here
@@ -246,7 +248,7 @@ def check_start_place(snapshot: PreflightSnapshot) -> Check:
     worst = float(np.max(beyond))
     return Check(
         "place of take-off", f"({x:.2f}, {y:.2f}) m, {-worst:.2f} m inside", "inside the space less its margin",
-        worst <= 0.0, "move the vehicle towards the middle of the room",
+        bool(inside(worst)), "move the vehicle towards the middle of the room",
     )  # fmt: skip
 
 
@@ -258,7 +260,7 @@ def check_plan_inside(snapshot: PreflightSnapshot) -> Check:
     worst = max(float(np.max(space.beyond(planned))), float(np.max(space.beyond(stops))))
     return Check(
         "plan and stops in the space", f"{-worst:.3f} m inside", "inside the space less its margin",
-        worst <= 1e-3, "plan again with this safety.yaml",
+        bool(inside(worst, QUANTUM)), "plan again with this safety.yaml",
     )  # fmt: skip
 
 
@@ -323,9 +325,10 @@ def check_fall(snapshot: PreflightSnapshot) -> Check:
     falls = falls_from(np.concatenate(ways), limits, mission.on_board.deviation)
     beyond = float(falls.beyond[falls.worst])
     where = falls.name_of_wall(falls.worst, limits)
-    found = f"trajectory {mission.on_board.falls}; before it {abs(beyond):.2f} m {'beyond' if beyond > 0 else 'from'} "
+    side = "from" if inside(beyond) else "beyond"
+    found = f"trajectory {mission.on_board.falls}; before it {abs(beyond):.2f} m {side} "
     return Check(
-        "fall after link loss", found + where, "inside the walls", beyond <= 0.0 or limits.link_loss.only_warn,
+        "fall after link loss", found + where, "inside the walls", bool(inside(beyond)) or limits.link_loss.only_warn,
         "move the vehicle towards the middle of the room, or lower `ground.go_to_speed`",
     )  # fmt: skip
 

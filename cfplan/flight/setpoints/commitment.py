@@ -7,8 +7,9 @@ be late, mistaken or broken, so the pilot verifies by itself, without trusting a
 - the bytes are those that were certified (checksum), and were made for just this commitment (order);
 - the splice is still ahead of the clock (time), and not farther than a minute;
 - position, velocity, acceleration, attitude and body rates there are the committed ones within a quantum (joint);
-- from setpoint to setpoint the vehicle moves as the velocities say, inside the space, and ends at rest;
-- from each setpoint there is a stop, which begins there and ends at rest inside the space.
+- from each setpoint there is a stop, which begins there and ends at rest (stops), as the setpoints do (end);
+- from setpoint to setpoint the vehicle moves as the velocities say (motion), inside the space (space), and within the
+  limits of plans, and in stops within those of stops (limits).
 
 Where anything of that fails, the old commitment is flown to its end. A commitment is a value: splicing makes a new one.
 """
@@ -16,6 +17,7 @@ Where anything of that fails, the old commitment is flown to its end. A commitme
 import math
 import struct
 import zlib
+from bisect import bisect_left
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -25,9 +27,11 @@ from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, LEAD, RATE, controller_attitude
+from cfplan.flight.setpoints.motion_certificate import SPAN, MotionExtremes, excess_of, motion_extremes
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, turns_for
-from cfplan.safety.space import Space
+from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import rotations_of
 
@@ -39,6 +43,10 @@ KEPT_BEHIND = 100  # setpoints before the one due that are kept, for a vehicle t
 QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
 LEVEL = 0.01  # rad of tilt, below which a vehicle hovers: twice what bytes round an attitude by
 LARGEST_JERK = 400.0  # m/s³, beyond which velocities do not belong together: ten times what plans reach
+_PERIOD = 1.0 / RATE
+# m between a position and what velocities say it is: by the trapezoidal rule the jerk times period³ / 12, and what is
+# rounded.
+_JUMP = LARGEST_JERK * _PERIOD**3 / 12 + QUANTUM * (1.0 + _PERIOD)
 _ROUNDING = 1e-9
 _MAGIC = b"proposal"
 _CHAIN = struct.Struct("<II")  # checksums of a commitment and of the proposal that continues it
@@ -58,7 +66,8 @@ class Fault(StrEnum):
     MOTION = "the proposed setpoints do not follow from one another"
     SPACE = "the proposal leaves the space"
     END = "the proposal does not end at rest"
-    STOPS = "the stops do not begin with their setpoints, or do not end at rest inside the space"
+    STOPS = "the stops do not begin with their setpoints, or do not end at rest"
+    LIMITS = "the proposal exceeds a limit"
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,13 +181,15 @@ def checksum_of(first: int, payloads: NDArray, stops: NDArray) -> int:
     return check
 
 
-def splice(commitment: Commitment, proposal: Proposal, now: int, space: Space) -> Commitment | Refusal:
+def splice(commitment: Commitment, proposal: Proposal, now: int, limits: Limits) -> Commitment | Refusal:
     """Return what is committed with the proposal, or why it is refused; `now` is the number of the setpoint due.
 
     Never raises, whatever the proposal holds.
     """
     if not isinstance(proposal, Proposal) or _wrong_shape(proposal.splice, proposal.payloads, proposal.stops):
         return Refusal(Fault.SHAPE, "")
+    if not 0 <= proposal.ending < len(proposal.stops):
+        return Refusal(Fault.SHAPE, f"{proposal.ending} of {len(proposal.stops)} stops not sent")
     if proposal.stops.shape[1] != commitment.stops.shape[1]:
         return Refusal(Fault.SHAPE, f"stops of {proposal.stops.shape[1]} setpoints")
     if proposal.checksum != checksum_of(proposal.splice, proposal.payloads, proposal.stops):
@@ -191,10 +202,13 @@ def splice(commitment: Commitment, proposal: Proposal, now: int, space: Space) -
         return Refusal(Fault.OUTSIDE, f"at setpoint {proposal.splice}, with {now} due")
     kept = min(proposal.splice, commitment.last) - commitment.first  # after its end the vehicle hovers
     asked = decode(proposal.payloads)
+    before = np.concatenate([commitment.payloads[np.maximum(kept + np.arange(-SPAN, 0), 0)], proposal.payloads])
     if refusal := (
         _differs(decode(commitment.payloads[kept : kept + 1]), asked, proposal.splice)
-        or _unfit(asked, proposal.payloads, proposal.splice, space)
-        or _unfit_stops(asked, proposal.stops, proposal.splice, space)
+        or _moves_at_end(proposal)
+        or _unfit(proposal, before, limits)
+        or _unfit_stops(asked, proposal)
+        or _unfit_in_stops(proposal, before, limits)
     ):
         return refusal
     return spliced(commitment, proposal, now)
@@ -251,32 +265,75 @@ def _differs(committed: FullStateSetpoints, asked: FullStateSetpoints, number: i
     return None
 
 
-def _unfit(asked: FullStateSetpoints, payloads: NDArray, first: int, space: Space) -> Refusal | None:
-    """Return why setpoints must not be flown: they jump, leave the space or do not end at rest."""
-    period = 1.0 / RATE
-    moved = np.diff(asked.position, axis=0) - 0.5 * period * (asked.velocity[1:] + asked.velocity[:-1])
-    # By the trapezoidal rule positions are off by the jerk times period³ / 12 and by what is rounded.
-    jump = np.abs(moved).max(axis=1, initial=0.0)
-    if (jump > LARGEST_JERK * period**3 / 12 + QUANTUM * (1.0 + period)).any():
-        at = int(np.argmax(jump))
-        return Refusal(Fault.MOTION, f"after setpoint {first + at} the position jumps by {jump[at]:.3f} m")
-    beyond = space.beyond(asked.position).max(axis=1)
-    if (beyond > QUANTUM).any():
-        at = int(np.argmax(beyond))
-        return Refusal(Fault.SPACE, f"setpoint {first + at} is {beyond[at]:.3f} m too far out")
-    end = FullStateSetpoints(*(getattr(asked, name)[-1:] for name in FullStateSetpoints.__slots__))
-    return None if _rests(end).all() else Refusal(Fault.END, f"setpoint {first + len(payloads) - 1} still moves")
+def _moves_at_end(proposal: Proposal) -> Refusal | None:
+    if _rests(decode(proposal.payloads[-1:])).all():
+        return None
+    return Refusal(Fault.END, f"setpoint {proposal.splice + len(proposal.payloads) - 1} still moves")
 
 
-def _unfit_stops(asked: FullStateSetpoints, stops: NDArray, first: int, space: Space) -> Refusal | None:
+def _unfit(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | None:
+    """Return why setpoints must not be flown; those of the stop that ends them are judged as that stop."""
+    end = len(proposal.payloads) - proposal.ending
+    if found := _first_wrong(proposal.payloads[None], before, end, limits, in_stop=False):
+        fault, what, _, row = found
+        return Refusal(fault, f"setpoint {proposal.splice + row} {what}")
+    return None
+
+
+def _unfit_stops(asked: FullStateSetpoints, proposal: Proposal) -> Refusal | None:
+    """Return why stops are none of their setpoints, or not what the setpoints end with."""
+    stops, first, count = proposal.stops, proposal.splice, len(proposal.payloads)
     begin, end = decode(stops[:, 0]), decode(stops[:, -1])
     off = np.maximum(
         np.abs(begin.position - asked.position).max(axis=1), np.abs(begin.velocity - asked.velocity).max(axis=1)
     )
-    good = (off <= QUANTUM + _ROUNDING) & _rests(end) & (space.beyond(end.position).max(axis=1) <= QUANTUM)
-    if good.all():
+    good = (off <= QUANTUM + _ROUNDING) & _rests(end)
+    if not good.all():
+        return Refusal(Fault.STOPS, f"the stop from setpoint {first + int(np.argmin(good))}")
+    last = count - proposal.ending - 1
+    rows = np.minimum(np.arange(count - last), stops.shape[1] - 1)
+    if proposal.ending and (proposal.payloads[last:] != stops[last, rows]).any():
+        return Refusal(Fault.STOPS, f"the setpoints from {first + last} on are not the stop from there")
+    return None
+
+
+def _unfit_in_stops(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | None:
+    """Return why stops must not be flown."""
+    stops = proposal.stops
+    if found := _first_wrong(stops, before, stops.shape[1], limits, in_stop=True):
+        fault, what, number, row = found
+        return Refusal(fault, f"setpoint {row} of the stop from setpoint {proposal.splice + number} {what}")
+    return None
+
+
+def _first_wrong(
+    runs: NDArray, before: NDArray, end: int, limits: Limits, *, in_stop: bool
+) -> tuple[Fault, str, int, int] | None:
+    """Return what is wrong with rows before `end` of runs, (R, L, 29), and the first run and row where it is."""
+
+    def wrong(first: int, count: int, rows: int) -> tuple[Fault, str] | None:
+        worst = motion_extremes(runs[first : first + count], before[first:], limits.airframe, end=rows)
+        return _wrong(worst, limits, in_stop=in_stop)
+
+    if not wrong(0, len(runs), end):
         return None
-    return Refusal(Fault.STOPS, f"the stop from setpoint {first + int(np.argmin(good))}")
+    run = bisect_left(range(len(runs) - 1), True, key=lambda n: wrong(0, n + 1, end) is not None)
+    row = bisect_left(range(end - 1), True, key=lambda n: wrong(run, 1, n + 1) is not None)
+    found = wrong(run, 1, row + 1) or wrong(0, len(runs), end)
+    return None if found is None else (*found, run, row)
+
+
+def _wrong(worst: MotionExtremes, limits: Limits, *, in_stop: bool) -> tuple[Fault, str] | None:
+    """Return what is wrong with a motion by its worst values, of which one setpoint or more are at fault."""
+    # Stops lie on the chords between setpoints, which are off by an eighth of acceleration times period² at most.
+    chords = limits.flight.acceleration.brake * _PERIOD**2 / 4 if in_stop else 0.0
+    if not worst.jump <= _JUMP + chords:
+        return Fault.MOTION, f"jumps by {worst.jump:.3f} m"
+    beyond = float(limits.space.beyond(worst.corners).max())
+    if not inside(beyond, QUANTUM):
+        return Fault.SPACE, f"is {beyond:.3f} m too far out"
+    exceeds = excess_of(worst, limits, in_stop=in_stop)
+    return (Fault.LIMITS, exceeds) if exceeds else None
 
 
 def _rests(setpoints: FullStateSetpoints) -> NDArray:
@@ -288,3 +345,11 @@ def _rests(setpoints: FullStateSetpoints) -> NDArray:
     still = ~setpoints.velocity.any(axis=1) & (setpoints.body_rate[:, 2] == 0.0)
     level = np.hypot(axis[:, 0], axis[:, 1]) <= LEVEL
     return np.asarray(still & level & (np.abs(thrust - GRAVITY) <= 10 * QUANTUM))
+
+
+def warm_up(commitment: Commitment, limits: Limits) -> None:
+    """Verify a proposal for nobody: what that compiles or loads is there before the flight."""
+    end = Commitment(0, commitment.payloads[-2:], commitment.stops[-2:])
+    proposal = Proposal.of_bytes(propose(end, 0, end.payloads, end.stops).to_bytes())
+    assert proposal is not None
+    splice(end, proposal, 0, limits)

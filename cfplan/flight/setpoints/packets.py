@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from struct import Struct
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import NotCertifiedError
@@ -22,8 +23,8 @@ LARGEST = 32.767  # the largest value that 16 bits hold, in m, m/s, m/s² or rad
 _WIRE_OF_ONE = Struct("<B9hI3h")
 PAYLOAD_SIZE = _WIRE_OF_ONE.size
 _IN_MILLI = ("position", "velocity", "acceleration", "body_rate")
-_FIELD_PLACES = (1, 7, 13, 23)  # of these in a payload
-_QUATERNION_PLACE = 19
+FIELD_PLACES = (1, 7, 13, 23)  # of these in a payload
+QUATERNION_PLACE = 19
 _MAGNITUDES = 511  # nine bits for a component in [0, 1/√2]
 
 
@@ -113,10 +114,10 @@ def _packed(out: NDArray, values: tuple[NDArray, ...], compressed: NDArray) -> t
                 value = values[field][n, axis]
                 if not abs(value) <= LARGEST:
                     return n, field
-                milli, place = int(np.rint(value * 1000.0)), _FIELD_PLACES[field] + 2 * axis
+                milli, place = int(np.rint(value * 1000.0)), FIELD_PLACES[field] + 2 * axis
                 out[n, place], out[n, place + 1] = milli & 255, (milli >> 8) & 255
         for byte in range(4):
-            out[n, _QUATERNION_PLACE + byte] = (compressed[n] >> (8 * byte)) & 255
+            out[n, QUATERNION_PLACE + byte] = (compressed[n] >> (8 * byte)) & 255
     return -1, 0
 
 
@@ -127,12 +128,12 @@ def _unpacked(payloads: NDArray) -> tuple[NDArray, NDArray]:
     for n in range(len(payloads)):
         for field in range(4):
             for axis in range(3):
-                place = _FIELD_PLACES[field] + 2 * axis
+                place = FIELD_PLACES[field] + 2 * axis
                 bits = int(payloads[n, place]) | int(payloads[n, place + 1]) << 8
                 numbers[field, n, axis] = (bits - 65536 if bits >= 32768 else bits) / 1000.0
         bits = 0
         for byte in range(4):
-            bits |= int(payloads[n, _QUATERNION_PLACE + byte]) << (8 * byte)
+            bits |= int(payloads[n, QUATERNION_PLACE + byte]) << (8 * byte)
         compressed[n] = bits
     return numbers, compressed
 
@@ -165,15 +166,30 @@ def _compressed(quaternions: NDArray) -> tuple[NDArray, int]:
 def _decompressed(compressed: NDArray) -> NDArray:
     out = np.empty((len(compressed), 4))
     for n in range(len(compressed)):
-        bits = compressed[n]
-        largest, rest = bits >> 30, 1.0
-        shift = 20
-        for k in range(4):
-            if k != largest:
-                field = (bits >> shift) & 0x3FF
-                small = (field & 0x1FF) / (_MAGNITUDES * math.sqrt(2.0))
-                out[n, k] = -small if field >> 9 else small
-                rest -= small * small
-                shift -= 10
-        out[n, largest] = math.sqrt(max(0.0, rest))
+        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = decompressed(compressed[n])
     return out
+
+
+@register_jitable(forceinline=True)
+def decompressed(bits: int) -> tuple[float, float, float, float]:
+    """Return the quaternion x, y, z, w of its 32 bits.
+
+    There are no branches, so that a compiler can take several at once.
+    """
+    first, second, third = _small(bits >> 20), _small(bits >> 10), _small(bits)
+    square = 1.0 - first * first - second * second - third * third
+    largest = math.sqrt(square if square > 0.0 else 0.0)
+    in_x, in_x_or_y, not_in_w = bits < 1 << 30, bits < 2 << 30, bits < 3 << 30
+    return (
+        largest if in_x else first,
+        first if in_x else largest if in_x_or_y else second,
+        second if in_x_or_y else largest if not_in_w else third,
+        third if not_in_w else largest,
+    )
+
+
+@register_jitable(forceinline=True)
+def _small(bits: int) -> float:
+    """Return a component that is not the largest: its sign and nine bits."""
+    size = (bits & 0x1FF) / (_MAGNITUDES * math.sqrt(2.0))
+    return -size if bits & 0x200 else size

@@ -1,5 +1,8 @@
 """Commitments: new plans replace the rest from a splice on without a jump; all else is refused and changes nothing."""
 
+import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,7 +87,7 @@ def resummed(proposal: Proposal) -> Proposal:
 
 def test_a_new_plan_replaces_the_rest_and_nothing_jumps(committed, spliced, limits):
     joined, proposal = spliced
-    new = splice(committed, proposal, 110, limits.space)
+    new = splice(committed, proposal, 110, limits)
     assert isinstance(new, Commitment)
     assert new.splices == (120,)
     begin = 110 - KEPT_BEHIND
@@ -106,9 +109,9 @@ def test_its_bytes_and_stops_pass_the_checks_of_every_plan(spliced, limits):
 
 def test_splices_follow_one_another(flown, committed, spliced, limits):
     joined, proposal = spliced
-    one = splice(committed, proposal, 100, limits.space)
+    one = splice(committed, proposal, 100, limits)
     further, setpoints = continued(joined, 150, [[-0.3, 1.4, 1.1], [1.0, 2.2, 0.9]], limits)
-    second = splice(one, propose(one, 150, setpoints.payloads, stops_of(setpoints)), 140, limits.space)
+    second = splice(one, propose(one, 150, setpoints.payloads, stops_of(setpoints)), 140, limits)
     assert isinstance(second, Commitment)
     assert second.splices == (120, 150)
     assert second.last == 150 + len(setpoints.payloads) - 1
@@ -119,7 +122,7 @@ def test_what_is_flown_before_a_splice_far_ahead_stays(flown, committed, limits)
     """Of setpoints so far behind that no vehicle is there any more, but not of those between now and the splice."""
     _, setpoints = continued(flown, 300, [[-0.4, 2.0, 1.0]], limits)
     for now in (20, 150, 290):
-        new = splice(committed, propose(committed, 300, setpoints.payloads, stops_of(setpoints)), now, limits.space)
+        new = splice(committed, propose(committed, 300, setpoints.payloads, stops_of(setpoints)), now, limits)
         assert new.first == max(now - KEPT_BEHIND, 0)
         ahead = slice(now - new.first, 301 - new.first)
         np.testing.assert_array_equal(new.payloads[ahead], committed.payloads[now:301])
@@ -129,7 +132,7 @@ def test_what_is_flown_before_a_splice_far_ahead_stays(flown, committed, limits)
 def test_the_same_proposal_makes_the_same_checksum_whenever_it_comes(committed, spliced, limits):
     """So planner and pilot agree about what is committed, though they look at different moments."""
     _, proposal = spliced
-    early, late = (splice(committed, proposal, now, limits.space) for now in (5, 118))
+    early, late = (splice(committed, proposal, now, limits) for now in (5, 118))
     assert early.first != late.first
     assert early.checksum == late.checksum != committed.checksum
 
@@ -202,7 +205,7 @@ FAULTS = {
 def test_what_is_wrong_is_refused_in_words(committed, spliced, limits, case):
     make, now, fault = FAULTS[case]
     before = committed.payloads.copy(), committed.stops.copy(), committed.checksum
-    refused = splice(committed, make(spliced[1]), now, limits.space)
+    refused = splice(committed, make(spliced[1]), now, limits)
     assert isinstance(refused, Refusal)
     assert refused.fault is fault
     assert str(refused).startswith(str(fault))
@@ -213,8 +216,119 @@ def test_what_is_wrong_is_refused_in_words(committed, spliced, limits, case):
 
 def test_a_proposal_that_leaves_the_space_is_refused(committed, spliced, limits):
     smaller = replace(limits.space, high=(limits.space.high[0], 1.5, limits.space.high[2]))
-    refused = splice(committed, spliced[1], 0, smaller)
+    refused = splice(committed, spliced[1], 0, replace(limits, space=smaller))
     assert refused.fault is Fault.SPACE
+
+
+def at_most(limits, **plan):
+    return replace(limits, plan=replace(limits.plan, **plan))
+
+
+@pytest.mark.parametrize(
+    ("noun", "lowered"),
+    [
+        ("speed", lambda p: {"speed": 0.97 * p.speed}),
+        ("acceleration", lambda p: {"acceleration": 0.95 * p.acceleration}),
+        ("angular velocity", lambda p: {"angular_velocity": 0.3 * p.angular_velocity}),
+        ("tilt", lambda p: {"tilt": 0.9 * p.tilt}),
+        ("motor thrust", lambda p: {"motor_thrust_max": 0.75 * p.motor_thrust_max}),
+        ("specific thrust", lambda p: {"specific_thrust_min": 9.7}),
+    ],
+)
+def test_a_proposal_that_exceeds_a_limit_of_plans_is_refused(committed, spliced, limits, noun, lowered):
+    """One that was planned, certified and signed under others, as a planner with other limits would."""
+    _, proposal = spliced
+    refused = splice(committed, proposal, 110, at_most(limits, **lowered(limits.plan)))
+    assert isinstance(refused, Refusal)
+    assert refused.fault is Fault.LIMITS
+    assert re.search(rf"^setpoint \d+ reaches an? {noun} of", refused.detail)
+    number = int(refused.detail.split()[1])
+    assert 120 <= number < 120 + len(proposal.payloads)
+
+
+@pytest.mark.parametrize(
+    ("noun", "lowered"),
+    [
+        ("speed", lambda flight: replace(flight, speed=replace(flight.speed, brake=1.5))),
+        ("acceleration", lambda flight: replace(flight, acceleration=replace(flight.acceleration, brake=3.0))),
+        (
+            "angular velocity",
+            lambda flight: replace(flight, angular_velocity=replace(flight.angular_velocity, brake=1)),
+        ),
+        ("tilt", lambda flight: replace(flight, stop_tilt=0.4)),
+    ],
+)
+def test_a_proposal_with_a_stop_that_exceeds_what_stops_may_reach_is_refused(committed, spliced, limits, noun, lowered):
+    refused = splice(committed, spliced[1], 110, replace(limits, flight=lowered(limits.flight)))
+    assert isinstance(refused, Refusal)
+    assert refused.fault is Fault.LIMITS
+    assert re.search(rf"^setpoint \d+ of the stop from setpoint \d+ reaches an? {noun} of", refused.detail)
+
+
+# By how much a number in a packet is changed, in thousandths: places, velocities, thrusts and rates that no plan has.
+COLUMNS = {
+    1: 100,
+    3: 100,
+    5: -100,
+    7: 800,
+    9: -800,
+    11: 800,
+    13: 30_000,
+    15: -30_000,
+    17: 30_000,
+    23: 12_000,
+    27: -12_000,
+}
+
+
+@settings(max_examples=200, deadline=None)
+@given(data=st.data())
+def test_one_number_of_any_setpoint_of_any_stop_counts(committed, spliced, limits, data):
+    _, proposal = spliced
+    column = data.draw(st.sampled_from(sorted(COLUMNS)))
+    row = data.draw(st.integers(1, len(proposal.payloads) - 2))
+    within = data.draw(st.integers(1, proposal.stops.shape[1] - 2))
+    stops = moved(proposal.stops, (row, within), column, COLUMNS[column])
+    payloads = moved(proposal.payloads, row, column, COLUMNS[column])
+    for broken in (replace(proposal, stops=stops), replace(proposal, payloads=payloads)):
+        assert isinstance(splice(committed, resummed(broken), 100, limits), Refusal)
+    refused = splice(committed, resummed(replace(proposal, stops=stops)), 100, limits)
+    assert f"of the stop from setpoint {120 + row}" in refused.detail
+
+
+def test_setpoints_that_only_say_they_are_a_stop_keep_the_limits_of_plans(committed, spliced, limits):
+    _, proposal = spliced
+    refused = splice(committed, replace(proposal, ending=len(proposal.stops) - 1), 100, limits)
+    assert refused.fault is Fault.STOPS
+
+
+VERIFYING = """
+import sys
+import numpy as np
+from numba.core import event
+from cfplan.flight.setpoints.commitment import Commitment, Proposal, splice, warm_up
+from cfplan.safety.limits_file import load_limits
+
+limits, held = load_limits(sys.argv[1]), np.load(sys.argv[2])
+committed = Commitment(0, held["payloads"], held["stops"])
+warm_up(committed, limits)
+with event.install_recorder("numba:compile") as compiled:
+    spliced = splice(committed, Proposal.of_bytes(held["proposal"].tobytes()), 110, limits)
+print(type(spliced).__name__, len(compiled.buffer))
+"""
+
+
+def test_once_warmed_up_a_pilot_compiles_nothing(committed, spliced, tmp_path):
+    np.savez(
+        tmp_path / "held.npz", payloads=committed.payloads, stops=committed.stops,
+        proposal=np.frombuffer(spliced[1].to_bytes(), np.uint8),
+    )  # fmt: skip
+    safety_file = Path(__file__).parents[3] / "safety.yaml"
+    done = subprocess.run(
+        [sys.executable, "-c", VERIFYING, str(safety_file), str(tmp_path / "held.npz")],
+        cwd=safety_file.parent, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.split() == ["Commitment", "0"]
 
 
 @settings(max_examples=30, deadline=None)
@@ -232,7 +346,7 @@ def test_random_splices_are_flown_without_a_jump_or_refused(flown, committed, li
     except (InfeasibleError, InputError):  # no such plan: nothing to propose
         return
     proposal = propose(committed, number, setpoints.payloads, stops_of(setpoints))
-    result = splice(committed, proposal, number - ahead, limits.space)
+    result = splice(committed, proposal, number - ahead, limits)
     assert isinstance(result, Commitment) == (ahead >= LEAST_AHEAD)
     if isinstance(result, Refusal):
         assert result.fault is Fault.LATE
@@ -256,9 +370,9 @@ def test_a_broken_proposal_is_refused_whatever_is_broken(committed, spliced, lim
     places = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1))).integers(0, array.size, count)
     array.reshape(-1)[places] ^= data.draw(st.integers(1, 255))
     broken = replace(proposal, **{which: array})
-    refused = splice(committed, broken, 100, limits.space)
+    refused = splice(committed, broken, 100, limits)
     assert isinstance(refused, Refusal)
-    made_good = splice(committed, resummed(broken), 100, limits.space)
+    made_good = splice(committed, resummed(broken), 100, limits)
     if isinstance(made_good, Commitment):  # what the pilot can see of it is sound
         state = decode(made_good.payloads)
         assert limits.space.beyond(state.position).max() <= 1e-3

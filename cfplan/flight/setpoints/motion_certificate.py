@@ -1,0 +1,249 @@
+"""The motion that setpoints ask for, by their bytes alone: what a pilot certifies without the plan behind them.
+
+The velocities SPAN setpoints before and behind one tell its acceleration, which makes, with gravity and drag, the
+thrust vector of the motion; the direction of that is the axis z of the attitude to fly. What is sent leans away from
+it, by the turn that stands for traded rates (see rate_trade.py). With f the thrust vector sent, and K = 2 kR / kw,
+
+    thrust     T = f · z
+    body rate  ω = (ω_sent + K z × f / |f|) / (1 - K τ)        about body x and y; about z it is sent as it is
+
+where the denominator makes up for the attitude that the controller believes, which is τ old. So far as setpoints are
+the bytes of a certified plan or stop, these values are the certified ones within TOLERANCES.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.packets import FIELD_PLACES, PAYLOAD_SIZE, QUATERNION_PLACE, decompressed
+from cfplan.flight.setpoints.rate_trade import ATTITUDE_AGE, FIRMWARE_GAINS, TRADED_RATE_MAX
+from cfplan.machine_code import njit
+from cfplan.safety.limits import Limits
+from cfplan.safety.quantities import AT_MOST, QUANTITIES
+from cfplan.vehicle import measures as of
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.flatness import ROUNDING
+from cfplan.vehicle.panels import LANES
+from cfplan.vehicle.rotations import Vector, cross, dot, heading_of
+
+SPAN = 2  # setpoints on each side of one, whose velocities tell its acceleration
+_WIDTH = 128  # places in a row of a panel
+_MOST = 120  # setpoints looked at at once; those around them have a place too
+_LARGE = 1e9  # in place of what is no number
+# Rows of the panel of 16-bit words: position, velocity (from SPAN setpoints before on), acceleration, body rate, and
+# the quaternion's lower and upper half.
+_PLACE, _SPEED, _FORCE, _RATE, _TURN, _WORDS = 0, 3, 6, 9, 12, 14
+# Rows of the panel of the largest values so far: measures, and those whose least value counts with the other sign.
+_LEAST_THRUST, _TRADED, _JUMP = of.MEASURES, of.MEASURES + 1, of.MEASURES + 2
+_HIGH, _LOW, _ROWS = of.MEASURES + 3, of.MEASURES + 6, of.MEASURES + 9
+TOLERANCES = {"m/s": 1e-3, "m/s²": 0.1, "rad": math.radians(0.5), "rad/s": 0.3, "N": 1e-3}
+"""By unit, what bytes of a certified motion may seem to exceed a limit by. Velocities rounded to 1 mm/s tell the
+acceleration to 0.043 m/s² and its direction to 0.25°; the worst of 48 plans at all kinds of limits were 0.018 m/s²,
+0.15° and 0.02 rad/s beyond, and of their stops 0.03 m/s², 0.13° and 0.1 rad/s."""
+LED_THRUST = 1.0  # m/s², besides, of acceleration in stops: the thrust whose certified value counts there is sent ahead
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionExtremes:
+    """The worst values of runs of setpoints."""
+
+    high: NDArray  # (MEASURES,), of each measure the largest; NaN where bytes do not tell it
+    low: NDArray  # (MEASURES,), the least
+    traded: float  # rad/s, of body rates that are sent as a turn of the thrust
+    jump: float  # m, between a position and the next, beyond what the velocities there say
+    corners: NDArray  # (2, 3) m, the least and the largest coordinates
+
+
+def motion_extremes(runs: NDArray, before: NDArray, airframe: Airframe, end: int | None = None) -> MotionExtremes:
+    """Return the worst values of rows before `end` of runs of setpoints, (R, L, 29) uint8, R and L at least 1.
+
+    Run r follows the setpoints r to r + SPAN of `before`, (R + SPAN, 29) or more; behind its last row, that goes on.
+    """
+    panel, words = np.full(_ROWS * _WIDTH, -_LARGE), np.zeros(_WORDS * _WIDTH, dtype=np.int16)
+    _raise_by_runs(
+        panel, words, _read_only(runs.reshape(len(runs), -1)), _read_only(before),
+        runs.shape[1] if end is None else end, airframe.drag[0] / airframe.mass, FIRMWARE_GAINS.full_rate,
+    )  # fmt: skip
+    worst = panel.reshape(_ROWS, _WIDTH).max(axis=1)
+    high = worst[: of.MEASURES].copy()
+    high[of.ANGULAR_ACCELERATION] = np.nan
+    low = np.full(of.MEASURES, np.nan)
+    low[of.SPECIFIC_THRUST] = -worst[_LEAST_THRUST]
+    # Torque divides the thrust among the motors: one at least gives the mean, and one at most.
+    for each, thrust in ((high, high[of.SPECIFIC_THRUST]), (low, low[of.SPECIFIC_THRUST])):
+        each[of.MOTOR_THRUST : of.MOTOR_THRUST + 4] = thrust * airframe.mass / 4
+    corners = np.array([-worst[_LOW:_ROWS], worst[_HIGH:_LOW]])
+    return MotionExtremes(high, low, math.sqrt(worst[_TRADED]), float(worst[_JUMP]), corners)
+
+
+def excess_of(worst: MotionExtremes, limits: Limits, *, in_stop: bool) -> str:
+    """Return which limit of plans a motion exceeds, or `in_stop` which of stops, and by which value; empty if none."""
+    if not worst.traded <= TRADED_RATE_MAX + TOLERANCES["rad/s"]:
+        return f"sends {worst.traded:.3g} rad/s as a turn of the thrust; it may be at most {TRADED_RATE_MAX:.3g}"
+    for quantity in QUANTITIES:
+        if quantity.measure == of.ANGULAR_ACCELERATION or (in_stop and quantity.in_stop is None):
+            continue
+        limit = quantity.in_stop(limits) if in_stop and quantity.in_stop else quantity.allowed(limits.plan)
+        value = float(quantity.worst(worst.high if quantity.side == AT_MOST else worst.low))
+        tolerance = TOLERANCES[quantity.unit] + (LED_THRUST if in_stop and quantity.measure == of.ACCELERATION else 0.0)
+        if not quantity.excess(value, limit) <= tolerance:
+            side, unit = "at most" if quantity.side == AT_MOST else "at least", quantity.unit
+            if unit == "rad":
+                value, limit, unit = math.degrees(value), math.degrees(limit), "°"
+            article = "an" if quantity.noun[0] in "aeiou" else "a"
+            return f"reaches {article} {quantity.noun} of {value:.3g} {unit}; it may be {side} {limit:.3g}"
+    return ""
+
+
+def _read_only(array: NDArray) -> NDArray:
+    """Return a view that cannot be written: of arrays that can, compiled code has another variant."""
+    view = np.ascontiguousarray(array).view()
+    view.setflags(write=False)
+    return view
+
+
+@njit(error_model="numpy", fastmath=ROUNDING, allocates=False)
+def _raise_by_runs(
+    worst: NDArray, words: NDArray, runs: NDArray, before: NDArray, end: int, drag: float, full_rate: float
+) -> None:
+    """Update the panel of the largest values, (_ROWS * _WIDTH,), by rows before `end` of all runs, (R, L * 29)."""
+    for r in range(len(runs)):
+        if r > 0 and _is_left_of(runs[r], runs[r - 1]):
+            continue  # all of it was looked at
+        begin = 0
+        while begin < end:
+            lanes = min(end - begin, _MOST) // LANES * LANES
+            if lanes == 0:  # a few are left: rather look at others again than at each alone
+                begin = max(end - LANES, 0)
+                lanes = end - begin
+            _take_words(words, runs[r], before[r : r + SPAN], begin, lanes)
+            _raise_all(worst, words, lanes, drag, full_rate)
+            begin += lanes
+
+
+@register_jitable
+def _is_left_of(run: NDArray, other: NDArray) -> bool:
+    """Return whether a run is what is left of another from its second row on, as stops within a stop are."""
+    last = len(run) - PAYLOAD_SIZE
+    differs = np.uint8(0)
+    for at in range(PAYLOAD_SIZE):
+        differs = np.uint8(differs | (run[at] ^ other[min(at + PAYLOAD_SIZE, len(run) - 1)]))
+    if differs:  # as it mostly does, so little is compared
+        return False
+    for at in range(last):
+        differs = np.uint8(differs | (run[at] ^ other[at + PAYLOAD_SIZE]))
+    for at in range(last, len(run)):
+        differs = np.uint8(differs | (run[at] ^ other[at]))
+    return differs == 0
+
+
+@register_jitable
+def _take_words(words: NDArray, run: NDArray, before: NDArray, begin: int, lanes: int) -> None:
+    """Write so many rows of a run from `begin` on to the panel, and of those around them what is looked at."""
+    last = len(run) // PAYLOAD_SIZE - 1
+    for n in range(lanes):
+        row = PAYLOAD_SIZE * min(begin + n, last)
+        for axis in range(3):
+            words[(_PLACE + axis) * _WIDTH + n] = _word(run, row + FIELD_PLACES[0] + 2 * axis)
+            words[(_SPEED + axis) * _WIDTH + n + SPAN] = _word(run, row + FIELD_PLACES[1] + 2 * axis)
+            words[(_FORCE + axis) * _WIDTH + n] = _word(run, row + FIELD_PLACES[2] + 2 * axis)
+            words[(_RATE + axis) * _WIDTH + n] = _word(run, row + FIELD_PLACES[3] + 2 * axis)
+        words[_TURN * _WIDTH + n] = _word(run, row + QUATERNION_PLACE)
+        words[(_TURN + 1) * _WIDTH + n] = _word(run, row + QUATERNION_PLACE + 2)
+    for axis in range(3):
+        place, speed = FIELD_PLACES[0] + 2 * axis, FIELD_PLACES[1] + 2 * axis
+        words[(_PLACE + axis) * _WIDTH + lanes] = _word(run, PAYLOAD_SIZE * min(begin + lanes, last) + place)
+        for n in range(SPAN):
+            ahead, behind = PAYLOAD_SIZE * min(begin + lanes + n, last), begin + n - SPAN
+            velocity = _word(before[begin + n], speed) if behind < 0 else _word(run, PAYLOAD_SIZE * behind + speed)
+            words[(_SPEED + axis) * _WIDTH + n] = velocity
+            words[(_SPEED + axis) * _WIDTH + lanes + SPAN + n] = _word(run, ahead + speed)
+
+
+@register_jitable(forceinline=True)
+def _word(run: NDArray, at: int) -> Any:
+    return np.int16(np.uint16(run[at]) | np.uint16(np.uint16(run[at + 1]) << np.uint16(8)))
+
+
+@register_jitable(fastmath=ROUNDING)
+def _raise_all(worst: NDArray, words: NDArray, lanes: int, drag: float, full_rate: float) -> None:
+    lanes = min(lanes, _MOST)  # the compiler must see that no index overflows
+    for n in range(lanes):
+        _raise_worst(worst, words, n, drag, full_rate)
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def _raise_worst(worst: NDArray, words: NDArray, n: int, drag: float, full_rate: float) -> None:
+    """Update the largest values with one setpoint."""
+    place, place_ahead = _triple(words, _PLACE, n), _triple(words, _PLACE, n + 1)
+    velocity, velocity_ahead = _triple(words, _SPEED, n + SPAN), _triple(words, _SPEED, n + SPAN + 1)
+    earlier, later = _triple(words, _SPEED, n), _triple(words, _SPEED, n + 2 * SPAN)
+    over, half = RATE / (2 * SPAN), 0.5 / RATE
+    acceleration = (later[0] - earlier[0]) * over, (later[1] - earlier[1]) * over, (later[2] - earlier[2]) * over
+    x, y, z = acceleration
+    force = x + drag * velocity[0], y + drag * velocity[1], z + drag * velocity[2] + GRAVITY
+    x, y, z = force
+    inverse = 1.0 / math.sqrt(dot(force, force))
+    axis = x * inverse, y * inverse, z * inverse
+    x, y, z = _triple(words, _FORCE, n)
+    sent = x, y, z + GRAVITY
+    scale, lean = full_rate / math.sqrt(dot(sent, sent)), cross(axis, sent)
+    traded = scale * lean[0], scale * lean[1], scale * lean[2]
+    rate_x, rate_y, rate_z = _body_rate(traded, sent, words, n, full_rate)
+    thrust = dot(axis, sent)
+
+    _raise(worst, of.ACCELERATION, n, dot(acceleration, acceleration))
+    _raise(worst, of.BODY_RATE, n, rate_x * rate_x + rate_y * rate_y + rate_z * rate_z)
+    _raise(worst, of.TILT, n, (1.0 - axis[2]) / (1.0 + axis[2]))
+    _raise(worst, of.SPECIFIC_THRUST, n, thrust)
+    _raise(worst, _LEAST_THRUST, n, -thrust)
+    _raise(worst, _TRADED, n, dot(traded, traded))
+    _raise(worst, of.SPEED, n, dot(velocity, velocity))
+    _raise_place(worst, 0, n, place[0], place_ahead[0], half * (velocity[0] + velocity_ahead[0]))
+    _raise_place(worst, 1, n, place[1], place_ahead[1], half * (velocity[1] + velocity_ahead[1]))
+    _raise_place(worst, 2, n, place[2], place_ahead[2], half * (velocity[2] + velocity_ahead[2]))
+
+
+@register_jitable(forceinline=True)
+def _raise_place(worst: NDArray, axis: int, n: int, here: float, ahead: float, way: float) -> None:
+    """Update the largest values with one coordinate, of a setpoint and of the next, and the way between them."""
+    _raise(worst, _JUMP, n, abs(ahead - here - way))
+    _raise(worst, _HIGH + axis, n, here)
+    _raise(worst, _LOW + axis, n, -here)
+
+
+@register_jitable(forceinline=True, fastmath=ROUNDING)
+def _body_rate(traded: Vector, sent: Vector, words: NDArray, n: int, full_rate: float) -> Vector:
+    """Return the body rates that a setpoint asks for, of which some are `traded`, along the axes of the world."""
+    lower, upper = int(words[_TURN * _WIDTH + n]) & 0xFFFF, int(words[(_TURN + 1) * _WIDTH + n]) & 0xFFFF
+    cos, sin = heading_of(decompressed(upper << 16 | lower))
+    a, b, c = sent
+    left = -c * sin, c * cos, a * sin - b * cos  # the controller's y axis, and x is left × sent
+    about_x = dot(traded, cross(left, sent)) / math.sqrt(dot(left, left) * dot(sent, sent))
+    about_y = dot(traded, left) / math.sqrt(dot(left, left))
+    sent_x, sent_y, about_z = _triple(words, _RATE, n)
+    believed = 1.0 / (1.0 - ATTITUDE_AGE * full_rate)
+    return (sent_x + about_x) * believed, (sent_y + about_y) * believed, about_z
+
+
+@register_jitable(forceinline=True)
+def _triple(words: NDArray, row: int, n: int) -> Vector:
+    """Return what three rows have at a place, in m, m/s, m/s² or rad/s."""
+    return (
+        1e-3 * words[row * _WIDTH + n],
+        1e-3 * words[(row + 1) * _WIDTH + n],
+        1e-3 * words[(row + 2) * _WIDTH + n],
+    )
+
+
+@register_jitable(forceinline=True)
+def _raise(worst: NDArray, row: int, n: int, value: float) -> None:
+    """Update the largest value at a place; what is no number is larger than all."""
+    before = worst[row * _WIDTH + n]
+    value = value if value < _LARGE else _LARGE
+    worst[row * _WIDTH + n] = value if value > before else before
