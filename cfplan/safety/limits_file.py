@@ -363,7 +363,7 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
         raise InputError(
             f"firmware.newest ({content.firmware.newest}) is older than firmware.oldest ({content.firmware.oldest})",
             where=places.where("firmware", "newest"),
-            hint="write the newest that may fly, as \"2026.08\", or leave it out",
+            hint='write the newest that may fly, as "2026.08", or leave it out',
         )
     height = content.ground.take_off_height
     if not content.space.low[2] + content.space.margin <= height <= content.space.high[2] - content.space.margin:

@@ -83,7 +83,6 @@ def test_each_plan_goes_through_its_waypoints_without_a_stop_between(flown, limi
     ("waypoints", "error", "words"),
     [
         ([[0, 0, 9]], RequestRefusedError, "7.200 m too far out"),
-        ([[0.5, 0.5, 1], [0.5, 0.5, 1]], RequestRefusedError, "remove one of them"),
         ([["a", 1, 2]], InputError, "no numbers"),
         ([[np.nan, 0, 1]], InputError, "waypoint 1"),
         ([1, 2, 3], InputError, "rows of x, y, z"),
@@ -100,6 +99,69 @@ def test_what_cannot_be_flown_is_refused_in_words_and_the_flight_goes_on(flown, 
     assert np.linalg.norm(np.subtract(vehicle.position, [1, 0, 1])) < 0.1
     vehicle.land()
     assert vehicle.outcome.exit_code is ExitCode.OK
+
+
+def test_to_be_asked_to_go_where_it_is_is_done(flown):
+    vehicle, _ = flown
+    here = vehicle.position
+    assert here != (0.0, 0.0, 0.8)
+    for answer in (vehicle.fly([here]), vehicle.extend([here, here]), vehicle.replace([here, here])):
+        assert answer.verdict is PathVerdict.ACCEPTED
+    assert vehicle.wait(0.1)
+    vehicle.land()
+    assert vehicle.outcome.exit_code is ExitCode.OK
+
+
+def test_the_same_target_ten_times_a_second_is_flown_like_a_target_asked_for_once(flown):
+    vehicle, _ = flown
+    begun = vehicle.time
+    vehicle.fly([[1, 0, 1]])
+    arrives = None
+    for _ in range(60):
+        asked = vehicle.time
+        assert vehicle.fly([[1, 0, 1]]).verdict is PathVerdict.ACCEPTED
+        arrives = arrives or (vehicle.time if vehicle.resting else None)
+        vehicle.sleep(max(0.1 - (vehicle.time - asked), 0.0))
+    assert arrives - begun < 2.5
+    assert np.linalg.norm(np.subtract(vehicle.position, [1, 0, 1])) < 0.05
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("wish", [Wish.REPLACE, Wish.EXTEND])
+def test_waypoints_that_repeat_the_one_before_count_once(flown, wish, moving):
+    vehicle, flight = flown
+    before = vehicle.position
+    if moving:
+        before = (1.0, 2.0, 1.0)
+        vehicle.fly([before])
+        vehicle.sleep(0.6)
+    first = [before] if wish is Wish.EXTEND or not moving else []
+    twice = [*first, [0.5, 0.5, 1], [0.5, 0.5, 1.004], [-0.5, 0.5, 1], [-0.5, 0.5, 1]]
+    assert vehicle.ask(wish, twice).verdict is PathVerdict.ACCEPTED
+    assert len(flight.planner.held.ahead) == (3 if moving and wish is Wish.EXTEND else 2)
+    vehicle.wait()
+    assert np.linalg.norm(np.subtract(vehicle.position, [-0.5, 0.5, 1])) < 0.05
+
+
+def test_a_vehicle_asked_to_rest_where_it_passes_comes_back_there(flown):
+    vehicle, flight = flown
+    vehicle.fly([[1, 0, 1], [1, 2, 1]])
+    vehicle.sleep(0.9)
+    joint = vehicle.time - vehicle._begun + 0.2
+    place = flight.planner.held.flown.at(joint).position
+    assert vehicle.speed > 0.8
+    assert vehicle.fly([place]).verdict is PathVerdict.ACCEPTED
+    vehicle.wait()
+    assert np.linalg.norm(np.subtract(vehicle.position, place)) < 0.05
+
+
+def test_a_path_flown_already_is_left_for_a_shorter_one(flown):
+    """Its last waypoint alone is another request, which leaves out those before."""
+    vehicle, _ = flown
+    round_about = vehicle.fly([[1, 0, 1], [1, 1, 1], [0.3, 0.3, 1]])
+    assert vehicle.fly([[1, 0, 1], [1, 1, 1], [0.3, 0.3, 1]]).splice < 0  # nothing new
+    straight = vehicle.fly([[0.3, 0.3, 1]])
+    assert straight.ends < round_about.ends - 1.0
 
 
 def test_slower_counts_for_what_is_ahead_and_for_what_comes_until_faster_undoes_it(flown):

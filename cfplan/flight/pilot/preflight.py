@@ -75,8 +75,8 @@ def firmware_check(firmware: str, limits: Limits) -> Check:
     if found > newest:
         return Check(
             "firmware", firmware, "≤ " + version_text(newest), False,
-            "what is certified was read from older firmware: fly with one of these, or, once you know that time-outs and "
-            f'controller are the same, write newest: "{version_text(found)}" under firmware: in safety.yaml',
+            "time-outs and controller were read from older firmware: fly with that; or compare them, and write "
+            f'newest: "{version_text(found)}" under firmware: in safety.yaml',
         )  # fmt: skip
     return Check(
         "firmware", firmware or "unknown", "≥ " + version_text(oldest), bool(found) and found >= oldest,
