@@ -1,5 +1,7 @@
 """A program steers the virtual vehicle on the stepped clock: what it asks for is flown, or refused in words."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,8 @@ from cfplan.errors import (
     FlightEndedError,
     InfeasibleError,
     InputError,
+    LinkError,
+    PreflightError,
     RequestRefusedError,
 )
 from cfplan.flight.setpoints.encoding import RATE
@@ -277,6 +281,34 @@ def test_a_take_off_that_cannot_be_is_refused_and_nothing_is_armed(limits):
         with SteeredVehicle(flight, limits, uri="sim://0") as vehicle, pytest.raises((InfeasibleError, InputError)):
             vehicle.take_off(height)
         assert vehicle.outcome is None
+
+
+def test_a_take_off_that_takes_too_long_has_landed_when_that_is_said(limits):
+    slow = replace(limits, ground=replace(limits.ground, take_off_speed=0.004))
+    flight = SteppedSteering(slow)
+    with SteeredVehicle(flight, slow, uri="sim://0") as vehicle:
+        with pytest.raises(PreflightError, match="did not hover"):
+            vehicle.take_off(0.8)
+        assert flight.lab.truth().position[:, 2].max() > 0.2
+        assert vehicle.outcome is not None
+        assert not flight.lab.truth().motor[-1].any()
+
+
+def test_a_flight_that_does_not_end_is_no_flight_that_has_landed(flown, monkeypatch):
+    vehicle, flight = flown
+    monkeypatch.setattr(flight, "order", lambda _: None)
+    with pytest.raises(LinkError, match="not ended"):
+        vehicle.land()
+    monkeypatch.undo()
+
+
+def test_a_vehicle_that_was_cut_does_not_take_off(limits):
+    flight = SteppedSteering(limits)
+    with SteeredVehicle(flight, limits, uri="sim://0") as vehicle:
+        vehicle.cut()
+        with pytest.raises(FlightEndedError, match="cut"):
+            vehicle.take_off()
+    assert not flight.lab.truth().motor.any()
 
 
 def test_a_failed_preflight_check_is_said_in_words(limits):
