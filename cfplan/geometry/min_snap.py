@@ -5,6 +5,7 @@ at the waypoints. Their normal equations are block-tridiagonal and positive defi
 in linear time, after scaling to a unit diagonal because segments differ in length.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -72,6 +73,15 @@ def smooth_through(points: ArrayLike) -> Path:
             hint="give more points, or lay a path of least snap through these",
         )
     return with_rest_ends(times, pieces_through(points, times, start=None, rest_end=False))
+
+
+def spaced(points: NDArray) -> NDArray:
+    """Return points, (K, 3) m, without those closer than MIN_SPACING to the one that stays before them."""
+    kept: list[NDArray] = []
+    for point in points:
+        if not kept or not math.dist(point, kept[-1]) < MIN_SPACING:  # what is no number stays, to be refused
+            kept.append(point)
+    return np.array(kept).reshape(-1, 3)
 
 
 def check_points(points: NDArray, spacing: float = MIN_SPACING, where: Callable[[int], str] | None = None) -> None:

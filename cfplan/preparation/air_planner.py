@@ -21,6 +21,7 @@ from cfplan.preparation.replan import (
     HeldFlight,
     Replanned,
     at_pace,
+    bound_already,
     go_on,
     halt,
     pace,
@@ -35,6 +36,7 @@ PART = 4.0  # likewise, for each s that planning looks ahead
 SLACK = 0.001  # s more than that
 NEAR = 0.5  # s before one must plan the next part of a plan, from when on that is done
 QUIET = 1.0  # s without a request, after which more of a plan is committed than is near: others may replace it soon
+ON_ITS_WAY = "the vehicle is there, or on its way there already"
 FARTHEST = 30.0  # s ahead of which no more of it is committed even then, until the vehicle comes nearer
 
 
@@ -85,7 +87,7 @@ class PathAnswer:
 
     number: int
     verdict: PathVerdict
-    reason: str = ""  # why not, one line
+    reason: str = ""  # why not, or why nothing need be proposed, one line
     joint: float = math.nan  # s from the first setpoint, from when on the new plan is flown
     ends: float = math.nan  # s from the first setpoint, when it ends
     seconds: float = 0.0  # s from the request to the answer
@@ -144,6 +146,8 @@ def plan_request(
             paced = pace(held, first, speed, limits, yaw_angle=yaw, part=part, attempt=attempt)
             return paced or at_pace(held, speed)
     keep = request.wish is Wish.EXTEND
+    if (bound := bound_already(held, first, request.waypoints, limits, keep=keep)) is not None:
+        return bound
     return replan(held, first, request.waypoints, limits, keep=keep, yaw_angle=yaw, part=part, attempt=attempt)
 
 
@@ -189,7 +193,8 @@ def answer_changed(number: int, made: Replanned) -> PathAnswer:
 
 def answer_held(request: PathRequest, held: HeldFlight) -> PathAnswer:
     """Return the answer to a request for which nothing need be proposed."""
-    return PathAnswer(request.number, PathVerdict.ACCEPTED, ends=held.ends)
+    reason = ON_ITS_WAY if request.waypoints else ""
+    return PathAnswer(request.number, PathVerdict.ACCEPTED, reason, ends=held.ends)
 
 
 def answer_cut_short(number: int, held: HeldFlight, reason: str) -> PathAnswer:

@@ -25,7 +25,7 @@ from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
-from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times
+from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, spaced
 from cfplan.planning.continuation import (
     KINDS,
     LATE_HINT,
@@ -211,9 +211,9 @@ def replan(
 
     The motion changes SPLICE_AHEAD setpoints after the splice, or a little later where it cannot do so at once. With
     `keep`, the waypoints follow those that are ahead, and the motion changes only once that to them has begun; else
-    they replace them. Where the vehicle rests by then, the plan begins from rest. Where link loss or a gap would end
-    badly, the vehicle flies slower. So many setpoints are proposed as `part` says, and the stop behind them; without
-    it, all.
+    they replace them. Waypoints closer than MIN_SPACING to the one before, or to where the plan begins, are left out.
+    Where the vehicle rests by then, the plan begins from rest. Where link loss or a gap would end badly, the vehicle
+    flies slower. So many setpoints are proposed as `part` says, and the stop behind them; without it, all.
 
     Raises:
         InputError: what is given are no waypoints.
@@ -226,6 +226,26 @@ def replan(
         raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint="give rows of x, y, z in metres")
     check_waypoints(points, limits)
     return _replan_within(held, splice, _Wanted(points, limits, keep, yaw_angle, part, attempt))
+
+
+def bound_already(
+    held: HeldFlight, splice: int, waypoints: ArrayLike, limits: Limits, *, keep: bool = False
+) -> HeldFlight | None:
+    """Return what is held where the vehicle does by it what replan() is asked for, or rests there; else None."""
+    points = np.asarray(waypoints, dtype=float).reshape(-1, 3)
+    resting = at_rest_from(held, splice, limits)
+    splice, _ = _leaving(resting, splice, keep)
+    joint = (splice + SPLICE_AHEAD) / RATE
+    here, last = resting.flown.at(joint).position, resting.flown.at(resting.ends).position
+    s = float(resting.flown.trajectories[-1].s_at(max(joint - resting.flown.starts[-1], 0.0)))
+    unreached = resting.ahead[np.array(resting.reached) > s]
+    ahead = spaced(np.concatenate([here[None], unreached, last[None], resting.left]))
+    if keep:
+        return held if len(spaced(np.concatenate([ahead[-1:], points]))) == 1 else None
+    wanted = spaced(np.concatenate([here[None], points]))
+    if wanted.shape == ahead.shape and (np.linalg.norm(wanted - ahead, axis=1) < MIN_SPACING).all():
+        return held
+    return given_up(resting, limits) if len(wanted) == 1 and joint >= resting.ends else None
 
 
 def pace(
@@ -453,7 +473,9 @@ def _plan_at(
     leave, trajectory = joint - held.flown.starts[left], held.flown.trajectories[left]
     if leave >= trajectory.duration:
         place = held.flown.at(joint)
-        points = np.concatenate([place.position[None], held.left, points] if keep else [place.position[None], points])
+        points = spaced(np.concatenate([place.position[None], *([held.left] if keep else []), points]))
+        if len(points) < 2:
+            raise InfeasibleError("the vehicle rests there already", where="request", hint="nothing need be flown")
         path, reached = path_from_rest(points, limits)
         planned = plan(
             path,
@@ -467,13 +489,21 @@ def _plan_at(
     else:
         times = None
         if keep:
-            kept, times = _still_ahead(held, leave, points)
-            points = np.concatenate([kept, points])
+            points, times = _still_ahead(held, leave, points)
             if not len(points):
                 raise InfeasibleError(
                     "the last waypoint is all but reached",
                     where="request",
                     hint="ask for waypoints instead; they are flown so",
+                )
+        else:
+            state = trajectory.at(leave)
+            points = spaced(np.concatenate([state.position[None], points]))[1:]
+            if not len(points):
+                raise NoWayError(
+                    f"the vehicle passes it at {float(np.linalg.norm(state.velocity)):.2f} m/s",
+                    where="waypoint 1",
+                    hint="stop first, then ask for it again",
                 )
         made = continue_plan(
             trajectory, leave, points, limits, times=times, yaw_angle=yaw_angle, speed=speed, ways=ways,
@@ -615,7 +645,10 @@ def replan_behind_stop(
     """
     stop = halt(held, splice, limits)
     resting = stop if isinstance(stop, HeldFlight) else stop.held
-    made = replan(resting, max(splice, resting.exact_from), waypoints, limits, yaw_angle=yaw_angle, part=part)
+    begins = max(splice, resting.exact_from)
+    if isinstance(stop, Replanned) and bound_already(resting, begins, waypoints, limits) is not None:
+        return stop
+    made = replan(resting, begins, waypoints, limits, yaw_angle=yaw_angle, part=part)
     return made if isinstance(stop, HeldFlight) else replace(made, stop=stop)
 
 
@@ -728,7 +761,7 @@ def accepted(replanned: Replanned, commitment: Commitment) -> HeldFlight:
 
 
 def _still_ahead(held: HeldFlight, leave: float, more: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the waypoints not yet passed at `leave`, s, and the nominal times to each of them and to those after."""
+    """Return the waypoints not yet passed at `leave`, s, with `more` behind them, and the nominal times to each."""
     last = held.flown.trajectories[-1]
     s = float(last.s_at(leave))
     here = last.path(s)
@@ -739,5 +772,6 @@ def _still_ahead(held: HeldFlight, leave: float, more: NDArray) -> tuple[NDArray
     ]
     times = np.diff([s, *(held.reached[number] for number in kept)])
     begin = held.ahead[kept[-1]] if kept else here
-    new = centripetal_times(np.concatenate([begin[None], more])) if len(more) else np.empty(0)
-    return held.ahead[kept].reshape(-1, 3), np.concatenate([times, new])
+    onward = spaced(np.concatenate([begin[None], more]))
+    new = centripetal_times(onward) if len(onward) > 1 else np.empty(0)
+    return np.concatenate([held.ahead[kept].reshape(-1, 3), onward[1:]]), np.concatenate([times, new])

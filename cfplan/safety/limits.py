@@ -101,6 +101,7 @@ class FirmwareSettings:
     controller: int  # stabilizer.controller
     estimator: int  # stabilizer.estimator
     oldest: tuple[int, ...]  # the oldest firmware that may fly
+    newest: tuple[int, ...] = ()  # the newest firmware that may fly; older plan files name none
     watchdog: bool = True
     """Whether motors stop 1 s after the pilot's last sign of life; it locks then, also after landing, and the pilot
     restarts the vehicle there."""

@@ -120,10 +120,14 @@ class _LinkLoss(_Section):
     velocity_error: Annotated[float, Field(ge=0.0, le=1.0)]
 
 
+_Version = Annotated[str, StringConstraints(pattern=r"^\d{4}\.\d{1,2}(\.\d{1,3})?$")]
+
+
 class _Firmware(_Section):
     controller: Annotated[int, Field(ge=1, le=6)]
     estimator: Annotated[int, Field(ge=1, le=3)]
-    oldest: Annotated[str, StringConstraints(pattern=r"^\d{4}\.\d{1,2}(\.\d{1,3})?$")]
+    oldest: _Version
+    newest: _Version
     watchdog: StrictBool
 
 
@@ -246,7 +250,12 @@ def load_limits(file: Path | str) -> Limits:
         space=_made(Space, content.space),
         battery=_made(BatteryLimits, content.battery),
         pose=PoseLimits(**pose, yaw_agreement=yaw_agreement),
-        firmware=_made(FirmwareSettings, content.firmware, oldest=tuple(map(int, content.firmware.oldest.split(".")))),
+        firmware=_made(
+            FirmwareSettings,
+            content.firmware,
+            oldest=_version(content.firmware.oldest),
+            newest=_version(content.firmware.newest),
+        ),
         ground=_made(GroundManoeuvres, content.ground),
         link_loss=LinkLossLimits(
             only_warn=content.link_loss.outside == "warn",
@@ -280,6 +289,10 @@ def _plan_limits(plan: _Plan, airframe: Airframe) -> PlanLimits:
         angular_acceleration=plan.angular_acceleration,
         **within_reserve(airframe, plan.motor_reserve),
     )
+
+
+def _version(text: str) -> tuple[int, ...]:
+    return tuple(map(int, text.split(".")))
 
 
 def _check_order(content: _SafetyFile, places: Places) -> None:
@@ -345,6 +358,12 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
             f"at {pose.rate:g} Hz every pose grows older than pose.age_warning",
             where=places.where("pose", "age_warning"),
             hint=f"write an age_warning above {1.0 / pose.rate:.3g} s, or a higher rate",
+        )
+    if _version(content.firmware.newest) < _version(content.firmware.oldest):
+        raise InputError(
+            f"firmware.newest ({content.firmware.newest}) is older than firmware.oldest ({content.firmware.oldest})",
+            where=places.where("firmware", "newest"),
+            hint='write the newest that may fly, as "2026.08", or leave it out',
         )
     height = content.ground.take_off_height
     low, high, margin = content.space.low[2], content.space.high[2], content.space.margin

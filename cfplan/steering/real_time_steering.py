@@ -55,6 +55,7 @@ class RealTimeSteering:
         self._orders: deque[Order] = deque()
         self._more_orders = more_orders
         self._unanswered: set[int] = set()
+        self._fault: BaseException | None = None  # of a listener to the planner
         self.planner: AirPlanner | None = None
         self._thread: threading.Thread | None = None
         try:
@@ -79,7 +80,7 @@ class RealTimeSteering:
             self.planner = self._open.enter_context(AirPlanner(held, mission.limits, self._vehicle.pilot.proposals))
         self._thread = threading.Thread(target=self._fly, args=(mission, listeners), name="flight")
         self._thread.start()
-        threading.Thread(target=self._listen, args=(listeners,), name="planner's answers", daemon=True).start()
+        threading.Thread(target=self._hear_planner, args=(listeners,), name="planner's answers", daemon=True).start()
         self.wait(lambda: self.planner is not None and self.planner.ready, _PLANNER_STARTS)
 
     def _fly(self, mission: Mission, listeners: Listeners) -> None:
@@ -96,16 +97,26 @@ class RealTimeSteering:
                 pose_source=self._source,
                 pilot=self._vehicle.pilot,
                 on_telemetry=tell,
-                more_orders=lambda: [*self._new_orders(), *self._more_orders()],
+                more_orders=self._next_orders,
                 keyboard=self._keyboard,
             )
         except CfplanError as error:
             outcome = error
         except BaseException as error:  # a fault of a listener, which has landed the vehicle
-            outcome = CfplanError(f"fault in the flight: {error!r}", hint="please report this")
+            outcome = _fault(error)
+        if self._fault is not None and not isinstance(outcome, CfplanError):
+            outcome = _fault(self._fault)
         with self._change:
             self.outcome = outcome
             self._change.notify_all()
+
+    def _hear_planner(self, listeners: Listeners) -> None:
+        """Pass the planner's answers on until the flight has ended; a fault in that lands the vehicle."""
+        try:
+            self._listen(listeners)
+        except BaseException as error:
+            self._fault = error
+            self.order(Order.LAND)
 
     def _listen(self, listeners: Listeners) -> None:
         """Pass the planner's answers on, and answer for it once it has ended."""
@@ -126,11 +137,10 @@ class RealTimeSteering:
             if gone:
                 REAL_CLOCK.sleep(_LISTEN_PERIOD)
 
-    def _new_orders(self) -> list[Order]:
-        orders: list[Order] = []
+    def _next_orders(self) -> Iterator[Order]:
         while self._orders:
-            orders.append(self._orders.popleft())
-        return orders
+            yield self._orders.popleft()
+        yield from self._more_orders()
 
     def ask(self, wish: Wish, waypoints: Sequence[Triple]) -> int:
         assert self.planner is not None
@@ -156,6 +166,10 @@ class RealTimeSteering:
                 self.order(Order.LAND)
             self._thread.join(_LANDING)
         self._open.close()
+
+
+def _fault(error: BaseException) -> CfplanError:
+    return CfplanError(f"fault in the flight: {error!r}", hint="please report this")
 
 
 @contextlib.contextmanager

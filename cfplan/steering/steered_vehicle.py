@@ -16,7 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cfplan.errors import CfplanError, ExitCode, FlightEndedError, InputError, PreflightError, RequestRefusedError
+from cfplan.errors import (
+    CfplanError,
+    ExitCode,
+    FlightEndedError,
+    InputError,
+    LinkError,
+    PreflightError,
+    RequestRefusedError,
+)
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
@@ -60,6 +68,7 @@ class SteeredVehicle:
         self._answers: dict[int, PathAnswer] = {}
         self._unread: list[PathAnswer] = []
         self._asked: set[int] = set()
+        self._started = False
         self._phase: Phase | None = None
         self._begun = math.nan  # s, when setpoint 0 was due
         self._sent: SetpointSent | None = None
@@ -121,9 +130,11 @@ class SteeredVehicle:
         """Check everything as before any flight, arm, climb to a height, m, and return once the vehicle hovers there.
 
         Without a height, to that of the limits. Raises a CfplanError where the vehicle cannot take off: a check failed,
-        the hover lies outside the space, or the link or its poses cannot be had. Nothing is armed then.
+        the hover lies outside the space, or the link or its poses cannot be had. Then nothing was armed; or, where the
+        vehicle left the floor and does not hover within two minutes, or somebody lands it, it has landed and is
+        disarmed.
         """
-        if self._recording is not None or self._phase is not None:
+        if self._started:
             raise InputError("it has taken off already", where="take_off", hint="connect again for another flight")
         limits = self._limits
         if height is not None:
@@ -141,10 +152,16 @@ class SteeredVehicle:
                 self._records, self._name, self._uri, limits, place, yaw, clock=self._flight.clock
             )
             self._on_record(self._recording)
+        self._started = True
         self._flight.start(mission, held, Listeners(self._hear, self._hear_answer))
         if not self._flight.wait(lambda: self._phase in _FLYING and self._sent is not None, _TAKE_OFF_WITHIN):
             self._require_flying()
-            raise PreflightError("it did not take off in time", where=self._uri, hint="see the record's events")
+            self._end(Order.LAND)
+            raise PreflightError(
+                f"it did not hover within {_TAKE_OFF_WITHIN:.0f} s, and was landed",
+                where=self._uri,
+                hint="see the record's events; raise ground.take_off_speed if the climb takes that long",
+            )
 
     def fly(self, waypoints: ArrayLike) -> PathAnswer:
         """Fly through waypoints, (K, 3) m, to rest at the last, instead of what is ahead; the same as `replace`."""
@@ -252,15 +269,12 @@ class SteeredVehicle:
 
     def finish(self) -> None:
         """Fly what is committed to its end, then land, disarm, and return. Raises as `land` does."""
-        if self._phase is not None and self._flight.outcome is None:
-            self._flight.order(Order.FINISH)
-            self._flight.wait(lambda: False, self._ends + _LAND_WITHIN)
+        self._end(Order.FINISH, self._ends + _LAND_WITHIN)
         self.land()
 
     def cut(self) -> None:
-        """Cut the motors at once, wherever the vehicle is: it falls."""
-        self._flight.order(Order.CUT)
-        self._flight.wait(lambda: False, _LAND_WITHIN)
+        """Cut the motors at once, wherever the vehicle is: it falls. After that it does not take off either."""
+        self._end(Order.CUT)
 
     def close(self) -> None:
         """Land the vehicle if it flies, release it, and end its record. May be called twice; does not raise."""
@@ -287,10 +301,20 @@ class SteeredVehicle:
 
     # Within.
 
-    def _end(self, order: Order) -> None:
-        if self._phase is not None and self._flight.outcome is None:
+    def _end(self, order: Order, patience: float = _LAND_WITHIN) -> None:
+        """Give an order that ends the flight, and wait until it has ended. Raises LinkError where it does not."""
+        if self._flight.outcome is not None:
+            return
+        if self._started or order is Order.CUT:
             self._flight.order(order)
-            self._flight.wait(lambda: False, _LAND_WITHIN)
+        if self._started:
+            self._flight.wait(lambda: False, patience)
+            if self._flight.outcome is None:
+                raise LinkError(
+                    f"the flight has not ended {patience:.0f} s after the order to",
+                    where=self._uri,
+                    hint="keep away from the vehicle until it lies still",
+                )
 
     def _hear(self, message: Telemetry) -> None:
         """Take telemetry, in the thread that attends to the flight."""
@@ -321,7 +345,7 @@ class SteeredVehicle:
             raise ended
         if ended is not None:
             raise _ended(ended)
-        if self._phase is None and self._recording is None:
+        if not self._started:
             raise _not_flying()
 
 

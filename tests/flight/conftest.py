@@ -10,6 +10,7 @@ from septic_flight import septic_payloads
 
 from cfplan.errors import LinkError
 from cfplan.flight.clock import SteppedClock
+from cfplan.flight.firmware import NEWEST_KNOWN
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.mission import Mission
@@ -55,7 +56,7 @@ def make_limits() -> Limits:
             rate=100.0, rate_min=50.0, latency=0.01, age_warning=0.05, age_brake=0.15, age_land=0.5, jump=0.1,
             agreement=0.03, yaw_agreement=0.1,
         ),
-        firmware=FirmwareSettings(controller=2, estimator=2, oldest=(2025, 9, 1)),
+        firmware=FirmwareSettings(controller=2, estimator=2, oldest=(2025, 9, 1), newest=NEWEST_KNOWN),
         ground=GroundManoeuvres(take_off_height=0.5, take_off_speed=0.5, go_to_speed=0.5, land_speed=0.4),
     )  # fmt: skip
 

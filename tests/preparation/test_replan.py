@@ -170,7 +170,6 @@ def test_a_flight_replanned_again_and_again_keeps_every_limit_in_what_was_sent(h
         ([[0, 0]], InputError),
         ([[0, 0, np.nan]], InputError),
         ([[0, 0, 5]], InfeasibleError),
-        ([[0.5, 0, 1], [0.5, 0, 1]], InputError),
     ],
 )
 def test_what_cannot_be_flown_is_refused_in_words(held, limits, waypoints, error):

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cfplan.errors import CfplanError, InputError
+from cfplan.flight.firmware import NEWEST_KNOWN
 from cfplan.safety.limits import Ladder
 from cfplan.safety.limits_file import DEFAULTS, load_limits
 from cfplan.vehicle.airframes import AIRFRAMES
@@ -53,7 +54,7 @@ def test_the_projects_own_file_says_what_the_design_says():
     assert limits.flight.acceleration.brake == limits.flight.angular_velocity.brake == 10.0
     assert limits.flight.deviation == Ladder(0.3, 0.6, 1.0)
     assert [high - low for low, high in zip(limits.space.low, limits.space.high, strict=True)] == [4.5, 8.0, 2.0]
-    assert limits.firmware.oldest == (2025, 9, 1)
+    assert (limits.firmware.oldest, limits.firmware.newest) == ((2025, 9, 1), NEWEST_KNOWN)
 
 
 @pytest.mark.parametrize("vehicle", AIRFRAMES)
@@ -114,7 +115,7 @@ def test_the_defaults_are_the_projects_own_file():
 NUMBERS = [".".join(p) for p in keys() if p[-1] not in NO_POSITIVE_NUMBER]
 
 
-@pytest.mark.parametrize("place", [place for place in NUMBERS if place != "firmware.oldest"])
+@pytest.mark.parametrize("place", [place for place in NUMBERS if not place.startswith("firmware.")])
 @pytest.mark.parametrize("value", [0, -1.0, "fast", True, None, float("nan"), float("inf"), [1.0], 1e9])
 def test_no_number_may_be_zero_negative_or_no_number(tmp_path, place, value):
     with pytest.raises(InputError) as error:
@@ -161,6 +162,8 @@ def test_unknown_keys_are_errors(tmp_path, place):
         ({"pose.rate": 15, "pose.rate_min": 10}, "every pose grows older"),
         ({"ground.take_off_height": 0.1}, "ends outside the space"),
         ({"firmware.oldest": "new"}, "oldest"),
+        ({"firmware.newest": 2026.08}, "newest"),
+        ({"firmware.newest": "2025.02"}, "older than firmware.oldest"),
         ({"firmware.controller": 9}, "controller"),
         ({"link_loss.outside": "ignore"}, r"link_loss.outside.*refuse.*warn"),
         ({"link_loss.outside": True}, r"link_loss.outside.*refuse.*warn"),

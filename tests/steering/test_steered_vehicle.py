@@ -1,5 +1,7 @@
 """A program steers the virtual vehicle on the stepped clock: what it asks for is flown, or refused in words."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,8 @@ from cfplan.errors import (
     FlightEndedError,
     InfeasibleError,
     InputError,
+    LinkError,
+    PreflightError,
     RequestRefusedError,
 )
 from cfplan.flight.setpoints.encoding import RATE
@@ -83,7 +87,6 @@ def test_each_plan_goes_through_its_waypoints_without_a_stop_between(flown, limi
     ("waypoints", "error", "words"),
     [
         ([[0, 0, 9]], RequestRefusedError, "7.200 m too far out"),
-        ([[0.5, 0.5, 1], [0.5, 0.5, 1]], RequestRefusedError, "remove one of them"),
         ([["a", 1, 2]], InputError, "no numbers"),
         ([[np.nan, 0, 1]], InputError, "waypoint 1"),
         ([1, 2, 3], InputError, "rows of x, y, z"),
@@ -100,6 +103,69 @@ def test_what_cannot_be_flown_is_refused_in_words_and_the_flight_goes_on(flown, 
     assert np.linalg.norm(np.subtract(vehicle.position, [1, 0, 1])) < 0.1
     vehicle.land()
     assert vehicle.outcome.exit_code is ExitCode.OK
+
+
+def test_to_be_asked_to_go_where_it_is_is_done(flown):
+    vehicle, _ = flown
+    here = vehicle.position
+    assert here != (0.0, 0.0, 0.8)
+    for answer in (vehicle.fly([here]), vehicle.extend([here, here]), vehicle.replace([here, here])):
+        assert answer.verdict is PathVerdict.ACCEPTED
+    assert vehicle.wait(0.1)
+    vehicle.land()
+    assert vehicle.outcome.exit_code is ExitCode.OK
+
+
+def test_the_same_target_ten_times_a_second_is_flown_like_a_target_asked_for_once(flown):
+    vehicle, _ = flown
+    begun = vehicle.time
+    vehicle.fly([[1, 0, 1]])
+    arrives = None
+    for _ in range(60):
+        asked = vehicle.time
+        assert vehicle.fly([[1, 0, 1]]).verdict is PathVerdict.ACCEPTED
+        arrives = arrives or (vehicle.time if vehicle.resting else None)
+        vehicle.sleep(max(0.1 - (vehicle.time - asked), 0.0))
+    assert arrives - begun < 2.5
+    assert np.linalg.norm(np.subtract(vehicle.position, [1, 0, 1])) < 0.05
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("wish", [Wish.REPLACE, Wish.EXTEND])
+def test_waypoints_that_repeat_the_one_before_count_once(flown, wish, moving):
+    vehicle, flight = flown
+    before = vehicle.position
+    if moving:
+        before = (1.0, 2.0, 1.0)
+        vehicle.fly([before])
+        vehicle.sleep(0.6)
+    first = [before] if wish is Wish.EXTEND or not moving else []
+    twice = [*first, [0.5, 0.5, 1], [0.5, 0.5, 1.004], [-0.5, 0.5, 1], [-0.5, 0.5, 1]]
+    assert vehicle.ask(wish, twice).verdict is PathVerdict.ACCEPTED
+    assert len(flight.planner.held.ahead) == (3 if moving and wish is Wish.EXTEND else 2)
+    vehicle.wait()
+    assert np.linalg.norm(np.subtract(vehicle.position, [-0.5, 0.5, 1])) < 0.05
+
+
+def test_a_vehicle_asked_to_rest_where_it_passes_comes_back_there(flown):
+    vehicle, flight = flown
+    vehicle.fly([[1, 0, 1], [1, 2, 1]])
+    vehicle.sleep(0.9)
+    joint = vehicle.time - vehicle._begun + 0.2
+    place = flight.planner.held.flown.at(joint).position
+    assert vehicle.speed > 0.8
+    assert vehicle.fly([place]).verdict is PathVerdict.ACCEPTED
+    vehicle.wait()
+    assert np.linalg.norm(np.subtract(vehicle.position, place)) < 0.05
+
+
+def test_a_path_flown_already_is_left_for_a_shorter_one(flown):
+    """Its last waypoint alone is another request, which leaves out those before."""
+    vehicle, _ = flown
+    round_about = vehicle.fly([[1, 0, 1], [1, 1, 1], [0.3, 0.3, 1]])
+    assert vehicle.fly([[1, 0, 1], [1, 1, 1], [0.3, 0.3, 1]]).splice < 0  # nothing new
+    straight = vehicle.fly([[0.3, 0.3, 1]])
+    assert straight.ends < round_about.ends - 1.0
 
 
 def test_slower_counts_for_what_is_ahead_and_for_what_comes_until_faster_undoes_it(flown):
@@ -215,6 +281,34 @@ def test_a_take_off_that_cannot_be_is_refused_and_nothing_is_armed(limits):
         with SteeredVehicle(flight, limits, uri="sim://0") as vehicle, pytest.raises((InfeasibleError, InputError)):
             vehicle.take_off(height)
         assert vehicle.outcome is None
+
+
+def test_a_take_off_that_takes_too_long_has_landed_when_that_is_said(limits):
+    slow = replace(limits, ground=replace(limits.ground, take_off_speed=0.004))
+    flight = SteppedSteering(slow)
+    with SteeredVehicle(flight, slow, uri="sim://0") as vehicle:
+        with pytest.raises(PreflightError, match="did not hover"):
+            vehicle.take_off(0.8)
+        assert flight.lab.truth().position[:, 2].max() > 0.2
+        assert vehicle.outcome is not None
+        assert not flight.lab.truth().motor[-1].any()
+
+
+def test_a_flight_that_does_not_end_is_no_flight_that_has_landed(flown, monkeypatch):
+    vehicle, flight = flown
+    monkeypatch.setattr(flight, "order", lambda _: None)
+    with pytest.raises(LinkError, match="not ended"):
+        vehicle.land()
+    monkeypatch.undo()
+
+
+def test_a_vehicle_that_was_cut_does_not_take_off(limits):
+    flight = SteppedSteering(limits)
+    with SteeredVehicle(flight, limits, uri="sim://0") as vehicle:
+        vehicle.cut()
+        with pytest.raises(FlightEndedError, match="cut"):
+            vehicle.take_off()
+    assert not flight.lab.truth().motor.any()
 
 
 def test_a_failed_preflight_check_is_said_in_words(limits):

@@ -15,16 +15,16 @@ from enum import IntEnum
 from types import FrameType, TracebackType
 from typing import Any
 
-_ESCAPE_WAIT = 0.03  # s in which the rest of an arrow key follows its Esc
+from cfplan.flight.clock import REAL_CLOCK
+
+_ESCAPE_WAIT = 0.03  # s within which the rest of an arrow key follows its Esc
 _LONGEST_BURST = 1 << 16  # bytes that are read in one go
-_SEQUENCE = re.compile(rb"\x1b?\x1b(\[[0-?]*[!-/]*[@-~]?|O[0-9;]*[A-Za-z]?)")  # an arrow or function key, or its start
-_KEYS = re.compile(rb"(?P<escapes>\x1b+)(?P<next>[^\x1b])?|(?P<space> )", re.DOTALL)
-_ALT = b"\x00"  # stands for a sequence: Esc before it is Alt
 _ARROWS = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}  # by the letter that ends the sequence
-_TYPED = re.compile(
-    rb"\x1b+(?:\[[0-9;]*|O)(?P<arrow>[A-D])|\x1b+(?:\[[0-?]*[!-/]*[@-~]?|O[0-9;]*[A-Za-z]?|.)?|(?P<other>[!-~])",
+_KEY = re.compile(  # an arrow or function key as terminals send it, else a single byte
+    rb"\x1b(?:(?:\[[0-9;]*|O)(?P<arrow>[A-D])|\[\[[A-E]|\[[0-?]*[!-/]*[@-Z\\-~]|O[0-9;]*[A-Za-z])|(?P<byte>.)",
     re.DOTALL,
 )
+_BEGUN = re.compile(rb"\x1b(?:\[\[|\[[0-?]*[!-/]*|O[0-9;]*)?\Z")  # what may become an arrow or function key yet
 _MOST_TYPED = 1000  # keys that are kept until somebody asks for them
 
 
@@ -34,6 +34,9 @@ class Order(IntEnum):
     FINISH = 0  # fly what is committed to its end, then land, without waiting for a new plan
     LAND = 1
     CUT = 2
+
+
+_ORDERS = {b" ": Order.LAND, b"\x1b": Order.CUT}
 
 
 @dataclass
@@ -53,25 +56,23 @@ class HeldOrders:
 
 
 def orders_of(keys: bytes) -> list[Order]:
-    """Return the orders of a burst of typed keys that silence follows: space lands, Esc cuts.
+    """Return the orders in a burst of typed keys: space lands, Esc cuts.
 
-    Only an Esc that stands alone or is typed twice cuts: before another key it is Alt, or begins an arrow key.
+    Each Esc cuts that does not begin an arrow or function key, so also one before another key. Alt with a key sends
+    the same bytes and cuts too: a vehicle cut by mistake is better than one that is not cut.
     """
-    orders = []
-    for key in _KEYS.finditer(_SEQUENCE.sub(_ALT, keys)):
-        escapes = len(key["escapes"] or b"")
-        if escapes > 1 or (escapes == 1 and key["next"] is None):
-            orders += [Order.CUT] * escapes
-        if key["space"] or key["next"] == b" ":
-            orders.append(Order.LAND)
-    return orders
+    return [_ORDERS[key["byte"]] for key in _KEY.finditer(keys) if key["byte"] in _ORDERS]
 
 
 def keys_of(keys: bytes) -> list[str]:
     """Return the keys of a burst that are no orders: up, down, left, right, and printable characters but for space."""
-    typed = _TYPED.finditer(keys)
-    names = [_ARROWS[key["arrow"]] if key["arrow"] else (key["other"] or b"").decode("ascii") for key in typed]
-    return [name for name in names if name]
+    names = []
+    for key in _KEY.finditer(keys):
+        if key["arrow"]:
+            names.append(_ARROWS[key["arrow"]])
+        elif key["byte"] and b"!" <= key["byte"] <= b"~":
+            names.append(key["byte"].decode("ascii"))
+    return names
 
 
 class Keyboard:
@@ -141,7 +142,7 @@ class Keyboard:
         return self._terminal[0] if self._terminal is not None else None
 
     def orders(self) -> list[Order]:
-        """Return the orders since the last call. Takes 30 ms after an Esc, else does not wait."""
+        """Return the orders since the last call. Takes 30 ms where they end with an Esc, else does not wait."""
         if self._terminal is not None:
             burst = _burst(self._terminal[0])
             self._orders.extend(orders_of(burst))
@@ -163,16 +164,20 @@ class Keyboard:
 
 
 def _burst(terminal: int) -> bytes:
-    """Return what was typed, and after an Esc what follows it at once."""
-    keys = b""
+    """Return what was typed, and what follows its last Esc within 30 ms unless an Esc before it cuts already."""
+    keys, until = b"", dict[int, float]()  # s until which the rest of a key is waited for, by where it begins
     with contextlib.suppress(OSError):  # it has closed
         while len(keys) < _LONGEST_BURST:
-            if keys.endswith(b"\x1b"):
-                select.select([terminal], [], [], _ESCAPE_WAIT)
             more = os.read(terminal, 4096)
-            if not more:
-                break
             keys += more
+            if more:
+                continue
+            begun = _BEGUN.search(keys)
+            if begun is None or Order.CUT in orders_of(keys[: begun.start()]):
+                break
+            left = until.setdefault(begun.start(), REAL_CLOCK.now() + _ESCAPE_WAIT) - REAL_CLOCK.now()
+            if left <= 0.0 or not select.select([terminal], [], [], left)[0]:
+                break
     return keys
 
 

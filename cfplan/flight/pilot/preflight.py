@@ -74,7 +74,14 @@ def check_firmware(snapshot: PreflightSnapshot) -> Check:
 
 
 def firmware_check(firmware: str, limits: Limits) -> Check:
-    oldest, found = limits.firmware.oldest, version_of(firmware)
+    """Compare the version with the oldest and the newest that may fly: of a newer one nothing is known."""
+    oldest, newest, found = limits.firmware.oldest, limits.firmware.newest, version_of(firmware)
+    if found > newest:
+        return Check(
+            "firmware", firmware, "≤ " + version_text(newest), False,
+            "time-outs and controller were read from older firmware: fly with that; or compare them, and write "
+            f'newest: "{version_text(found)}" under firmware: in safety.yaml',
+        )  # fmt: skip
     return Check(
         "firmware", firmware or "unknown", "≥ " + version_text(oldest), bool(found) and found >= oldest,
         "update the vehicle's firmware: older filters go wrong with yaw beyond 90°",
@@ -134,7 +141,7 @@ def timeouts_check(firmware: str) -> Check:
         found = None
     text = f"level after {found.level_out:g} s, off after {found.motors_off:g} s" if found else "unknown"
     if version > NEWEST_KNOWN:
-        text += f"; the firmware is newer than {version_text(NEWEST_KNOWN)}, the newest that cfplan was read from"
+        text += f" as in {version_text(NEWEST_KNOWN)}, the newest that cfplan knows"
     return Check(
         "supervisor's time-outs", text, f"level after {assumed.level_out:g} s, off after {assumed.motors_off:g} s",
         found == assumed, "fly with a firmware from 2023.06 on",

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing.connection import Connection, wait
@@ -30,7 +30,7 @@ from cfplan.flight.telemetry import Telemetry
 
 _SWITCH_INTERVAL = 0.0001  # s; the stream gets the interpreter back after at most this
 _THREAD_PRIORITY = STREAM_PRIORITY // 2
-_POLL_PERIOD = 0.05  # s
+_POLL_PERIOD = 0.02  # s between looks for orders that are no keys
 _LANDING_TIME = 60.0  # s that a pilot without a main process has to land
 
 
@@ -103,7 +103,7 @@ def fly(
     drivers: Sequence[type] = (),
     pilot: PilotProcess | None = None,
     on_telemetry: Callable[[Telemetry], None] = lambda _: None,
-    more_orders: Callable[[], Sequence[Order]] = tuple,
+    more_orders: Callable[[], Iterable[Order]] = tuple,
     keyboard: Keyboard | None = None,
 ) -> FlightOutcome:
     """Fly a mission and return when the vehicle is down. Call from the main thread, so that Ctrl-C lands.
@@ -111,20 +111,22 @@ def fly(
     `pilot` is a process that was started before, with `drivers`; without one it is started now. `pose_source` and
     `drivers` go there by pickle. `on_telemetry` gets every message, in order; what it raises is raised here after the
     vehicle has landed. `more_orders` returns the orders since its last call that came neither by key nor by signal; it
-    must not wait. `keyboard` is one that was entered before; without one it is entered for the flight. Raises
-    LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose source raises.
+    must not wait, and a thread calls it. `keyboard` is one that was entered before; without one it is entered for the
+    flight. Raises LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose source
+    raises.
     """
     held = Keyboard() if keyboard is None else contextlib.nullcontext(keyboard)
     with held as entered, pilot or start_pilot(drivers) as started:
         started.assign(mission, uri, pose_source)
-        attendant = Attendant(partial(_send, started.orders), entered, on_telemetry, more_orders)
-        return _attend(started.process, started.telemetry, entered, attendant)
+        attendant = Attendant(partial(_send, started.orders, threading.Lock()), entered, on_telemetry, more_orders)
+        with _orders_passed(entered, attendant):
+            return _attend(started.process, started.telemetry, attendant)
 
 
 class Attendant:
     """The main process's side of a flight: it passes telemetry one way and orders the other.
 
-    A listener that fails lands the vehicle, and its failure is raised when the flight has ended.
+    A listener or a source of orders that fails lands the vehicle, and its failure is raised when the flight has ended.
     """
 
     def __init__(
@@ -132,15 +134,19 @@ class Attendant:
         give: Callable[[Order], None],
         keyboard: Keyboard,
         on_telemetry: Callable[[Telemetry], None],
-        more_orders: Callable[[], Sequence[Order]],
+        more_orders: Callable[[], Iterable[Order]],
     ):
         self._give, self._keyboard, self._on_telemetry, self._more_orders = give, keyboard, on_telemetry, more_orders
-        self.failure: BaseException | None = None  # of a listener
+        self.failure: BaseException | None = None  # the first of a listener or a source of orders
 
     def pass_orders(self) -> None:
         """Give the pilot the orders since the last call."""
-        for order in (*self._keyboard.orders(), *self._more_orders()):
-            self._give(order)
+        for source in (self._keyboard.orders, self._more_orders):
+            try:
+                for order in source():
+                    self._give(order)
+            except BaseException as error:  # the other source is asked still
+                self._fail(error)
 
     def tell(self, messages: Sequence[Telemetry]) -> None:
         """Tell the listener, unless it has failed."""
@@ -149,8 +155,12 @@ class Attendant:
                 for message in messages:
                     self._on_telemetry(message)
             except BaseException as error:  # a fault here must not break the flight
-                self.failure = error
-                self._give(Order.LAND)
+                self._fail(error)
+
+    def _fail(self, error: BaseException) -> None:
+        if self.failure is None:
+            self.failure = error
+            self._give(Order.LAND)
 
     def conclude(self, last: FlightOutcome | CfplanError) -> FlightOutcome:
         """Return the outcome of a flight by the pilot's last message. Raises what failed, here or there."""
@@ -161,16 +171,28 @@ class Attendant:
         return last
 
 
-def _attend(process: BaseProcess, telemetry: Connection, keyboard: Keyboard, attendant: Attendant) -> FlightOutcome:
-    """Attend to a pilot's process until its last message."""
+@contextlib.contextmanager
+def _orders_passed(keyboard: Keyboard, attendant: Attendant) -> Iterator[None]:
+    """Pass orders to the pilot during the block, by a thread, so that none waits for a listener."""
+    ended = threading.Event()
+
+    def pass_orders() -> None:
+        while not ended.is_set():
+            wait([keyboard.descriptor] if keyboard.descriptor is not None else [], _POLL_PERIOD)
+            attendant.pass_orders()
+
+    passing = threading.Thread(target=pass_orders, name="keys", daemon=True)
+    passing.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        passing.join()
+
+
+def _attend(process: BaseProcess, telemetry: Connection, attendant: Attendant) -> FlightOutcome:
+    """Pass on the telemetry of a pilot's process until its last message."""
     while True:
-        watched: list[Connection | int] = [telemetry]
-        if keyboard.descriptor is not None:
-            watched.append(keyboard.descriptor)
-        ready = wait(watched, _POLL_PERIOD)
-        attendant.pass_orders()
-        if telemetry not in ready:
-            continue
         try:
             message = telemetry.recv()
         except (EOFError, OSError):
@@ -188,8 +210,8 @@ def _died(process: BaseProcess) -> LinkError:
     )
 
 
-def _send(orders: Connection, order: Order) -> None:
-    with contextlib.suppress(OSError):  # a pilot that is gone is noticed by its telemetry
+def _send(orders: Connection, lock: threading.Lock, order: Order) -> None:
+    with lock, contextlib.suppress(OSError):  # a pilot that is gone is noticed by its telemetry
         orders.send(order)
 
 
@@ -207,7 +229,7 @@ def _signals_ignored():
 
 
 class OrderReceiver(HeldOrders):
-    """Orders of the main process to the pilot, read by a thread; `gone` when the main process has ended."""
+    """Orders of the main process to the pilot, read by a thread; `gone` when they end, however they do."""
 
     def __init__(self, connection: Connection):
         super().__init__()
@@ -215,11 +237,10 @@ class OrderReceiver(HeldOrders):
         threading.Thread(target=self._run, name="orders", daemon=True).start()
 
     def _run(self) -> None:
-        try:
+        with contextlib.suppress(Exception):  # also of what is no order: after it none can be trusted to be read
             while True:
                 self.give(self._connection.recv())
-        except (EOFError, OSError, TypeError):  # TypeError: it was closed here while it was read
-            self.gone = True
+        self.gone = True
 
 
 def _run(

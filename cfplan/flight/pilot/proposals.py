@@ -121,7 +121,10 @@ class ReceivedProposals(HeldProposals):
     def _read(self) -> None:
         with contextlib.suppress(EOFError, OSError, TypeError):  # TypeError: it was closed here while it was read
             while True:
-                if proposal := Proposal.of_bytes(self._connection.recv_bytes(LONGEST_MESSAGE)):
+                message, proposal = self._connection.recv_bytes(LONGEST_MESSAGE), None
+                with contextlib.suppress(Exception):  # what cannot be read is no proposal; the next one may be
+                    proposal = Proposal.of_bytes(message)
+                if proposal is not None:
                     self._came = proposal.checksum, REAL_CLOCK.now()
                     self.give(proposal)
 

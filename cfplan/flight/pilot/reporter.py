@@ -38,6 +38,8 @@ class Reporter:
                 self._connection.send(batch)
         except OSError:
             return None  # no reader any more; the pilot learns that from its orders
+        except Exception:  # what cannot be sent is left out, not all that comes after it
+            self.dropped += len(batch)
         return _PERIOD
 
     def close(self, last: object) -> None:

@@ -11,6 +11,7 @@ import textwrap
 import pytest
 from waiting import until
 
+from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.keys import Keyboard, Order, keys_of, orders_of
 
 
@@ -28,20 +29,24 @@ from cfplan.flight.pilot.keys import Keyboard, Order, keys_of, orders_of
         (b"\x1b[A\x1b", [Order.CUT]),
         (b"\x1b\x1b", [Order.CUT, Order.CUT]),
         (b"\x1b\x1bx", [Order.CUT, Order.CUT]),
-        (b"\x1bx", []),
-        (b"\x1b\xc3\xa9", []),
-        (b"\x1bO", []),
-        (b"\x1b[", []),
-        (b"\x1b[1;", []),
-        (b"\x1b ", [Order.LAND]),
-        (b"\x1bO ", [Order.LAND]),
-        (b"\x1b\x1b[A", []),
+        (b"\x1bx", [Order.CUT]),
+        (b"\x1b\xc3\xa9", [Order.CUT]),
+        (b"\x1bO", [Order.CUT]),
+        (b"\x1b[", [Order.CUT]),
+        (b"\x1b[1;", [Order.CUT]),
+        (b"\x1b ", [Order.CUT, Order.LAND]),
+        (b"\x1bO ", [Order.CUT, Order.LAND]),
+        (b"\x1b\x1b[A", [Order.CUT]),
+        (b"\x1bq", [Order.CUT]),
+        (b"qqq\x1bqqq", [Order.CUT]),
+        (b"\x1b[A\x1b[A\x1b\x1b[A", [Order.CUT]),
+        (b"\x1b[24~\x1b[1;5P", []),
         (b"\x1b[[A", []),
         (b"\x1b[A" * 1000, []),
         (b"\x1b[A" * 1000 + b"\x1b", [Order.CUT]),
     ],
 )
-def test_space_lands_and_esc_cuts_and_arrows_do_neither(keys, orders):
+def test_space_lands_and_esc_cuts_whatever_is_typed_with_it_and_arrows_do_neither(keys, orders):
     assert orders_of(keys) == orders
 
 
@@ -53,10 +58,10 @@ def test_space_lands_and_esc_cuts_and_arrows_do_neither(keys, orders):
         (b"\x1bOA\x1b[1;5D", ["up", "left"]),
         (b"wW1;", ["w", "W", "1", ";"]),
         (b"a b\x1b", ["a", "b"]),
-        (b"\x1bxa", ["a"]),
-        (b"\x1b[15~\x1bOPa", ["a"]),
+        (b"\x1bxa", ["x", "a"]),
+        (b"\x1b[15~\x1bOP\x1b[[Aa", ["a"]),
         (b"\r\n\t\x00\xc3\xa9", []),
-        (b"\x1b[", []),
+        (b"\x1b[", ["["]),
     ],
 )
 def test_other_keys_have_names(keys, names):
@@ -95,6 +100,7 @@ def test_signal_handlers_are_given_back_even_after_an_error():
 
 _PROGRAM = """
 import sys, termios, time
+from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.keys import Keyboard
 before = termios.tcgetattr(0)
 try:
@@ -113,19 +119,61 @@ print("restored" if termios.tcgetattr(0) == before else "changed", flush=True)
 """
 
 
-def test_a_burst_of_arrow_keys_is_not_torn(monkeypatch):
+@pytest.fixture
+def typed(monkeypatch):
+    """A keyboard, and what types bytes on its terminal."""
     ours, theirs = pty.openpty()
     with os.fdopen(theirs) as terminal:
         monkeypatch.setattr("sys.stdin", terminal)
         monkeypatch.setattr("os.tcgetpgrp", lambda _: os.getpgrp())
         with Keyboard() as keyboard:
-            for burst in (b"\x1b[A" * 100, b"x" + b"\x1b[A" * 100, b"xy" + b"\x1b[A" * 100, b"x" * 63 + b"\x1bx"):
-                os.write(ours, burst)
-                assert keyboard.orders() == []
-                assert keyboard.orders() == []
-            os.write(ours, b"\x1b[A" * 100 + b"\x1b")
-            assert keyboard.orders() == [Order.CUT]
+            yield keyboard, lambda keys: os.write(ours, keys)
         os.close(ours)
+
+
+def test_a_burst_of_arrow_keys_is_not_torn(typed):
+    keyboard, press = typed
+    for burst in (b"\x1b[A" * 100, b"x" + b"\x1b[A" * 100, b"xy" + b"\x1b[A" * 100, b"x" * 63):
+        press(burst)
+        assert keyboard.orders() == []
+        assert keyboard.orders() == []
+    press(b"\x1b[A" * 100 + b"\x1b")
+    assert keyboard.orders() == [Order.CUT]
+
+
+@pytest.mark.parametrize("torn", [(b"\x1b", b"[A"), (b"\x1b[", b"A"), (b"\x1b[1", b";5A"), (b"\x1b", b"[", b"A")])
+def test_an_arrow_key_that_comes_in_pieces_does_not_cut(typed, monkeypatch, torn):
+    keyboard, press = typed
+    pieces = list(torn)
+
+    def next_piece_comes(*_):
+        if not pieces:
+            return [], [], []
+        press(pieces.pop(0))
+        return [0], [], []
+
+    press(pieces.pop(0))
+    monkeypatch.setattr("select.select", next_piece_comes)
+    assert keyboard.orders() == []
+    assert keyboard.typed() == ["up"]
+
+
+@pytest.mark.parametrize(("first", "held"), [(b"\x1b", b"\x1b"), (b"\x1b[", b"0"), (b"ww\x1bw", b"w")])
+def test_esc_cuts_while_a_key_is_held_down(typed, monkeypatch, first, held):
+    keyboard, press = typed
+    select_now, repeats = select.select, 0
+
+    def key_repeats(sources, *_):
+        nonlocal repeats
+        repeats += 1
+        REAL_CLOCK.sleep(0.01)  # a hundred a second
+        press(held)
+        return select_now(sources, [], [], 0.1)
+
+    press(first)
+    monkeypatch.setattr("select.select", key_repeats)
+    assert Order.CUT in keyboard.orders()
+    assert repeats < 10
 
 
 def test_ctrl_s_does_not_stop_the_output(monkeypatch):
@@ -143,6 +191,7 @@ def test_ctrl_s_does_not_stop_the_output(monkeypatch):
 
 _LEFT_ALONE = """
 import sys, time
+from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.keys import Keyboard
 with Keyboard() as keyboard:
     print("ready", flush=True)
@@ -169,6 +218,7 @@ def test_a_terminal_that_closes_lands_and_output_to_it_ends_nothing(tmp_path):
 
 _PIPED = """
 import os, sys, time
+from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.keys import Keyboard
 reading, writing = os.pipe()
 os.write(writing, b"0 1 2 \\x1b")

@@ -109,10 +109,17 @@ def test_a_vehicle_that_does_not_tell_its_firmware_is_refused(ground):
     assert failures(replace(ground, firmware="")) == ["firmware", "supervisor's time-outs"]
 
 
-def test_a_firmware_newer_than_those_known_flies_and_says_so(ground):
-    newer = replace(ground, firmware="2031.11")
-    assert failures(newer) == []
-    assert any("newer than 2026.08" in check.value for check in run_checks(newer))
+@pytest.mark.parametrize("firmware", ["2026.08.1", "2026.09", "2031.11"])
+def test_a_firmware_newer_than_those_known_is_refused_unless_the_limits_name_it(ground, mission, firmware):
+    newer = replace(ground, firmware=firmware)
+    (refused,) = (check for check in run_checks(newer) if not check.passed)
+    assert (refused.name, refused.value) == ("firmware", firmware)
+    assert "newest" in refused.hint
+    assert firmware in refused.hint
+    named = replace(mission.limits, firmware=replace(mission.limits.firmware, newest=version_of(firmware)))
+    allowed = replace(newer, mission=replace(mission, limits=named))
+    assert failures(allowed) == []
+    assert any("newest that cfplan knows" in check.value for check in run_checks(allowed))
 
 
 def outside(rule, limits):

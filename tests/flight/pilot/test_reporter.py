@@ -117,3 +117,13 @@ def test_a_main_process_that_ends_is_noticed(pipe):
     writer.close()
     assert until(lambda: orders.gone)
     assert orders.worst is None
+
+
+def test_a_message_that_cannot_be_sent_costs_none_that_comes_later(pipe):
+    reader, writer = pipe
+    report = Reporter(writer)
+    report(lambda: "no pickle")
+    assert until(lambda: report.dropped == 1)
+    report(event(1))
+    report.close("done")
+    assert received(reader) == ([event(1)], "done")
