@@ -87,7 +87,7 @@ def refinements(
         for state, rows in ((task.start, near[:2]), (task.end, near[-3:-1])):
             if state:
                 rows[:, 1] = end_coefficients(state.yaw, state.dyaw * step)
-    if len(windows_of(nodes, *far_enough(window, step, limits))) > 1:
+    if len(windows_of(nodes, *far_enough(window, path, nodes, limits))) > 1:
         joined = by_windows(whole, window, partial(_refine_window, task), near)
         yield _solution(whole, joined, began, task.deadline)
         return

@@ -4,7 +4,6 @@ Each window begins in the state where the kept part of the one before ends, and 
 than it takes to brake. Joints are crossed a little below the limits.
 """
 
-import math
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.deadline import Deadline
+from cfplan.geometry.path import Path
 from cfplan.planners.expert.layout import Shape, layout_of
 from cfplan.planners.expert.problem import Ends, Segment
 from cfplan.planners.expert.tightening import Tightened
@@ -51,9 +51,13 @@ def windows_of(nodes: int, kept: int, ahead: int) -> list[tuple[int, int]]:
     return [(first, nodes if first == begins[-1] else first + kept + ahead) for first in begins]
 
 
-def far_enough(size: WindowSize, step: float, limits: PlanLimits) -> WindowSize:
-    """Return the size, larger where that many intervals of a fine grid are too short to brake in."""
-    needed = math.ceil((limits.speed**2 / limits.acceleration + LOOKAHEAD) / step)
+def far_enough(size: WindowSize, path: Path, nodes: int, limits: PlanLimits) -> WindowSize:
+    """Return the size, larger where that many of the path's `nodes` intervals are too short to brake in somewhere."""
+    spacing = np.linalg.norm(path(np.linspace(0.0, path.end, nodes + 1), 1), axis=1) * (path.end / nodes)
+    length = np.append(0.0, np.cumsum((spacing[1:] + spacing[:-1]) / 2.0))  # m, of the path up to each node
+    joints = np.arange(size.kept, nodes)  # there is none before
+    seen = np.searchsorted(length, length[joints] + limits.speed**2 / limits.acceleration + LOOKAHEAD)
+    needed = int((np.minimum(seen, nodes) - joints).max(initial=0))
     return WindowSize(max(size.kept, 2 * needed), max(size.ahead, needed))
 
 
@@ -71,7 +75,7 @@ def by_windows(
     shape, ends = whole.layout.shape, whole.ends
     nodes, step = shape.nodes, whole.path.end / shape.nodes
     coefficients = np.zeros((nodes + 3, 2 if shape.free_yaw else 1)) if near is None else near.copy()
-    kept, ahead = far_enough(size, step, whole.limits)
+    kept, ahead = far_enough(size, whole.path, nodes, whole.limits)
     windows = windows_of(nodes, kept, ahead)
     iterations = rounds = 0
     for number, (first, last) in enumerate(windows):
