@@ -193,19 +193,19 @@ class _Compiling(event.Listener):
 
     depth = 0
     collector_was_on = False
-    begun, seconds = 0.0, 0.0  # s of the processor
+    begun, seconds = 0.0, 0.0  # s
 
     def on_start(self, event: Any) -> None:
         if self.depth == 0:
             self.collector_was_on = gc.isenabled()
             gc.disable()
-            self.begun = time.process_time()
+            self.begun = time.monotonic()
         self.depth += 1
 
     def on_end(self, event: Any) -> None:
         self.depth -= 1
         if self.depth == 0:
-            self.seconds += time.process_time() - self.begun
+            self.seconds += time.monotonic() - self.begun
             if self.collector_was_on:
                 gc.enable()
 
@@ -219,30 +219,9 @@ def compiles() -> bool:
     return _listener.depth > 0
 
 
-_AGE = 1e-3  # s on the wall, for which a reading of the processor's clock does; one takes up to 80 µs
-_reading: tuple[float, float] | None = None  # when it was taken, by perf_counter, and what it was
-
-
 def time_without_compiling() -> float:
-    """Return the processor time of this process, s, less what compiling took: what its own work takes every time.
-
-    It may be a millisecond old, as solvers ask for it at every step.
-    """
-    global _reading
-    now = time.perf_counter()
-    reading = _reading
-    if reading is None or now - reading[0] > _AGE:
-        _reading = reading = now, time.process_time() - _listener.seconds
-    return reading[1]
-
-
-def _forget_reading() -> None:
-    global _reading
-    _reading = None  # a new process has a clock of its own
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_reading)
+    """Return the time, s, on a clock that stands still while this process compiles."""
+    return (_listener.begun if _listener.depth else time.monotonic()) - _listener.seconds
 
 
 class _Library(JITCodeLibrary):
