@@ -35,7 +35,6 @@ from cfplan.planners.expert.windows import (
     WindowSize,
     by_windows,
     failed_status,
-    far_enough,
     solution_of,
     windows_of,
 )
@@ -87,7 +86,7 @@ def refinements(
         for state, rows in ((task.start, near[:2]), (task.end, near[-3:-1])):
             if state:
                 rows[:, 1] = end_coefficients(state.yaw, state.dyaw * step)
-    if len(windows_of(nodes, *far_enough(window, path, nodes, limits))) > 1:
+    if len(windows_of(path, nodes, window, limits)) > 1:
         joined = by_windows(whole, window, partial(_refine_window, task), near)
         yield _solution(whole, joined, began, task.deadline)
         return

@@ -53,14 +53,20 @@ def test_a_profile_near_the_experts_becomes_as_fast_and_certified_in_fewer_steps
     assert solution.stats["iterations"] < from_afar.stats["iterations"]
 
 
-def test_windows_cover_a_path_and_each_looks_ahead():
-    kept, ahead = LONG_WINDOW
+@pytest.mark.parametrize("spacing", [1.0, 0.1, 0.01])
+def test_windows_cover_a_path_and_each_looks_ahead_far_enough_to_brake(spacing):
+    (kept, ahead), limits = LONG_WINDOW, LIMIT_SETS["hardware"].limits
     for nodes in (1, 100, kept + ahead, kept + ahead + 1, 1000):
-        windows = windows_of(nodes, kept, ahead)
+        line = min_snap([[0, 0, 1], [nodes * spacing, 0, 1]])
+        windows = windows_of(line, nodes, LONG_WINDOW, limits)
         assert windows[0][0] == 0
-        assert windows[-1][1] == nodes
-        for (_, ends), (begins, _) in itertools.pairwise(windows):
-            assert ends - begins == ahead
+        assert windows[-1][1:] == (nodes, nodes)
+        places = line(np.linspace(0.0, line.end, nodes + 1))[:, 0]
+        for (begins, left, ends), (next_begins, _, _) in itertools.pairwise(windows):
+            assert left == next_begins
+            assert left - begins >= kept
+            assert ends - left >= ahead
+            assert places[ends] - places[left] > limits.speed**2 / limits.acceleration
 
 
 def test_a_long_path_by_windows_is_as_fast_as_by_the_whole_and_continuous_at_joints():
