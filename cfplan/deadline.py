@@ -1,7 +1,7 @@
 """Deadline: the moment by which planning answers with what it has.
 
 Whoever works in rounds asks between two of them whether it has passed. Where it has not, it changes nothing. Time is
-the processor's, which planning keeps busy, and compiling does not count: what else the computer does changes no plan.
+what a user waits, however little of the processor planning gets; compiling does not count.
 """
 
 import math

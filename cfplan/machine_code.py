@@ -2,7 +2,8 @@
 
 Modules take `njit` from here. What a function is compiled to is kept in a file whose name hashes everything that it
 depends on: the module's source, the sources of all cfplan modules that it imports, directly or not, the versions of the
-compilers, the processor, and the types of the arguments. So no file can be out of date, and none is ever changed.
+compilers, the processor, and the types of the arguments. So no file can be out of date, and none is ever changed. Where
+a source has changed since this process began, it may have imported the old one: then it compiles for itself alone.
 Where two processes need the same function, one compiles it and the other waits. Where the folder cannot be written,
 each process compiles for itself.
 """
@@ -17,6 +18,7 @@ import os
 import pickle
 import platform
 import re
+import secrets
 import sys
 import tempfile
 import threading
@@ -43,6 +45,7 @@ from numba.core.types import Omitted
 from numba.core.typing.typeof import Purpose, typeof
 
 PACKAGE = Path(__file__).parent
+_BEGUN = time.time()
 _IMPORT = re.compile(r"^\s*from (cfplan[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 _KEPT_DAYS = 60.0  # after which files that no process has read are deleted
 _DIGEST = 32  # bytes of the checksum before a file's content
@@ -82,7 +85,10 @@ def _machine() -> bytes:
 
 @lru_cache(maxsize=512)
 def _source(module: str) -> tuple[str, tuple[str, ...]]:
-    """Return a module's hash, and the cfplan modules that it imports; none where the name is no module."""
+    """Return a module's hash, and the cfplan modules that it imports; none where the name is no module.
+
+    The hash is one that no other process has where the file has changed since this one began.
+    """
     first, *parts = module.split(".")
     if first == PACKAGE.name:
         path = PACKAGE.joinpath(*parts)
@@ -91,13 +97,14 @@ def _source(module: str) -> tuple[str, tuple[str, ...]]:
         path = Path(getattr(sys.modules.get(module), "__file__", None) or "none")
     try:
         text = path.read_bytes()
+        changed = path.stat().st_ctime > _BEGUN
     except OSError:
         return "", ()
     imported: list[str] = []
     for package, names in _IMPORT.findall(text.decode()):
         members = (name.split()[0] for name in names.strip("()").split(",") if name.strip())
         imported += [package, *(f"{package}.{member}" for member in members)]
-    return hashlib.sha256(text).hexdigest(), tuple(imported)
+    return secrets.token_hex() if changed else hashlib.sha256(text).hexdigest(), tuple(imported)
 
 
 @lru_cache(maxsize=512)
@@ -186,19 +193,19 @@ class _Compiling(event.Listener):
 
     depth = 0
     collector_was_on = False
-    begun, seconds = 0.0, 0.0  # s of the processor
+    begun, seconds = 0.0, 0.0  # s
 
     def on_start(self, event: Any) -> None:
         if self.depth == 0:
             self.collector_was_on = gc.isenabled()
             gc.disable()
-            self.begun = time.process_time()
+            self.begun = time.monotonic()
         self.depth += 1
 
     def on_end(self, event: Any) -> None:
         self.depth -= 1
         if self.depth == 0:
-            self.seconds += time.process_time() - self.begun
+            self.seconds += time.monotonic() - self.begun
             if self.collector_was_on:
                 gc.enable()
 
@@ -212,30 +219,9 @@ def compiles() -> bool:
     return _listener.depth > 0
 
 
-_AGE = 1e-3  # s on the wall, for which a reading of the processor's clock does; one takes up to 80 µs
-_reading: tuple[float, float] | None = None  # when it was taken, by perf_counter, and what it was
-
-
 def time_without_compiling() -> float:
-    """Return the processor time of this process, s, less what compiling took: what its own work takes every time.
-
-    It may be a millisecond old, as solvers ask for it at every step.
-    """
-    global _reading
-    now = time.perf_counter()
-    reading = _reading
-    if reading is None or now - reading[0] > _AGE:
-        _reading = reading = now, time.process_time() - _listener.seconds
-    return reading[1]
-
-
-def _forget_reading() -> None:
-    global _reading
-    _reading = None  # a new process has a clock of its own
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_reading)
+    """Return the time, s, on a clock that stands still while this process compiles."""
+    return (_listener.begun if _listener.depth else time.monotonic()) - _listener.seconds
 
 
 class _Library(JITCodeLibrary):
@@ -321,10 +307,8 @@ class _Kept(_Cache):
         name = self.file_name(sig)
         result = self._load(name, sig, target_context)
         if result is None:
-            _locks.take(name)
+            _locks.take(name)  # until give_back()
             result = self._load(name, sig, target_context)
-            if result is not None:
-                _locks.give_back(name)
         return result
 
     def _load(self, name: str, signature: Any, target_context: Any) -> CompileResult | None:
@@ -341,7 +325,11 @@ class _Kept(_Cache):
         name = self.file_name(sig)
         if not data.library.has_dynamic_globals:
             _write(name, dumps((str(sig), data._reduce())))
-        _locks.give_back(name)
+
+    def give_back(self, sig: Any) -> None:
+        """Let other processes go on that wait for this one to compile, whether it has or failed."""
+        if kept():
+            _locks.give_back(self.file_name(sig))
 
     def enable(self) -> None: ...
 
@@ -375,8 +363,21 @@ def _compiling(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     options = {"no_cfunc_wrapper": True, **options}
     made: Any = numba.njit(**options)(function)
     if hasattr(made, "_cache"):  # else numba is switched off
-        made._cache = _Kept(function)
+        made._cache = cache = _Kept(function)
+        made.compile = _giving_back(made.compile, cache)
     return made
+
+
+def _giving_back(compile_types: Callable[[Any], Any], cache: _Kept) -> Callable[[Any], Any]:
+    """Return a dispatcher's compile() that gives back the lock which the cache has taken, also where it raises."""
+
+    def compile_and_give_back(sig: Any) -> Any:
+        try:
+            return compile_types(sig)
+        finally:
+            cache.give_back(sig)
+
+    return compile_and_give_back
 
 
 def kept_or_made(title: str, module: str, make: Callable[[], bytes]) -> bytes:
@@ -390,13 +391,17 @@ def kept_or_made(title: str, module: str, make: Callable[[], bytes]) -> bytes:
     data = _read(name)
     if data is None:
         _locks.take(name)
-        data = _read(name)
-        if data is None:
-            _listener.on_start(None)
-            data = make()
-            _listener.on_end(None)
-            _write(name, data)
-        _locks.give_back(name)
+        try:
+            data = _read(name)
+            if data is None:
+                _listener.on_start(None)
+                try:
+                    data = make()
+                finally:
+                    _listener.on_end(None)
+                _write(name, data)
+        finally:
+            _locks.give_back(name)
     return data
 
 
@@ -542,8 +547,10 @@ def compile_call(call: Call) -> bool:
     name = _file_of(call)
     if not _locks.take(name, wait=False):
         return False
-    getattr(sys.modules[call.module], call.function).compile(call.types)
-    _locks.give_back(name)
+    try:
+        getattr(sys.modules[call.module], call.function).compile(call.types)
+    finally:
+        _locks.give_back(name)
     return True
 
 

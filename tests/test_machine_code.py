@@ -1,5 +1,7 @@
 """Compiled functions are kept where no stale code can come from, and by two processes at once."""
 
+import gc
+import math
 import os
 import re
 import subprocess
@@ -123,6 +125,7 @@ def test_a_change_in_an_imported_module_changes_the_key(monkeypatch, tmp_path):
     }.items():
         (tmp_path / "cfplan" / f"{name}.py").write_text(text)
     monkeypatch.setattr(machine_code, "PACKAGE", tmp_path / "cfplan")
+    monkeypatch.setattr(machine_code, "_BEGUN", math.inf)  # as processes see it that begin behind the change
 
     def keys():
         machine_code.key.cache_clear()
@@ -138,6 +141,66 @@ def test_a_change_in_an_imported_module_changes_the_key(monkeypatch, tmp_path):
     finally:
         machine_code.key.cache_clear()
         machine_code._source.cache_clear()
+
+
+def start(folder, code):
+    """Start a process that can import from the folder, and is told by a line of its standard input to go on."""
+    return subprocess.Popen(
+        [sys.executable, "-c", code], cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join((str(PACKAGE.parent), str(folder)))},
+    )  # fmt: skip
+
+
+EDITED = "from cfplan.machine_code import njit\nfrom cfplan.vehicle.airframe import GRAVITY\n\n@njit\ndef height():\n"
+IMPORTED = "from edited import height\nprint('ready', flush=True)\ninput()\nprint(height())"
+
+
+def test_a_module_that_is_edited_once_it_is_imported_is_not_kept_as_what_it_has_become(cache, tmp_path):
+    (tmp_path / "edited.py").write_text(EDITED + "    return 1\n")
+    before = start(tmp_path, IMPORTED)
+    assert before.stdout.readline() == "ready\n"
+    (tmp_path / "edited.py").write_text(EDITED + "    return 1000\n")
+    after = start(tmp_path, IMPORTED)
+    assert before.communicate("\n", timeout=100)[0] == "1\n"
+    assert after.communicate("\n", timeout=100)[0] == "ready\n1000\n"
+    again = start(tmp_path, IMPORTED + "\nprint(sum(height.stats.cache_hits.values()))")
+    assert again.communicate("\n", timeout=100)[0] == "ready\n1000\n1\n"
+
+
+FAILING = """
+from cfplan.machine_code import njit
+from numba.core.errors import NumbaError
+
+@njit
+def fails(x):
+    return x.nothing_of_this_name
+
+try:
+    fails(1.0)
+except NumbaError:
+    print("raised", flush=True)
+input()
+"""
+
+
+def test_a_process_that_fails_to_compile_lets_others_try(cache, tmp_path):
+    (tmp_path / "failing.py").write_text(FAILING)
+    first = start(tmp_path, "import failing")
+    assert first.stdout.readline() == "raised\n"
+    assert start(tmp_path, "import failing").communicate("\n", timeout=60)[0] == "raised\n"  # while the first is there
+    first.communicate("\n", timeout=60)
+
+
+def test_what_fails_to_be_made_leaves_the_collector_on_and_lets_others_make_it(cache, tmp_path):
+    def fail():
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        machine_code.kept_or_made("something", "cfplan.errors", fail)
+    assert gc.isenabled()
+    assert not machine_code.compiles()
+    code = "from cfplan.machine_code import *; print(kept_or_made('something', 'cfplan.errors', lambda: b'made'))"
+    assert start(tmp_path, code).communicate(timeout=60)[0] == "b'made'\n"
 
 
 SLOWLY = """

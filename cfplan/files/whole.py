@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,11 +27,14 @@ def check_new_file(file: Path, *suffixes: str, overwrite: bool) -> None:
 def whole(file: Path) -> Iterator[Path]:
     """Yield a name beside the file to write to, which takes the file's place when the block ends well.
 
+    Threads, processes and computers may write the same file at once: the last to end is the one that is read.
     Raises OSError, and what the block raises; nothing is then left behind.
     """
-    unfinished = file.with_name(f".{file.name}.{os.getpid()}.new")
+    unfinished = file.with_name(f".{file.name}.{secrets.token_hex(4)}.new")
     try:
         yield unfinished
+        with unfinished.open("rb+") as written:
+            os.fsync(written)  # else the name may be on disk before the content when the power fails
         unfinished.replace(file)
     finally:
         with contextlib.suppress(OSError):

@@ -185,11 +185,19 @@ def find_model(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...]
     Raises:
         InputError: a model there is damaged, or a folder holds none.
     """
-    return _find(airframe, limits, (*folders, models_folder()))
+    searched = (*folders, models_folder())
+    return _find(airframe, limits, searched, tuple(map(_card_versions, searched)))
+
+
+def _card_versions(folder: Path) -> tuple[tuple[str, int, int, int], ...]:
+    """Return what tells the cards in a folder, or of a folder of models, from those that were there before."""
+    files = [file for file in (folder / CARD, *folder.glob(f"*/{CARD}")) if file.is_file()]
+    return tuple(sorted((str(file), (at := file.stat()).st_ino, at.st_mtime_ns, at.st_size) for file in files))
 
 
 @lru_cache(maxsize=8)
-def _find(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...]) -> Model | None:
+def _find(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...], versions: tuple[Any, ...]) -> Model | None:
+    """Find a model as find_model() does; with other `versions` of the cards it is read again."""
     known, candidates = scaled_limits(airframe, limits), []
     for place, folder in enumerate(folders):
         if (folder / CARD).is_file():

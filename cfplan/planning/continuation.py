@@ -151,17 +151,17 @@ def continue_plan(
         lambda: _guided(begins[:2], points, FIRST_TIMES_GUIDED_AT_LAST, GUIDES_IN_MOTION[1:]),
     )
     for number, way in islice(_sound(makers, limits, known, ways), MOST_TRIES):
+        caps = _slowing_to(speed, way) if speed < limits.plan.speed else None
         task = _with_room(PlanningTask(
             way.path, limits.airframe, limits.plan, round(grid * default_nodes(way.path, PLANNER)), yaw, yaw_angle,
-            start=way.start,
-            speed_caps=_slowing_to(speed, way) if speed < limits.plan.speed else None,
+            start=way.start, speed_caps=caps,
         ))  # fmt: skip
         failure = _why_not(task.refusal or Solution(Status.NOT_CONVERGED, None))
         if number == ways.found or can_begin(task):
             is_new, ways.found, ways.searched = number != ways.found, number, time.perf_counter() - begun
             if is_new and too_late():
                 raise TooLateError("no way has been found in time", where="request", hint=LATE_HINT)
-            found = _solve(task, limits)
+            found = _solve(task, limits, caps)
             if not isinstance(found, str):
                 check_endurance(found.trajectory.duration, limits)
                 return Continuation(_plan(found, task, limits, time.perf_counter() - begun), way.reached)
@@ -378,19 +378,20 @@ class _Found(NamedTuple):
 
 
 def _with_room(task: PlanningTask) -> PlanningTask:
-    """Return the task with limits that leave room, if the state at its start does."""
-    with_less = replace(task, limits=with_room(task.limits, task.airframe))
+    """Return the task with limits and speed caps that leave room, if the state at its start does."""
+    limits, caps = with_room(task.limits, task.airframe), task.speed_caps
+    with_less = replace(task, limits=limits, speed_caps=caps and caps.scaled(1.0 - ROOM))
     return with_less if with_less.refusal is None else task
 
 
-def _solve(task: PlanningTask, limits: Limits) -> _Found | str:
-    """Return a certified trajectory, or why there is none."""
+def _solve(task: PlanningTask, limits: Limits, caps: SpeedCaps | None) -> _Found | str:
+    """Return a trajectory certified against the limits and `caps`, of which the task's leave room; or why not."""
     leaves_room = task.limits is not limits.plan
     solution = plan_early(task, BETWEEN * ROOM) if leaves_room else plan_early(task)
     if solution.profile is None:
         return _why_not(solution)
     trajectory = Trajectory(task.path, solution.profile, task.airframe)
-    certificate = certify(trajectory, limits.plan, limits.space)
+    certificate = certify(trajectory, limits.plan, limits.space, caps)
     if not certificate.passed:
         return f"the plan exceeds the limit on {certificate.worst.name} by {certificate.worst.share - 1.0:.2%}"
     return _Found(trajectory, certificate, solution.joints)

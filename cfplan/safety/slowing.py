@@ -84,9 +84,9 @@ def slow_until_certified(
 
 
 def _excess(certificate: Certificate) -> float:
-    """Return by how much the worst share exceeds 1. Not a number (no thrust, upside down) is infinitely much."""
-    share = certificate.worst.share
-    return np.inf if np.isnan(share) else share - 1.0
+    """Return the largest usage of a limit that slowing changes, less 1; infinity for NaN (no thrust, upside down)."""
+    usages = [margin.share for margin in certificate.margins if margin.name != WALLS]
+    return np.inf if np.isnan(usages).any() else max(usages) - 1.0
 
 
 def _hover_share(airframe: Airframe, limits: PlanLimits) -> float:

@@ -159,7 +159,7 @@ def _trial(seed: int, limits: Limits, compare_every: int) -> HardPlan:
         trial = replace(trial, length=drawn.path.length, budget=default_budget(drawn.path))
         signal.setitimer(signal.ITIMER_PROF, PATIENCE * trial.budget)
         begun = time.process_time()
-        trial = replace(trial, **_plan(drawn, limits, Deadline.after(trial.budget)))
+        trial = replace(trial, **_plan(drawn, limits, Deadline.after(trial.budget, time.process_time)))
     except CfplanError as error:
         trial = replace(trial, status=REFUSED if error.hint else CRASHED, reason=str(error))
     except _HangsError:

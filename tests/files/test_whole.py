@@ -37,6 +37,28 @@ def test_what_fails_while_it_is_written_leaves_the_old_one_and_nothing_else(tmp_
     assert os.listdir(tmp_path) == ["plan.json"]
 
 
+def test_two_writers_of_a_file_at_once_do_not_meet(tmp_path):
+    file = tmp_path / "plan.json"
+    with whole(file) as first:
+        first.write_text("first")
+        with whole(file) as second:
+            second.write_text("second")
+        assert file.read_text() == "second"
+    assert file.read_text() == "first"
+    assert os.listdir(tmp_path) == ["plan.json"]
+
+
+def test_the_content_is_on_disk_before_it_takes_the_place_of_the_old_one(tmp_path, monkeypatch):
+    file, synced = tmp_path / "plan.json", []
+    file.write_text("old")
+    monkeypatch.setattr(os, "fsync", lambda opened: synced.append((os.fstat(opened.fileno()), file.read_text())))
+    write_whole(file, b"new")
+    ((written, before),) = synced
+    assert before == "old"
+    assert os.path.samestat(written, file.stat())
+    assert written.st_size == len(b"new")
+
+
 def test_a_device_is_no_file_and_stays(tmp_path):
     link = tmp_path / "null"
     link.symlink_to("/dev/null")

@@ -162,6 +162,21 @@ def test_the_model_that_knows_limits_and_vehicle_is_found(tmp_path, monkeypatch,
         found(HARDWARE.limits, "nothing")
 
 
+@pytest.mark.parametrize("where", ["mine", "."])
+def test_a_model_that_is_trained_again_is_the_one_that_is_found_next(tmp_path, make_card, make_weights, where):
+    def found() -> Model:
+        model = find_model(HARDWARE.airframe, HARDWARE.limits, (tmp_path / where,))
+        assert isinstance(model, Model)
+        return model
+
+    save_model(tmp_path / "mine", make_card(name="first"), make_weights())
+    first = found()
+    assert first.name == "first"
+    assert found() is first
+    save_model(tmp_path / "mine", make_card(name="again"), make_weights(seed=1))
+    assert found().name == "again"
+
+
 def test_models_are_beside_the_package_in_a_checkout():
     assert models_folder().name == "models"
 

@@ -5,12 +5,14 @@ Time is a count of how often planning asked for it, so a deadline falls between 
 
 from dataclasses import replace
 from itertools import count
+from threading import Event
 
 import pytest
 
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.yaw import YawMode
+from cfplan.machine_code import kept_or_made
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.expert.refine import refine
 from cfplan.planners.expert.windows import WindowSize
@@ -102,6 +104,26 @@ def test_what_takes_longer_than_the_battery_lasts_is_refused_before_it_is_planne
     short = replace(limits, battery=replace(limits.battery, endurance=20.0))
     with pytest.raises(InfeasibleError, match="at least"):
         plan(path, short.airframe, short, speed_factor=0.05)
+
+
+def test_a_budget_is_what_a_user_waits_whoever_has_the_processor():
+    deadline = Deadline.after(0.05)
+    Event().wait(0.1)  # in which this process has nothing of the processor
+    assert deadline.passed
+
+
+def test_compiling_does_not_count(monkeypatch, tmp_path):
+    monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path))
+    deadline, left_meanwhile = Deadline.after(1.0), []
+
+    def compiled() -> bytes:
+        Event().wait(1.2)
+        left_meanwhile.append(deadline.left)
+        return b""
+
+    kept_or_made("something", "cfplan.errors", compiled)
+    assert left_meanwhile[0] > 0.0
+    assert not deadline.passed
 
 
 def test_deadlines_count_on_their_own_clock():

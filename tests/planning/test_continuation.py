@@ -51,6 +51,21 @@ def test_more_waypoints_ahead_change_the_way_little_and_save_the_stop(flown, lim
     assert leave + made.plan.trajectory.duration < 1.03 * at_once.trajectory.duration
 
 
+@pytest.mark.parametrize(
+    ("speed", "share", "waypoints"),
+    [
+        (0.5, 0.3, [[-0.07, -0.91, 1.14], [0.83, -0.92, 0.79], [1.18, 2.18, 0.87]]),
+        (0.7, 0.02, [[0.45, 2.5, 1.15], [0.23, 0.2, 0.71], [0.68, -0.6, 0.76]]),
+        (0.7, 0.1, [[1.19, 0.8, 0.98], [0.16, -2.46, 0.84], [1.14, -2.18, 0.79]]),
+    ],
+)
+def test_a_lower_speed_is_not_exceeded_between_the_nodes_either(flown, limits, speed, share, waypoints):
+    made = continue_plan(flown.trajectory, share * flown.trajectory.duration, waypoints, limits, speed=speed).plan
+    times = np.arange(0.0, made.trajectory.duration, 5e-4)
+    slowed_down = made.trajectory.s_at(times) > made.path.end / 2
+    assert np.linalg.norm(made.trajectory.at(times[slowed_down]).velocity, axis=1).max() <= speed
+
+
 def test_plans_can_be_continued_again_and_again(flown, limits):
     """Twelve replans, 0.4 s apart, each through two new waypoints: one flight without a jump."""
     random = np.random.default_rng(1)

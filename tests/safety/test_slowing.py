@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.min_snap import min_snap
-from cfplan.safety.certificate import certify
+from cfplan.safety.certificate import WALLS, certify
 from cfplan.safety.slowing import RESOLUTION, slow_until_certified
 from cfplan.safety.space import Space
 from cfplan.vehicle.trajectory import Trajectory
@@ -67,6 +67,16 @@ def test_limits_that_no_flight_keeps_are_named(make_profile, changes, message):
     trajectory = Trajectory(PATH, make_profile(PATH.end, np.full(20, 4.0)), AIRFRAME)
     with pytest.raises(InfeasibleError, match=message):
         slow_until_certified(trajectory, replace(LIMITS, **changes))
+
+
+def test_a_path_along_a_wall_is_slowed_no_more_than_one_in_the_open(make_profile):
+    trajectory = Trajectory(PATH, make_profile(PATH.end, np.full(20, 4.0)), AIRFRAME)
+    far = Space(low=(-4.0, -4.0, 0.0), high=(4.0, 4.0, 4.0), margin=0.1)
+    highest = max(PATH(np.linspace(0.0, PATH.end, 20_001))[:, 2])
+    touching = replace(far, high=(4.0, 4.0, float(highest) + far.margin + 1e-6))
+    slowed = {space: slow_until_certified(trajectory, LIMITS, space) for space in (far, touching)}
+    assert slowed[touching].certificate.worst.name == WALLS
+    assert slowed[touching].speed_factor == pytest.approx(slowed[far].speed_factor, rel=RESOLUTION)
 
 
 def test_slowing_does_not_help_against_walls(make_profile):

@@ -55,9 +55,9 @@ def plan_expert(
     Yaw is that of the Hopf fibration. FIXED holds the yaw angle, TANGENT follows the horizontal direction of flight;
     both are laid out before the speed (see YawSpline), which then respects what turning takes. FREE leaves yaw to the
     optimiser, from a first yaw between that angle and a quarter turn more, as the paper has it. A start or end state
-    brings its own yaw in every mode. A path longer than `window` is planned window by window. The search begins as the
-    first of `starts` that succeeds. At the task's deadline there is no profile, unless only limits between points were
-    still exceeded.
+    brings its own yaw in every mode. A path longer than `window` is planned window by window, and as a whole if one of
+    them fails. The search begins as the first of `starts` that succeeds. At the task's deadline there is no profile,
+    unless only limits between points were still exceeded.
 
     Raises:
         InputError: fewer nodes than the path needs.
@@ -133,6 +133,8 @@ def _plan(
 
     whole = _segment(task, task.nodes)
     joined = by_windows(whole, window, search)
+    if isinstance(joined, str) and sum(window) < task.nodes and not task.deadline.passed:
+        joined = by_windows(whole, WindowSize(task.nodes, 0), search)  # nothing led on from where two windows met
     if isinstance(joined, str):
         return Solution(failed_status(task.deadline), None, joined)
     return solution_of(whole, joined, began)

@@ -42,20 +42,30 @@ def guess(
     `yaw` is None where it is not to be guessed, else where it starts if no state says so.
     """
     step = path.end / nodes
-    cubic = guess_spline(path, airframe, limits, nodes) / unit
-    slow, held = cubic.copy(), []
-    for state, here, there in ((start, cubic, slow), (end, cubic[::-1], slow[::-1])):
+    cubic = led_into(guess_spline(path, airframe, limits, nodes) / unit, unit, step, start, end)
+    if yaw is None:
+        return cubic[:, None]
+    return np.stack([cubic, np.append(_yaw(start, end, yaw, nodes, step), 0.0)], axis=1)
+
+
+def led_into(
+    coefficients: NDArray, unit: float, step: float, start: BoundaryState | None, end: BoundaryState | None
+) -> NDArray:
+    """Return (N+3,) coefficients of h over its `unit` that have the boundary states, and come away from them smoothly.
+
+    The given ones must be positive; `step` is of s, an interval.
+    """
+    led, held = coefficients.copy(), []
+    for state, here, there in ((start, led, coefficients), (end, led[::-1], coefficients[::-1])):
         if state:
             turned = 1.0 if state is start else -1.0
             first = node_coefficients(state.h / unit, turned * state.dh * step / unit, state.ddh * step**2 / unit)
             if min(first) > 0:
-                here[1:] *= np.exp(_leave(np.log(first[1:]) - np.log(there[1:3]), len(cubic) - 1, bool(start and end)))
+                here[1:] *= np.exp(_leave(np.log(first[1:]) - np.log(there[1:3]), len(led) - 1, bool(start and end)))
             held.append((here, first))
     for here, first in held:  # both have left their mark before either is put in place
         here[:3] = first
-    if yaw is None:
-        return cubic[:, None]
-    return np.stack([cubic, np.append(_yaw(start, end, yaw, nodes, step), 0.0)], axis=1)
+    return led
 
 
 def _leave(offsets: NDArray, count: int, held: bool) -> NDArray:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cfplan.deadline import Deadline
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.expert.initial_guess import lowered
+from cfplan.planners.expert.initial_guess import led_into, lowered
 from cfplan.planners.expert.layout import Shape, layout_of
 from cfplan.planners.expert.problem import FLOOR, Ends, Problem, Segment, build_problem, interval_of, slowness_of
 from cfplan.planners.expert.search import (
@@ -35,7 +35,6 @@ from cfplan.planners.expert.windows import (
     WindowSize,
     by_windows,
     failed_status,
-    far_enough,
     solution_of,
     windows_of,
 )
@@ -43,7 +42,7 @@ from cfplan.planners.solution import Solution
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.profile_spline import h_coefficients
-from cfplan.vehicle.yaw_spline import YawSpline
+from cfplan.vehicle.yaw_spline import YawSpline, end_coefficients
 
 # Share of h by which the search begins below the given profile: where that uses limits to the full, nearly all
 # constraints then begin inside their bounds, and steps are long.
@@ -79,10 +78,15 @@ def refinements(
     layout = layout_of(Shape(nodes, free, turning_limited=limits.angular_acceleration < math.inf))
     ends, yaw = Ends(task.start, task.end), YawSpline.of(profile)
     whole = Segment(path, task.airframe, limits, ends, yaw, layout, task.speed_caps, slowness_of(profile.h, limits))
-    near = np.maximum(h_coefficients(profile) / whole.unit, FLOOR)[:, None]
+    step = path.end / nodes
+    near = np.maximum(h_coefficients(profile) / whole.unit, FLOOR)
+    near = led_into(near, whole.unit, step, task.start, task.end)[:, None]
     if free:
-        near = np.column_stack([near, np.append(yaw.coefficients(path.end / nodes), 0.0)])
-    if len(windows_of(nodes, *far_enough(window, path.end / nodes, limits))) > 1:
+        near = np.column_stack([near, np.append(yaw.coefficients(step), 0.0)])
+        for state, rows in ((task.start, near[:2]), (task.end, near[-3:-1])):
+            if state:
+                rows[:, 1] = end_coefficients(state.yaw, state.dyaw * step)
+    if len(windows_of(path, nodes, window, limits)) > 1:
         joined = by_windows(whole, window, partial(_refine_window, task), near)
         yield _solution(whole, joined, began, task.deadline)
         return
@@ -112,11 +116,9 @@ class _HeldAtPoints(NamedTuple):
 
 def _hold_at_points(task: PlanningTask, segment: Segment, near: NDArray) -> _HeldAtPoints | str:
     """Solve the problem from the coefficients `near`, or return why not."""
-    ends = segment.ends
     interval, step = interval_of(segment, near), segment.path.end / segment.layout.shape.nodes
-    agrees = not ends.end and (ends.continues or not ends.start)  # with the boundary states
     rate, angle, capped = segment.unit**0.5 / step, task.yaw_angle, segment.caps is not None
-    problem = build_problem(segment, angle, coefficients=lowered(near, SLOWER, ends.held, rate) if agrees else None)
+    problem = build_problem(segment, angle, coefficients=lowered(near, SLOWER, segment.ends.held, rate))
     attempt = _search(problem, interval, capped, task.deadline)
     if rejection_reason(attempt, segment) and not task.deadline.passed:  # not near enough
         problem = build_problem(segment, angle)

@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert.expert import can_begin, plan_early, plan_expert
 from cfplan.planners.expert.windows import WindowSize
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
+from cfplan.planning.planners import default_nodes
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.safety.limits import PlanLimits
+from cfplan.studies.scaling import path_of_length
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
@@ -47,6 +49,28 @@ def test_a_long_path_by_windows_is_as_fast_as_at_once_and_certified_across_joint
         assert certify(trajectory, HARDWARE.limits).passed
         times.append(trajectory.duration)
     assert times[0] == pytest.approx(times[1], rel=5e-3)
+
+
+def test_the_windows_of_a_path_do_not_depend_on_the_unit_of_s():
+    points = np.concatenate([CORNERED, CORNERED + 0.4, CORNERED - 0.3, CORNERED + 0.2])
+    limits, found = replace(HARDWARE.limits, speed=4.0), []
+    for unit in (0.1, 1.0, 10.0):
+        path = min_snap(points, times=unit * centripetal_times(points))
+        solution = plan_expert(PlanningTask(path, HARDWARE.airframe, limits, nodes=600))
+        found.append((solution.stats["windows"], duration(path, solved(solution), HARDWARE.airframe)))
+    assert [windows for windows, _ in found] == [found[0][0]] * 3
+    assert found[0][0] > 1
+    assert [seconds for _, seconds in found] == pytest.approx([found[0][1]] * 3, rel=1e-3)
+
+
+# In the first three windows of a fixed count of intervals saw too little ahead; in the others, of 40 to 100 m, a window
+# begins where nothing leads on, and the path is planned at once.
+@pytest.mark.parametrize(("length", "seed"), [(60.0, 1), (60.0, 4), (60.0, 5), (40.0, 132), (60.0, 117), (100.0, 9)])
+def test_a_long_path_is_planned_wherever_its_windows_meet(length, seed):
+    path = path_of_length(length, "10x10x10", seed)
+    task = PlanningTask(path, SIMULATION.airframe, SIMULATION.limits, nodes=default_nodes(path))
+    profile = solved(plan_expert(task))
+    assert certify(Trajectory(path, profile, SIMULATION.airframe), SIMULATION.limits).passed
 
 
 @pytest.mark.parametrize("yaw", YawMode)

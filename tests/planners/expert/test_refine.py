@@ -7,6 +7,7 @@ import pytest
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.random_paths import random_waypoints
+from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.expert.refine import refine
 from cfplan.planners.expert.windows import LONG_WINDOW, WindowSize, windows_of
@@ -52,14 +53,20 @@ def test_a_profile_near_the_experts_becomes_as_fast_and_certified_in_fewer_steps
     assert solution.stats["iterations"] < from_afar.stats["iterations"]
 
 
-def test_windows_cover_a_path_and_each_looks_ahead():
-    kept, ahead = LONG_WINDOW
+@pytest.mark.parametrize("spacing", [1.0, 0.1, 0.01])
+def test_windows_cover_a_path_and_each_looks_ahead_far_enough_to_brake(spacing):
+    (kept, ahead), limits = LONG_WINDOW, LIMIT_SETS["hardware"].limits
     for nodes in (1, 100, kept + ahead, kept + ahead + 1, 1000):
-        windows = windows_of(nodes, kept, ahead)
+        line = min_snap([[0, 0, 1], [nodes * spacing, 0, 1]])
+        windows = windows_of(line, nodes, LONG_WINDOW, limits)
         assert windows[0][0] == 0
-        assert windows[-1][1] == nodes
-        for (_, ends), (begins, _) in itertools.pairwise(windows):
-            assert ends - begins == ahead
+        assert windows[-1][1:] == (nodes, nodes)
+        places = line(np.linspace(0.0, line.end, nodes + 1))[:, 0]
+        for (begins, left, ends), (next_begins, _, _) in itertools.pairwise(windows):
+            assert left == next_begins
+            assert left - begins >= kept
+            assert ends - left >= ahead
+            assert places[ends] - places[left] > limits.speed**2 / limits.acceleration
 
 
 def test_a_long_path_by_windows_is_as_fast_as_by_the_whole_and_continuous_at_joints():
@@ -83,6 +90,20 @@ def test_boundary_states_are_kept():
     profile = refine(PlanningTask(part, chosen.airframe, chosen.limits, start=start, end=end), cut).profile
     for state, found in ((start, profile.boundary(0)), (end, profile.boundary(-1))):
         assert (found.h, found.dh, found.ddh) == pytest.approx((state.h, state.dh, state.ddh), rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("yaw", [YawMode.FIXED, YawMode.FREE])
+@pytest.mark.parametrize("held", ["start", "end", "both"])
+@pytest.mark.parametrize("seed", [1, 3, 4])
+def test_between_boundary_states_too_the_search_begins_at_the_given_profile(held, yaw, seed):
+    path, chosen, expert = planned("hardware", seed)
+    first, last = 0 if held == "end" else 30, 100 if held == "start" else 80
+    part = path.part(expert.s[first], expert.s[last])
+    states = {"start": expert.boundary(first) if first else None, "end": expert.boundary(last) if last < 100 else None}
+    near = spline_profile(h_coefficients(expert)[first : last + 3], part.end, YawSpline.of(expert).part(first, last))
+    task = PlanningTask(part, chosen.airframe, chosen.limits, nodes=last - first, yaw=yaw, **states)
+    steps = [refine(task, each).stats["iterations"] for each in (near, disturbed(near, part.end, 0.8, seed))]
+    assert steps[0] < 0.7 * steps[1]
 
 
 def test_what_cannot_be_refined_has_a_reason():

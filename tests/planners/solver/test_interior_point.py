@@ -127,6 +127,21 @@ def test_what_is_not_a_number_is_told():
     assert "not a number" in ended.message
 
 
+@pytest.mark.parametrize("steepness", [1e60, 1e70, 1e140])
+def test_a_huge_gradient_ends_the_search_with_a_message(steepness):
+    class Cliff(Valley):
+        def evaluate(self, v):
+            return Values(-steepness * float(v.sum()), np.zeros(2 * self.size))
+
+        def linearise(self, x, terms):
+            gradients = np.vstack([np.full(self.size, -steepness), np.zeros((3, self.size))])
+            return Linearisation(gradients, np.tile([1.0, 0.0], (self.size, 1)), lambda dv: np.zeros(2 * self.size))
+
+    ended = minimise(Cliff(8, -np.inf, np.inf), np.zeros(8), Search(iterations=5))
+    assert not ended.solved
+    assert ended.message
+
+
 def test_a_search_goes_on_from_another_whose_bounds_were_wider_in_a_few_steps():
     start = np.linspace(0.5, 1.5, 8)
     near = Search(barrier=1e-3, last_barrier=1e-3, gradient=1e-3, feasibility=1e-3, iterations=300)
