@@ -41,6 +41,7 @@ test: $(VENV)/installed-tests
 test-processors: $(PROCESSORS:%=test-as-%)
 
 test-as-%: $(VENV)/installed-tests
+	$(BIN)/python -m tests.processors $* $(BIN)/cfplan doctor --warm-up
 	$(BIN)/python -m tests.processors $* $(PYTEST)
 
 slow: $(VENV)/installed-tests
