@@ -14,7 +14,10 @@ define counting_packages
 	done) & counting=$$!; trap "kill $$counting" EXIT; $(1)
 endef
 
-.PHONY: install fly test slow fuzz dist site pictures lint clean
+PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
+PROCESSORS := own older plain mixed
+
+.PHONY: install fly test test-processors slow fuzz dist site pictures lint clean
 
 install: $(VENV)/installed
 
@@ -32,7 +35,14 @@ fly: install
 	$(BIN)/cfplan fly flights/figure8.yaml
 
 test: $(VENV)/installed-tests
-	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
+	$(PYTEST)
+
+# The same tests as other processors round, by the settings of tests/processors.py.
+test-processors: $(PROCESSORS:%=test-as-%)
+
+test-as-%: $(VENV)/installed-tests
+	$(BIN)/python -m tests.processors $* $(BIN)/cfplan doctor --warm-up
+	$(BIN)/python -m tests.processors $* $(PYTEST)
 
 slow: $(VENV)/installed-tests
 	$(BIN)/python -m pytest -m slow

@@ -76,11 +76,17 @@ def kept() -> bool:
     return _writable(cache_folder())
 
 
+def _processor() -> tuple[str, str]:
+    """Return the name and the features that code is compiled for: this computer's, or those of NUMBA_CPU_NAME."""
+    _, name, features = cpu_target.target_context.codegen().magic_tuple()
+    return name, features
+
+
 @lru_cache(maxsize=1)
 def _machine() -> bytes:
     """Return what machine code depends on besides sources; a cache folder may be shared by machines that differ."""
     versions = (numba.__version__, llvmlite.__version__, np.__version__, platform.python_version())
-    return repr((versions, llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())).encode()
+    return repr((versions, *_processor())).encode()
 
 
 @lru_cache(maxsize=512)
@@ -420,17 +426,16 @@ _engines: list[Any] = []  # that own the code of functions handed out
 
 
 def vector_width() -> int:
-    """Return how many doubles a register of this processor holds: wider vectors would only crowd the registers."""
-    features = llvm.get_host_cpu_features()
-    return 8 if features.get("avx512f") else 4 if features.get("avx") else 2
+    """Return how many doubles a register of the processor holds: wider vectors would only crowd the registers."""
+    features = _processor()[1].split(",")
+    return 8 if "+avx512f" in features else 4 if "+avx" in features else 2
 
 
 def _target_machine() -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    return llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2, jit=True
-    )
+    cpu, features = _processor()
+    return llvm.Target.from_default_triple().create_target_machine(cpu=cpu, features=features, opt=2, jit=True)
 
 
 def _parsed(source: str, target: Any) -> Any:

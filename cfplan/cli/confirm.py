@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from cfplan.errors import ExitCode, InputError
+from cfplan.numbers import shown
 from cfplan.safety.space import inside
 from cfplan.steering.starting_vehicle import SIMULATED
 
@@ -46,7 +47,8 @@ def describe(prepared: "Prepared", uri: str) -> str:
     speed = float(np.linalg.norm(decode(mission.payloads).velocity, axis=1).max())
     space = mission.limits.space
     walls = ", ".join(
-        f"{axis} {low:.2f} to {high:.2f} m" for axis, low, high in zip("xyz", space.low, space.high, strict=True)
+        f"{axis} {shown(low, '.2f')} to {shown(high, '.2f')} m"
+        for axis, low, high in zip("xyz", space.low, space.high, strict=True)
     )
     remedy = "a lower --speed" if mission.limits.firmware.watchdog else "a lower --speed, or firmware.watchdog,"
     advice = f" With {remedy} it would not come so far." if not inside(lost.beyond) else ""

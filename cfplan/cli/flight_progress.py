@@ -20,6 +20,7 @@ from cfplan.flight.telemetry import (
     Telemetry,
     VehicleStatus,
 )
+from cfplan.numbers import coordinates
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -122,8 +123,7 @@ class FlightProgress:
         elif self._bar.disable:
             numbers.append(f"{now - self._entered:.0f} s")
         if self._pose is not None:
-            x, y, z = (round(value, 2) + 0.0 for value in self._pose.position)  # no -0.0
-            numbers.append(f"({x:.2f}, {y:.2f}, {z:.2f}) m")
+            numbers.append(f"{coordinates(self._pose.position, '.2f')} m")
         if self._battery is not None:
             numbers.append(f"{self._battery:.2f} V")
         self._bar.update(self._task, completed=done, numbers="  ".join(numbers))

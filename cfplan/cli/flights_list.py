@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from cfplan.cli.output import print_json, print_table
+from cfplan.numbers import shown
 from cfplan.recording.record import FLIGHT_FILE, SUMMARY_FILE
 
 _UNKNOWN = "–"
@@ -51,4 +52,4 @@ def _summary(record: Path) -> dict[str, Any]:
 
 
 def _number(value: Any, scale: float, digits: int, unit: str) -> str:
-    return f"{scale * value:.{digits}f} {unit}" if isinstance(value, int | float) else _UNKNOWN
+    return f"{shown(scale * value, f'.{digits}f')} {unit}" if isinstance(value, int | float) else _UNKNOWN

@@ -10,6 +10,7 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import print_json, print_table
 from cfplan.errors import printable
+from cfplan.numbers import shown
 
 if TYPE_CHECKING:
     from cfplan.flight.mocap.survey import Survey
@@ -63,7 +64,7 @@ def _print(uri: str, found: "Survey") -> None:
     lines = []
     for body in found.bodies:
         counts = [str(body.counts.get(name, 0)) for name in ("good", "frozen", "jumped", "flipped", "not a pose")]
-        angles = [f"{math.degrees(angle):.0f}°" if body.position else "–" for angle in (body.yaw, body.tilt)]
+        angles = [f"{shown(math.degrees(angle), '.0f')}°" if body.position else "–" for angle in (body.yaw, body.tilt)]
         lines.append([body.name, f"{100 * body.seen:.1f} %", *counts, _place(body.position), *angles])
     print_table(f"{len(lines)} bodies", columns, lines)
     for remark in _remarks(found):
@@ -86,4 +87,4 @@ def _milliseconds(seconds: float) -> str:
 
 
 def _place(position: tuple[float, float, float] | None) -> str:
-    return " ".join(f"{value:.3f}" for value in position) if position else "not seen"
+    return " ".join(shown(each, ".3f") for each in position) if position else "not seen"

@@ -8,6 +8,7 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json
 from cfplan.errors import InputError
+from cfplan.numbers import shown
 from cfplan.preparation.compiled_calls import Stage
 
 
@@ -59,7 +60,7 @@ def plan(
 def _compared(duration: float, bound: float, speed_factor: float) -> str:
     """Return one line about a flight's duration and the least time of any flight at the same share of its speed, s."""
     at_share = f" at {speed_factor:g} of full speed" if speed_factor < 1.0 else ""
-    return f"{100 * (duration / bound - 1.0):.1f} % above {bound:.2f} s, which no flight{at_share} beats"
+    return f"{shown(100 * (duration / bound - 1.0), '.1f')} % above {bound:.2f} s, which no flight{at_share} beats"
 
 
 def _check_files(output: Path | None, figure: Path | None, force: bool) -> None:

@@ -18,6 +18,7 @@ from cfplan.cli.output import Steps
 from cfplan.errors import InputError, LinkError
 from cfplan.files.nearest import nearest
 from cfplan.files.shipped import example_limits
+from cfplan.numbers import coordinates
 
 if TYPE_CHECKING:
     from cfplan.recording.rerun.live import LiveView
@@ -205,8 +206,7 @@ class StateLine:
         locked = state.name == "LOCKED"
         name = state.name.lower().replace("_", " ")
         if self._on_terminal:
-            x, y, z = position
-            click.echo(f"\r\033[K{x:.2f} {y:.2f} {z:.2f} m, {name}", nl=False, err=True)
+            click.echo(f"\r\033[K{coordinates(position, '.2f')} m, {name}", nl=False, err=True)
         elif changed:
             click.echo(self._begin + name, err=True)
         if changed and locked:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from cfplan.errors import InputError
 from cfplan.geometry.polynomials import padded, shifted
 from cfplan.machine_code import njit
+from cfplan.numbers import coordinates
 
 MAX_ORDER = 5
 STANDSTILL = 0.01  # |γ'|, which is 1 at the nominal 1 m/s: where an inner minimum falls below this, the path stops
@@ -161,9 +162,8 @@ class Path:
         return _slowest_within(self.breaks, self.origins, self._table(1), low, high)
 
     def _refuse(self, what: str, s: float, where: str) -> None:
-        x, y, z = self(s)
         raise InputError(
-            f"{what} at s = {s:.3f} of {self.end:.3f}, position ({x:.3f}, {y:.3f}, {z:.3f}) m",
+            f"{what} at s = {s:.3f} of {self.end:.3f}, position {coordinates(self(s), '.3f')} m",
             where=where,
             hint="move a waypoint sideways so that the path turns in a curve, or split the flight in two",
         )

@@ -22,6 +22,7 @@ from cfplan.identification.translation import (
     FlightModel,
     slow_voltage,
 )
+from cfplan.numbers import shown
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 # N, standard uncertainty: an accelerometer off by 0.3 m/s² steps the estimate at each pose by 3 mm/s, which the gain on
@@ -53,11 +54,12 @@ class IdentifiedQuantity:
 
     def row(self) -> list[str]:
         """Return name, value with uncertainty, what was assumed before, and a remark, for people."""
-        doubt = f" ± {self.scale * self.deviation:.{self.digits}f}" if math.isfinite(self.deviation) else ""
-        before = f"{self.scale * self.before:.{self.digits}f}" if math.isfinite(self.before) else "–"
+        spec = f".{self.digits}f"
+        doubt = f" ± {shown(self.scale * self.deviation, spec)}" if math.isfinite(self.deviation) else ""
+        before = f"{shown(self.scale * self.before, spec)}" if math.isfinite(self.before) else "–"
         return [
             self.name,
-            f"{self.scale * self.value:.{self.digits}f}{doubt} {self.unit}",
+            f"{shown(self.scale * self.value, spec)}{doubt} {self.unit}",
             before,
             self.untold or self.remark,
         ]

@@ -28,6 +28,7 @@ from cfplan.geometry.min_snap import centripetal_times, check_times, min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.features import REFERENCE, ScaledLimits, node_features, scaled_limits
+from cfplan.numbers import coordinates
 from cfplan.planners.expert.expert import can_begin, plan_early
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
@@ -171,12 +172,11 @@ def continue_plan(
     failure = failure or _unsound(_made(straight)[0][1].path, limits)
     speed = float(np.linalg.norm(trajectory.at(leave).velocity))
     away = float(np.linalg.norm(points[0] - joint.derivatives[0]))
+    rest = trajectory.at(min(leave + STOPPING, trajectory.duration)).position
     raise NoWayError(
         f"from {speed:.2f} m/s no way leads through waypoint 1, {away:.2f} m away: {failure}",
         where="waypoint 1",
-        hint="give a waypoint farther on than ({:.2f}, {:.2f}, {:.2f}) m, where it could rest, or stop first".format(
-            *trajectory.at(min(leave + STOPPING, trajectory.duration)).position
-        ),
+        hint=f"give a waypoint farther on than {coordinates(rest, '.2f')} m, where it could rest, or stop first",
     )
 
 
@@ -204,9 +204,8 @@ def check_waypoints(points: NDArray, limits: Limits) -> None:
     beyond = limits.space.beyond(points).max(axis=1)
     if not (good := inside(beyond) | np.isnan(beyond)).all():  # what is no number is for whoever makes the path
         at = int(np.argmin(good))
-        x, y, z = points[at]
         raise InfeasibleError(
-            f"({x:.3f}, {y:.3f}, {z:.3f}) m is {beyond[at]:.3f} m too far out",
+            f"{coordinates(points[at], '.3f')} m is {beyond[at]:.3f} m too far out",
             where=f"waypoint {at + 1}",
             hint="keep waypoints inside the space less its margin",
         )

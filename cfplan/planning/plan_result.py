@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from cfplan.errors import InputError
 from cfplan.geometry.path import Path
+from cfplan.numbers import shown
 from cfplan.safety.certificate import Certificate
 from cfplan.safety.limits import Limits
 from cfplan.safety.speed_caps import SpeedCaps
@@ -68,4 +69,4 @@ class Plan:
             return ""
         first, *others = self.slowing.reasons
         more = f" and {len(others)} places more" if len(others) > 1 else f" and {others[0]}" if others else ""
-        return f"{100 * self.time_lost:.1f} % slower for {first}{more}"
+        return f"{shown(100 * self.time_lost, '.1f')} % slower for {first}{more}"

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cfplan.errors import CfplanError, InfeasibleError, NotCertifiedError
 from cfplan.machine_code import njit
+from cfplan.numbers import shown
 from cfplan.planners.expert.intersample import violates_at_nodes
 from cfplan.planners.expert.refine import refinements
 from cfplan.planners.task import PlanningTask
@@ -47,7 +48,7 @@ class Repaired:
     def describe(self) -> str:
         """Return one sentence, empty if nothing was changed."""
         duration = self.trajectory.duration
-        cost = f"{self.before:.3f} s became {duration:.3f} s ({duration / self.before - 1:+.2%})"
+        cost = f"{self.before:.3f} s became {duration:.3f} s ({shown(duration / self.before - 1, '+.2%')})"
         why = f" ({self.failed})" if self.failed else ""
         if self.speed_factor < 1.0:
             return f"slowed to {self.speed_factor:.2%} of its speed to pass{why}; {cost}"

@@ -21,6 +21,7 @@ from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
 from cfplan.flight.on_board.pieces import Pieces
 from cfplan.geometry.polynomial_csv import polynomial_rows, read_polynomial_rows
 from cfplan.machine_code import compile_from_here
+from cfplan.numbers import shown
 from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
@@ -171,7 +172,7 @@ def _describe(made: OnBoardTrajectory, planned: PlannedFlight) -> str:
     kind = f"compressed, {len(made.memory)} bytes" if made.compressed else f"{len(made.memory)} bytes"
     longer = made.duration / planned.duration - 1.0
     return (
-        f"{len(made.pieces.durations)} pieces, {kind}, {made.duration:.2f} s ({100 * longer:+.1f} %), "
+        f"{len(made.pieces.durations)} pieces, {kind}, {made.duration:.2f} s ({shown(100 * longer, '+.1f')} %), "
         f"within {1000 * made.error:.0f} mm"
     )
 

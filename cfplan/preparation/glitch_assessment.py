@@ -3,6 +3,7 @@
 import numpy as np
 
 from cfplan.flight.setpoints.encoding import EncodedFlight
+from cfplan.numbers import coordinates
 from cfplan.preparation.local_slowing import Assessment
 from cfplan.safety.limits import Limits
 from cfplan.simulation.glitches import GAP, KINDS, TURNED_OVER, glitch_at_sampled_setpoints
@@ -23,6 +24,6 @@ def assess_glitches(encoded: EncodedFlight, limits: Limits) -> Assessment:
         return f"of {GAP:g} s in {KINDS[kind[at]]} takes the vehicle {off:.2f} m off, at a tilt of {tilt:.0f}°"
 
     def near(at: int) -> str:
-        return "({:.2f}, {:.2f}, {:.2f}) m".format(*encoded.decoded.position[at])
+        return f"{coordinates(encoded.decoded.position[at], '.2f')} m"
 
     return Assessment("a gap", encoded.times, share - KEPT, share, describe, near, _HINT)

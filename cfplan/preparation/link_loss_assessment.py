@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.flight.setpoints.stops import DURATION, encode_stops
+from cfplan.numbers import shown
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
@@ -183,4 +184,4 @@ def _reach(moments: LinkLossMoments) -> NDArray:
 
 
 def _how_far(beyond: float) -> str:
-    return f"{beyond:.2f} m beyond" if not inside(beyond) else f"within {abs(beyond):.2f} m of"
+    return f"within {shown(-beyond, '.2f')} m of" if inside(beyond) else f"{beyond:.2f} m beyond"

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError
+from cfplan.numbers import coordinates
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan_result import LocalSlowing, Plan
 from cfplan.planning.repair import repair, slow
@@ -100,10 +101,9 @@ def slow_locally(plan: Plan, assess: Assess, deadline: Deadline = NEVER) -> tupl
             return _faster(plan, assess, (slowed, assessed), caps, deadline)
     worst = max((each for each in assessed if not each.passed), key=lambda each: each.excess[each.worst])
     at = worst.worst
-    x, y, z = slowed.trajectory.at(worst.time[at]).position
     raise InfeasibleError(
         f"{worst.what} at {worst.time[at]:.2f} s {worst.describe(at)}, however slowly the vehicle flies there",
-        where=f"({x:.2f}, {y:.2f}, {z:.2f}) m",
+        where=f"{coordinates(slowed.trajectory.at(worst.time[at]).position, '.2f')} m",
         hint=worst.hint,
     )
 

@@ -26,6 +26,7 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.setpoints.encoding import RATE, encode_motion, encode_trajectory
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE
 from cfplan.flight.setpoints.rate_trade import gains_under
+from cfplan.numbers import shown
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.export_flight import Form, fit_polynomials, plan_for_polynomials
 from cfplan.preparation.local_slowing import Assessment, slow_locally
@@ -129,7 +130,7 @@ def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
 
 
 def _beyond(beyond: float) -> str:
-    return f"{beyond:.2f} m beyond" if not inside(beyond) else f"{abs(beyond):.2f} m from"
+    return f"{shown(-beyond, '.2f')} m from" if inside(beyond) else f"{beyond:.2f} m beyond"
 
 
 def _require_harmless_fall(

@@ -26,6 +26,7 @@ from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
 from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, spaced
+from cfplan.numbers import coordinates
 from cfplan.planning.continuation import (
     KINDS,
     LATE_HINT,
@@ -184,9 +185,8 @@ def hold_hover(position: Triple, yaw: float, limits: Limits) -> HeldFlight:
     """
     beyond = float(limits.space.beyond(np.array([position])).max())
     if not inside(beyond):
-        x, y, z = position
         raise InfeasibleError(
-            f"the hover at ({x:.2f}, {y:.2f}, {z:.2f}) m is {beyond:.2f} m too far out",
+            f"the hover at {coordinates(position, '.2f')} m is {beyond:.2f} m too far out",
             where="take-off",
             hint="take off to a height inside the space less its margin, and nearer to the middle of the room",
         )

@@ -19,6 +19,7 @@ from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.rate_trade import ahead, gains_under
 from cfplan.flight.telemetry import Triple
+from cfplan.numbers import coordinates
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.space import inside
 from cfplan.simulation.link_loss import link_loss_of_slow_motion
@@ -82,5 +83,4 @@ def _way(begin: Triple, end: Triple, yaw: float, end_yaw: float, duration: float
 
 
 def _text(place: Triple) -> str:
-    x, y, z = place
-    return f"({x:.2f}, {y:.2f}, {z:.2f}) m"
+    return f"{coordinates(place, '.2f')} m"

@@ -11,6 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import oaconvolve
 
 from cfplan.errors import InputError
+from cfplan.numbers import coordinates, shown
 from cfplan.recording.header import Triple
 from cfplan.recording.importers.mocap_log import LoggedSubject
 from cfplan.recording.record import Record
@@ -82,11 +83,10 @@ class Alignment:
     alike: bool  # whether the log looks like a flight of the plan at all
 
     def __str__(self) -> str:
-        x, y, z = (round(100 * value, 1) + 0.0 for value in self.aside)  # no -0.0
         return (
-            f"offset {self.offset:z.3f} s, {100 * self.covered:.0f} % of the plan seen, deviation "
+            f"offset {shown(self.offset, '.3f')} s, {100 * self.covered:.0f} % of the plan seen, deviation "
             f"{100 * self.rms_deviation:.1f} cm rms, {100 * self.max_deviation:.1f} cm max, "
-            f"in the mean ({x:.1f}, {y:.1f}, {z:.1f}) cm aside"
+            f"in the mean {coordinates((100 * each for each in self.aside), '.1f')} cm aside"
         )
 
 

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
+from cfplan.numbers import coordinates
 
 LONGEST = 12 * 3600.0  # s, from the first time to the last; more cost memory and minutes wherever times are compared
 _LATEST = 1e11  # s; microseconds taken for seconds are later
@@ -35,9 +36,8 @@ def check_places(position: NDArray, name: str, *, where: str) -> None:
     """Raise InputError where a position, (N, 3) m, is farther away than any flight; NaN is not seen."""
     wrong = np.flatnonzero((np.abs(position) > _FARTHEST).any(axis=1))
     if len(wrong):
-        x, y, z = position[wrong[0]]
         raise InputError(
-            f"position {int(wrong[0]) + 1} of {name} is ({x:g}, {y:g}, {z:g}) m",
+            f"position {int(wrong[0]) + 1} of {name} is {coordinates(position[wrong[0]], 'g')} m",
             where=where,
             hint="the file is damaged, or its lengths are not in the unit that its format has",
         )

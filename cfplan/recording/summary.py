@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.telemetry import Phase
+from cfplan.numbers import shown
 from cfplan.recording.commitments import committed_path, committed_time
 from cfplan.recording.path_distance import distance_to_path
 from cfplan.recording.record import Record, Setpoints
@@ -292,7 +293,7 @@ def begun(record: Record) -> str:
 
 def _text(value: float, unit: str, digits: int) -> str:
     """Return the number with its unit; a dash where it is not known."""
-    return f"{value:.{digits}f} {unit}" if math.isfinite(value) else UNKNOWN
+    return f"{shown(value, f'.{digits}f')} {unit}" if math.isfinite(value) else UNKNOWN
 
 
 def _peak(time: NDArray, vectors: NDArray, begin: float, end: float) -> float:

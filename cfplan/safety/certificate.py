@@ -19,6 +19,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
+from cfplan.numbers import shown
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import AT_LEAST, QUANTITIES, Quantity
 from cfplan.safety.space import Space, inside
@@ -64,8 +65,8 @@ class Margin:
     def shown(self, value: float) -> str:
         """Return a value in the unit of safety.yaml, where angles are in degrees."""
         if self.unit == "rad":
-            return f"{math.degrees(value):.1f} °"
-        return f"{value:.{3 if self.unit == 'N' else 2}f} {self.unit}"
+            return f"{shown(math.degrees(value), '.1f')} °"
+        return f"{shown(value, '.3f' if self.unit == 'N' else '.2f')} {self.unit}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +94,9 @@ class Certificate:
                 margin.name,
                 margin.shown(margin.worst),
                 margin.shown(margin.limit).split()[0],
-                f"{100 * margin.share:.1f} %",
+                f"{shown(100 * margin.share, '.1f')} %",
                 f"{margin.time:.2f} s",
-                "{:z.2f} {:z.2f} {:z.2f}".format(*margin.position),
+                " ".join(shown(each, ".2f") for each in margin.position),
             )
             for margin in self.margins
         ]

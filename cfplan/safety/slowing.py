@@ -6,6 +6,7 @@ import numpy as np
 
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError, NotCertifiedError
+from cfplan.numbers import coordinates, shown
 from cfplan.safety.certificate import WALLS, Certificate, certify
 from cfplan.safety.feasibility import describe_hover, hover_violation
 from cfplan.safety.limits import PlanLimits
@@ -77,7 +78,7 @@ def slow_until_certified(
     if best is None:
         raise InfeasibleError(
             f"{certificate.worst.name} exceeds its limit however slow the flight",
-            where="({:.2f}, {:.2f}, {:.2f}) m".format(*certificate.worst.position),
+            where=f"{coordinates(certificate.worst.position, '.2f')} m",
             hint="loosen that limit or change the path there",
         )
     return best
@@ -103,7 +104,7 @@ def _check_place(certificate: Certificate) -> None:
     for margin in certificate.margins:
         if margin.name == WALLS and not margin.passed:
             raise InfeasibleError(
-                f"the path comes within {margin.worst:.3f} m of the walls, the margin is {margin.limit:g} m",
-                where="({:.2f}, {:.2f}, {:.2f}) m".format(*margin.position),
+                f"the path comes within {shown(margin.worst, '.3f')} m of the walls, the margin is {margin.limit:g} m",
+                where=f"{coordinates(margin.position, '.2f')} m",
                 hint="move or place the path",
             )

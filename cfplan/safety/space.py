@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.path import Path
+from cfplan.numbers import coordinates
 
 _SAMPLES = 33  # of each piece of a path
 _AXES = ("x", "y", "z")
@@ -76,11 +77,10 @@ def _refuse(space: Space, point: NDArray, what: str, where: str) -> None:
     beyond = space.beyond(point)
     axis = int(np.argmax(np.where(np.isfinite(beyond), beyond, np.inf)))
     low = bool(point[axis] < (space.low[axis] + space.high[axis]) / 2)
-    x, y, z = point
     outside = beyond[axis] - space.margin
     far = f"{outside:.3f} m beyond" if outside > 0 else f"{abs(outside):.3f} m from"
     raise InfeasibleError(
-        f"{what}, ({x:.3f}, {y:.3f}, {z:.3f}) m, is {far} {_side(space, axis, low)}, "
+        f"{what}, {coordinates(point, '.3f')} m, is {far} {_side(space, axis, low)}, "
         f"{max(beyond[axis], 0.0):.3f} m too far with the margin of {space.margin:g} m",
         where=where,
         hint="move or place the path, or correct `space` in safety.yaml if the room is larger",

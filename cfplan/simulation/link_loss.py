@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from cfplan.flight.firmware import Timeouts, gains_for
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, decode
+from cfplan.numbers import shown
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
 from cfplan.simulation.dynamics.body import pack_body
@@ -95,7 +96,7 @@ class LinkLossMoments:
         """Return what people call the wall of a setpoint: "the wall x = 2.25 m"."""
         axis, side = WALLS[self.wall[number]]
         place = (limits.space.low, limits.space.high)[side][axis]
-        return f"the {'ceiling' if axis == 2 else 'wall'} {'xyz'[axis]} = {place:g} m"
+        return f"the {'ceiling' if axis == 2 else 'wall'} {'xyz'[axis]} = {shown(place, 'g')} m"
 
 
 def simulate_link_loss(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLoss:

@@ -11,6 +11,7 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.telemetry import Event, Level, PathAnswered, PathRequested, Telemetry, Triple
 from cfplan.identification.advice import suggests_identification
+from cfplan.numbers import coordinates
 from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.air_planner import PathAnswer, PathRequest, PathVerdict, Wish
 from cfplan.recording.header import RecordHeader, header_of_steering
@@ -91,7 +92,7 @@ class SteeringRecord:
 
 def described(wish: Wish, waypoints: tuple[Triple, ...]) -> str:
     """Say what is asked for, in a line."""
-    places = ", ".join(f"({x:.2f}, {y:.2f}, {z:.2f})" for x, y, z in waypoints)
+    places = ", ".join(coordinates(waypoint, ".2f") for waypoint in waypoints)
     match wish:
         case Wish.EXTEND:
             return f"fly on through {places}"

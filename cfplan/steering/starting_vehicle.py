@@ -6,6 +6,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from cfplan.errors import InputError
+from cfplan.numbers import coordinates, shown
 
 if TYPE_CHECKING:
     from cfplan.flight.mocap.poses import PoseSource
@@ -62,8 +63,8 @@ def look_at_hardware(uri: str, mocap_uri: str | None, limits: "PoseLimits", on_s
             pose = source.poses()[-1]
         finally:
             source.close()
-        x, y, z = pose.position
-        said.append(f"seen at {x:.2f} {y:.2f} {z:.2f} m, yaw {math.degrees(yaw_of(pose.quaternion)):.0f}°")
+        yaw = math.degrees(yaw_of(pose.quaternion))
+        said.append(f"seen at {coordinates(pose.position, '.2f')} m, yaw {shown(yaw, '.0f')}°")
 
 
 def _is_virtual(uri: str, mocap_uri: str) -> bool:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from cfplan import errors
 from cfplan.errors import CfplanError, ExitCode
+from cfplan.numbers import coordinates
 
 _KINDS = Path(errors.__file__)
 PACKAGE = _KINDS.parent
@@ -292,6 +293,8 @@ class _Words:
             return [*self._chosen(node.func.value.id), *default]
         if isinstance(node.func, ast.Name) and node.func.id in ("str", "printable") and node.args:
             return self._texts(node.args[0])
+        if _called(node) == coordinates.__name__:
+            return [coordinates((0.0, 0.0, 0.0), "g").replace("0", GAP)]
         function = self._function(node)
         if function is None:
             return [GAP]

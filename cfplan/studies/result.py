@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from cfplan.errors import InputError
 from cfplan.files.json_values import json_value
+from cfplan.numbers import shown
 from cfplan.studies.provenance import Provenance, provenance
 
 NOTHING = "–"  # stands where there was nothing to measure
@@ -29,13 +30,6 @@ class Column:
     goal: str = ""  # what it should not exceed
     meaning: str = ""  # where the title alone does not say it
 
-    def _plain_format(self, value: Any) -> str:
-        """Return the format, by which no number is shown as minus zero."""
-        if not isinstance(value, float) or not self.format:
-            return self.format
-        signed = self.format.startswith(("+", "-", " "))
-        return f"{self.format[:signed]}z{self.format[signed:]}"
-
     def text(self, row: Mapping[str, Any]) -> str:
         """Return the column's cell of this row."""
         value = row[self.key]
@@ -45,7 +39,8 @@ class Column:
             return f"{value}/{row[self.of]}"
         if isinstance(value, str):
             return value
-        number = f"{value * SCALE[self.unit] if self.unit in SCALE else value:{self._plain_format(value)}}"
+        value = value * SCALE[self.unit] if self.unit in SCALE else value
+        number = shown(value, self.format) if isinstance(value, float) and self.format else f"{value:{self.format}}"
         return number + (self.unit if self.unit == "×" else f" {self.unit}" if self.unit else "")
 
 

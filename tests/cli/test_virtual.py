@@ -27,7 +27,7 @@ def test_a_locked_supervisor_is_said_once_with_what_to_do(capsys, monkeypatch, t
         line.show(state, [0.0, 1.0, 0.5])
     told = capsys.readouterr().err
     assert told.count(LOCKED) == 1
-    assert ("0.00 1.00 0.50 m, flying" in told) is terminal
+    assert ("(0.00, 1.00, 0.50) m, flying" in told) is terminal
     if not terminal:
         assert told.splitlines() == ["ready to fly", "flying", "warning level out", "locked", LOCKED]
 

@@ -225,7 +225,7 @@ def test_the_compiled_certificate_is_that_of_plain_numpy(make_profile, waypoints
 
 
 def test_margins_are_what_they_once_were(make_profile):
-    """Worst value, share and time of each, as plain numpy makes them."""
+    """Worst value, share and time of each, as plain numpy makes them; processors round the path otherwise."""
     once = {
         "speed": (2.5812494200507654, 1.2906247100253827, 3.9599245506935365),
         "acceleration": (3.953892151082605, 0.7907784302165209, 2.661764298369392),
@@ -241,10 +241,10 @@ def test_margins_are_what_they_once_were(make_profile):
     h, yaw = 1.0 + 0.5 * np.sin(1.3 * np.arange(30)), 0.3 * np.cos(0.9 * np.arange(29)).cumsum()
     trajectory = Trajectory(path, make_profile(path.end, h, yaw), AIRFRAME)
     certificate = certify(trajectory, replace(LIMITS, angular_acceleration=35.0), SPACE)
-    assert certificate.duration == pytest.approx(7.2628029465075254, rel=1e-13)
+    assert certificate.duration == pytest.approx(7.2628029465075254, rel=1e-9)
     assert certificate.samples == 7610
     for margin in certificate.margins:
-        assert (margin.worst, margin.share, margin.time) == pytest.approx(once[margin.name], rel=1e-12)
+        assert (margin.worst, margin.share, margin.time) == pytest.approx(once[margin.name], rel=1e-9)
 
 
 def test_the_worst_value_is_where_and_when_the_certificate_says(trajectory):

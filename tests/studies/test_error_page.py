@@ -73,7 +73,7 @@ def test_what_ends_a_flight_is_explained():
 
 @pytest.mark.parametrize("line", re.findall(r"^    error: (.*)$", (REPOSITORY / "docs/mistakes.md").read_text(), re.M))
 def test_what_is_printed_is_found_on_the_page(line):
-    """Messages as commands print them, which another test compares to the letter, have their row."""
+    """Messages as commands print them, which another test compares, have their row."""
     said = re.sub(r" \(hint: .*\)$", "", line)
     known = [message for row in rows() for message in row.messages if len(re.findall(r"[^\W\d_]", message)) > 3]
     assert any(re.fullmatch(f"(?:.*: )?{pattern(message)}", said) for message in known)

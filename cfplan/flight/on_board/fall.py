@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.firmware import Timeouts
+from cfplan.numbers import shown
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.airframe import GRAVITY
 
@@ -43,7 +44,7 @@ class Falls:
         """Return what people call the wall of a state: "the wall x = 2.25 m"."""
         axis, side = WALLS[self.wall[number]]
         place = (limits.space.low, limits.space.high)[side][axis]
-        return f"the {'ceiling' if axis == 2 else 'wall'} {'xyz'[axis]} = {place:g} m"
+        return f"the {'ceiling' if axis == 2 else 'wall'} {'xyz'[axis]} = {shown(place, 'g')} m"
 
 
 def falls_from(states: NDArray, limits: Limits, deviation: float) -> Falls:

@@ -21,6 +21,7 @@ from cfplan.flight.radio.supervisor_bits import FAULTS, FLYING
 from cfplan.flight.setpoints.commitment import QUANTUM
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Estimate, Triple, VehicleStatus
+from cfplan.numbers import coordinates, shown
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
 from cfplan.vehicle.rotations import tilt_of, yaw_of
@@ -254,8 +255,8 @@ def check_start_place(snapshot: PreflightSnapshot) -> Check:
     beyond = space.beyond((x, y, snapshot.mission.take_off_height))
     worst = float(np.max(beyond))
     return Check(
-        "place of take-off", f"({x:.2f}, {y:.2f}) m, {-worst:.2f} m inside", "inside the space less its margin",
-        bool(inside(worst)), "move the vehicle towards the middle of the room",
+        "place of take-off", f"{coordinates((x, y), '.2f')} m, {shown(-worst, '.2f')} m inside",
+        "inside the space less its margin", bool(inside(worst)), "move the vehicle towards the middle of the room",
     )  # fmt: skip
 
 
@@ -266,7 +267,7 @@ def check_plan_inside(snapshot: PreflightSnapshot) -> Check:
     stops = decode(snapshot.mission.stops.reshape(-1, snapshot.mission.stops.shape[-1])).position
     worst = max(float(np.max(space.beyond(planned))), float(np.max(space.beyond(stops))))
     return Check(
-        "plan and stops in the space", f"{-worst:.3f} m inside", "inside the space less its margin",
+        "plan and stops in the space", f"{shown(-worst, '.3f')} m inside", "inside the space less its margin",
         bool(inside(worst, QUANTUM)), "plan again with this safety.yaml",
     )  # fmt: skip
 

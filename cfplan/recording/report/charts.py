@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.numbers import shown
 from cfplan.planning.active_limits import on_white
 from cfplan.recording.plots import FAR_LIMIT, LIMIT, Colour
 
@@ -155,7 +156,7 @@ def _grid(frame: _Frame, x_label: str, y_label: str = "") -> str:
 
 
 def _label(value: float) -> str:
-    return f"{value + 0.0:.6g}"
+    return shown(value, ".6g")
 
 
 def _line(frame: _Frame, curve: Curve) -> str:

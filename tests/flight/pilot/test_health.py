@@ -6,7 +6,6 @@ import pytest
 
 from cfplan.errors import ExitCode
 from cfplan.flight.pilot.health import FRESH, GONE, LATE, Descent, Freshness, Health, HealthMonitor
-from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase
 
 PHASES = (Phase.TAKE_OFF, Phase.GO_TO_START, Phase.STREAM, Phase.HOLD, Phase.LAND)
