@@ -56,7 +56,8 @@ def windows_of(path: Path, nodes: int, size: WindowSize, limits: PlanLimits) -> 
     length = np.append(0.0, np.cumsum((spacing[1:] + spacing[:-1]) / 2.0))  # m, of the path up to each node
     far_enough = np.searchsorted(length, length + limits.speed**2 / limits.acceleration + LOOKAHEAD)
     seen = np.minimum(far_enough, nodes).tolist()  # up to which node a window looks that keeps what is before this one
-    windows, first = [], 0
+    windows: list[tuple[int, int, int]] = []
+    first = 0
     while True:
         left = first + max(size.kept, 2 * (seen[first] - first))
         beyond = max(left + size.ahead, seen[min(left, nodes)])
