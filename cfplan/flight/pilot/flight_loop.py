@@ -94,6 +94,7 @@ class FlightLoop:
         self._link: Link | None = None
         self._feeding = False  # poses are read and forwarded
         self.airborne = False
+        self._took_off = False  # from then on a fault of this program is dealt with, not raised
         self._stop_expected = math.inf  # s, from when on motors that do not turn were meant to stop
         self._tolerated = Rung.NONE  # an abort of this rung or a lesser one changes nothing
         self.commitment = Commitment(0, mission.payloads, mission.stops)
@@ -144,7 +145,7 @@ class FlightLoop:
 
     def lift_off(self) -> None:
         """From now on every trigger of the abort ladder counts, not only orders."""
-        self.airborne = True
+        self.airborne = self._took_off = True
 
     def touch_down(self) -> None:
         """From now on only orders count again."""
@@ -281,7 +282,7 @@ class FlightLoop:
         except (AbortRaised, LinkLost):
             raise
         except Exception as error:
-            if not self.airborne:
+            if not self._took_off:
                 raise
             if step not in self._faults:
                 self._faults.add(step)
@@ -336,7 +337,7 @@ class FlightLoop:
         try:
             self._forward_poses()
         except Exception as error:
-            if not self.airborne:
+            if not self._took_off:
                 raise
             if not self.pose_fault:
                 self.pose_fault = f"fault in the pilot: {error!r}"

@@ -385,6 +385,47 @@ def test_a_fault_of_the_program_itself_lands(world, fly):
     assert world.position[2] < 0.05
 
 
+def test_an_error_that_cfplan_raises_in_the_air_lands_too(world, fly):
+    def fault():
+        raise InputError("invented", where="flight", hint="none")
+
+    world.when(Phase.STREAM, 1.0, fault)
+    outcome = fly()
+    assert (outcome.exit_code, outcome.rung) == (ExitCode.ENDED_BY_SAFETY, Rung.LAND)
+    assert world.position[2] < 0.05
+    assert not world.armed
+
+
+@pytest.mark.parametrize("broken", ["keep_alive", "poses", "send_pose", "revive_log"])
+@pytest.mark.parametrize("phase", [Phase.TAKE_OFF, Phase.STREAM, Phase.LAND])
+def test_a_lasting_fault_in_a_step_of_the_tick_lands_and_does_not_cut(world, fly, broken, phase):
+    def fail(*_):
+        raise ZeroDivisionError("invented")
+
+    if broken == "revive_log":
+        world.when(phase, 0.3, lambda: setattr(world, "status_silent", True))
+    world.when(phase, 0.3, lambda: setattr(world, broken, fail))
+    outcome = fly()
+    assert (outcome.exit_code, outcome.rung) == (ExitCode.ENDED_BY_SAFETY, Rung.LAND)
+    assert "emergency stop" not in world.calls
+    assert world.position[2] < 0.05
+    assert not world.armed
+
+
+def test_a_fault_of_pose_handling_is_that_no_pose_comes(world, fly):
+    whole, failing = world.poses, []
+
+    def fail():
+        if len(failing) < 8:
+            failing.append(world.now)
+            raise ZeroDivisionError("invented")
+        return whole()
+
+    world.when(Phase.STREAM, 1.0, lambda: setattr(world, "poses", fail))
+    assert fly().exit_code is ExitCode.OK  # 0.08 s without poses
+    assert "invented" in world.said
+
+
 def test_leaving_the_room_beyond_the_last_line_cuts(world, limits, fly):
     world.when(Phase.GO_TO_START, 0.5, lambda: blow_away(world))
     outcome = fly(flight=replace(limits.flight, deviation=Ladder(9.0, 9.0, 9.0)))
