@@ -67,6 +67,7 @@ class Landing:
     def land(self) -> None:
         """Descend from where the vehicle is asked to be, and stop its motors. Raises AbortRaised if they do not."""
         self.begin()
+        self._stands |= self._loop.stream is None  # its motors are being stopped already, on the floor
         while not self._stands:
             if self._loop.descent is Descent.HELD:
                 self._loop.hold_where_it_is()

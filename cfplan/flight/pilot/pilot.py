@@ -97,7 +97,13 @@ class Pilot:
             self._history.say(level, f"{abort.rung.name.lower()}: {abort.text}")
             try:
                 if loop.airborne:
-                    {Rung.BRAKE: flown.brake, Rung.LAND: descents[-1], Rung.CUT: self._cut}[abort.rung]()
+                    match abort.rung:
+                        case Rung.BRAKE:
+                            flown.brake()
+                        case Rung.LAND:
+                            descents[-1]()
+                        case _:
+                            self._cut()
                 return exit_code, ", then ".join(reasons)
             except AbortRaised as graver:
                 abort = graver.abort

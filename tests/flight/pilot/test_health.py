@@ -129,3 +129,15 @@ def test_a_status_that_falls_silent_while_the_vehicle_arms_keeps_it_on_the_floor
     assert outcome.exit_code is ExitCode.PREFLIGHT
     assert world.position[2] == world.floor
     assert not world.armed
+
+
+@pytest.mark.parametrize("silent_after", [0.4, 0.6, 0.8])
+def test_a_status_that_falls_silent_while_a_take_off_is_given_up_leaves_nothing_armed(world, fly, silent_after):
+    world.other_body = True
+    world.when(Phase.TAKE_OFF, silent_after, lambda: setattr(world, "status_silent", True))
+    outcome = fly()
+    assert outcome.exit_code in (ExitCode.PREFLIGHT, ExitCode.ENDED_BY_SAFETY)
+    assert "fault" not in outcome.reason
+    assert "emergency stop" not in world.calls
+    assert not world.armed
+    assert not world.motors_on
