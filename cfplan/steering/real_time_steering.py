@@ -5,7 +5,7 @@ import sys
 import threading
 import types
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from cfplan.errors import CfplanError
 from cfplan.flight.clock import REAL_CLOCK
@@ -43,7 +43,7 @@ class RealTimeSteering:
         on_step: OnStep,
         *,
         keys: bool,
-        more_orders: Callable[[], Sequence[Order]] = tuple,
+        more_orders: Callable[[], Iterable[Order]] = tuple,
     ):
         """Start the pilot's process, and a virtual vehicle's lab. `keys` says whether those of the terminal count.
 
