@@ -46,6 +46,7 @@ _RECENT = 1.0  # s of good poses that are kept
 MOVES_OTHERWISE = 0.2
 LINK_LOST_AFTER = 10.0  # s without an acknowledgement, in flight; until then the link may come back
 _BRAKES_IN = 0.2  # s of its speed, by which a vehicle that levels out stops beyond where it is
+_FEWEST_HEIGHTS = 3  # that tell whether a body rests
 _STREAMS = 8  # that are remembered: a pose that comes late is judged by the stream of its time
 
 
@@ -197,7 +198,7 @@ class FlightLoop:
         while self.stream is self.plan and (left := due - LOOKS_UNTIL - self.now()) > 0.0:
             if not self._proposals.wait(left):
                 return
-            self._guard("proposals", lambda: self._consider_proposal(self.now(), self._just_sent))
+            self._consider_proposal(self.now(), self._just_sent)
 
     def _consider_proposal(self, now: float, sent: int) -> None:
         """Fly what a planner proposes from its splice on if it verifies; answer the planner.
@@ -263,16 +264,17 @@ class FlightLoop:
 
     def tick(self) -> float:
         """Serve one deadline: the setpoint, then the poses, then the abort monitor. Return the time after it, s."""
-        due = self._deadlines.wait(self._consider_meanwhile)
+        due = self._deadlines.wait(lambda due: self._guard("proposals", lambda: self._consider_meanwhile(due)))
         now = self.now()
         self.waking.append(now - due)
+        late = max(now - due, now - self._sent_at - 1.0 / self.mission.rate)  # wherever this computer stood still
         self._guard("setpoints", lambda: self._send_setpoint(now, due))
         self._guard("watchdog", lambda: self._keep_alive(now))
         self._take_poses()
         self._guard("proposals", lambda: self._consider_due_proposal(now))
         self._guard("logs", lambda: self._look(now))
         self._obey_orders()
-        self._guard("abort monitor", lambda: self._monitor_flight(now, now - due))
+        self._guard("abort monitor", lambda: self._monitor_flight(now, late))
         return now
 
     def _guard(self, step: str, act: Callable[[], None]) -> None:
@@ -325,7 +327,7 @@ class FlightLoop:
         )
         streams = self.stream is not None and not self.stream.on_board
         self._left_alone |= self.airborne and streams and self.health.uplink is GONE
-        if self.health.uplink is FRESH and (self.airborne or self.watched):
+        if self.health.uplink is FRESH and self._took_off:
             for log in ("estimate", "status"):
                 if getattr(self.health, log) is GONE:
                     link.revive_log(log)
@@ -428,7 +430,7 @@ class FlightLoop:
     def _monitor_flight(self, now: float, late: float) -> None:
         """Raise LinkLost or AbortRaised where there is a reason to; only in the air."""
         link, estimate = self.link, self.estimate
-        if link.lost or (self.airborne and now - link.acknowledged > LINK_LOST_AFTER):
+        if link.lost or (self.airborne and self._health_monitor.uplink_silent > LINK_LOST_AFTER):
             raise LinkLost
         if not self.airborne or self._stopped():
             return
@@ -464,7 +466,8 @@ class FlightLoop:
         off = 0.0
         if (
             self.airborne
-            and not self.history.first_setpoint
+            and self._tolerated is Rung.NONE
+            and not (self.history.first_setpoint or self._left_alone)
             and estimate is not None
             and self.health.estimate is FRESH
             and now - self.pose().time <= self.limits.pose.age_warning
@@ -532,9 +535,8 @@ class FlightLoop:
     def heights(self, duration: float) -> list[float]:
         """Return the heights, m, of the good poses of the last `duration`, s; none if they do not reach back as far."""
         since = self.now() - duration
-        if not self.recent or self.recent[0].time > since:
-            return []
-        return [pose.position[2] for pose in self.recent if pose.time > since]
+        heights = [pose.position[2] for pose in self.recent if pose.time > since]
+        return heights if len(heights) >= _FEWEST_HEIGHTS and self.recent[0].time <= since else []
 
     @property
     def blind_for(self) -> float:

@@ -1,8 +1,8 @@
 """Health: which of its sources the pilot still hears, and the table of what it does about each combination.
 
-There are four sources: the uplink, by acknowledgements of what was sent; the vehicle's two logs, estimate and status;
-and the poses that reach the vehicle. Each is fresh, late or gone. The pilot computes that once a tick, and abort
-ladder, landing, holding and link loss read nothing else about silence.
+There are four sources: the uplink, by answers to cflib's pings, which acknowledge that the vehicle hears; the
+vehicle's two logs, estimate and status; and the poses that reach the vehicle. Each is fresh, late or gone. The pilot
+computes that once a tick; abort ladder, landing, holding and link loss read it.
 
 Acknowledgements alone say whether the vehicle can be steered. A vehicle whose logs are silent while it acknowledges
 flies what it is sent, so it brakes along its certified stop, lands by poses and is disarmed like any other.
@@ -20,7 +20,7 @@ from cfplan.flight.firmware import Timeouts
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.safety.limits import PoseLimits
 
-UPLINK_LATE = 0.25  # s without an acknowledgement; cflib asks for one ten times a second
+UPLINK_LATE = 0.25  # s without an answer to cflib's pings, ten a second
 UPLINK_GONE = Timeouts().level_out  # s; a vehicle that has had no setpoint for so long leaves its stream
 LOG_GONE = 0.5  # s without a message of one of the vehicle's logs
 _LONGEST_STEP = 0.05  # s between two ticks that count as silence; beyond it this computer stood still
@@ -107,6 +107,11 @@ class HealthMonitor:
         self._limits = limits
         self._looked = math.nan  # s, when it was last computed
         self._silent = [0.0, 0.0, 0.0]  # s, of uplink, estimate and status
+
+    @property
+    def uplink_silent(self) -> float:
+        """Return how long, s, nothing has been acknowledged."""
+        return self._silent[0]
 
     def look(self, now: float, *, uplink: float, estimate: float, status: float, poses: float) -> Health:
         """Return the health at a tick; each argument is in s on its clock, when that source was last heard.

@@ -211,11 +211,15 @@ def stop_until_seen(loop: FlightLoop, send: Callable[[], object]) -> bool:
 
     A vehicle that acknowledges but does not tell its status has had what was sent; then that counts.
     """
+
+    def stopped() -> bool:
+        return loop.health.status is FRESH and not loop.bits(FLYING)
+
     loop.end_stream()
     loop.expect_stop()
     for _ in range(TRIES):
         send()
-        loop.until(lambda: not loop.bits(FLYING) or loop.health.status_unknown, MOTORS_STOP_WITHIN)
-        if not loop.bits(FLYING):
+        loop.until(lambda: stopped() or loop.health.status_unknown, MOTORS_STOP_WITHIN)
+        if stopped():
             return True
     return loop.health.status_unknown

@@ -12,6 +12,7 @@ from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.pilot.abort_monitor import Abort, fault_abort
 from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.flight_loop import LINK_LOST_AFTER, TRIES, AbortRaised, FlightLoop, LinkLost, OrderSource
+from cfplan.flight.pilot.health import FRESH
 from cfplan.flight.pilot.manoeuvres import Manoeuvres
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.on_board_manoeuvres import OnBoardManoeuvres
@@ -142,8 +143,10 @@ class Pilot:
             try:
                 for _ in range(TRIES):
                     loop.link.arm(False)
-                    if loop.until(lambda: not loop.bits(ARMED), 0.2):
+                    if loop.until(lambda: loop.health.status is FRESH and not loop.bits(ARMED), 0.2):
                         break
+                else:
+                    self._history.say(Level.WARNING, "the vehicle does not say that it is disarmed")
             except (LinkLost, AbortRaised):
                 self._history.say(Level.WARNING, "the link went before the vehicle was disarmed")
             locked = loop.bits(LOCKED)

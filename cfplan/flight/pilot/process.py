@@ -278,8 +278,8 @@ def _run(
         last = replace(pilot.fly(), telemetry_dropped=report.dropped)
     except CfplanError as error:
         last = error
-    except Exception as error:  # on the ground; in the air the pilot lands first
-        last = CfplanError(f"fault in the pilot: {error!r}", where=uri, hint="nothing was armed; please report this")
+    except Exception as error:  # before take-off, or where even cutting broke
+        last = CfplanError(f"fault in the pilot: {error!r}", where=uri, hint="please report this")
     report.close(last)
     os._exit(0)  # cflib leaves threads behind that never end
 

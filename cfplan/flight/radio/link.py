@@ -55,7 +55,7 @@ class Link:
         self._crazyflie, self.uri, self._report, self._clock = crazyflie, uri, report, clock
         self._radio_lock = radio_lock
         self.lost = ""  # why the link is gone; empty while it stands
-        self.acknowledged = clock.now()  # s, when the vehicle last acknowledged that it had a packet
+        self.acknowledged = clock.now()  # s, when the vehicle last answered one of cflib's pings, ten a second
         self.estimate: Estimate | None = None
         self.status: VehicleStatus | None = None
         self.position_variance: Triple | None = None  # m² along x, y, z
@@ -66,7 +66,7 @@ class Link:
         self._revivals: dict[str, Iterator[bytes | None]] = {}  # of each log, by its name
         # s, when the vehicle's clock of ms was zero, according to the quickest messages; when the last message came
         self._log_zero, self._log_heard = math.inf, 0.0
-        # The radio tells of each packet; other drivers have nothing but cflib's pings, ten a second.
+        # The radio acknowledges each packet, but for its own processor; an answer comes from the one that flies.
         crazyflie.link_statistics.latency_updated.add_callback(lambda _: self.note_acknowledgement())
         crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
         crazyflie.add_port_callback(PLATFORM_PORT, self._on_platform)
@@ -249,7 +249,7 @@ class Link:
         restart_vehicle(self.uri, self._clock)
 
     def note_acknowledgement(self) -> None:
-        """Remember that the vehicle has just acknowledged a packet; a callback of the radio."""
+        """Remember that the vehicle has just acknowledged a packet; a callback of cflib."""
         self.acknowledged = self._clock.now()
 
     def note_loss(self, _: str, reason: str = "the link was closed") -> None:

@@ -33,7 +33,7 @@ from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, turns_for
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import rotations_of
+from cfplan.vehicle.rotations import rotations_of, yaw_of
 
 SPLICE_AHEAD = math.ceil((LEAD + BRAKE_LEAD) * RATE)  # setpoints from a splice to its joint: so far ahead one looks
 LEAST_AHEAD = 0  # setpoints from the one just sent to a splice, at least: the first that is another comes behind that
@@ -48,6 +48,7 @@ _PERIOD = 1.0 / RATE
 # rounded.
 _JUMP = LARGEST_JERK * _PERIOD**3 / 12 + QUANTUM * (1.0 + _PERIOD)
 _ROUNDING = 1e-9
+_SAME_HEADING = 0.1  # rad; a stop trades other rates than its setpoint, which turns the heading by up to 0.02
 _MAGIC = b"proposal"
 _CHAIN = struct.Struct("<II")  # checksums of a commitment and of the proposal that continues it
 # magic, what it follows, checksum, splice, setpoints, setpoints of a stop, stops that are sent, whether it goes on
@@ -287,7 +288,8 @@ def _unfit_stops(asked: FullStateSetpoints, proposal: Proposal) -> Refusal | Non
     off = np.maximum(
         np.abs(begin.position - asked.position).max(axis=1), np.abs(begin.velocity - asked.velocity).max(axis=1)
     )
-    good = (off <= QUANTUM + _ROUNDING) & _rests(end)
+    turned = np.abs(np.remainder(yaw_of(begin.quaternion.T) - yaw_of(asked.quaternion.T) + np.pi, 2 * np.pi) - np.pi)
+    good = (off <= QUANTUM + _ROUNDING) & (turned <= _SAME_HEADING) & _rests(end)
     if not good.all():
         return Refusal(Fault.STOPS, f"the stop from setpoint {first + int(np.argmin(good))}")
     last = count - proposal.ending - 1

@@ -39,12 +39,13 @@ _LARGE = 1e9  # in place of what is no number
 # the quaternion's lower and upper half.
 _PLACE, _SPEED, _FORCE, _RATE, _TURN, _WORDS = 0, 3, 6, 9, 12, 14
 # Rows of the panel of the largest values so far: measures, and those whose least value counts with the other sign.
-_LEAST_THRUST, _TRADED, _JUMP = of.MEASURES, of.MEASURES + 1, of.MEASURES + 2
-_HIGH, _LOW, _ROWS = of.MEASURES + 3, of.MEASURES + 6, of.MEASURES + 9
+_LEAST_THRUST, _TRADED, _JUMP, _TURNED = of.MEASURES, of.MEASURES + 1, of.MEASURES + 2, of.MEASURES + 3
+_HIGH, _LOW, _ROWS = of.MEASURES + 4, of.MEASURES + 7, of.MEASURES + 10
 TOLERANCES = {"m/s": 1e-3, "m/s²": 0.1, "rad": math.radians(0.5), "rad/s": 0.3, "N": 1e-3}
 """By unit, what bytes of a certified motion may seem to exceed a limit by. Velocities rounded to 1 mm/s tell the
 acceleration to 0.043 m/s² and its direction to 0.25°; the worst of 48 plans at all kinds of limits were 0.018 m/s²,
 0.15° and 0.02 rad/s beyond, and of their stops 0.03 m/s², 0.13° and 0.1 rad/s."""
+FASTEST_HEADING = 2.0  # times the largest body rate; the heading of an attitude that leans by 60° turns as fast
 LED_THRUST = 1.0  # m/s², besides, of acceleration in stops: the thrust whose certified value counts there is sent ahead
 
 
@@ -55,6 +56,7 @@ class MotionExtremes:
     high: NDArray  # (MEASURES,), of each measure the largest; NaN where bytes do not tell it
     low: NDArray  # (MEASURES,), the least
     traded: float  # rad/s, of body rates that are sent as a turn of the thrust
+    turn: float  # rad, by which the heading turns from one setpoint to the next
     jump: float  # m, between a position and the next, beyond what the velocities there say
     corners: NDArray  # (2, 3) m, the least and the largest coordinates
 
@@ -78,13 +80,17 @@ def motion_extremes(runs: NDArray, before: NDArray, airframe: Airframe, end: int
     for each, thrust in ((high, high[of.SPECIFIC_THRUST]), (low, low[of.SPECIFIC_THRUST])):
         each[of.MOTOR_THRUST : of.MOTOR_THRUST + 4] = thrust * airframe.mass / 4
     corners = np.array([-worst[_LOW:_ROWS], worst[_HIGH:_LOW]])
-    return MotionExtremes(high, low, math.sqrt(worst[_TRADED]), float(worst[_JUMP]), corners)
+    turn = math.acos(max(1.0 - worst[_TURNED], -1.0))
+    return MotionExtremes(high, low, math.sqrt(worst[_TRADED]), turn, float(worst[_JUMP]), corners)
 
 
 def excess_of(worst: MotionExtremes, limits: Limits, *, in_stop: bool) -> str:
     """Return which limit of plans a motion exceeds, or `in_stop` which of stops, and by which value; empty if none."""
     if not worst.traded <= TRADED_RATE_MAX + TOLERANCES["rad/s"]:
         return f"sends {worst.traded:.3g} rad/s as a turn of the thrust; it may be at most {TRADED_RATE_MAX:.3g}"
+    most = FASTEST_HEADING * limits.plan.angular_velocity / RATE
+    if not worst.turn <= most:
+        return f"turns the heading by {math.degrees(worst.turn):.3g}°; it may be at most {math.degrees(most):.3g}"
     for quantity in QUANTITIES:
         if quantity.measure == of.ANGULAR_ACCELERATION or (in_stop and quantity.in_stop is None):
             continue
@@ -155,6 +161,8 @@ def _take_words(words: NDArray, run: NDArray, before: NDArray, begin: int, lanes
             words[(_RATE + axis) * _WIDTH + n] = _word(run, row + FIELD_PLACES[3] + 2 * axis)
         words[_TURN * _WIDTH + n] = _word(run, row + QUATERNION_PLACE)
         words[(_TURN + 1) * _WIDTH + n] = _word(run, row + QUATERNION_PLACE + 2)
+    ahead = PAYLOAD_SIZE * min(begin + lanes, last) + QUATERNION_PLACE
+    words[_TURN * _WIDTH + lanes], words[(_TURN + 1) * _WIDTH + lanes] = _word(run, ahead), _word(run, ahead + 2)
     for axis in range(3):
         place, speed = FIELD_PLACES[0] + 2 * axis, FIELD_PLACES[1] + 2 * axis
         words[(_PLACE + axis) * _WIDTH + lanes] = _word(run, PAYLOAD_SIZE * min(begin + lanes, last) + place)
@@ -203,6 +211,9 @@ def _raise_worst(worst: NDArray, words: NDArray, n: int, drag: float, full_rate:
     _raise(worst, of.SPECIFIC_THRUST, n, thrust)
     _raise(worst, _LEAST_THRUST, n, -thrust)
     _raise(worst, _TRADED, n, dot(traded, traded))
+    (cos, sin), (cos_ahead, sin_ahead) = _heading(words, n), _heading(words, n + 1)
+    norm = math.sqrt((cos * cos + sin * sin) * (cos_ahead * cos_ahead + sin_ahead * sin_ahead))
+    _raise(worst, _TURNED, n, 1.0 - (cos * cos_ahead + sin * sin_ahead) / norm)
     _raise(worst, of.SPEED, n, dot(velocity, velocity))
     _raise_place(worst, 0, n, place[0], place_ahead[0], half * (velocity[0] + velocity_ahead[0]))
     _raise_place(worst, 1, n, place[1], place_ahead[1], half * (velocity[1] + velocity_ahead[1]))
@@ -220,8 +231,7 @@ def _raise_place(worst: NDArray, axis: int, n: int, here: float, ahead: float, w
 @register_jitable(forceinline=True, fastmath=ROUNDING)
 def _body_rate(traded: Vector, sent: Vector, words: NDArray, n: int, full_rate: float) -> Vector:
     """Return the body rates that a setpoint asks for, of which some are `traded`, along the axes of the world."""
-    lower, upper = int(words[_TURN * _WIDTH + n]) & 0xFFFF, int(words[(_TURN + 1) * _WIDTH + n]) & 0xFFFF
-    cos, sin = heading_of(decompressed(upper << 16 | lower))
+    cos, sin = _heading(words, n)
     a, b, c = sent
     left = -c * sin, c * cos, a * sin - b * cos  # the controller's y axis, and x is left × sent
     about_x = dot(traded, cross(left, sent)) / math.sqrt(dot(left, left) * dot(sent, sent))
@@ -229,6 +239,13 @@ def _body_rate(traded: Vector, sent: Vector, words: NDArray, n: int, full_rate: 
     sent_x, sent_y, about_z = _triple(words, _RATE, n)
     believed = 1.0 / (1.0 - ATTITUDE_AGE * full_rate)
     return (sent_x + about_x) * believed, (sent_y + about_y) * believed, about_z
+
+
+@register_jitable(forceinline=True)
+def _heading(words: NDArray, n: int) -> tuple[float, float]:
+    """Return the horizontal components of the body's x axis that a setpoint asks for."""
+    lower, upper = int(words[_TURN * _WIDTH + n]) & 0xFFFF, int(words[(_TURN + 1) * _WIDTH + n]) & 0xFFFF
+    return heading_of(decompressed(upper << 16 | lower))
 
 
 @register_jitable(forceinline=True)

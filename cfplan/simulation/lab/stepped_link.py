@@ -46,7 +46,7 @@ class SteppedLink(Link):
             platform=SimpleNamespace(get_protocol_version=lambda: lab.vehicle.settings.protocol),
             link_statistics=SimpleNamespace(
                 latency=SimpleNamespace(latency=_ROUND_TRIP_MS),
-                latency_updated=SimpleNamespace(add_callback=lambda _: None),  # the radio tells of acknowledgements
+                latency_updated=SimpleNamespace(add_callback=lambda _: None),  # the radio stands for pings
             ),
             add_port_callback=lambda port, note: self._callbacks.setdefault(port, []).append(note),
         )

@@ -80,6 +80,35 @@ def test_logs_that_come_back_for_a_moment_and_go_again_land_by_poses(world, fly,
     assert world.revived == list(logs)
 
 
+@pytest.mark.parametrize("phase", PHASES)
+def test_poses_that_come_back_for_a_moment_and_go_again_land(world, fly, phase):
+    silence(world, "poses", phase, [(0.0, 0.6), (0.7, None)])
+    assert_reaction(world, fly(), Health(poses=GONE))
+
+
+@pytest.mark.parametrize("phase", [phase for phase in PHASES if phase is not Phase.LAND])
+def test_an_uplink_that_comes_back_for_a_moment_and_goes_again_is_lost(world, fly, phase):
+    silence(world, "uplink", phase, [(0.0, 0.6), (0.7, None)])
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.LINK_LOST
+    assert "emergency stop" not in world.calls
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_an_uplink_that_comes_back_lands_the_vehicle_where_it_is(world, fly, phase):
+    silence(world, "uplink", phase, [(0.0, 0.6)])
+    assert_reaction(world, fly(), Health(estimate=GONE))
+
+
+def test_an_armed_vehicle_whose_status_fell_silent_is_disarmed_by_more_than_one_packet(world, fly):
+    world.when(Phase.ARM, 0.0, lambda: vars(world).update(status_silent=True, arms_lost=0))
+    world.when(Phase.DISARM, 0.0, lambda: setattr(world, "arms_lost", 1))
+    fly()
+    assert world.calls.count("disarm") > 1
+    assert not world.armed
+    assert "does not say that it is disarmed" in world.said
+
+
 def test_a_silent_vehicle_that_acknowledges_flies_its_certified_stop(world, fly, mission):
     for log in ("estimate", "status"):
         silence(world, log, Phase.STREAM, [(0.0, None)])

@@ -25,7 +25,7 @@ from cfplan.flight.setpoints.commitment import (
     splice,
 )
 from cfplan.flight.setpoints.encoding import LEAD, RATE, check_bytes, encode_trajectory
-from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.packets import QUATERNION_PLACE, compress_quaternion, decode
 from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.geometry.min_snap import min_snap
@@ -294,6 +294,27 @@ def test_one_number_of_any_setpoint_of_any_stop_counts(committed, spliced, limit
         assert isinstance(splice(committed, resummed(broken), 100, limits), Refusal)
     refused = splice(committed, resummed(replace(proposal, stops=stops)), 100, limits)
     assert f"of the stop from setpoint {120 + row}" in refused.detail
+
+
+def turned_round(rows):
+    """Return setpoints (..., 29) whose heading is turned by 180°."""
+    x, y, z, w = decode(rows.reshape(-1, rows.shape[-1])).quaternion.T
+    turned = rows.copy()
+    packed = compress_quaternion(np.column_stack([-y, x, w, -z])).astype("<u4").view(np.uint8)
+    turned[..., QUATERNION_PLACE : QUATERNION_PLACE + 4] = packed.reshape(*rows.shape[:-1], 4)
+    return turned
+
+
+@pytest.mark.parametrize("begin", [0, 40])
+def test_a_heading_that_turns_at_once_is_refused_in_setpoints_and_in_their_stops(committed, spliced, limits, begin):
+    _, proposal = spliced
+    payloads, stops = proposal.payloads.copy(), proposal.stops.copy()
+    payloads[50:52] = turned_round(payloads[50:52])
+    stops[30, begin:60] = turned_round(stops[30, begin:60])
+    for broken in (replace(proposal, payloads=payloads), replace(proposal, stops=stops)):
+        refused = splice(committed, resummed(broken), 110, limits)
+        assert isinstance(refused, Refusal)
+        assert refused.fault in (Fault.LIMITS, Fault.STOPS)
 
 
 def test_setpoints_that_only_say_they_are_a_stop_keep_the_limits_of_plans(committed, spliced, limits):
