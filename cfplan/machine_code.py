@@ -3,7 +3,7 @@
 Modules take `njit` from here. What a function is compiled to is kept in a file whose name hashes everything that it
 depends on: the module's source, the sources of all cfplan modules that it imports, directly or not, the versions of the
 compilers, the processor, and the types of the arguments. So no file can be out of date, and none is ever changed. If a
-source has changed since this process began, which may have imported the old one, the process compiles for itself.
+source has changed since this process began, which may have imported the old one, the process compiles for itself only.
 Where two processes need the same function, one compiles it and the other waits. Where the folder cannot be written,
 each process compiles for itself.
 """

@@ -69,7 +69,7 @@ class Descent(Enum):
 class Reaction:
     """The pilot's reaction to the health of one tick."""
 
-    rung: Rung  # lowest rung of the abort ladder to take, from take-off to the hover after the plan
+    rung: Rung  # rung of the abort ladder to take at least, from take-off to the hover after the plan
     descent: Descent  # how the vehicle comes down then; also during a landing
 
 
