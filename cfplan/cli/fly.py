@@ -37,8 +37,8 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
     "--waypoints",
     "lines",
     metavar="-|unix:PATH",
-    help="Instead of a path: fly waypoints that come while it flies, x y z a line, from standard input (-) or from "
-    "clients of a Unix socket, as unix:waypoints.sock.",
+    help="Instead of a path: fly waypoints read in flight, one x y z a line, from standard input (-) or from clients "
+    "of a Unix socket, as unix:waypoints.sock.",
 )
 @click.option(
     "--on-board",

@@ -52,7 +52,7 @@ def fly_waypoints(
     yes: bool,
     as_json: bool,
 ) -> int:
-    """Take off, fly what lines of standard input or of a Unix socket ask for, land, and return the exit code."""
+    """Take off, fly the requests in lines of standard input or of a Unix socket, land, and return the exit code."""
     steps = Steps(as_json=as_json)
     if not yes and not uri.startswith(SIMULATED):
         raise InputError("hardware takes off at once", where=uri, hint="--yes, once nobody stands in the room")

@@ -109,7 +109,7 @@ def read_table(file: pathlib.Path, columns: int, what: str) -> tuple[NDArray, li
 
 
 def may_have_decimal_commas(text: str) -> bool:
-    """Return whether commas between digits stand in a row of numbers that semicolons or blanks separate too."""
+    """Return whether a row of numbers has commas between digits, and semicolons or blanks as separators besides."""
     return bool(re.search(r"\d,\d", text) and re.search(r";|[^\s,;]\s+[^\s,;]", text))
 
 

@@ -55,7 +55,7 @@ class RealTimeSteering:
         self._orders: deque[Order] = deque()
         self._more_orders = more_orders
         self._unanswered: set[int] = set()
-        self._fault: BaseException | None = None  # of a listener to the planner
+        self._fault: BaseException | None = None  # of the thread that hears the planner
         self.planner: AirPlanner | None = None
         self._thread: threading.Thread | None = None
         try:
@@ -111,7 +111,7 @@ class RealTimeSteering:
             self._change.notify_all()
 
     def _hear_planner(self, listeners: Listeners) -> None:
-        """Pass the planner's answers on until the flight has ended; a fault in that lands the vehicle."""
+        """Pass the planner's answers on until the flight has ended; a fault here lands the vehicle."""
         try:
             self._listen(listeners)
         except BaseException as error:

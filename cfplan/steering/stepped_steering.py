@@ -40,7 +40,7 @@ class SteppedSteering:
         vehicle: VehicleSettings | None = None,
         more_orders: Callable[[], Iterable[Order]] = tuple,
     ):
-        """Stand on the lab's floor. A plan takes `planning`, s. `more_orders` is asked at every step of the flight."""
+        """Stand on the lab's floor. A plan takes `planning`, s. `more_orders` is called at every step of the flight."""
         self.lab = SteppedLab(limits.airframe, seed=seed, vehicle=vehicle)
         self.clock = self.lab.clock
         self.outcome: FlightOutcome | CfplanError | None = None

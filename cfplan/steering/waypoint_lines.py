@@ -6,7 +6,7 @@
 
 Each line is answered by one that begins with its number. Waypoints that wait together are planned together. A line that
 cannot be flown, or is no such line, is refused in words, and the flight goes on as it was. The lines `land` and `cut`
-count as soon as they are read, whatever lines before them wait for.
+count as soon as they are read, before all lines that still wait.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ MOST_TOGETHER = 20  # waiting waypoints that are planned as one request
 MOST_WAITING = 10_000  # lines; more are refused
 LONGEST = 10_000  # bytes of a line
 _PATIENCE = 0.1  # s
-_OWNER_ONLY = 0o177  # umask: nobody else may connect
+_OWNER_ONLY = 0o177  # umask: only the owner may connect
 _HINT = "write x y z in metres, as 1.0 0.0 1.2; or replace, stop, slower, faster, land, cut"
 _PLACE_HINT = "write - for standard input, or unix:PATH for a socket, as unix:waypoints.sock"
 _ENDS = "refused: the flight ends"
@@ -61,7 +61,7 @@ class TextLine:
 class LineSource(Protocol):
     """The lines of a flight."""
 
-    ending: bool  # whether a line has ordered to land or to cut; then no line before it counts any more
+    ending: bool  # whether a line has ordered to land or to cut; lines that still wait are then refused
 
     def next(self, patience: float) -> TextLine | None:
         """Return the next line, waiting for it for `patience`, s; None where none came. Raises EOFError at the end."""
@@ -77,12 +77,12 @@ class _Asked:
 
 
 def order_of(text: str) -> Order | None:
-    """Return the order in a line, None where it is none."""
+    """Return the order that a line gives, None if it gives none."""
     return _ORDERS.get(text.strip().lower())
 
 
 def parse_line(text: str) -> tuple[Wish, tuple[Triple, ...]]:
-    """Return the request in a line that is no order, and its waypoints. Raises InputError where there is none."""
+    """Return the wish and the waypoints of a line that is not an order. Raises InputError if it is not a request."""
     word, rest = [*text.split(maxsplit=1), "", ""][:2]
     wish = _WISHES.get(word.lower())
     if wish is None:
@@ -106,10 +106,10 @@ def parse_line(text: str) -> tuple[Wish, tuple[Triple, ...]]:
 
 
 def steer_by_lines(vehicle: SteeredVehicle, lines: LineSource) -> None:
-    """Fly what lines ask for until they end, one orders to land or to cut, or the flight ends; then the vehicle lands.
+    """Fly the requests in lines until the lines end, one orders to land or to cut, or the flight ends; then land.
 
-    At the end of the lines it first flies what was asked for. The orders themselves are not given here: their source
-    gives them to the pilot. Raises FlightEndedError where a safety rule or the operator's keys ended the flight.
+    At the end of the lines the vehicle first flies all requests. Orders are not given here: their source passes them to
+    the pilot. Raises FlightEndedError if a safety rule or the operator's keys ended the flight.
     """
     waiting: list[_Asked] = []
     try:
@@ -125,7 +125,7 @@ def steer_by_lines(vehicle: SteeredVehicle, lines: LineSource) -> None:
 
 
 def _ask_until_the_end(vehicle: SteeredVehicle, lines: LineSource, waiting: list[_Asked]) -> None:
-    """Ask for what lines want, until they or the flight end; `waiting` are those that wait to be asked together."""
+    """Make the requests in lines until the lines or the flight end; those that are `waiting` are made together."""
     while not lines.ending:
         if vehicle.outcome is not None:
             raise FlightEndedError(vehicle.outcome.reason, where="flight", hint="the record tells what happened")
@@ -140,7 +140,7 @@ def _ask_until_the_end(vehicle: SteeredVehicle, lines: LineSource, waiting: list
             continue
         try:
             _ask_all(vehicle, lines, waiting)
-        finally:  # where the flight has ended meanwhile it has its answer with those that wait
+        finally:  # if the flight has ended meanwhile, it is answered with those that wait
             if asked is not None:
                 waiting.append(asked)
         if asked is not None and asked.wish is not Wish.EXTEND:
@@ -156,9 +156,9 @@ def _read(line: TextLine) -> _Asked | None:
 
 
 def _ask_all(vehicle: SteeredVehicle, lines: LineSource, asked: list[_Asked]) -> None:
-    """Ask for what lines want, together; where that is refused, for each alone, so that each has its answer.
+    """Make the requests of lines together; if that is refused, one by one, so that each line has its answer.
 
-    Those that were answered are taken out of the list. After an order no line is asked for.
+    Answered lines are removed from the list. After an order no request is made.
     """
     if len(asked) > 1 and not lines.ending:
         with contextlib.suppress(RequestRefusedError, InputError):
@@ -179,7 +179,7 @@ def _answer_alone(vehicle: SteeredVehicle, asked: _Asked) -> str:
 
 
 def refuse_rest(lines: LineSource) -> None:
-    """Answer the lines that have come and are not asked for any more."""
+    """Refuse the lines that still wait."""
     with contextlib.suppress(EOFError):
         while (line := lines.next(0.0)) is not None:
             line.answer(_ENDS)
@@ -209,7 +209,7 @@ class QueuedLines:
             yield self._orders.popleft()
 
     def take(self, content: bytes, reply: Callable[[str], None]) -> None:
-        """Take a line; one that is empty or a remark is none."""
+        """Take a line; empty lines and remarks are skipped."""
         text = content.decode("utf-8", "replace")
         if not text.strip() or text.lstrip().startswith("#"):
             return
@@ -233,7 +233,7 @@ class QueuedLines:
         with contextlib.suppress(OSError, ValueError):
             while line := stream.readline(LONGEST):
                 rest = line
-                while len(rest) == LONGEST and not rest.endswith(b"\n"):  # the line goes on, and is refused
+                while len(rest) == LONGEST and not rest.endswith(b"\n"):  # skip the rest of a line that is too long
                     rest = stream.readline(LONGEST)
                 self.take(line, reply)
 
@@ -246,9 +246,9 @@ class QueuedLines:
 def opened_lines(place: str, reply: Callable[[str], None]) -> Iterator[QueuedLines]:
     """Yield the lines of standard input, `-`, or of clients of a Unix socket, `unix:PATH`.
 
-    Nobody but the socket's owner can connect to it. Answers to standard input go to `reply`, those to a client to that
-    client. Whoever steers by the lines also gives their `orders` to the pilot. Raises InputError where the place is
-    wrong or taken.
+    Only the socket's owner can connect to it. Answers to standard input go to `reply`, those to a client to that
+    client. The caller also passes the `orders` of the lines to the pilot. Raises InputError if the place is wrong or
+    taken.
     """
     lines = QueuedLines()
     if place == STANDARD_INPUT:
@@ -272,7 +272,7 @@ def opened_lines(place: str, reply: Callable[[str], None]) -> Iterator[QueuedLin
 
 @contextlib.contextmanager
 def _listening(path: Path) -> Iterator[socket.socket]:
-    """Yield a socket that listens at a path, and that nobody but its owner can connect to; remove it afterwards."""
+    """Yield a socket that listens at a path, to which only its owner can connect; remove it afterwards."""
     with socket.socket(socket.AF_UNIX) as server:
         try:
             made = _bind(server, path)
@@ -293,7 +293,7 @@ def _listening(path: Path) -> Iterator[socket.socket]:
 
 
 def _bind(server: socket.socket, path: Path) -> os.stat_result:
-    """Let a socket listen at a path; return what is there then. Raises InputError or OSError."""
+    """Let a socket listen at a path; return the status of that path. Raises InputError or OSError."""
     _remove_left_over(path)
     mask = os.umask(_OWNER_ONLY)
     try:
@@ -309,7 +309,7 @@ def _shown(path: Path) -> str:
 
 
 def _remove_left_over(path: Path) -> None:
-    """Remove a socket on which nobody listens any more. Raises InputError where something else is there, or OSError."""
+    """Remove a socket on which no program listens. Raises InputError if anything else is there, or OSError."""
     try:
         found = os.lstat(path)
     except FileNotFoundError:
@@ -331,7 +331,7 @@ def _serve(server: socket.socket, lines: QueuedLines) -> None:
     while server.fileno() >= 0:
         try:
             client, _ = server.accept()
-        except OSError:  # it was closed, or there are too many open files for now
+        except OSError:  # it was closed, or too many files are open for now
             REAL_CLOCK.sleep(_PATIENCE)
             continue
         if busy.acquire(blocking=False):
@@ -345,7 +345,7 @@ def _attend(client: socket.socket, lines: QueuedLines, busy: threading.Lock) -> 
     hears = True
 
     def reply(text: str) -> None:
-        """Answer, unless the client is gone or does not read its answers: nothing waits for it."""
+        """Answer unless the client is gone or does not read its answers; never wait for it."""
         nonlocal hears
         answer = f"{text}\n".encode()
         try:

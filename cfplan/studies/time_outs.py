@@ -134,7 +134,7 @@ def _link() -> list[TimeOut]:
             "the vehicle's firmware", "firmware",
         ),
         TimeOut(
-            "acknowledgements, which then come again before its motors stop", UPLINK_GONE,
+            "acknowledgements, if they come again before the motors stop", UPLINK_GONE,
             "it hovers where it is, then lands there; nothing old is sent", "the pilot", health,
         ),
         TimeOut(

@@ -1,4 +1,4 @@
-"""The main process's threads of a steered flight: none of them dies in silence."""
+"""Threads of the main process in a steered flight: none of them fails silently."""
 
 import pickle
 from contextlib import nullcontext

@@ -35,7 +35,7 @@ from cfplan.steering.waypoint_lines import (
 
 
 class ListedLines(QueuedLines):
-    """Lines of a list; `sleep 0.5` lets so many s of the flight pass."""
+    """Lines of a list; `sleep 0.5` lets 0.5 s of the flight pass."""
 
     def __init__(self, lines: Iterable[str]):
         super().__init__()
@@ -95,7 +95,7 @@ def test_words_replace_slow_down_stop_and_land(limits):
 
 
 class TimedLines(QueuedLines):
-    """Lines that come at times of the flight, s, whatever is under way; the first one at 0."""
+    """Lines that come at given times of the flight, s after `begin`."""
 
     def __init__(self, lines: Iterable[tuple[float, str]]):
         super().__init__()
@@ -293,7 +293,7 @@ def test_a_path_where_no_socket_can_be_is_refused(place, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("place", ["", "7777", "unix:", "127.0.0.1:7777", "[::1]:7777", "0.0.0.0:7777"])
 def test_lines_come_from_no_other_place(place):
-    """A port of this machine can be reached by each of its users, and by what a browser shows."""
+    """A port of this machine can be reached by each of its users, and by pages in a browser."""
     with pytest.raises(InputError, match="neither standard input nor a socket"), opened_lines(place, print):
         pass
 

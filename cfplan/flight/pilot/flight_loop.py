@@ -5,7 +5,7 @@ forwards the newest good pose, and looks for reasons to end the flight. Whatever
 so poses flow and the abort monitor watches meanwhile. A reason to leave the plan arrives as `AbortRaised` out of any
 wait.
 
-Each step of a tick is guarded: a fault of this program lands the vehicle, and while it lands the other steps go on.
+Each step of a tick is guarded: if one fails, the vehicle lands, and the other steps continue meanwhile.
 """
 
 import math
@@ -41,9 +41,9 @@ from cfplan.vehicle.rotations import yaw_of
 TRIES = 3
 _KEEP_ALIVE_PERIOD = 0.1  # s; the vehicle's watchdog stops the motors after 1 s without a keep-alive packet
 _RECENT = 1.0  # s of good poses that are kept
-# m/s, horizontally and lasting, that the poses may move otherwise than the vehicle believes, while it flies slowly:
-# 0.05 in the virtual lab, where the wind blows 0.15, and 0.4 once the vehicle cannot be held any more.
-MOVES_OTHERWISE = 0.2
+VELOCITY_MISMATCH = 0.2
+"""m/s, horizontal: difference between the velocities of poses and estimate, in slow flight, above which poses are
+distrusted if it lasts. In the virtual lab it is 0.05, in wind 0.15, and 0.4 once the vehicle cannot be held."""
 LINK_LOST_AFTER = 10.0  # s without an acknowledgement, in flight; until then the link may come back
 _BRAKES_IN = 0.2  # s of its speed, by which a vehicle that levels out stops beyond where it is
 _FEWEST_HEIGHTS = 3  # that tell whether a body rests
@@ -95,7 +95,7 @@ class FlightLoop:
         self._link: Link | None = None
         self._feeding = False  # poses are read and forwarded
         self.airborne = False
-        self._took_off = False  # from then on a fault of this program is dealt with, not raised
+        self._took_off = False  # once True, a fault of this program lands the vehicle instead of being raised
         self._stop_expected = math.inf  # s, from when on motors that do not turn were meant to stop
         self._tolerated = Rung.NONE  # an abort of this rung or a lesser one changes nothing
         self.commitment = Commitment(0, mission.payloads, mission.stops)
@@ -109,8 +109,8 @@ class FlightLoop:
         self._begun: deque[Stream] = deque(maxlen=_STREAMS)  # the last streams, each with its start
         self.pose_fault = ""  # why the last pose was not good
         self._forwarded = math.inf  # s, the time of the last pose that was forwarded
-        self._otherwise_since = math.inf  # s, since when the poses have moved otherwise than the vehicle believes
-        self.distrusted = ""  # why poses are not believed for the rest of the flight; it is slow until that is seen
+        self._mismatch_since = math.inf  # s, since when the velocities of poses and estimate have differed
+        self.distrusted = ""  # why poses are ignored for the rest of the flight; empty while they are trusted
         self._source_fault = ""
         self._log_since = -math.inf  # s, since when the vehicle's log has come without a gap, in flight
         self._kept_alive = -math.inf  # s, when the vehicle's watchdog was last sent a keep-alive packet
@@ -242,9 +242,9 @@ class FlightLoop:
         return Descent.HELD if self._left_alone else self.health.reaction.descent
 
     def hold_where_it_is(self) -> None:
-        """Send a hover near where the vehicle is; once it acknowledges, this reaches it, and it is left alone no more.
+        """Send a hover near where the vehicle is; once the vehicle acknowledges, it is no longer left alone.
 
-        That is by the poses, by its own estimate if those do not come, or else where it was seen last.
+        The place is that of the poses, without them that of the vehicle's estimate, or else where it was seen last.
         """
         estimate, space = self.link.estimate, self.limits.space
         position, velocity, yaw = self.seen()
@@ -278,7 +278,7 @@ class FlightLoop:
         return now
 
     def _guard(self, step: str, act: Callable[[], None]) -> None:
-        """Take a step of a tick. A fault of it lands the vehicle, once; while it lands the steps that work go on."""
+        """Run one step of a tick. Its first fault lands the vehicle; the other steps continue meanwhile."""
         try:
             act()
         except (AbortRaised, LinkLost):
@@ -316,7 +316,7 @@ class FlightLoop:
             self._consider_proposal(now, self._just_sent)
 
     def _look(self, now: float) -> None:
-        """Compute the health of this tick, and create logs anew that the vehicle sends no more."""
+        """Compute the health of this tick, and create anew the logs that the vehicle no longer sends."""
         link = self.link
         self.health = self._health_monitor.look(
             now,
@@ -333,7 +333,7 @@ class FlightLoop:
                     link.revive_log(log)
 
     def _take_poses(self) -> None:
-        """Forward the poses that have come. In the air a fault of that means that none did: they grow old."""
+        """Forward the poses that have come. After take-off, a fault here counts as no pose: the last one grows old."""
         if not self._feeding:
             return
         try:
@@ -428,7 +428,7 @@ class FlightLoop:
         return self.link.status if self.health.status is not GONE else None
 
     def _monitor_flight(self, now: float, late: float) -> None:
-        """Raise LinkLost or AbortRaised where there is a reason to; only in the air."""
+        """Raise LinkLost if the link is lost, and in the air AbortRaised if there is a reason to abort."""
         link, estimate = self.link, self.estimate
         if link.lost or (self.airborne and self._health_monitor.uplink_silent > LINK_LOST_AFTER):
             raise LinkLost
@@ -456,11 +456,11 @@ class FlightLoop:
             raise AbortRaised(abort)
 
     def _compare_motion(self, now: float) -> None:
-        """Believe no pose any more of a body that lastingly moves otherwise than the vehicle believes.
+        """Distrust all poses once their velocity has differed from the estimate's for `flight.patience`.
 
-        Its axes are not the vehicle's then, or it is another body: by such poses no vehicle can be held, but by its own
-        sensors it still lands. Take-off and the way to the start are slow, so that little else explains it; later it is
-        not looked at. On the floor nothing shows how the body is turned about the vertical.
+        The axes of the tracked body are then not the vehicle's, or it is another body. The vehicle cannot be held by
+        such poses, but it can land by its own sensors. Only take-off and the way to the start are checked: they are
+        slow, so little else explains the difference. On the floor, the body's yaw cannot be observed.
         """
         estimate, then = self.link.estimate, self._predictor.middle
         off = 0.0
@@ -474,8 +474,8 @@ class FlightLoop:
             and not math.isnan(then)
         ):
             off = math.dist(self._predictor.velocity()[:2], estimate.velocity_at(then)[:2])
-        self._otherwise_since = min(self._otherwise_since, now) if off > MOVES_OTHERWISE else math.inf
-        if now - self._otherwise_since >= self.limits.flight.patience and not self.distrusted:
+        self._mismatch_since = min(self._mismatch_since, now) if off > VELOCITY_MISMATCH else math.inf
+        if now - self._mismatch_since >= self.limits.flight.patience and not self.distrusted:
             self.distrusted = (
                 f"the tracked body moves by {off:.2f} m/s otherwise than the vehicle believes: "
                 "are its axes the vehicle's?"
@@ -487,7 +487,7 @@ class FlightLoop:
         return status is not None and status.time > self._stop_expected and not any(status.motor)
 
     def _obey_orders(self) -> None:
-        """Raise AbortRaised for an operator command or the loss of the main process; while there is no link, too."""
+        """Raise AbortRaised for an operator command or the loss of the main process; also without a link."""
         abort = ordered(self._orders.worst, main_gone=self._orders.gone)
         if abort is not None:
             self._leave_for(abort)

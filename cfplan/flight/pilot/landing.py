@@ -32,7 +32,7 @@ _SETTLE = 0.3  # s at the end of a descent before the motors stop
 _BLIND_BENEATH = 2.0  # m below the floor that setpoints sink to without poses, so that their time ends first
 _BLIND_FOR = 3.0  # s without poses after which the motors stop, as the estimate may be metres off
 _CLEAR = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
-_SEEN_FOR = 0.2  # s of fresh poses, so several of them, after which they are believed again
+_SEEN_FOR = 0.2  # s of fresh poses, so several of them, after which they are trusted again
 MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
 _LOOK_AGAIN = 0.05  # s
 _BENEATH = 0.3  # m below the floor: an estimate that has the vehicle there is worth nothing
@@ -67,7 +67,7 @@ class Landing:
     def land(self) -> None:
         """Descend from where the vehicle is asked to be, and stop its motors. Raises AbortRaised if they do not."""
         self.begin()
-        self._stands |= self._loop.stream is None  # its motors are being stopped already, on the floor
+        self._stands |= self._loop.stream is None  # its motors are already being stopped, on the floor
         while not self._stands:
             if self._loop.descent is Descent.HELD:
                 self._loop.hold_where_it_is()
@@ -207,9 +207,10 @@ def stop_motors(loop: FlightLoop) -> bool:
 
 
 def stop_until_seen(loop: FlightLoop, send: Callable[[], object]) -> bool:
-    """Let `send` stop the motors, a few times until the vehicle says that it no longer flies; return whether they stop.
+    """Call `send`, which stops the motors, until the vehicle reports that it no longer flies; return whether they stop.
 
-    A vehicle that acknowledges but does not tell its status has had what was sent; then that counts.
+    There are TRIES calls at most. If the vehicle then acknowledges but does not report its status, the motors count as
+    stopped.
     """
 
     def stopped() -> bool:

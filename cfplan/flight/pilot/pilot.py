@@ -77,7 +77,7 @@ class Pilot:
         except LinkLost:
             raise
         except Exception as error:
-            if loop.airborne:  # whatever it is, it must not end in the air
+            if loop.airborne:  # no error may end the flight in the air
                 return self._leave_plan(fault_abort(error))
             if not isinstance(error, CfplanError) or not self._history.checks:
                 raise
@@ -89,7 +89,7 @@ class Pilot:
     def _leave_plan(self, abort: Abort) -> tuple[ExitCode, str]:
         """Go down the ladder to the ground; return how the flight counts, and why."""
         loop, flown = self._loop, self._manoeuvres
-        descents = [flown.land, flown.stop_and_land]  # the last one counts; one that breaks gives way to the other
+        descents = [flown.land, flown.stop_and_land]  # the last one is flown; one that fails is removed
         exit_code, reasons = abort.exit_code, [abort.text]
         while True:
             self._history.rung = max(self._history.rung, abort.rung)

@@ -63,10 +63,10 @@ class Link:
         self.replies: dict[int, int] = {}  # command of the on-board commander: the code that it answered, 0 for done
         self.firmware = ""
         self._preflight_blocks: list[Any] = []
-        self._revivals: dict[str, Iterator[bytes | None]] = {}  # of each log, by its name
+        self._revivals: dict[str, Iterator[bytes | None]] = {}  # packets that create a log anew, by its name
         # s, when the vehicle's clock of ms was zero, according to the quickest messages; when the last message came
         self._log_zero, self._log_heard = math.inf, 0.0
-        # The radio acknowledges each packet, but for its own processor; an answer comes from the one that flies.
+        # The radio chip acknowledges each packet by itself; a ping is answered by the processor that flies.
         crazyflie.link_statistics.latency_updated.add_callback(lambda _: self.note_acknowledgement())
         crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
         crazyflie.add_port_callback(PLATFORM_PORT, self._on_platform)
@@ -127,7 +127,7 @@ class Link:
             self._send(LOCALIZATION_PORT, 1, b"\x04")
 
     def revive_log(self, name: str) -> None:
-        """Send the next packet that creates `estimate` or `status` anew; called at each tick while that is silent."""
+        """Send the next packet that creates `estimate` or `status` anew; call it each tick while that is silent."""
         payload = next(self._revivals[name])
         if payload is not None:
             self._send(LOG_PORT, SETTINGS_CHANNEL, payload)

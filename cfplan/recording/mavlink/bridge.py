@@ -72,7 +72,7 @@ class GroundStation:
     """The link to one ground station; sends and receives while it is entered.
 
     `show` takes a message of the pilot's and returns at once; `orders` returns the commands since the last call.
-    Only what comes from that place, its host and its port, is heard.
+    Only packets from the host and port of that place are heard.
     """
 
     def __init__(self, place: Place, log: Path | None = None, *, boot: float | None = None, clock: Clock = REAL_CLOCK):
@@ -187,7 +187,7 @@ class GroundStation:
                 data, sender = self._socket.recvfrom(_LARGEST_DATAGRAM)
             except OSError:  # what was sent before came back as not deliverable
                 continue
-            if sender[:2] != self._target[:2]:  # others on this machine, or in its network, stop no flight
+            if sender[:2] != self._target[:2]:  # no other program may stop the flight
                 continue
             for packet, message in messages_in(data):
                 self._hear(packet, message)

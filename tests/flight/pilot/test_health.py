@@ -1,4 +1,4 @@
-"""The table of health: what the pilot does when sources fall silent, alone and together, in every phase."""
+"""The table of health: the pilot's reactions to sources that fall silent, alone and together, in every phase."""
 
 import itertools
 
@@ -12,11 +12,11 @@ PHASES = (Phase.TAKE_OFF, Phase.GO_TO_START, Phase.STREAM, Phase.HOLD, Phase.LAN
 SILENT = {"uplink": "uplink_dead", "poses": "poses_stopped", "estimate": "estimate_silent", "status": "status_silent"}
 CELLS = [Health(*cell) for cell in itertools.product(Freshness, repeat=4)]
 LATE_FOR = 0.35  # s
-MOMENT = dict.fromkeys(Phase, 0.3) | {Phase.STREAM: 0.1}  # s; in the stream while it is slow, as what is not sent lags
+MOMENT = dict.fromkeys(Phase, 0.3) | {Phase.STREAM: 0.1}  # s; early in the stream, where it is slow and lags little
 
 
 def silence(world, source, phase, spans):
-    """Let a source be silent in each span, s after its MOMENT in the phase; None ends it never."""
+    """Silence a source in each span, s after its MOMENT in the phase; an end of None is never."""
     for begin, end in spans:
         world.when(phase, MOMENT[phase] + begin, lambda: setattr(world, SILENT[source], True))
         if end is not None:
@@ -31,7 +31,7 @@ def bring_about(world, cell, phase):
 
 
 def assert_reaction(world, outcome, cell):
-    """Assert what the table says of the cell."""
+    """Assert the reaction that the table has for the cell."""
     if cell.uplink is GONE:  # the vehicle is alone, and comes down by link loss
         assert outcome.exit_code is ExitCode.LINK_LOST
         assert not [call for call in world.calls if call in ("disarm", "emergency stop")]
@@ -137,7 +137,7 @@ def test_a_computer_that_stood_still_hears_before_it_judges(limits):
     heard = dict.fromkeys(("uplink", "estimate", "status", "poses"), 9.999)
     assert monitor.look(10.0, **heard) == Health()
     stalled = monitor.look(11.0, **heard)
-    assert (stalled.uplink, stalled.poses) == (FRESH, GONE)  # poses are old all the same
+    assert (stalled.uplink, stalled.poses) == (FRESH, GONE)  # poses have grown old all the same
     for step in range(1, 60):
         last = monitor.look(11.0 + step / 100, **heard)
     assert last == Health(GONE, GONE, GONE, GONE)

@@ -428,7 +428,7 @@ def test_a_lasting_fault_in_a_step_of_the_tick_lands_and_does_not_cut(world, fly
     assert not world.armed
 
 
-def test_a_fault_of_pose_handling_is_that_no_pose_comes(world, fly):
+def test_a_fault_of_pose_handling_counts_as_no_pose(world, fly):
     whole, failing = world.poses, []
 
     def fail():

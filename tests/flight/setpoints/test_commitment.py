@@ -236,7 +236,7 @@ def at_most(limits, **plan):
     ],
 )
 def test_a_proposal_that_exceeds_a_limit_of_plans_is_refused(committed, spliced, limits, noun, lowered):
-    """One that was planned, certified and signed under others, as a planner with other limits would."""
+    """The proposal was planned, certified and signed under other limits."""
     _, proposal = spliced
     refused = splice(committed, proposal, 110, at_most(limits, **lowered(limits.plan)))
     assert isinstance(refused, Refusal)
@@ -265,7 +265,7 @@ def test_a_proposal_with_a_stop_that_exceeds_what_stops_may_reach_is_refused(com
     assert re.search(rf"^setpoint \d+ of the stop from setpoint \d+ reaches an? {noun} of", refused.detail)
 
 
-# By how much a number in a packet is changed, in thousandths: places, velocities, thrusts and rates that no plan has.
+# By byte, the change of a number in a packet, in thousandths: positions, velocities, thrusts and rates of no plan.
 COLUMNS = {
     1: 100,
     3: 100,
@@ -317,7 +317,7 @@ def test_a_heading_that_turns_at_once_is_refused_in_setpoints_and_in_their_stops
         assert refused.fault in (Fault.LIMITS, Fault.STOPS)
 
 
-def test_setpoints_that_only_say_they_are_a_stop_keep_the_limits_of_plans(committed, spliced, limits):
+def test_setpoints_that_only_claim_to_be_a_stop_are_refused(committed, spliced, limits):
     _, proposal = spliced
     refused = splice(committed, replace(proposal, ending=len(proposal.stops) - 1), 100, limits)
     assert refused.fault is Fault.STOPS
