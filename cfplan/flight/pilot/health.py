@@ -1,8 +1,8 @@
 """Health: how recently the pilot heard each of its sources, and the table of its reactions to each combination.
 
-There are four sources: the uplink (answers to cflib's pings, which acknowledge that the vehicle hears), the vehicle's
-two logs (estimate and status), and the poses that reach the vehicle. Each is fresh, late or gone. The pilot computes the
-health once a tick; the abort ladder, holding and landing react to silence by it.
+There are four sources: the uplink (answers to cflib's pings, which acknowledge that the vehicle hears), its two logs
+(estimate and status), and the poses that reach the vehicle. Each is fresh, late or gone. The pilot computes the health
+once a tick; the abort ladder, holding and landing react to silence by it.
 
 Only acknowledgements show whether the vehicle can be steered. A vehicle that acknowledges while its logs are silent
 follows its setpoints, so it brakes along its certified stop, lands by poses and is disarmed as usual.
