@@ -327,7 +327,7 @@ class FlightLoop:
         )
         streams = self.stream is not None and not self.stream.on_board
         self._left_alone |= self.airborne and streams and self.health.uplink is GONE
-        if self.health.uplink is FRESH and self._took_off:
+        if self.health.uplink is FRESH and self._feeding:
             for log in ("estimate", "status"):
                 if getattr(self.health, log) is GONE:
                     link.revive_log(log)

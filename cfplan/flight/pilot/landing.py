@@ -13,7 +13,7 @@ stop once its setpoint is on the floor, the motors stop at once: by an estimate 
 import math
 from collections.abc import Callable
 
-from cfplan.flight.pilot.abort_monitor import safety_abort
+from cfplan.flight.pilot.abort_monitor import FALLEN, safety_abort
 from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
 from cfplan.flight.pilot.health import FRESH, Descent
 from cfplan.flight.pilot.outcome import Rung
@@ -26,6 +26,7 @@ _BENEATH_FLOOR = 0.3  # m below where it took off, and below the space, that set
 _NEAR_FLOOR = 0.15  # m above where it took off
 _NOT_FOLLOWING = 0.05  # m that a standing vehicle is above its setpoint, near the floor
 _NOT_HELD = 0.25  # m above its setpoint, where the controller asks for no thrust: what does not fall, stands
+_LIES_FOR, _LIES_WITHIN = 0.08, 0.02  # s and m: poses so near to where it took off from show that it is on the floor
 _STANDS_FOR = 0.3  # s
 _STANDS_WITHIN = 0.015  # m, the range of the heights of a standing body's poses
 _SETTLE = 0.3  # s at the end of a descent before the motors stop
@@ -93,11 +94,12 @@ class Landing:
         def interrupted() -> bool:
             return self._blind_on_floor() or loop.descent is not Descent.BY_POSES
 
-        loop.until(
-            lambda: stands_by_poses(self._loop, self._floor, _NOT_HELD) or self._sunk() or interrupted(), math.inf
-        )
+        def stands() -> bool:
+            return stands_by_poses(loop, self._floor, _NOT_HELD) or self._lies()
+
+        loop.until(lambda: stands() or self._sunk() or interrupted(), math.inf)
         if not interrupted():
-            self._conclude(stands_by_poses(self._loop, self._floor, _NOT_HELD))
+            self._conclude(stands())
 
     def _descend_blindly(self) -> None:
         """Sink quickly, off the walls, until the estimate or the time says that it is enough, or poses are back."""
@@ -134,6 +136,15 @@ class Landing:
         rate = loop.mission.rate
         sinks = descent(position, yaw, -velocity[2], pace, self._floor, lowest, loop.limits, rate, aside)
         loop.begin(Stream(sinks, rate))
+
+    def _lies(self) -> bool:
+        """Return whether poses show the vehicle on the floor, far below its setpoint: it fell there.
+
+        It believes a motion that the floor has ended, and would fly off by that as its setpoint lifts it again.
+        """
+        heights = self._loop.heights(_LIES_FOR)
+        on_floor = bool(heights) and max(heights) - self._floor < _LIES_WITHIN
+        return on_floor and self._loop.asked()[0][2] - self._floor > FALLEN
 
     def _sunk(self) -> bool:
         stream = self._loop.stream

@@ -141,11 +141,7 @@ class Pilot:
             loop.tolerate(Rung.CUT)  # the flight is over: nothing can end it any more
             loop.end_stream()
             try:
-                for _ in range(TRIES):
-                    loop.link.arm(False)
-                    if loop.until(lambda: loop.health.status is FRESH and not loop.bits(ARMED), 0.2):
-                        break
-                else:
+                if not self._disarm():
                     self._history.say(Level.WARNING, "the vehicle does not say that it is disarmed")
             except (LinkLost, AbortRaised):
                 self._history.say(Level.WARNING, "the link went before the vehicle was disarmed")
@@ -155,6 +151,17 @@ class Pilot:
                 self._restart()
         loop.close_poses()
         self._history.enter(Phase.CLOSED)
+
+    def _disarm(self) -> bool:
+        """Disarm the vehicle; return whether it says so. Where the radio is dead, wait for it: it may come back."""
+        loop, heard = self._loop, 0
+        give_up = loop.now() + LINK_LOST_AFTER
+        while heard < TRIES and loop.now() < give_up:
+            loop.link.arm(False)
+            if loop.until(lambda: loop.health.status is FRESH and not loop.bits(ARMED), 0.2):
+                return True
+            heard += loop.health.uplink is FRESH
+        return False
 
     def _restart(self) -> None:
         """Restart the vehicle, which its watchdog locks now that nothing feeds it, for the next flight."""
