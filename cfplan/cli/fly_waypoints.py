@@ -1,7 +1,7 @@
 """`cfplan fly --waypoints`: the path comes a line at a time, while the vehicle flies."""
 
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,15 +73,11 @@ def fly_waypoints(
             uri, mocap=mocap_uri, safety=limits, records=records, name=NAME, keys=not typed,
             on_step=steps, on_record=watchers.open, more_orders=lambda: chain(lines.orders(), watchers.orders()),
         )  # fmt: skip
-        try:
-            with vehicle:
-                vehicle.take_off()
-                steps.say("in the air: one waypoint a line, as 1.0 0.0 1.2; land lands")
-                steer_by_lines(vehicle, lines)
-        except FlightEndedError:
-            pass  # its outcome says why
-        finally:
-            refuse_rest(lines)
+        stack.callback(refuse_rest, lines)
+        with suppress(FlightEndedError), vehicle:  # its outcome says why
+            vehicle.take_off()
+            steps.say("in the air: one waypoint a line, as 1.0 0.0 1.2; land lands")
+            steer_by_lines(vehicle, lines)
     return _print_result(vehicle, answers, as_json)
 
 
