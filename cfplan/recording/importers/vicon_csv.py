@@ -25,8 +25,9 @@ LARGEST_ROOM = 100.0  # m from the origin; beyond it the unit is wrong
 _MARK = b"\xef\xbb\xbf"  # of the byte order, as some programs write it first
 _BEGIN = re.compile(rb"[\s,;\"]*[A-Za-z][\w ]*\"?[,;\t ]*\r?\n\"?[\d.,]+\"?[,;\t ]*\r?\n")
 _FRAME = re.compile(rb"(?m)^\"?frame\"?[,;\t]\"?sub ?frame", re.IGNORECASE)
-_BLANK = re.compile(rb"(?m)^[ \t,;\r]+$")
-_SECTION = re.compile(rb"\A\n*|\n\n+(?=[^\n\d\"-])")  # what begins with a number goes on with the frames before
+_LEADING = re.compile(rb"[\s,;]*")
+_BLANK = re.compile(rb"\n[ \t,;\r]+(?=\n|\Z)")
+_SECTION = re.compile(rb"\n\n+(?=[^\n\d\"-])")  # what begins with a number goes on with the frames before
 _HEAD = re.compile(rb"(?:[^\n]*\n?){5}")
 
 
@@ -43,8 +44,9 @@ def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
 
     Raises InputError where a head, a unit or a number is wrong; a last line that is cut off only ends the log.
     """
-    data = _BLANK.sub(b"", file.read_bytes().removeprefix(_MARK))
-    begins = [match.end() for match in _SECTION.finditer(data)]
+    data = _BLANK.sub(b"\n", file.read_bytes().removeprefix(_MARK))
+    first = _LEADING.match(data).end()  # type: ignore[union-attr]  # it always matches
+    begins = [first, *(match.end() for match in _SECTION.finditer(data, first))]
     subjects: dict[str, LoggedSubject] = {}
     sections: list[Section] = []
     notes: list[str] = []
