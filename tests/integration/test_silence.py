@@ -52,7 +52,7 @@ def test_a_vehicle_that_acknowledges_lands_whatever_is_silent(line, phase, logs,
 @pytest.mark.parametrize("phase", MOMENTS)
 @pytest.mark.parametrize("logs", [(ESTIMATE,), (STATUS,), (ESTIMATE, STATUS)])
 def test_logs_that_come_back_for_a_moment_change_nothing(line, phase, logs):
-    spans = ((0.0, 0.6), (0.7, FOR_GOOD))
+    spans = ((0.0, 0.7), (0.8, FOR_GOOD))
     flown = fly_silenced(line, phase, *(VehicleFault(log, *span) for log, span in itertools.product(logs, spans)))
     assert_down(flown)
     assert (flown.rung, flown.motors_off) == ("land", 0)

@@ -22,7 +22,7 @@ from cfplan.safety.limits import PoseLimits
 
 UPLINK_LATE = 0.25  # s without an answer to cflib's pings, ten a second
 UPLINK_GONE = Timeouts().level_out  # s; a vehicle without a setpoint for this long leaves its stream
-LOG_GONE = 0.5  # s without a message of one of the vehicle's logs
+LOG_GONE = 0.6  # s without a message of one of the vehicle's logs; of a dead radio the uplink is gone before them
 _LONGEST_STEP = 0.05  # s of silence counted between two ticks at most; beyond it this computer stalled
 
 

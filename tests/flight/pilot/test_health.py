@@ -75,20 +75,20 @@ def test_each_cell_in_the_other_phases(world, fly, cell, phase):
 @pytest.mark.parametrize("logs", [("estimate",), ("status",), ("estimate", "status")])
 def test_logs_that_come_back_for_a_moment_and_go_again_land_by_poses(world, fly, logs, phase):
     for log in logs:
-        silence(world, log, phase, [(0.0, 0.6), (0.7, None)])
+        silence(world, log, phase, [(0.0, 0.7), (0.8, None)])
     assert_reaction(world, fly(), Health(**dict.fromkeys(logs, GONE)))
     assert world.revived == list(logs)
 
 
 @pytest.mark.parametrize("phase", PHASES)
 def test_poses_that_come_back_for_a_moment_and_go_again_land(world, fly, phase):
-    silence(world, "poses", phase, [(0.0, 0.6), (0.7, None)])
+    silence(world, "poses", phase, [(0.0, 0.7), (0.8, None)])
     assert_reaction(world, fly(), Health(poses=GONE))
 
 
 @pytest.mark.parametrize("phase", [phase for phase in PHASES if phase is not Phase.LAND])
 def test_an_uplink_that_comes_back_for_a_moment_and_goes_again_is_lost(world, fly, phase):
-    silence(world, "uplink", phase, [(0.0, 0.6), (0.7, None)])
+    silence(world, "uplink", phase, [(0.0, 0.7), (0.8, None)])
     outcome = fly()
     assert outcome.exit_code is ExitCode.LINK_LOST
     assert "emergency stop" not in world.calls
@@ -96,7 +96,7 @@ def test_an_uplink_that_comes_back_for_a_moment_and_goes_again_is_lost(world, fl
 
 @pytest.mark.parametrize("phase", PHASES)
 def test_an_uplink_that_comes_back_lands_the_vehicle_where_it_is(world, fly, phase):
-    silence(world, "uplink", phase, [(0.0, 0.6)])
+    silence(world, "uplink", phase, [(0.0, 0.7)])
     assert_reaction(world, fly(), Health(estimate=GONE))
 
 
