@@ -233,6 +233,8 @@ def bound_already(
 ) -> HeldFlight | None:
     """Return the held flight if by it the vehicle already flies this request to replan(), or rests there; else None."""
     points = np.asarray(waypoints, dtype=float).reshape(-1, 3)
+    if not len(points):  # nothing was asked for
+        return None
     resting = at_rest_from(held, splice, limits)
     splice, _ = _leaving(resting, splice, keep)
     joint = (splice + SPLICE_AHEAD) / RATE

@@ -2,7 +2,6 @@
 
 import queue
 import struct
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -109,9 +108,7 @@ def test_a_ping_of_cflibs_own_is_dropped_by_a_radio_that_is_dead_for_long_and_en
     driver.send_soon(packet(9, 1, b"\x04"))
     wait(dongle, 0.05)
     driver.send_soon(packet(9, 1, b"\x04"))  # fills the queue
-    begun = time.monotonic()
     driver.send_packet(packet(15, 0, b"ping"))
-    assert time.monotonic() - begun < 2.0
     assert not ended
 
 
