@@ -95,12 +95,13 @@ def _braking(limits: Limits) -> dict[str, Any]:
     state = flown.at(times)
     speed = np.linalg.norm(state.velocity, axis=1)
     begin = int(np.flatnonzero(speed >= _FULL * speed.max())[-1])
-    number = math.ceil((times[begin] - LEAD) * RATE)  # of the setpoint for then
+    number = math.ceil((times[begin] - LEAD) * RATE)  # of the first setpoint from then on
+    passed = float(speed[begin]) * (number / RATE + LEAD - float(times[begin]))  # m, until that setpoint is due
     lean = np.degrees(np.arccos(np.clip(state.thrust_axis[begin:, 2], -1.0, 1.0)))
     return {
         "speed": float(speed[begin]),
         "distance": _way(state.position[begin:]),
-        "flown": _flown(held.commitment.payloads[number:], 0, held, number, limits),
+        "flown": passed + _flown(held.commitment.payloads[number:], 0, held, number, limits),
         "duration": flown.duration - float(times[begin]),
         "acceleration": float(np.linalg.norm(state.acceleration[begin:], axis=1).max()),
         "tilt": float(lean.max()),
