@@ -89,7 +89,8 @@ def steer_by_lines(vehicle: SteeredVehicle, lines: LineSource) -> None:
     number, waiting = 0, list[_Asked]()
     while True:
         if vehicle.outcome is not None:
-            raise FlightEndedError(vehicle.outcome.reason, where="flight", hint="the record tells what happened")
+            hint = vehicle.outcome.hint or "the record tells what happened"
+            raise FlightEndedError(vehicle.outcome.reason, where="flight", hint=hint)
         try:
             line = lines.next(0.0 if waiting else _PATIENCE)
         except EOFError:
