@@ -37,7 +37,7 @@ fly: install
 test: $(VENV)/installed-tests
 	$(PYTEST)
 
-# The same tests as other processors round, by the settings of tests/processors.py.
+# The same tests with the rounding of other processors, by the settings in tests/processors.py.
 test-processors: $(PROCESSORS:%=test-as-%)
 
 test-as-%: $(VENV)/installed-tests

@@ -1,7 +1,7 @@
 """Deadline: the moment by which planning answers with what it has.
 
-Whoever works in rounds asks between two of them whether it has passed. Where it has not, it changes nothing. Time is
-what a user waits, however little of the processor planning gets; compiling does not count.
+Code that works in rounds asks between two rounds whether the deadline has passed; until then it changes nothing. By
+default a deadline counts the time that a user waits, not processor time, and stops counting while code is compiled.
 """
 
 import math

@@ -2,8 +2,8 @@
 
 Modules take `njit` from here. What a function is compiled to is kept in a file whose name hashes everything that it
 depends on: the module's source, the sources of all cfplan modules that it imports, directly or not, the versions of the
-compilers, the processor, and the types of the arguments. So no file can be out of date, and none is ever changed. Where
-a source has changed since this process began, it may have imported the old one: then it compiles for itself alone.
+compilers, the processor, and the types of the arguments. So no file can be out of date, and none is ever changed. If a
+source has changed since this process began, which may have imported the old one, the process compiles for itself only.
 Where two processes need the same function, one compiles it and the other waits. Where the folder cannot be written,
 each process compiles for itself.
 """
@@ -45,7 +45,7 @@ from numba.core.types import Omitted
 from numba.core.typing.typeof import Purpose, typeof
 
 PACKAGE = Path(__file__).parent
-_BEGUN = time.time()
+_BEGUN = time.time()  # s, when this process began
 _IMPORT = re.compile(r"^\s*from (cfplan[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 _KEPT_DAYS = 60.0  # after which files that no process has read are deleted
 _DIGEST = 32  # bytes of the checksum before a file's content
@@ -77,7 +77,7 @@ def kept() -> bool:
 
 
 def _processor() -> tuple[str, str]:
-    """Return the name and the features that code is compiled for: this computer's, or those of NUMBA_CPU_NAME."""
+    """Return name and features of the processor to compile for: this computer's, or that of NUMBA_CPU_NAME."""
     _, name, features = cpu_target.target_context.codegen().magic_tuple()
     return name, features
 
@@ -93,7 +93,7 @@ def _machine() -> bytes:
 def _source(module: str) -> tuple[str, tuple[str, ...]]:
     """Return a module's hash, and the cfplan modules that it imports; none where the name is no module.
 
-    The hash is one that no other process has where the file has changed since this one began.
+    If the file has changed since this process began, the hash is a random one, which no other process has.
     """
     first, *parts = module.split(".")
     if first == PACKAGE.name:
@@ -333,7 +333,7 @@ class _Kept(_Cache):
             _write(name, dumps((str(sig), data._reduce())))
 
     def give_back(self, sig: Any) -> None:
-        """Let other processes go on that wait for this one to compile, whether it has or failed."""
+        """Release the lock of a compilation, which has ended or failed, to the processes that wait for it."""
         if kept():
             _locks.give_back(self.file_name(sig))
 
@@ -375,7 +375,7 @@ def _compiling(function: Callable[..., Any], options: dict[str, Any]) -> Any:
 
 
 def _giving_back(compile_types: Callable[[Any], Any], cache: _Kept) -> Callable[[Any], Any]:
-    """Return a dispatcher's compile() that gives back the lock which the cache has taken, also where it raises."""
+    """Return a dispatcher's compile() that also releases the lock that the cache has taken, even if it raises."""
 
     def compile_and_give_back(sig: Any) -> Any:
         try:

@@ -1,12 +1,12 @@
-"""Runs a command as other processors would round: `python -m tests.processors plain pytest tests/safety`.
+"""Runs a command with the rounding of other processors: `python -m tests.processors plain pytest tests/safety`.
 
-Compilers and libraries choose their code by what the processor offers, and round otherwise in each. They are told here
-that it offers less. Each setting names what the processor has:
+Compilers and libraries choose code by the features of the processor, and each choice rounds differently. Here they are
+told that it has fewer features:
 
-    own    all that this one has
-    older  no wider vectors than those of the year 2013 (AVX2)
-    plain  nothing but what each of its architecture has
-    mixed  all for compiled functions, nothing for numpy, another for linear algebra: no processor, but another rounding
+    own    all features of this processor
+    older  no vectors wider than those of 2013 (AVX2)
+    plain  only the features that all processors of this architecture have
+    mixed  all features for compiled functions, none for numpy, others for linear algebra: like no real processor
 """
 
 import os
@@ -17,8 +17,8 @@ from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 
 
 def settings() -> dict[str, dict[str, str]]:
-    """Return the variables of each setting; a process that was started without any of them must ask."""
-    # numpy refuses names that it was not built to choose by, and warns of those that the processor does not offer.
+    """Return the environment variables of each setting; call it in a process that was started without any of them."""
+    # numpy refuses features that it does not choose code by, and warns of those that the processor lacks.
     dispatched = [name for name in __cpu_dispatch__ if __cpu_features__[name]]
     plain = {
         "NUMBA_CPU_NAME": "generic", "NPY_DISABLE_CPU_FEATURES": " ".join(dispatched),
@@ -43,7 +43,7 @@ def settings() -> dict[str, dict[str, str]]:
 
 
 def unset(variables: dict[str, str]) -> dict[str, str]:
-    """Return variables without those of settings, some of which machines set by themselves."""
+    """Return variables without those of settings; some machines set a few of those by themselves."""
     names = {"NVPL_BLAS_DEBUG_CPU_TYPE", *(name for chosen in settings().values() for name in chosen)}
     return {name: value for name, value in variables.items() if name not in names}
 

@@ -125,7 +125,7 @@ def test_a_change_in_an_imported_module_changes_the_key(monkeypatch, tmp_path):
     }.items():
         (tmp_path / "cfplan" / f"{name}.py").write_text(text)
     monkeypatch.setattr(machine_code, "PACKAGE", tmp_path / "cfplan")
-    monkeypatch.setattr(machine_code, "_BEGUN", math.inf)  # as processes see it that begin behind the change
+    monkeypatch.setattr(machine_code, "_BEGUN", math.inf)  # as in processes that begin after the change
 
     def keys():
         machine_code.key.cache_clear()
@@ -144,7 +144,7 @@ def test_a_change_in_an_imported_module_changes_the_key(monkeypatch, tmp_path):
 
 
 def start(folder, code):
-    """Start a process that can import from the folder, and is told by a line of its standard input to go on."""
+    """Start a process that can import from the folder, and goes on after a line on its standard input."""
     return subprocess.Popen(
         [sys.executable, "-c", code], cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONPATH": os.pathsep.join((str(PACKAGE.parent), str(folder)))},
@@ -155,7 +155,7 @@ EDITED = "from cfplan.machine_code import njit\nfrom cfplan.vehicle.airframe imp
 IMPORTED = "from edited import height\nprint('ready', flush=True)\ninput()\nprint(height())"
 
 
-def test_a_module_that_is_edited_once_it_is_imported_is_not_kept_as_what_it_has_become(cache, tmp_path):
+def test_code_of_a_module_that_was_edited_after_its_import_is_not_kept_for_the_new_source(cache, tmp_path):
     (tmp_path / "edited.py").write_text(EDITED + "    return 1\n")
     before = start(tmp_path, IMPORTED)
     assert before.stdout.readline() == "ready\n"

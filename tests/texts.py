@@ -1,7 +1,7 @@
 """Texts with computed numbers, compared by their parts: words to the letter, numbers as numbers.
 
-Another processor rounds otherwise, so a number may differ by one in the last digit that is printed, and no more. Whole
-numbers count something, and must be equal.
+Processors round differently, so a number may differ by one in the last digit that is printed. Whole numbers count
+something, and must be equal.
 """
 
 import re
@@ -23,5 +23,5 @@ def _numbers(text: str) -> list[Decimal]:
 
 
 def _tolerance(number: Decimal) -> Decimal:
-    """Return what one in the last digit is worth; 0 where there is no digit behind the point."""
+    """Return one unit of the last digit; 0 if there is no digit after the point."""
     return Decimal(1).scaleb(int(number.as_tuple().exponent)) if number.as_tuple().exponent < 0 else Decimal(0)

@@ -36,9 +36,9 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
 @click.option(
     "--waypoints",
     "lines",
-    metavar="-|HOST:PORT",
-    help="Instead of a path: fly waypoints that come while it flies, x y z a line, from standard input (-) or from "
-    "clients of a port of this machine, as 127.0.0.1:7777.",
+    metavar="-|unix:PATH",
+    help="Instead of a path: fly waypoints read in flight, one x y z a line, from standard input (-) or from clients "
+    "of a Unix socket, as unix:waypoints.sock.",
 )
 @click.option(
     "--on-board",

@@ -1,7 +1,8 @@
 """`cfplan fly --waypoints`: the path comes a line at a time, while the vehicle flies."""
 
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,14 +52,14 @@ def fly_waypoints(
     yes: bool,
     as_json: bool,
 ) -> int:
-    """Take off, fly what lines of standard input or of a socket ask for, land, and return the exit code."""
+    """Take off, fly the requests in lines of standard input or of a Unix socket, land, and return the exit code."""
     steps = Steps(as_json=as_json)
     if not yes and not uri.startswith(SIMULATED):
         raise InputError("hardware takes off at once", where=uri, hint="--yes, once nobody stands in the room")
     limits = options.read_limits(safety_file, Path.cwd(), steps, compile_to=Stage.FLIGHT)
     with steps.waiting("loading planners and simulator"):
         from cfplan.steering.connect import connect
-        from cfplan.steering.waypoint_lines import STANDARD_INPUT, opened_lines, steer_by_lines
+        from cfplan.steering.waypoint_lines import STANDARD_INPUT, opened_lines, refuse_rest, steer_by_lines
     answers: list[str] = []
     typed = place == STANDARD_INPUT and sys.stdin.isatty()  # the lines, so keys are none
 
@@ -70,15 +71,13 @@ def fly_waypoints(
         lines, watchers = stack.enter_context(opened_lines(place, reply)), _Watchers(watched, stack)
         vehicle = connect(
             uri, mocap=mocap_uri, safety=limits, records=records, name=NAME, keys=not typed,
-            on_step=steps, on_record=watchers.open, more_orders=watchers.orders,
+            on_step=steps, on_record=watchers.open, more_orders=lambda: chain(lines.orders(), watchers.orders()),
         )  # fmt: skip
-        try:
-            with vehicle:
-                vehicle.take_off()
-                steps.say("in the air: one waypoint a line, as 1.0 0.0 1.2; land lands")
-                steer_by_lines(vehicle, lines)
-        except FlightEndedError:
-            pass  # its outcome says why
+        stack.callback(refuse_rest, lines)
+        with suppress(FlightEndedError), vehicle:  # its outcome says why
+            vehicle.take_off()
+            steps.say("in the air: one waypoint a line, as 1.0 0.0 1.2; land lands")
+            steer_by_lines(vehicle, lines)
     return _print_result(vehicle, answers, as_json)
 
 

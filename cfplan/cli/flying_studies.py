@@ -133,7 +133,7 @@ def steering() -> Study:
 
 
 def _by_seeds(count: int, first_seed: int, minutes: float = math.inf, **rest: Any) -> dict[str, Any]:
-    """Return the options of flights drawn by seeds as their studies take them."""
+    """Return the arguments of a study whose flights are drawn by seeds."""
     return {"seeds": range(first_seed, first_seed + count), "minutes": minutes, **rest}
 
 

@@ -105,7 +105,7 @@ _PLANNING = (
     click.option(
         "--budget",
         type=click.FloatRange(0, min_open=True),
-        help="s that planning may take, compiling aside.  [default: 5, and 0.02 a metre]",
+        help="Longest planning time, s, without compiling.  [default: 5, and 0.02 a metre]",
     ),
     click.option(
         "--speed",

@@ -16,6 +16,7 @@ from cfplan.errors import InputError
 MAX_FILE_SIZE = 4_000_000  # bytes; a path or a set of limits is a few kilobytes
 MAX_NUMBER = 1e6  # metres, seconds or coefficients: a larger number is a slip and would cost digits
 PIPE_PATIENCE = 5.0  # s without a byte
+DECIMAL_COMMA_HINT = "write decimals with a point, as 1.5, and the same separator between all numbers"
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 
 
@@ -77,7 +78,8 @@ def read_table(file: pathlib.Path, columns: int, what: str) -> tuple[NDArray, li
     Blank lines, lines that start with # and one header line are skipped. `what` describes a row in error messages.
 
     Raises:
-        InputError: a row of another length or a number that is not finite, with its line; no rows.
+        InputError: a row of another length, commas that may be decimal ones, or a number that is not finite, with its
+            line; no rows.
     """
     rows: list[list[float]] = []
     lines: list[int] = []
@@ -93,11 +95,22 @@ def read_table(file: pathlib.Path, columns: int, what: str) -> tuple[NDArray, li
             header_allowed = False
             continue
         header_allowed = False
+        if may_have_decimal_commas(text):
+            raise InputError(
+                f"decimal commas, or two kinds of separators: {text[:40]!r}",
+                where=f"{file}:{number}",
+                hint=DECIMAL_COMMA_HINT,
+            )
         rows.append(_numbers(cells, columns, what, f"{file}:{number}"))
         lines.append(number)
     if not rows:
         raise InputError("no rows of numbers", where=str(file), hint=f"each row is {what}")
     return np.array(rows), lines
+
+
+def may_have_decimal_commas(text: str) -> bool:
+    """Return whether a row of numbers has commas between digits, and semicolons or blanks as separators besides."""
+    return bool(re.search(r"\d,\d", text) and re.search(r";|[^\s,;]\s+[^\s,;]", text))
 
 
 def _numbers(cells: list[str], columns: int, what: str, where: str) -> list[float]:

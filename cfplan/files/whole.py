@@ -27,14 +27,14 @@ def check_new_file(file: Path, *suffixes: str, overwrite: bool) -> None:
 def whole(file: Path) -> Iterator[Path]:
     """Yield a name beside the file to write to, which takes the file's place when the block ends well.
 
-    Threads, processes and computers may write the same file at once: the last to end is the one that is read.
+    Threads, processes and computers may write the same file at once; the last one to finish determines its content.
     Raises OSError, and what the block raises; nothing is then left behind.
     """
     unfinished = file.with_name(f".{file.name}.{secrets.token_hex(4)}.new")
     try:
         yield unfinished
         with unfinished.open("rb+") as written:
-            os.fsync(written)  # else the name may be on disk before the content when the power fails
+            os.fsync(written)  # else a power failure may leave the name on disk without the content
         unfinished.replace(file)
     finally:
         with contextlib.suppress(OSError):

@@ -76,10 +76,10 @@ def smooth_through(points: ArrayLike) -> Path:
 
 
 def spaced(points: NDArray) -> NDArray:
-    """Return points, (K, 3) m, without those closer than MIN_SPACING to the one that stays before them."""
+    """Return points, (K, 3) m, without those closer than MIN_SPACING to the last point that is kept."""
     kept: list[NDArray] = []
     for point in points:
-        if not kept or not math.dist(point, kept[-1]) < MIN_SPACING:  # what is no number stays, to be refused
+        if not kept or not math.dist(point, kept[-1]) < MIN_SPACING:  # NaN is kept, to be refused
             kept.append(point)
     return np.array(kept).reshape(-1, 3)
 

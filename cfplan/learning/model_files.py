@@ -190,14 +190,14 @@ def find_model(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...]
 
 
 def _card_versions(folder: Path) -> tuple[tuple[str, int, int, int], ...]:
-    """Return what tells the cards in a folder, or of a folder of models, from those that were there before."""
+    """Return name, inode, time and size of each card in a folder and its subfolders: a new card differs in them."""
     files = [file for file in (folder / CARD, *folder.glob(f"*/{CARD}")) if file.is_file()]
     return tuple(sorted((str(file), (at := file.stat()).st_ino, at.st_mtime_ns, at.st_size) for file in files))
 
 
 @lru_cache(maxsize=8)
 def _find(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...], versions: tuple[Any, ...]) -> Model | None:
-    """Find a model as find_model() does; with other `versions` of the cards it is read again."""
+    """Find a model as find_model() does; a change of the cards' `versions` has it read again."""
     known, candidates = scaled_limits(airframe, limits), []
     for place, folder in enumerate(folders):
         if (folder / CARD).is_file():

@@ -202,7 +202,7 @@ def path_from_rest(points: ArrayLike, limits: Limits) -> tuple[Path, tuple[float
 def check_waypoints(points: NDArray, limits: Limits) -> None:
     """Raise InfeasibleError where one of the waypoints, (K, 3) m, lies outside the space."""
     beyond = limits.space.beyond(points).max(axis=1)
-    if not (good := inside(beyond) | np.isnan(beyond)).all():  # what is no number is for whoever makes the path
+    if not (good := inside(beyond) | np.isnan(beyond)).all():  # NaN is refused where the path is made
         at = int(np.argmin(good))
         raise InfeasibleError(
             f"{coordinates(points[at], '.3f')} m is {beyond[at]:.3f} m too far out",
@@ -377,14 +377,14 @@ class _Found(NamedTuple):
 
 
 def _with_room(task: PlanningTask) -> PlanningTask:
-    """Return the task with limits and speed caps that leave room, if the state at its start does."""
+    """Return the task with limits and speed caps that leave room, if its start state allows."""
     limits, caps = with_room(task.limits, task.airframe), task.speed_caps
     with_less = replace(task, limits=limits, speed_caps=caps and caps.scaled(1.0 - ROOM))
     return with_less if with_less.refusal is None else task
 
 
 def _solve(task: PlanningTask, limits: Limits, caps: SpeedCaps | None) -> _Found | str:
-    """Return a trajectory certified against the limits and `caps`, of which the task's leave room; or why not."""
+    """Return a trajectory certified against the limits and `caps`, to which the task leaves room; or why not."""
     leaves_room = task.limits is not limits.plan
     solution = plan_early(task, BETWEEN * ROOM) if leaves_room else plan_early(task)
     if solution.profile is None:

@@ -169,7 +169,7 @@ def _take(step: Step, task: PlanningTask, nodes: int | None, space: Space) -> tu
 
 
 def _by_reason(notes: Sequence[str]) -> list[str]:
-    """Return notes, "who: why" each, with each reason once, behind all whom it stopped."""
+    """Merge notes of the form "planner: reason": each reason occurs once, after all planners that it stopped."""
     stopped: dict[str, list[str]] = {}
     for note in notes:
         who, _, why = note.partition(": ")

@@ -87,7 +87,7 @@ class PathAnswer:
 
     number: int
     verdict: PathVerdict
-    reason: str = ""  # why not, or why nothing need be proposed, one line
+    reason: str = ""  # one line: why it was refused, or why nothing need be proposed
     joint: float = math.nan  # s from the first setpoint, from when on the new plan is flown
     ends: float = math.nan  # s from the first setpoint, when it ends
     seconds: float = 0.0  # s from the request to the answer

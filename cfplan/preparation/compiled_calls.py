@@ -66,7 +66,7 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         for coarsely in (True, False):
             link_loss_within_stops(stop, lost.snapshots[:, first], limits, end, coarsely=coarsely)
         glitch_at_sampled_setpoints(begin, limits)
-        if last >= Stage.FLIGHT:  # before encoding a flight, which ends the noting of calls
+        if last >= Stage.FLIGHT:  # before encoding a flight, which ends the recording of calls
             from cfplan.flight.setpoints.commitment import Commitment, warm_up
 
             at_rest = encode_stops(encoded.motion, RATE, rows=np.array([-1, -1]) % len(encoded.payloads))

@@ -61,7 +61,7 @@ class Assessment:
 
     @property
     def at_fault(self) -> NDArray:
-        """Return (N,) which setpoints end beyond what is allowed."""
+        """Return (N,) whether each setpoint ends beyond what is allowed."""
         return ~np.asarray(inside(self.excess))
 
     @property

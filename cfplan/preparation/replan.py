@@ -231,7 +231,7 @@ def replan(
 def bound_already(
     held: HeldFlight, splice: int, waypoints: ArrayLike, limits: Limits, *, keep: bool = False
 ) -> HeldFlight | None:
-    """Return what is held where the vehicle does by it what replan() is asked for, or rests there; else None."""
+    """Return the held flight if by it the vehicle already flies this request to replan(), or rests there; else None."""
     points = np.asarray(waypoints, dtype=float).reshape(-1, 3)
     resting = at_rest_from(held, splice, limits)
     splice, _ = _leaving(resting, splice, keep)

@@ -199,7 +199,7 @@ def _margin(bound: _Bound, peak: float, time: float, s: float, position: Sequenc
 
 
 def share_of(quantity: Quantity, worst: float, limit: float, unused: float) -> float:
-    """Return the share of a limit that is used; of the walls' margin all of it at most, as long as it is kept."""
+    """Return the usage of a limit; for the walls it is at most 1 if the margin is kept within rounding."""
     room = limit - unused
     share = (worst - unused) / room if room * quantity.side > 0 else math.inf
     return min(share, 1.0) if quantity.name == WALLS and inside(limit - worst) else share

@@ -13,15 +13,15 @@ from cfplan.numbers import coordinates
 _SAMPLES = 33  # of each piece of a path
 _AXES = ("x", "y", "z")
 TOLERANCE = 1e-6
-"""m by which a place may lie beyond a wall, or a margin before it, and count as inside: a thousandth of what packets
-round places by, and far above what sums and a path's equations round. A path drawn at the margin keeps it."""
+"""m that a position may lie beyond a wall, or a margin before it, and count as inside: a thousandth of the rounding in
+packets, and far above the rounding of sums and of a path's equations. A path drawn at the margin keeps it."""
 _MILLIMETRES = 30.0  # larger coordinates of a path that lies in the space when divided by 1000 are in millimetres
 
 
 def inside(beyond: ArrayLike, rounding: float = 0.0) -> Any:
-    """Return whether places so far beyond a wall, or a margin before it, in m, count as inside; not what is no number.
+    """Return whether positions count as inside that are `beyond` a wall, or a margin before it, m; NaN does not.
 
-    All comparisons with walls are this one. `rounding`, m, is what places were rounded by before.
+    All comparisons with walls use this function. `rounding`, m, is by how much the positions were rounded before.
     """
     return np.asarray(beyond) <= TOLERANCE + rounding
 

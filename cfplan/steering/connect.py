@@ -1,6 +1,6 @@
 """Connect a program to a vehicle, real or virtual, that it will steer."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from cfplan.errors import InputError
@@ -32,7 +32,7 @@ def connect(
     keys: bool = True,
     on_step: OnStep = ignore_steps,
     on_record: Callable[[SteeringRecord], None] = lambda _: None,
-    more_orders: Callable[[], Sequence[Order]] = tuple,
+    more_orders: Callable[[], Iterable[Order]] = tuple,
 ) -> SteeredVehicle:
     """Connect to a vehicle and return it, on the ground; use it in a `with` block, behind which it has landed.
 
@@ -57,7 +57,7 @@ def connect(
     compile_from_here()
     flight: FlightInProgress
     if stepped:
-        flight = SteppedSteering(limits)
+        flight = SteppedSteering(limits, more_orders=more_orders)
     else:
         look_at_hardware(uri, mocap, limits.pose, on_step)
         flight = RealTimeSteering(uri, mocap, limits, on_step, keys=keys, more_orders=more_orders)

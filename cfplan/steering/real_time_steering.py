@@ -5,7 +5,7 @@ import sys
 import threading
 import types
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from cfplan.errors import CfplanError
 from cfplan.flight.clock import REAL_CLOCK
@@ -43,7 +43,7 @@ class RealTimeSteering:
         on_step: OnStep,
         *,
         keys: bool,
-        more_orders: Callable[[], Sequence[Order]] = tuple,
+        more_orders: Callable[[], Iterable[Order]] = tuple,
     ):
         """Start the pilot's process, and a virtual vehicle's lab. `keys` says whether those of the terminal count.
 
@@ -55,7 +55,7 @@ class RealTimeSteering:
         self._orders: deque[Order] = deque()
         self._more_orders = more_orders
         self._unanswered: set[int] = set()
-        self._fault: BaseException | None = None  # of a listener to the planner
+        self._fault: BaseException | None = None  # of the thread that hears the planner
         self.planner: AirPlanner | None = None
         self._thread: threading.Thread | None = None
         try:
@@ -111,7 +111,7 @@ class RealTimeSteering:
             self._change.notify_all()
 
     def _hear_planner(self, listeners: Listeners) -> None:
-        """Pass the planner's answers on until the flight has ended; a fault in that lands the vehicle."""
+        """Pass the planner's answers on until the flight has ended; a fault here lands the vehicle."""
         try:
             self._listen(listeners)
         except BaseException as error:

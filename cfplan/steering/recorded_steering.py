@@ -106,6 +106,6 @@ def answer_text(answer: PathAnswer) -> str:
     if answer.verdict not in (PathVerdict.ACCEPTED, PathVerdict.CHANGED):
         return f"{answer.verdict.value}: {answer.reason}" if answer.reason else answer.verdict.value
     if answer.splice < 0:
-        return f"accepted: {answer.reason or 'what is asked for next is flown so'}"
+        return f"accepted: {answer.reason or 'the next request is flown so'}"
     begins = f"from {answer.joint:.2f} s on{', after a stop' if answer.stop else ''}"
     return f"{answer.verdict.value}: another motion {begins}, at rest at {answer.ends:.2f} s"

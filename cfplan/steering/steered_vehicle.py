@@ -129,10 +129,9 @@ class SteeredVehicle:
     def take_off(self, height: float | None = None) -> None:
         """Check everything as before any flight, arm, climb to a height, m, and return once the vehicle hovers there.
 
-        Without a height, to that of the limits. Raises a CfplanError where the vehicle cannot take off: a check failed,
-        the hover lies outside the space, or the link or its poses cannot be had. Then nothing was armed; or, where the
-        vehicle left the floor and does not hover within two minutes, or somebody lands it, it has landed and is
-        disarmed.
+        Without a height, to that of the limits. Raises a CfplanError if the vehicle cannot take off: a check failed,
+        the hover lies outside the space, or there is no link or no pose. The vehicle was not armed then. It also raises
+        one if the vehicle does not hover within two minutes or is landed meanwhile; the vehicle is disarmed then.
         """
         if self._started:
             raise InputError("it has taken off already", where="take_off", hint="connect again for another flight")
@@ -273,7 +272,7 @@ class SteeredVehicle:
         self.land()
 
     def cut(self) -> None:
-        """Cut the motors at once, wherever the vehicle is: it falls. After that it does not take off either."""
+        """Cut the motors at once, wherever the vehicle is: it falls. Afterwards it does not take off."""
         self._end(Order.CUT)
 
     def close(self) -> None:

@@ -6,7 +6,7 @@ flies the same on every run, however fast the computer is, and minutes of flight
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from cfplan.errors import CfplanError
 from cfplan.flight.pilot.keys import HeldOrders, Keyboard, Order
@@ -32,14 +32,20 @@ class SteppedSteering:
     """A flight in the stepped lab; a FlightInProgress."""
 
     def __init__(
-        self, limits: Limits, *, planning: float = PLANNING, seed: int = 0, vehicle: VehicleSettings | None = None
+        self,
+        limits: Limits,
+        *,
+        planning: float = PLANNING,
+        seed: int = 0,
+        vehicle: VehicleSettings | None = None,
+        more_orders: Callable[[], Iterable[Order]] = tuple,
     ):
-        """Stand on the lab's floor. A plan takes `planning`, s."""
+        """Stand on the lab's floor. A plan takes `planning`, s. `more_orders` is called at every step of the flight."""
         self.lab = SteppedLab(limits.airframe, seed=seed, vehicle=vehicle)
         self.clock = self.lab.clock
         self.outcome: FlightOutcome | CfplanError | None = None
         self.planner: SteppedPlanner | None = None
-        self._limits, self._planning = limits, planning
+        self._limits, self._planning, self._more_orders = limits, planning, more_orders
         self._orders, self._asked_orders = HeldOrders(), deque[Order]()
         self._answers: list[PathAnswer] = []
         self._ours, self._theirs = threading.Semaphore(0), threading.Semaphore(0)
@@ -53,7 +59,7 @@ class SteppedSteering:
 
     def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
         self.planner = SteppedPlanner(held, mission.limits, self.clock, listeners.answer, planning=self._planning)
-        attendant = Attendant(self._orders.give, Keyboard(), listeners.telemetry, self._new_orders)
+        attendant = Attendant(self._orders.give, Keyboard(), listeners.telemetry, self._next_orders)
 
         def report(message: Telemetry) -> None:
             attendant.tell([message])
@@ -86,10 +92,10 @@ class SteppedSteering:
         finally:
             self._ours.release()
 
-    def _new_orders(self) -> list[Order]:
-        orders = list(self._asked_orders)
-        self._asked_orders.clear()
-        return orders
+    def _next_orders(self) -> Iterator[Order]:
+        while self._asked_orders:
+            yield self._asked_orders.popleft()
+        yield from self._more_orders()
 
     def ask(self, wish: Wish, waypoints: Sequence[Triple]) -> int:
         assert self.planner is not None

@@ -1,49 +1,67 @@
-"""Steer by lines of text: one waypoint or word a line, from standard input or a socket on this machine.
+"""Steer by lines of text: one waypoint or word a line, from standard input or a Unix socket.
 
     1.0 0.0 1.2                   fly on through x y z, m, after what is ahead
     replace 0 -1 1.5  1 1 1       fly through these instead, from the next joint on
     stop | slower | faster | land | cut
 
 Each line is answered by one that begins with its number. Waypoints that wait together are planned together. A line that
-cannot be flown, or is no such line, is refused in words, and the flight goes on as it was.
+cannot be flown, or is no such line, is refused in words, and the flight goes on as it was. The lines `land` and `cut`
+count as soon as they are read, before all lines that still wait.
 """
 
 import contextlib
+import os
 import queue
 import socket
+import stat
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO, Protocol
 
 from cfplan.errors import FlightEndedError, InputError, RequestRefusedError, printable
+from cfplan.files.text import DECIMAL_COMMA_HINT, may_have_decimal_commas
+from cfplan.flight.clock import REAL_CLOCK
+from cfplan.flight.pilot.keys import Order
 from cfplan.flight.telemetry import Triple
 from cfplan.preparation.air_planner import Wish
 from cfplan.steering.recorded_steering import answer_text
 from cfplan.steering.steered_vehicle import SteeredVehicle, checked_waypoints
 
 STANDARD_INPUT = "-"
-LOCAL = ("127.0.0.1", "localhost", "::1")
-LAND, CUT = "land", "cut"
+SOCKET = "unix:"  # before the path of a socket
 MOST_TOGETHER = 20  # waiting waypoints that are planned as one request
-_LONGEST = 10_000  # characters of a line
-_WAITING = 1000  # lines that wait; a sender that is faster is held up
+MOST_WAITING = 10_000  # lines; more are refused
+LONGEST = 10_000  # bytes of a line
 _PATIENCE = 0.1  # s
+_OWNER_ONLY = 0o177  # umask: only the owner may connect
 _HINT = "write x y z in metres, as 1.0 0.0 1.2; or replace, stop, slower, faster, land, cut"
-_WORDS = {wish.value: wish for wish in Wish}
+_PLACE_HINT = "write - for standard input, or unix:PATH for a socket, as unix:waypoints.sock"
+_ENDS = "refused: the flight ends"
+_WISHES = {wish.value: wish for wish in Wish}
+_ORDERS = {"land": Order.LAND, "cut": Order.CUT}
 
 
 @dataclass(frozen=True, slots=True)
 class TextLine:
     """A line, and where its answer goes."""
 
+    number: int  # from 1 on, of all lines of a flight
     text: str
     reply: Callable[[str], None]
 
+    def answer(self, text: str) -> None:
+        """Answer the line."""
+        self.reply(f"{self.number} {text}")
+
 
 class LineSource(Protocol):
-    """Where lines come from."""
+    """The lines of a flight."""
+
+    ending: bool  # whether a line has ordered to land or to cut; lines that still wait are then refused
 
     def next(self, patience: float) -> TextLine | None:
         """Return the next line, waiting for it for `patience`, s; None where none came. Raises EOFError at the end."""
@@ -51,27 +69,34 @@ class LineSource(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """What a line asks for: a wish with waypoints, or to land or to cut."""
+    """A line's request."""
 
     line: TextLine
-    number: int  # of the line
-    wish: Wish | str
+    wish: Wish
     waypoints: tuple[Triple, ...] = ()
 
 
-def parse_line(text: str) -> tuple[Wish | str, tuple[Triple, ...]]:
-    """Return what a line asks for, and its waypoints. Raises InputError where it is no such line."""
-    words = text.replace(",", " ").split()
-    wish: Wish | str = Wish.EXTEND
-    if words and words[0].lower() in (*_WORDS, LAND, CUT):
-        word = words.pop(0).lower()
-        wish = _WORDS.get(word, word)
+def order_of(text: str) -> Order | None:
+    """Return the order that a line gives, None if it gives none."""
+    return _ORDERS.get(text.strip().lower())
+
+
+def parse_line(text: str) -> tuple[Wish, tuple[Triple, ...]]:
+    """Return the wish and the waypoints of a line that is not an order. Raises InputError if it is not a request."""
+    word, rest = [*text.split(maxsplit=1), "", ""][:2]
+    wish = _WISHES.get(word.lower())
+    if wish is None:
+        wish, rest = Wish.EXTEND, text
     if wish not in (Wish.EXTEND, Wish.REPLACE):
-        if words:
-            raise InputError(f"{words[0]!r} after {str(wish)!r}", where="line", hint=_HINT)
+        if rest.strip():
+            raise InputError(f"{rest.split()[0][:60]!r} after {wish.value!r}", where="line", hint=_HINT)
         return wish, ()
+    if may_have_decimal_commas(rest):
+        raise InputError(
+            f"decimal commas, or two kinds of separators: {rest.strip()[:60]!r}", where="line", hint=DECIMAL_COMMA_HINT
+        )
     try:
-        numbers = [float(word) for word in words]
+        numbers = [float(word) for word in rest.replace(",", " ").split()]
     except ValueError:
         raise InputError(f"{text.strip()[:60]!r} is no waypoint", where="line", hint=_HINT) from None
     if not numbers or len(numbers) % 3:
@@ -81,72 +106,94 @@ def parse_line(text: str) -> tuple[Wish | str, tuple[Triple, ...]]:
 
 
 def steer_by_lines(vehicle: SteeredVehicle, lines: LineSource) -> None:
-    """Fly what lines ask for until they end, one says to land, or the flight ends; then the vehicle lands.
+    """Fly the requests in lines until the lines end, one orders to land or to cut, or the flight ends; then land.
 
-    At the end of the lines it first flies what was asked for. Raises FlightEndedError where a safety rule or the
-    operator ended the flight.
+    At the end of the lines the vehicle first flies all requests. Orders are not given here: their source passes them to
+    the pilot. Raises FlightEndedError if a safety rule or the operator's keys ended the flight.
     """
-    number, waiting = 0, list[_Asked]()
-    while True:
+    waiting: list[_Asked] = []
+    try:
+        _ask_until_the_end(vehicle, lines, waiting)
+    except FlightEndedError:
+        if not lines.ending:
+            raise
+    finally:
+        for each in waiting:
+            each.line.answer(_ENDS)
+        refuse_rest(lines)
+    vehicle.finish()
+
+
+def _ask_until_the_end(vehicle: SteeredVehicle, lines: LineSource, waiting: list[_Asked]) -> None:
+    """Make the requests in lines until the lines or the flight end; those that are `waiting` are made together."""
+    while not lines.ending:
         if vehicle.outcome is not None:
             hint = vehicle.outcome.hint or "the record tells what happened"
             raise FlightEndedError(vehicle.outcome.reason, where="flight", hint=hint)
         try:
             line = lines.next(0.0 if waiting else _PATIENCE)
         except EOFError:
-            _ask_all(vehicle, waiting)
-            vehicle.finish()
+            _ask_all(vehicle, lines, waiting)
             return
-        if line is not None and line.text.strip() and not line.text.lstrip().startswith("#"):
-            number += 1
-            asked = _read(line, number)
-            if asked is not None and asked.wish is Wish.EXTEND and len(waiting) < MOST_TOGETHER:
+        asked = _read(line) if line is not None else None
+        if asked is not None and asked.wish is Wish.EXTEND and len(waiting) < MOST_TOGETHER:
+            waiting.append(asked)
+            continue
+        try:
+            _ask_all(vehicle, lines, waiting)
+        finally:  # if the flight has ended meanwhile, it is answered with those that wait
+            if asked is not None:
                 waiting.append(asked)
-                continue
-            _ask_all(vehicle, waiting)
-            waiting = []
-            if asked is not None and asked.wish in (LAND, CUT):
-                asked.line.reply(f"{number} accepted: {asked.wish}")
-                vehicle.land() if asked.wish == LAND else vehicle.cut()
-                return
-            waiting = [asked] if asked is not None else []
-        if waiting and (line is None or waiting[0].wish is not Wish.EXTEND):
-            _ask_all(vehicle, waiting)
-            waiting = []
+        if asked is not None and asked.wish is not Wish.EXTEND:
+            _ask_all(vehicle, lines, waiting)
 
 
-def _read(line: TextLine, number: int) -> _Asked | None:
+def _read(line: TextLine) -> _Asked | None:
     try:
-        return _Asked(line, number, *parse_line(line.text))
+        return _Asked(line, *parse_line(line.text))
     except InputError as error:
-        line.reply(f"{number} refused: {error}")
+        line.answer(f"refused: {error}")
         return None
 
 
-def _ask_all(vehicle: SteeredVehicle, asked: list[_Asked]) -> None:
-    """Ask for what lines want, together; where that is refused, for each alone, so that each has its answer."""
-    if not asked:
-        return
-    wish = asked[0].wish
-    assert isinstance(wish, Wish)
-    try:
-        answer = vehicle.ask(wish, [point for each in asked for point in each.waypoints])
-    except (RequestRefusedError, InputError) as error:
-        if len(asked) == 1:
-            asked[0].line.reply(f"{asked[0].number} {error.what if 'refused' in error.what else f'refused: {error}'}")
-        else:
+def _ask_all(vehicle: SteeredVehicle, lines: LineSource, asked: list[_Asked]) -> None:
+    """Make the requests of lines together; if that is refused, one by one, so that each line has its answer.
+
+    Answered lines are removed from the list. After an order no request is made.
+    """
+    if len(asked) > 1 and not lines.ending:
+        with contextlib.suppress(RequestRefusedError, InputError):
+            answer = vehicle.ask(asked[0].wish, [point for each in asked for point in each.waypoints])
             for each in asked:
-                _ask_all(vehicle, [each])
-        return
-    for each in asked:
-        each.line.reply(f"{each.number} {answer_text(answer)}")
+                each.line.answer(answer_text(answer))
+            asked.clear()
+    while asked and not lines.ending:
+        asked[0].line.answer(_answer_alone(vehicle, asked[0]))
+        del asked[0]
+
+
+def _answer_alone(vehicle: SteeredVehicle, asked: _Asked) -> str:
+    try:
+        return answer_text(vehicle.ask(asked.wish, asked.waypoints))
+    except (RequestRefusedError, InputError) as error:
+        return error.what if "refused" in error.what else f"refused: {error}"
+
+
+def refuse_rest(lines: LineSource) -> None:
+    """Refuse the lines that still wait."""
+    with contextlib.suppress(EOFError):
+        while (line := lines.next(0.0)) is not None:
+            line.answer(_ENDS)
 
 
 class QueuedLines:
-    """Lines that threads read; a LineSource."""
+    """Lines that threads read; a LineSource. Orders among them do not wait: `orders` returns them at once."""
 
     def __init__(self) -> None:
-        self._queue: queue.Queue[TextLine | None] = queue.Queue(_WAITING)
+        self._queue: queue.Queue[TextLine | None] = queue.Queue(MOST_WAITING)
+        self._orders: deque[Order] = deque()
+        self._number = 0
+        self.ending = False
 
     def next(self, patience: float) -> TextLine | None:
         try:
@@ -157,11 +204,39 @@ class QueuedLines:
             raise EOFError
         return line
 
+    def orders(self) -> Iterator[Order]:
+        """Yield the orders since the last call; never waits."""
+        while self._orders:
+            yield self._orders.popleft()
+
+    def take(self, content: bytes, reply: Callable[[str], None]) -> None:
+        """Take a line; empty lines and remarks are skipped."""
+        text = content.decode("utf-8", "replace")
+        if not text.strip() or text.lstrip().startswith("#"):
+            return
+        self._number += 1
+        line = TextLine(self._number, text, reply)
+        if (order := order_of(text)) is not None:
+            self._orders.append(order)
+            self.ending = True
+            line.answer(f"accepted: {order.name.lower()}")
+            return
+        if len(content) >= LONGEST:
+            line.answer(f"refused: longer than {LONGEST} bytes")
+            return
+        try:
+            self._queue.put_nowait(line)
+        except queue.Full:
+            line.answer(f"refused: {MOST_WAITING} lines wait already")
+
     def read(self, stream: IO[bytes], reply: Callable[[str], None]) -> None:
         """Take a stream's lines until it ends or breaks."""
         with contextlib.suppress(OSError, ValueError):
-            while text := stream.readline(_LONGEST):
-                self._queue.put(TextLine(text.decode("utf-8", "replace"), reply))
+            while line := stream.readline(LONGEST):
+                rest = line
+                while len(rest) == LONGEST and not rest.endswith(b"\n"):  # skip the rest of a line that is too long
+                    rest = stream.readline(LONGEST)
+                self.take(line, reply)
 
     def end(self) -> None:
         """Say that no more lines come."""
@@ -170,62 +245,117 @@ class QueuedLines:
 
 @contextlib.contextmanager
 def opened_lines(place: str, reply: Callable[[str], None]) -> Iterator[QueuedLines]:
-    """Yield the lines of standard input, `-`, or of clients of a port of this machine, as 127.0.0.1:7777.
+    """Yield the lines of standard input, `-`, or of clients of a Unix socket, `unix:PATH`.
 
-    Answers to standard input go to `reply`, those to a client to that client. Raises InputError where the place is
-    wrong or its port is taken.
+    Only the socket's owner can connect to it. Answers to standard input go to `reply`, those to a client to that
+    client. The caller also passes the `orders` of the lines to the pilot. Raises InputError if the place is wrong or
+    taken.
     """
     lines = QueuedLines()
     if place == STANDARD_INPUT:
 
         def read() -> None:
-            lines.read(sys.stdin.buffer, reply)
-            lines.end()
+            try:
+                lines.read(sys.stdin.buffer, reply)
+            finally:
+                lines.end()
 
         threading.Thread(target=read, name="standard input", daemon=True).start()
         yield lines
         return
-    with _listening(place) as server:
+    path = place.removeprefix(SOCKET)
+    if not path or path == place:
+        raise InputError("neither standard input nor a socket", where=printable(place), hint=_PLACE_HINT)
+    with _listening(Path(path)) as server:
         threading.Thread(target=_serve, args=(server, lines), name="waypoint socket", daemon=True).start()
         yield lines
 
 
-def _listening(place: str) -> socket.socket:
-    host, _, port = place.rpartition(":")
-    if host.strip("[]") not in LOCAL or not port.isdecimal() or not 0 < int(port) < 1 << 16:
-        raise InputError(
-            "not a port of this machine", where=printable(place), hint="write - for standard input, or 127.0.0.1:7777"
-        )
+@contextlib.contextmanager
+def _listening(path: Path) -> Iterator[socket.socket]:
+    """Yield a socket that listens at a path, to which only its owner can connect; remove it afterwards."""
+    with socket.socket(socket.AF_UNIX) as server:
+        try:
+            made = _bind(server, path)
+        except OSError as error:
+            raise InputError(
+                f"cannot be listened on ({error.strerror or error})",
+                where=_shown(path),
+                hint="name a short path in a folder of yours",
+            ) from error
+        try:
+            yield server
+        finally:
+            with contextlib.suppress(OSError):
+                server.shutdown(socket.SHUT_RDWR)  # which wakes the thread that waits for clients
+            with contextlib.suppress(OSError):
+                if os.path.samestat(os.lstat(path), made):
+                    os.unlink(path)
+
+
+def _bind(server: socket.socket, path: Path) -> os.stat_result:
+    """Let a socket listen at a path; return the status of that path. Raises InputError or OSError."""
+    _remove_left_over(path)
+    mask = os.umask(_OWNER_ONLY)
     try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        return socket.create_server((host.strip("[]"), int(port)), family=family)
-    except OSError as error:
-        raise InputError(
-            f"cannot be listened on ({error.strerror or error})", where=place, hint="take another port"
-        ) from error
+        server.bind(str(path))
+    finally:
+        os.umask(mask)
+    server.listen()
+    return os.lstat(path)
+
+
+def _shown(path: Path) -> str:
+    return printable(f"{SOCKET}{path}")
+
+
+def _remove_left_over(path: Path) -> None:
+    """Remove a socket on which no program listens. Raises InputError if anything else is there, or OSError."""
+    try:
+        found = os.lstat(path)
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(found.st_mode):
+        raise InputError("exists, and is no socket", where=_shown(path), hint="name another path, or remove that")
+    with socket.socket(socket.AF_UNIX) as probe:
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            os.unlink(path)
+            return
+    raise InputError("another program listens there", where=_shown(path), hint="name another path, or end that program")
 
 
 def _serve(server: socket.socket, lines: QueuedLines) -> None:
     """Read the lines of one client at a time; another is refused in words. One that vanishes changes nothing."""
     busy = threading.Lock()
-    with contextlib.suppress(OSError):  # it was closed
-        while True:
+    while server.fileno() >= 0:
+        try:
             client, _ = server.accept()
-            if busy.acquire(blocking=False):
-                threading.Thread(target=_attend, args=(client, lines, busy), name="client", daemon=True).start()
-            else:
-                with contextlib.suppress(OSError), client:
-                    client.sendall(b"0 refused: another client steers this flight\n")
+        except OSError:  # it was closed, or too many files are open for now
+            REAL_CLOCK.sleep(_PATIENCE)
+            continue
+        if busy.acquire(blocking=False):
+            threading.Thread(target=_attend, args=(client, lines, busy), name="client", daemon=True).start()
+        else:
+            with contextlib.suppress(OSError), client:
+                client.sendall(b"0 refused: another client steers this flight\n")
 
 
 def _attend(client: socket.socket, lines: QueuedLines, busy: threading.Lock) -> None:
+    hears = True
+
     def reply(text: str) -> None:
-        with contextlib.suppress(OSError):
-            client.sendall(f"{text}\n".encode())
+        """Answer unless the client is gone or does not read its answers; never wait for it."""
+        nonlocal hears
+        answer = f"{text}\n".encode()
+        try:
+            hears = hears and client.send(answer, socket.MSG_DONTWAIT) == len(answer)
+        except OSError:
+            hears = False
 
     try:
         with client, client.makefile("rb") as stream:
-            client.settimeout(None)
             lines.read(stream, reply)
     finally:
         busy.release()

@@ -1,8 +1,8 @@
 """Fly with random faults in the stepped lab, death among them. None may leave the walls, each must end disarmed.
 
-The seed of a flight draws the path, the phase and moment at which things begin to go wrong, one to three faults at once
-with their lengths and sizes, whether logs or acknowledgements fall silent besides, and whether the pilot or the radio
-dies for good. Then the vehicle is alone and comes down by its own time-outs; its last setpoint must have been harmless.
+The seed of a flight determines its path, the phase and moment of the first fault, one to three faults at once with
+their lengths and sizes, whether logs or acknowledgements fall silent as well, and whether the pilot or the radio dies
+for good. The vehicle is then alone and comes down by its own time-outs; its last setpoint must have been harmless.
 """
 
 import contextlib
@@ -64,7 +64,7 @@ _PHASES: tuple[tuple[Phase, float], ...] = (
 _SHARE_SILENT = 0.35  # of the flights: logs or acknowledgements fall silent
 _SHARE_FLAPPING = 0.4  # of those: they come back for a moment
 _BACK_FOR = 0.1  # s
-# What falls silent together.
+# Sources that fall silent together.
 _SILENCES: tuple[tuple[Any, ...], ...] = (
     (VehicleFaultKind.SILENT_ESTIMATE,),
     (VehicleFaultKind.SILENT_STATUS,),
@@ -214,7 +214,7 @@ def random_scenario(seed: int, mission: Mission) -> Scenario:
 
 
 def with_silence(scenario: Scenario, seed: int) -> Scenario:
-    """Return a scenario in which, in a share of the flights, logs or acknowledgements fall silent besides."""
+    """Return the scenario; in a fraction of the flights, logs or acknowledgements fall silent as well."""
     chance = np.random.default_rng((seed, 1))
     if chance.random() > _SHARE_SILENT:
         return scenario

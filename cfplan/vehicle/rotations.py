@@ -206,7 +206,7 @@ def dot(first: Vector, second: Vector) -> Scalar:
 
 @register_jitable(forceinline=True)
 def cross(first: Vector, second: Vector) -> Vector:
-    """Return the outer product."""
+    """Return the cross product."""
     (a, b, c), (p, q, r) = first, second
     return b * r - c * q, c * p - a * r, a * q - b * p
 

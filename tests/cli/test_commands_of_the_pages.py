@@ -213,27 +213,31 @@ def test_waypoints_are_flown_as_it_is_shown(cfplan, folder, tmp_path, monkeypatc
     monkeypatch.chdir(folder)
     by_clock = partial(connect.connect, stepped=True)
     monkeypatch.setattr(connect, "connect", by_clock)
-    asked = b"1 0 1\n0 1 1.2\nland\n"
+    asked = b"1 0 1\n0 1 1.2\n"
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(asked)))
-    if "127.0.0.1:7777" in line:
-        threading.Thread(target=ask_by_the_port, args=(7777, asked), daemon=True).start()
+    if found := re.search(r"unix:(\S+)", line):
+        threading.Thread(target=ask_by_the_socket, args=(folder / found[1], asked), daemon=True).start()
     ended = cfplan(*shlex.split(line)[1:], "--records", tmp_path)
     assert ended.code in (0, 6), ended.err
-    assert len(list(tmp_path.iterdir())) == 1
+    assert ended.out.count("accepted") == (0 if found else 2)
+    (flight,) = tmp_path.iterdir()
+    assert len(list(flight.glob("plan-*.parquet"))) > 0
 
 
-def ask_by_the_port(port, lines):
+def ask_by_the_socket(path, lines):
     while True:
-        try:
-            client = socket.create_connection(("127.0.0.1", port), timeout=60)
-        except ConnectionRefusedError:
-            continue
-        with client:
+        with socket.socket(socket.AF_UNIX) as client:
+            client.settimeout(60)
+            try:
+                client.connect(str(path))
+            except OSError:  # it is not there yet
+                continue
+            answers = client.makefile("rb")
             client.sendall(lines)
-            client.shutdown(socket.SHUT_WR)
-            while client.recv(4096):
-                pass
-        return
+            assert all(b"accepted" in answers.readline() for _ in lines.splitlines())
+            client.sendall(b"land\n")
+            assert b"accepted" in answers.readline()
+            return
 
 
 @pytest.mark.parametrize("line", pages.lines_for(COMPLETED))

@@ -1,4 +1,4 @@
-"""docs/mistakes.md says of every mistake what cfplan says of it; numbers that are computed may round otherwise."""
+"""docs/mistakes.md has the message of cfplan for every mistake; computed numbers may round differently."""
 
 import re
 from pathlib import Path

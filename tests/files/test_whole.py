@@ -37,7 +37,7 @@ def test_what_fails_while_it_is_written_leaves_the_old_one_and_nothing_else(tmp_
     assert os.listdir(tmp_path) == ["plan.json"]
 
 
-def test_two_writers_of_a_file_at_once_do_not_meet(tmp_path):
+def test_two_writers_of_a_file_at_once_do_not_disturb_each_other(tmp_path):
     file = tmp_path / "plan.json"
     with whole(file) as first:
         first.write_text("first")

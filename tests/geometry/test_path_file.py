@@ -139,6 +139,19 @@ def test_each_mistake_is_named_with_its_place(load, content, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "row", ["0,0;0,0;1,0", "0,0 0,0 1,0", "0,0\t0,0\t1,0", "1;0,5;1", "1;0,5", "0,5 1", "0 0 1,5", "1,5;2;1"]
+)
+def test_decimal_commas_in_a_file_are_refused_as_such(load, row):
+    with pytest.raises(InputError, match=r"comma.csv:2: decimal commas.*point"):
+        load("points: comma.csv\n", comma=f"0;0;1\n{row}\n2;0;1\n")
+
+
+@pytest.mark.parametrize("row", ["1,0,1", "1, 0, 1", "1 , 0 ,1", "1;0;1", "1; 0; 1", "1 0 1", "1\t0\t1", "1,0,1,"])
+def test_one_separator_is_enough(load, row):
+    assert load("points: rows.csv\n", rows=f"0,0,1\n{row}\n").path.end > 0.9
+
+
 numbers = st.floats() | st.integers(-3, 3) | st.floats(-3, 3)
 points = st.lists(st.lists(numbers, min_size=3, max_size=3) | st.lists(numbers, max_size=4), max_size=6)
 contents = st.fixed_dictionaries(

@@ -319,6 +319,28 @@ def test_late_poses_a_tumble_and_no_poses_end_inside(slalom):
     assert (flown.landed, flown.disarmed, flown.readable) == (True, True, True)
 
 
+@pytest.mark.parametrize("moment", [0.3, 0.6, 0.9])
+def test_a_vehicle_that_fell_while_the_computer_stood_still_is_not_lifted_again(moment, line):
+    """Of 10,000 flights one left the walls: it took off from the floor by its wrong estimate, and its radio died."""
+    tumbles, lost = VehicleFault(VehicleFaultKind.TUMBLE, 0.3, 0.09), RadioFault(RadioFaultKind.DEAD, 1.3, FOR_GOOD)
+    scenario = Scenario("fell", Rung.LAND, (tumbles, lost), Phase.LAND, moment, stall=0.95)
+    truth = (flown := fly_stepped(scenario, line)).truth
+    woken = truth.time > flown.struck + 0.95
+    down = np.flatnonzero(woken & (truth.position[:, 2] < 0.01))[0]
+    assert truth.position[down:, 2].max() < 0.1
+    judged = judge(scenario, flown, line, readable=True)
+    assert (judged.landed, judged.disarmed) == (True, True)
+    assert judged.to_wall > 0.5
+
+
+@pytest.mark.parametrize("dead", [2.0, 4.7, 8.0])
+def test_a_vehicle_that_armed_unheard_is_disarmed_once_its_radio_is_back(dead, line):
+    faults = (RadioFault(RadioFaultKind.DEAD, 0.005, dead),)
+    flown = fly_scenario(Scenario("armed", Rung.NONE, faults, phase=Phase.ARM, moment=0.0), line)
+    assert flown.to_wall > 0.5
+    assert (flown.landed, flown.disarmed, flown.readable) == (True, True, True)
+
+
 @pytest.mark.parametrize("sooner", [0.0, -0.05])
 def test_a_vehicle_whose_motors_stop_as_it_flies_towards_a_wall_falls_inside(sooner, missions):
     """At 1.8 m/s, 0.8 m from the wall, where it brakes."""

@@ -8,6 +8,7 @@ import pytest
 from stepped_flight import at_setpoint, fly_stepped
 
 from cfplan.errors import ExitCode, InfeasibleError, InputError, PreflightError
+from cfplan.flight.on_board.commands import LAND
 from cfplan.flight.on_board.fall import falls_from
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, read_compressed, read_raw
 from cfplan.flight.pilot.keys import HeldOrders, Order
@@ -19,9 +20,10 @@ from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.wire import Port
-from cfplan.studies.fault_scenarios import SCENARIOS
+from cfplan.studies.fault_scenarios import FOR_GOOD, SCENARIOS, Scenario
 from cfplan.studies.faults import fly_scenario
 
 REPOSITORY = Path(__file__).parents[2]
@@ -190,6 +192,31 @@ def test_the_operator_ends_it_by_a_stop_of_a_second(line):
     at = int(np.searchsorted(flight.truth.time, begun))
     assert np.linalg.norm(flight.truth.position[at] - flight.truth.position[at - 20]) < 0.1
     assert begun - flight.outcome.first_setpoint - row / line.mission.rate == pytest.approx(1.0, abs=0.15)
+
+
+def test_where_its_commander_refuses_to_land_setpoints_land_it(line):
+    lab, orders = SteppedLab(LIMITS.airframe), HeldOrders()
+    receive = lab.vehicle.planner.receive
+
+    def refuse(payload, *rest, **more):
+        if payload[0] == LAND:
+            return bytes((LAND, 0, 0, 8))  # ENOEXEC
+        return receive(payload, *rest, **more)
+
+    lab.vehicle.planner.receive = refuse
+    row = len(line.mission.payloads) // 3
+    flight = fly_stepped(line.mission, at_setpoint(row, lambda: orders.give(Order.LAND)), orders=orders, lab=lab)
+    assert (flight.outcome.exit_code, flight.outcome.rung) == (ExitCode.ENDED_BY_OPERATOR, Rung.LAND)
+    assert flight.truth.off_in_air[-1] == 0
+    assert flight.truth.position[-1, 2] == 0.0
+    assert not flight.truth.locked
+
+
+@pytest.mark.parametrize("kind", [VehicleFaultKind.SILENT_ESTIMATE, VehicleFaultKind.SILENT_STATUS])
+def test_a_silent_log_lands_it_by_its_commander(line, kind):
+    flown = fly_scenario(Scenario("silent", Rung.LAND, (VehicleFault(kind, 0.0, FOR_GOOD),)), line.mission)
+    assert (flown.rung, flown.motors_off) == ("land", 0)
+    assert (flown.landed, flown.disarmed, flown.readable) == (True, True, True)
 
 
 @pytest.mark.parametrize(

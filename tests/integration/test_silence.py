@@ -52,7 +52,7 @@ def test_a_vehicle_that_acknowledges_lands_whatever_is_silent(line, phase, logs,
 @pytest.mark.parametrize("phase", MOMENTS)
 @pytest.mark.parametrize("logs", [(ESTIMATE,), (STATUS,), (ESTIMATE, STATUS)])
 def test_logs_that_come_back_for_a_moment_change_nothing(line, phase, logs):
-    spans = ((0.0, 0.6), (0.7, FOR_GOOD))
+    spans = ((0.0, 0.7), (0.8, FOR_GOOD))
     flown = fly_silenced(line, phase, *(VehicleFault(log, *span) for log, span in itertools.product(logs, spans)))
     assert_down(flown)
     assert (flown.rung, flown.motors_off) == ("land", 0)
@@ -81,7 +81,7 @@ def test_an_uplink_and_poses_that_are_both_gone_end_by_link_loss_inside(line, ph
 def test_logs_that_the_vehicle_deleted_while_its_radio_was_dead_are_created_anew(line, kind, back_after):
     flown = fly_silenced(line, Phase.STREAM, RadioFault(kind, 0.0, back_after))
     assert_down(flown)
-    if back_after > 1.0:  # its watchdog has stopped the motors, which only its log tells
+    if back_after > 1.0:  # only the log shows that its watchdog has stopped the motors
         assert "the vehicle locked" in flown.reason
     else:
         assert flown.rung == "land"

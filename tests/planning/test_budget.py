@@ -106,9 +106,9 @@ def test_what_takes_longer_than_the_battery_lasts_is_refused_before_it_is_planne
         plan(path, short.airframe, short, speed_factor=0.05)
 
 
-def test_a_budget_is_what_a_user_waits_whoever_has_the_processor():
+def test_a_budget_is_time_that_a_user_waits_not_processor_time():
     deadline = Deadline.after(0.05)
-    Event().wait(0.1)  # in which this process has nothing of the processor
+    Event().wait(0.1)  # during which this process does not use the processor
     assert deadline.passed
 
 

@@ -1,4 +1,4 @@
-"""Walls are compared alike by all: 10,000 random rooms, with places at the margin, a hair beyond it and well beyond."""
+"""All comparisons with walls agree, in 10,000 random rooms: at the margin, a hair beyond it and well beyond."""
 
 import re
 from dataclasses import replace
@@ -37,7 +37,7 @@ WALL = Quantity(WALLS, "m", "", "", AT_LEAST, dense.POSITION, 3)
 
 
 def rooms(count):
-    """Rooms with round numbers, a place by the margin, that wall's axis and side, and whether the place is inside."""
+    """Yield rooms with round numbers, a place by the margin, that wall's axis and side, and whether it is inside."""
     random = np.random.default_rng(1)
     for number in range(count):
         low, size = np.round(random.uniform(-3.0, 0.0, 3), 2), np.round(random.uniform(1.5, 6.0, 3), 2)
@@ -45,7 +45,7 @@ def rooms(count):
         space = Space(tuple(low.tolist()), tuple((low + size).round(2).tolist()), margin)
         axis, high, beyond = int(random.integers(3)), bool(random.integers(2)), BEYOND[number % len(BEYOND)]
         place = (np.add(space.low, space.high) / 2).round(digits)
-        # As a person writes it: the wall's number less the margin's, which is rounded otherwise than it is computed.
+        # As a person writes it: wall less margin in decimals, which rounds differently from the computed difference.
         edge = round(space.high[axis] - margin, 3) if high else round(space.low[axis] + margin, 3)
         place[axis] = edge + (beyond if high else -beyond)
         yield space, tuple(place.tolist()), axis, high, beyond <= TOLERANCE
@@ -64,7 +64,7 @@ def room_limits(limits, space):
 
 
 def verdicts(space, place, axis, high, limits):
-    """What each says of a vehicle at the place: whether it is inside."""
+    """Return, by the name of each check, whether it counts a vehicle at the place as inside."""
     pose = Pose(10.0, 10.0, place, LEVEL)
     seen = Observation(10.0, pose=pose)
     here = np.array(place)
@@ -93,7 +93,7 @@ def test_a_place_at_the_margin_is_inside_for_all_and_one_beyond_for_none(limits)
 
 
 def straight(space, place, axis):
-    """The ends of a level way along a wall."""
+    """Return the ends of a level way along a wall."""
     along = (axis + 1) % 2
     ends = np.array([place, place])
     ends[:, along] += (-0.3, 0.3)
@@ -110,7 +110,7 @@ def test_paths_at_the_margin_pass_the_path_check_and_the_certificate(limits, mak
 
 
 def test_hovers_and_stops_at_the_margin_pass_in_planning_and_in_the_air(limits):
-    """In packets places are rounded to a millimetre, which is allowed for: so beyond it is by 2 cm here."""
+    """Packets round positions to a millimetre, which is tolerated, so places outside are 2 cm beyond here."""
     for space, place, _, _, inside in rooms(16):
         if not inside and not (space.beyond(place) > 0.01).any():
             continue

@@ -225,7 +225,7 @@ def test_the_compiled_certificate_is_that_of_plain_numpy(make_profile, waypoints
 
 
 def test_margins_are_what_they_once_were(make_profile):
-    """Worst value, share and time of each, as plain numpy makes them; processors round the path otherwise."""
+    """Worst value, share and time of each, as computed by plain numpy; processors round the path differently."""
     once = {
         "speed": (2.5812494200507654, 1.2906247100253827, 3.9599245506935365),
         "acceleration": (3.953892151082605, 0.7907784302165209, 2.661764298369392),

@@ -105,7 +105,7 @@ def test_what_cannot_be_flown_is_refused_in_words_and_the_flight_goes_on(flown, 
     assert vehicle.outcome.exit_code is ExitCode.OK
 
 
-def test_to_be_asked_to_go_where_it_is_is_done(flown):
+def test_a_request_to_go_where_it_is_is_accepted(flown):
     vehicle, _ = flown
     here = vehicle.position
     assert here != (0.0, 0.0, 0.8)
@@ -160,7 +160,7 @@ def test_a_vehicle_asked_to_rest_where_it_passes_comes_back_there(flown):
 
 
 def test_a_path_flown_already_is_left_for_a_shorter_one(flown):
-    """Its last waypoint alone is another request, which leaves out those before."""
+    """A request for its last waypoint alone is a new one, without the waypoints before."""
     vehicle, _ = flown
     round_about = vehicle.fly([[1, 0, 1], [1, 1, 1], [0.3, 0.3, 1]])
     assert vehicle.fly([[1, 0, 1], [1, 1, 1], [0.3, 0.3, 1]]).splice < 0  # nothing new
@@ -283,7 +283,7 @@ def test_a_take_off_that_cannot_be_is_refused_and_nothing_is_armed(limits):
         assert vehicle.outcome is None
 
 
-def test_a_take_off_that_takes_too_long_has_landed_when_that_is_said(limits):
+def test_a_take_off_that_takes_too_long_has_landed_when_it_raises(limits):
     slow = replace(limits, ground=replace(limits.ground, take_off_speed=0.004))
     flight = SteppedSteering(slow)
     with SteeredVehicle(flight, slow, uri="sim://0") as vehicle:
@@ -294,7 +294,7 @@ def test_a_take_off_that_takes_too_long_has_landed_when_that_is_said(limits):
         assert not flight.lab.truth().motor[-1].any()
 
 
-def test_a_flight_that_does_not_end_is_no_flight_that_has_landed(flown, monkeypatch):
+def test_landing_raises_if_the_flight_does_not_end(flown, monkeypatch):
     vehicle, flight = flown
     monkeypatch.setattr(flight, "order", lambda _: None)
     with pytest.raises(LinkError, match="not ended"):

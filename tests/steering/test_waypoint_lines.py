@@ -1,7 +1,12 @@
 """Waypoints that come as lines of text: each line is answered, and whatever it holds the flight goes on."""
 
+import math
+import os
 import socket
-from collections.abc import Iterable
+import stat
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,18 +16,31 @@ from hypothesis import strategies as st
 from waiting import until
 
 from cfplan.cli import cfplan as command_line
-from cfplan.errors import ExitCode, InputError
+from cfplan.errors import ExitCode, FlightEndedError, InputError
+from cfplan.flight.pilot.keys import Order
 from cfplan.preparation.air_planner import Wish
+from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.steering.steered_vehicle import SteeredVehicle
 from cfplan.steering.stepped_steering import SteppedSteering
-from cfplan.steering.waypoint_lines import TextLine, opened_lines, parse_line, steer_by_lines
+from cfplan.steering.waypoint_lines import (
+    LONGEST,
+    MOST_WAITING,
+    QueuedLines,
+    TextLine,
+    opened_lines,
+    parse_line,
+    refuse_rest,
+    steer_by_lines,
+)
 
 
-class ListedLines:
-    """Lines of a list; `sleep 0.5` lets so many s of the flight pass."""
+class ListedLines(QueuedLines):
+    """Lines of a list; `sleep 0.5` lets 0.5 s of the flight pass."""
 
-    def __init__(self, vehicle: SteeredVehicle, lines: Iterable[str]):
-        self._vehicle, self._lines = vehicle, list(lines)
+    def __init__(self, lines: Iterable[str]):
+        super().__init__()
+        self._lines = list(lines)
+        self.vehicle: SteeredVehicle | None = None
         self.answers: list[str] = []
 
     def next(self, patience: float) -> TextLine | None:
@@ -30,15 +48,17 @@ class ListedLines:
             raise EOFError
         text = self._lines.pop(0)
         if text.startswith("sleep"):
-            self._vehicle.sleep(float(text.split()[1]))
+            self.vehicle.sleep(float(text.split()[1]))
             return None
-        return TextLine(text, self.answers.append)
+        self.take(text.encode(), self.answers.append)
+        return super().next(0.0)
 
 
 def steer(limits, lines: Iterable[str]) -> tuple[SteeredVehicle, list[str]]:
-    with SteeredVehicle(SteppedSteering(limits), limits, uri="sim://0") as vehicle:
+    source = ListedLines(lines)
+    with SteeredVehicle(SteppedSteering(limits, more_orders=source.orders), limits, uri="sim://0") as vehicle:
+        source.vehicle = vehicle
         vehicle.take_off(0.8)
-        source = ListedLines(vehicle, lines)
         steer_by_lines(vehicle, source)
     return vehicle, source.answers
 
@@ -69,9 +89,91 @@ def test_of_waypoints_that_wait_together_those_outside_are_refused_alone(limits)
 def test_words_replace_slow_down_stop_and_land(limits):
     lines = ["1.5 2.5 1", "sleep 0.8", "slower", "replace -1 2 1", "sleep 0.5", "stop", "sleep 3", "land", "0 0 1"]
     vehicle, answers = steer(limits, lines)
-    assert [answer.split()[1] for answer in answers] == ["accepted:"] * 4 + ["accepted:"]
-    assert answers[-1] == "5 accepted: land"
-    assert vehicle.outcome.exit_code is ExitCode.OK
+    assert [answer.split()[1] for answer in answers] == ["accepted:"] * 5 + ["refused:"]
+    assert answers[4] == "5 accepted: land"
+    assert vehicle.outcome.exit_code in (ExitCode.OK, ExitCode.ENDED_BY_OPERATOR)
+
+
+class TimedLines(QueuedLines):
+    """Lines that come at given times of the flight, s after `begin`."""
+
+    def __init__(self, lines: Iterable[tuple[float, str]]):
+        super().__init__()
+        self._lines = list(lines)
+        self.answers: list[str] = []
+        self.ordered = math.nan  # s, when the last line was taken
+        self.flight: SteppedSteering | None = None
+        self._begun = math.inf
+
+    def orders(self) -> Iterator[Order]:
+        now = self.flight.clock.now()
+        while self._lines and now >= self._begun + self._lines[0][0]:
+            self.ordered = now
+            self.take(self._lines.pop(0)[1].encode(), self.answers.append)
+        return super().orders()
+
+    def next(self, patience: float) -> TextLine | None:
+        if self._queue.empty():
+            self.flight.wait(lambda: False, patience)
+        return super().next(0.0)
+
+    def begin(self) -> None:
+        self._begun = self.flight.clock.now()
+
+
+@pytest.mark.parametrize(
+    ("order", "reason"), [("land", "operator ended"), ("cut", "cut the motors"), (" LAND \r", "operator ended")]
+)
+@pytest.mark.parametrize("fault", [PlannerFault.KILLED, None])
+def test_an_order_waits_for_no_line_before_it(limits, order, reason, fault):
+    """Neither while a request waits for a planner that hangs, nor while 30 lines wait behind it."""
+    many = [(0.0, f"{0.05 * k} 1 1") for k in range(30)]
+    lines = TimedLines([*many, (0.5, "0 2 1"), (1.0, order), (1.0, "0 0 1")])
+    flight = lines.flight = SteppedSteering(limits, more_orders=lambda: lines.orders())
+    with SteeredVehicle(flight, limits, uri="sim://0") as vehicle:
+        vehicle.take_off(0.8)
+        flight.planner.fault = fault
+        lines.begin()
+        flight.wait(lambda: lines._queue.qsize() == 30, 1.0)
+        steer_by_lines(vehicle, lines)
+        assert reason in vehicle.outcome.reason
+    truth = flight.lab.truth()
+    down = truth.time[truth.position[:, 2] > 0.1].max()
+    assert 0.0 < down - lines.ordered < (4.0 if "land" in order.lower() else 0.6)
+    numbers = [int(answer.split()[0]) for answer in lines.answers]
+    assert sorted(numbers) == list(range(1, 34))
+    assert f"32 accepted: {order.strip().lower()}" in lines.answers
+    assert "33 refused: the flight ends" in lines.answers
+
+
+def test_an_order_to_land_during_the_take_off_lands(limits):
+    lines = TimedLines([(0.0, "1 0 1"), (0.0, "land")])
+
+    def orders_in_the_climb() -> Iterator[Order]:
+        if flight.first_pose()[0][2] > 0.2 and not lines.ending:
+            lines.begin()
+        return lines.orders()
+
+    flight = lines.flight = SteppedSteering(limits, more_orders=orders_in_the_climb)
+    with SteeredVehicle(flight, limits, uri="sim://0") as vehicle:
+        with pytest.raises(FlightEndedError, match="operator"):
+            vehicle.take_off(0.8)
+        assert vehicle.position[2] < 0.05
+    assert 0.1 < flight.lab.truth().position[:, 2].max() < 0.7
+    refuse_rest(lines)
+    assert lines.answers == ["2 accepted: land", "1 refused: the flight ends"]
+
+
+@pytest.mark.parametrize("line", ["1,1 1,0 1,1", "1,1;1,0;1,1", "1,1\t1,0\t1,1", "replace 0,5 0,5 1", "1 0,5 1"])
+def test_decimal_commas_are_refused_in_words(line):
+    with pytest.raises(InputError, match="decimal comma") as refused:
+        parse_line(line)
+    assert "point" in refused.value.hint
+
+
+@pytest.mark.parametrize("line", ["1 0 1.2", "1,0,1.2", "1, 0, 1.2", " 1 , 0 ,1.2\r\n", "1\t0\t1.2", "+1. -0 1.2e0"])
+def test_numbers_are_separated_by_blanks_or_by_commas(line):
+    assert parse_line(line) == (Wish.EXTEND, ((1.0, 0.0, 1.2),))
 
 
 @given(st.text())
@@ -85,48 +187,115 @@ def test_any_line_is_a_wish_or_an_error_of_one_line(text):
         assert "hint" in refused
         assert "\n" not in refused
     else:
-        assert wish in (*Wish, "land", "cut")
+        assert wish in Wish
         assert np.isfinite(np.array(waypoints)).all()
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A place for a socket, by a path that is short enough."""
+    monkeypatch.chdir(tmp_path)
+    return "unix:steer.sock"
 
 
-def test_a_second_client_is_refused_and_one_that_vanishes_makes_room():
-    port = free_port()
-    with opened_lines(f"127.0.0.1:{port}", print) as lines:
-        with socket.create_connection(("127.0.0.1", port)) as first:
+def connected() -> socket.socket:
+    client = socket.socket(socket.AF_UNIX)
+    client.settimeout(60.0)
+    client.connect("steer.sock")
+    return client
+
+
+def test_a_second_client_is_refused_and_one_that_vanishes_makes_room(place):
+    with opened_lines(place, print) as lines:
+        with connected() as first:
             first.sendall(b"1 0 1\n\xff\xfe\n")
             line = lines.next(60.0)
             assert line.text == "1 0 1\n"
-            line.reply("1 accepted")
+            line.answer("accepted")
             assert first.recv(100) == b"1 accepted\n"
             assert "�" in lines.next(60.0).text
-            with socket.create_connection(("127.0.0.1", port)) as second:
+            with connected() as second:
                 assert b"another client" in second.recv(100)
-        line.reply("nobody hears that")
+        line.answer("nobody hears that")
 
         def another_steers() -> bool:
-            with socket.create_connection(("127.0.0.1", port)) as third:
+            with connected() as third, suppress(BrokenPipeError):  # refused, as the first one is still there
                 third.sendall(b"0 1 1\n")
                 return lines.next(0.5) is not None
+            return False
 
         assert until(another_steers)
+    assert not Path("steer.sock").exists()
 
 
-@pytest.mark.parametrize("place", ["", "7777", "example.org:7777", "127.0.0.1:0", "127.0.0.1:x", "127.0.0.1:99999"])
-def test_a_place_that_is_no_port_of_this_machine_is_refused(place):
-    with pytest.raises(InputError, match="port of this machine"), opened_lines(place, print):
+def test_an_order_is_read_though_nobody_takes_lines_or_reads_answers(place):
+    with opened_lines(place, print) as lines, connected() as client:
+        client.sendall(b"1 0 1\n" * (MOST_WAITING + 20_000) + b"land\n")
+        assert until(lambda: lines.ending)
+        assert list(lines.orders()) == [Order.LAND]
+        assert client.recv(100).startswith(f"{MOST_WAITING + 1} refused: {MOST_WAITING} lines wait".encode())
+
+
+def test_a_line_that_is_too_long_is_refused_whole_and_the_next_one_counts(place):
+    with opened_lines(place, print) as lines, connected() as client:
+        client.sendall(b"replace " + b"1 0 1 " * LONGEST + b"\n0 1 1\n")
+        assert lines.next(60.0).text == "0 1 1\n"
+        assert client.recv(100) == f"1 refused: longer than {LONGEST} bytes\n".encode()
+
+
+def test_nobody_else_may_connect_and_no_port_is_open(place):
+    before = os.umask(0)
+    try:
+        with opened_lines(place, print):
+            mode = os.lstat("steer.sock").st_mode
+    finally:
+        assert os.umask(before) == 0
+    assert stat.S_ISSOCK(mode)
+    assert stat.S_IMODE(mode) == 0o600
+
+
+def test_a_socket_that_a_killed_program_left_behind_is_replaced(place):
+    with socket.socket(socket.AF_UNIX) as left_behind:
+        left_behind.bind("steer.sock")
+    with opened_lines(place, print) as lines, connected() as client:
+        client.sendall(b"1 0 1\n")
+        assert lines.next(60.0).text == "1 0 1\n"
+
+
+def test_a_socket_on_which_another_flight_listens_is_refused_and_stays(place):
+    with opened_lines(place, print) as lines:
+        with pytest.raises(InputError, match="another program listens"), opened_lines(place, print):
+            pass
+
+        def steers() -> bool:
+            with connected() as client, suppress(BrokenPipeError):  # refused, as the look is still there
+                client.sendall(b"1 0 1\n")
+                return lines.next(0.5) is not None
+            return False
+
+        assert until(steers)
+
+
+@pytest.mark.parametrize("make", [Path.touch, Path.mkdir, lambda path: path.symlink_to("nowhere")])
+def test_what_is_no_socket_is_refused_and_stays(place, make):
+    make(Path("steer.sock"))
+    with pytest.raises(InputError, match="no socket"), opened_lines(place, print):
+        pass
+    assert os.path.lexists("steer.sock")
+
+
+@pytest.mark.parametrize("place", ["unix:nowhere/steer.sock", f"unix:{'x' * 200}"])
+def test_a_path_where_no_socket_can_be_is_refused(place, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="cannot be listened on"), opened_lines(place, print):
         pass
 
 
-def test_a_port_that_is_taken_is_refused():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        place = f"127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(InputError, match="cannot be listened on"), opened_lines(place, print):
-            pass
+@pytest.mark.parametrize("place", ["", "7777", "unix:", "127.0.0.1:7777", "[::1]:7777", "0.0.0.0:7777"])
+def test_lines_come_from_no_other_place(place):
+    """A port of this machine can be reached by each of its users, and by pages in a browser."""
+    with pytest.raises(InputError, match="neither standard input nor a socket"), opened_lines(place, print):
+        pass
 
 
 @pytest.mark.parametrize(

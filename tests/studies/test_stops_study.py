@@ -13,8 +13,9 @@ def test_the_stop_that_is_flown_takes_hardly_more_way_than_the_fastest_plan_to_b
     [stop], [braking] = result.table("stops").rows, result.table("braking").rows
     assert braking["acceleration"] <= 5.0
     assert braking["turning"] <= 35.0
+    sampled = 0.5 * 2.0 / 100.0  # m: ways begin and end at setpoints, between which the vehicle moves on
     for way in ("distance", "flown"):
-        assert stop[way] < 1.1 * braking[way] * 2.0 / braking["speed"]
+        assert stop[way] < 1.1 * braking[way] * 2.0 / braking["speed"] + sampled
     assert stop["distance"] < stop["flown"] < stop["distance"] + 0.02  # motors lag, and the vehicle overshoots
 
 

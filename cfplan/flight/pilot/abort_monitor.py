@@ -39,7 +39,7 @@ class Observation:
     late: float = 0.0  # s, by which the last setpoint missed its deadline
 
 
-# How a quantity of the table with a ladder is measured; None while the log that tells it is gone.
+# The measured value of each quantity that has a ladder; None while the log that reports it is gone.
 MEASURED: Mapping[str, Callable[[Observation], Triple | None]] = MappingProxyType(
     {
         "speed": lambda seen: seen.estimate.velocity if seen.estimate is not None else None,
@@ -59,7 +59,7 @@ class AbortMonitor:
         self._since: dict[str, float] = {}
 
     def gravest(self, observation: Observation) -> Abort | None:
-        """Return the gravest abort of all, None where there is no reason for one."""
+        """Return the gravest abort, None if there is no reason for one."""
         aborts = [abort for abort in self._aborts(observation) if abort.rung]
         return max(aborts, key=lambda abort: abort.rung, default=None)
 
@@ -72,7 +72,7 @@ class AbortMonitor:
             yield AbortReason.LATE_SETPOINT.abort(Rung.BRAKE, seconds=observation.late)
 
     def _silence(self, observation: Observation) -> Abort:
-        """Return the abort of the present health, which names the source that matters most."""
+        """Return the abort that the present health calls for; its text names the most important silent source."""
         health, pose = observation.health, observation.pose
         rung, age_brake = health.reaction.rung, self._limits.pose.age_brake
         if health.uplink is GONE:
@@ -159,7 +159,7 @@ class AbortMonitor:
 
 
 def ordered(order: Order | None, *, main_gone: bool) -> Abort | None:
-    """Return an abort for an operator command or the loss of the main process; on the ground they count, too."""
+    """Return an abort for an operator command or the loss of the main process; both also count on the ground."""
     if order is Order.CUT:
         return AbortReason.OPERATOR_CUT.abort(Rung.CUT)
     if order is Order.LAND:
@@ -168,7 +168,7 @@ def ordered(order: Order | None, *, main_gone: bool) -> Abort | None:
 
 
 def fault_abort(error: Exception, rung: Rung = Rung.LAND) -> Abort:
-    """Return the abort for a fault of this program, or an error that it did not expect in the air."""
+    """Return the abort for a fault of this program or an unexpected error."""
     return AbortReason.PILOT_FAULT.abort(rung, error=error)
 
 

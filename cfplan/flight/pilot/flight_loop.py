@@ -5,7 +5,7 @@ forwards the newest good pose, and looks for reasons to end the flight. Whatever
 so poses flow and the abort monitor watches meanwhile. A reason to leave the plan arrives as `AbortRaised` out of any
 wait.
 
-Each step of a tick is guarded: a fault of this program lands the vehicle, and while it lands the other steps go on.
+Each step of a tick is guarded: if one fails, the vehicle lands, and the other steps continue meanwhile.
 """
 
 import math
@@ -42,11 +42,12 @@ from cfplan.vehicle.rotations import yaw_of
 TRIES = 3
 _KEEP_ALIVE_PERIOD = 0.1  # s; the vehicle's watchdog stops the motors after 1 s without a keep-alive packet
 _RECENT = 1.0  # s of good poses that are kept
-# m/s, horizontally and lasting, that the poses may move otherwise than the vehicle believes, while it flies slowly:
-# 0.05 in the virtual lab, where the wind blows 0.15, and 0.4 once the vehicle cannot be held any more.
-MOVES_OTHERWISE = 0.2
+VELOCITY_MISMATCH = 0.2
+"""m/s, horizontal: difference between the velocities of poses and estimate, in slow flight, above which poses are
+distrusted if it lasts. In the virtual lab it is 0.05, in wind 0.15, and 0.4 once the vehicle cannot be held."""
 LINK_LOST_AFTER = 10.0  # s without an acknowledgement, in flight; until then the link may come back
 _BRAKES_IN = 0.2  # s of its speed, by which a vehicle that levels out stops beyond where it is
+_FEWEST_HEIGHTS = 3  # that tell whether a body rests
 _STREAMS = 8  # that are remembered: a pose that comes late is judged by the stream of its time
 
 
@@ -95,7 +96,7 @@ class FlightLoop:
         self._link: Link | None = None
         self._feeding = False  # poses are read and forwarded
         self.airborne = False
-        self._took_off = False  # from then on a fault of this program is dealt with, not raised
+        self._took_off = False  # once True, a fault of this program lands the vehicle instead of being raised
         self._stop_expected = math.inf  # s, from when on motors that do not turn were meant to stop
         self._tolerated = Rung.NONE  # an abort of this rung or a lesser one changes nothing
         self.commitment = Commitment(0, mission.payloads, mission.stops)
@@ -109,8 +110,8 @@ class FlightLoop:
         self._begun: deque[Stream] = deque(maxlen=_STREAMS)  # the last streams, each with its start
         self.pose_fault = ""  # why the last pose was not good
         self._forwarded = math.inf  # s, the time of the last pose that was forwarded
-        self._otherwise_since = math.inf  # s, since when the poses have moved otherwise than the vehicle believes
-        self.distrusted = ""  # why poses are not believed for the rest of the flight; it is slow until that is seen
+        self._mismatch_since = math.inf  # s, since when the velocities of poses and estimate have differed
+        self.distrusted = ""  # why poses are ignored for the rest of the flight; empty while they are trusted
         self._source_fault = ""
         self._log_since = -math.inf  # s, since when the vehicle's log has come without a gap, in flight
         self._kept_alive = -math.inf  # s, when the vehicle's watchdog was last sent a keep-alive packet
@@ -198,7 +199,7 @@ class FlightLoop:
         while self.stream is self.plan and (left := due - LOOKS_UNTIL - self.now()) > 0.0:
             if not self._proposals.wait(left):
                 return
-            self._guard("proposals", lambda: self._consider_proposal(self.now(), self._just_sent))
+            self._consider_proposal(self.now(), self._just_sent)
 
     def _consider_proposal(self, now: float, sent: int) -> None:
         """Fly what a planner proposes from its splice on if it verifies; answer the planner.
@@ -242,9 +243,9 @@ class FlightLoop:
         return Descent.HELD if self._left_alone else self.health.reaction.descent
 
     def hold_where_it_is(self) -> None:
-        """Send a hover near where the vehicle is; once it acknowledges, this reaches it, and it is left alone no more.
+        """Send a hover near where the vehicle is; once the vehicle acknowledges, it is no longer left alone.
 
-        That is by the poses, by its own estimate if those do not come, or else where it was seen last.
+        The place is that of the poses, without them that of the vehicle's estimate, or else where it was seen last.
         """
         estimate, space = self.link.estimate, self.limits.space
         position, velocity, yaw = self.seen()
@@ -264,20 +265,21 @@ class FlightLoop:
 
     def tick(self) -> float:
         """Serve one deadline: the setpoint, then the poses, then the abort monitor. Return the time after it, s."""
-        due = self._deadlines.wait(self._consider_meanwhile)
+        due = self._deadlines.wait(lambda due: self._guard("proposals", lambda: self._consider_meanwhile(due)))
         now = self.now()
         self.waking.append(now - due)
+        late = max(now - due, now - self._sent_at - 1.0 / self.mission.rate)  # wherever this computer stood still
         self._guard("setpoints", lambda: self._send_setpoint(now, due))
         self._guard("watchdog", lambda: self._keep_alive(now))
         self._take_poses()
         self._guard("proposals", lambda: self._consider_due_proposal(now))
         self._guard("logs", lambda: self._look(now))
         self._obey_orders()
-        self._guard("abort monitor", lambda: self._monitor_flight(now, now - due))
+        self._guard("abort monitor", lambda: self._monitor_flight(now, late))
         return now
 
     def _guard(self, step: str, act: Callable[[], None]) -> None:
-        """Take a step of a tick. A fault of it lands the vehicle, once; while it lands the steps that work go on."""
+        """Run one step of a tick. Its first fault lands the vehicle; the other steps continue meanwhile."""
         try:
             act()
         except (AbortRaised, LinkLost):
@@ -315,7 +317,7 @@ class FlightLoop:
             self._consider_proposal(now, self._just_sent)
 
     def _look(self, now: float) -> None:
-        """Compute the health of this tick, and create logs anew that the vehicle sends no more."""
+        """Compute the health of this tick, and create anew the logs that the vehicle no longer sends."""
         link = self.link
         self.health = self._health_monitor.look(
             now,
@@ -326,13 +328,13 @@ class FlightLoop:
         )
         streams = self.stream is not None and not self.stream.on_board
         self._left_alone |= self.airborne and streams and self.health.uplink is GONE
-        if self.health.uplink is FRESH and (self.airborne or self.watched):
+        if self.health.uplink is FRESH and self._feeding:
             for log in ("estimate", "status"):
                 if getattr(self.health, log) is GONE:
                     link.revive_log(log)
 
     def _take_poses(self) -> None:
-        """Forward the poses that have come. In the air a fault of that means that none did: they grow old."""
+        """Forward the poses that have come. After take-off, a fault here counts as no pose: the last one grows old."""
         if not self._feeding:
             return
         try:
@@ -427,9 +429,9 @@ class FlightLoop:
         return self.link.status if self.health.status is not GONE else None
 
     def _monitor_flight(self, now: float, late: float) -> None:
-        """Raise LinkLost or AbortRaised where there is a reason to; only in the air."""
+        """Raise LinkLost if the link is lost, and in the air AbortRaised if there is a reason to abort."""
         link, estimate = self.link, self.estimate
-        if link.lost or (self.airborne and now - link.acknowledged > LINK_LOST_AFTER):
+        if link.lost or (self.airborne and self._health_monitor.uplink_silent > LINK_LOST_AFTER):
             raise LinkLost
         if not self.airborne or self._stopped():
             return
@@ -455,25 +457,26 @@ class FlightLoop:
             raise AbortRaised(abort)
 
     def _compare_motion(self, now: float) -> None:
-        """Believe no pose any more of a body that lastingly moves otherwise than the vehicle believes.
+        """Distrust all poses once their velocity has differed from the estimate's for `flight.patience`.
 
-        Its axes are not the vehicle's then, or it is another body: by such poses no vehicle can be held, but by its own
-        sensors it still lands. Take-off and the way to the start are slow, so that little else explains it; later it is
-        not looked at. On the floor nothing shows how the body is turned about the vertical.
+        The axes of the tracked body are then not the vehicle's, or it is another body. The vehicle cannot be held by
+        such poses, but it can land by its own sensors. Only take-off and the way to the start are checked: they are
+        slow, so little else explains the difference. On the floor, the body's yaw cannot be observed.
         """
         estimate, then = self.link.estimate, self._predictor.middle
         off = 0.0
         if (
             self.airborne
-            and not self.history.first_setpoint
+            and self._tolerated is Rung.NONE
+            and not (self.history.first_setpoint or self._left_alone)
             and estimate is not None
             and self.health.estimate is FRESH
             and now - self.pose().time <= self.limits.pose.age_warning
             and not math.isnan(then)
         ):
             off = math.dist(self._predictor.velocity()[:2], estimate.velocity_at(then)[:2])
-        self._otherwise_since = min(self._otherwise_since, now) if off > MOVES_OTHERWISE else math.inf
-        if now - self._otherwise_since >= self.limits.flight.patience and not self.distrusted:
+        self._mismatch_since = min(self._mismatch_since, now) if off > VELOCITY_MISMATCH else math.inf
+        if now - self._mismatch_since >= self.limits.flight.patience and not self.distrusted:
             self.distrusted = (
                 f"the tracked body moves by {off:.2f} m/s otherwise than the vehicle believes: "
                 "are its axes the vehicle's?"
@@ -485,7 +488,7 @@ class FlightLoop:
         return status is not None and status.time > self._stop_expected and not any(status.motor)
 
     def _obey_orders(self) -> None:
-        """Raise AbortRaised for an operator command or the loss of the main process; while there is no link, too."""
+        """Raise AbortRaised for an operator command or the loss of the main process; also without a link."""
         abort = ordered(self._orders.worst, main_gone=self._orders.gone)
         if abort is not None:
             self._leave_for(abort)
@@ -533,9 +536,8 @@ class FlightLoop:
     def heights(self, duration: float) -> list[float]:
         """Return the heights, m, of the good poses of the last `duration`, s; none if they do not reach back as far."""
         since = self.now() - duration
-        if not self.recent or self.recent[0].time > since:
-            return []
-        return [pose.position[2] for pose in self.recent if pose.time > since]
+        heights = [pose.position[2] for pose in self.recent if pose.time > since]
+        return heights if len(heights) >= _FEWEST_HEIGHTS and self.recent[0].time <= since else []
 
     @property
     def blind_for(self) -> float:

@@ -1,11 +1,11 @@
-"""Health: which of its sources the pilot still hears, and the table of what it does about each combination.
+"""Health: how recently the pilot heard each of its sources, and the table of its reactions to each combination.
 
-There are four sources: the uplink, by acknowledgements of what was sent; the vehicle's two logs, estimate and status;
-and the poses that reach the vehicle. Each is fresh, late or gone. The pilot computes that once a tick, and abort
-ladder, landing, holding and link loss read nothing else about silence.
+There are four sources: the uplink (answers to cflib's pings, which acknowledge that the vehicle hears), its two logs
+(estimate and status), and the poses that reach the vehicle. Each is fresh, late or gone. The pilot computes the health
+once a tick; the abort ladder, holding and landing react to silence by it.
 
-Acknowledgements alone say whether the vehicle can be steered. A vehicle whose logs are silent while it acknowledges
-flies what it is sent, so it brakes along its certified stop, lands by poses and is disarmed like any other.
+Only acknowledgements show whether the vehicle can be steered. A vehicle that acknowledges while its logs are silent
+follows its setpoints, so it brakes along its certified stop, lands by poses and is disarmed as usual.
 """
 
 import itertools
@@ -20,14 +20,14 @@ from cfplan.flight.firmware import Timeouts
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.safety.limits import PoseLimits
 
-UPLINK_LATE = 0.25  # s without an acknowledgement; cflib asks for one ten times a second
-UPLINK_GONE = Timeouts().level_out  # s; a vehicle that has had no setpoint for so long leaves its stream
-LOG_GONE = 0.5  # s without a message of one of the vehicle's logs
-_LONGEST_STEP = 0.05  # s between two ticks that count as silence; beyond it this computer stood still
+UPLINK_LATE = 0.25  # s without an answer to cflib's pings, ten a second
+UPLINK_GONE = Timeouts().level_out  # s; a vehicle without a setpoint for this long leaves its stream
+LOG_GONE = 0.6  # s without a message of one of the vehicle's logs; of a dead radio the uplink is gone before them
+_LONGEST_STEP = 0.05  # s of silence counted between two ticks at most; beyond it this computer stalled
 
 
 class Freshness(StrEnum):
-    """How long ago a source was heard."""
+    """How recently a source was heard."""
 
     FRESH = "fresh"
     LATE = "late"
@@ -48,12 +48,12 @@ class Health:
 
     @property
     def reaction(self) -> "Reaction":
-        """Return what the pilot does."""
+        """Return the pilot's reaction."""
         return REACTIONS[self]
 
     @property
     def status_unknown(self) -> bool:
-        """Return whether the vehicle hears the pilot and does not tell its status."""
+        """Return whether the vehicle acknowledges but does not report its status."""
         return self.status is GONE and self.uplink is not GONE
 
 
@@ -61,24 +61,24 @@ class Descent(Enum):
     """How the vehicle comes down."""
 
     BY_POSES = "its certified stop, then gently by poses until they show that it stands"
-    BLIND = "its certified stop, sinking meanwhile, then quickly until its estimate or the time says that it stands"
-    HELD = "a hover where it was seen last until it acknowledges again; without that it comes down by link loss"
+    BLIND = "its certified stop while sinking, then quickly until its estimate shows that it stands, or the time is up"
+    HELD = "a hover where it was seen last until it acknowledges again; else link loss"
 
 
 @dataclass(frozen=True, slots=True)
 class Reaction:
-    """What the pilot does by the health of one tick."""
+    """The pilot's reaction to the health of one tick."""
 
-    rung: Rung  # that its flight takes at least: from take-off to the hover behind the plan
-    descent: Descent  # how it then lands, and how a landing that has begun goes on
+    rung: Rung  # rung of the abort ladder to take at least, from take-off to the hover after the plan
+    descent: Descent  # how the vehicle comes down then; also during a landing
 
 
 _Fits = tuple[Freshness, ...]
 _ANY: _Fits = (FRESH, LATE, GONE)
 _HEARD: _Fits = (FRESH, LATE)
 
-# The first row that fits counts. Before lift-off none does: each phase waits for the source that it needs, and without
-# it the vehicle does not take off.
+# The first row that fits applies. None applies before lift-off: each phase waits for the source that it needs, and the
+# vehicle does not take off without it.
 _ROWS: tuple[tuple[_Fits, _Fits, _Fits, _Fits, Reaction], ...] = (
     # uplink, poses, estimate, status
     ((GONE,), _ANY, _ANY, _ANY, Reaction(Rung.LAND, Descent.HELD)),
@@ -105,14 +105,19 @@ class HealthMonitor:
 
     def __init__(self, limits: PoseLimits):
         self._limits = limits
-        self._looked = math.nan  # s, when it was last computed
-        self._silent = [0.0, 0.0, 0.0]  # s, of uplink, estimate and status
+        self._looked = math.nan  # s, when the health was last computed
+        self._silent = [0.0, 0.0, 0.0]  # s, how long uplink, estimate and status have been silent
+
+    @property
+    def uplink_silent(self) -> float:
+        """Return how long, s, nothing has been acknowledged."""
+        return self._silent[0]
 
     def look(self, now: float, *, uplink: float, estimate: float, status: float, poses: float) -> Health:
-        """Return the health at a tick; each argument is in s on its clock, when that source was last heard.
+        """Return the health at the time `now`, s; the other arguments are when each source was last heard, s.
 
-        While this computer stands still it hears nothing, so that does not count as silence of uplink and logs. Poses
-        grow old meanwhile.
+        A stall of this computer does not count as silence of uplink and logs, since it hears nothing meanwhile. Poses
+        grow old all the same.
         """
         step = min(now - self._looked, _LONGEST_STEP) if self._looked == self._looked else math.inf
         self._looked = now

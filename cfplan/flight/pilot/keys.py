@@ -24,7 +24,7 @@ _KEY = re.compile(  # an arrow or function key as terminals send it, else a sing
     rb"\x1b(?:(?:\[[0-9;]*|O)(?P<arrow>[A-D])|\[\[[A-E]|\[[0-?]*[!-/]*[@-Z\\-~]|O[0-9;]*[A-Za-z])|(?P<byte>.)",
     re.DOTALL,
 )
-_BEGUN = re.compile(rb"\x1b(?:\[\[|\[[0-?]*[!-/]*|O[0-9;]*)?\Z")  # what may become an arrow or function key yet
+_BEGUN = re.compile(rb"\x1b(?:\[\[|\[[0-?]*[!-/]*|O[0-9;]*)?\Z")  # an incomplete arrow or function key
 _MOST_TYPED = 1000  # keys that are kept until somebody asks for them
 
 
@@ -58,8 +58,8 @@ class HeldOrders:
 def orders_of(keys: bytes) -> list[Order]:
     """Return the orders in a burst of typed keys: space lands, Esc cuts.
 
-    Each Esc cuts that does not begin an arrow or function key, so also one before another key. Alt with a key sends
-    the same bytes and cuts too: a vehicle cut by mistake is better than one that is not cut.
+    Each Esc that does not begin an arrow or function key cuts, also one before another key. Alt with a key sends the
+    same bytes, so it cuts too: an unwanted cut is better than a missed one.
     """
     return [_ORDERS[key["byte"]] for key in _KEY.finditer(keys) if key["byte"] in _ORDERS]
 
@@ -142,7 +142,7 @@ class Keyboard:
         return self._terminal[0] if self._terminal is not None else None
 
     def orders(self) -> list[Order]:
-        """Return the orders since the last call. Takes 30 ms where they end with an Esc, else does not wait."""
+        """Return the orders since the last call. Waits up to 30 ms for the rest of an incomplete key."""
         if self._terminal is not None:
             burst = _burst(self._terminal[0])
             self._orders.extend(orders_of(burst))
@@ -164,8 +164,8 @@ class Keyboard:
 
 
 def _burst(terminal: int) -> bytes:
-    """Return what was typed, and what follows its last Esc within 30 ms unless an Esc before it cuts already."""
-    keys, until = b"", dict[int, float]()  # s until which the rest of a key is waited for, by where it begins
+    """Return the typed bytes; wait up to 30 ms for the rest of an incomplete key unless an Esc before it cuts."""
+    keys, until = b"", dict[int, float]()  # s, deadline for the rest of a key, by where it begins
     with contextlib.suppress(OSError):  # it has closed
         while len(keys) < _LONGEST_BURST:
             more = os.read(terminal, 4096)

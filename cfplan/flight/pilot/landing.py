@@ -13,6 +13,7 @@ stop once its setpoint is on the floor, the motors stop at once: by an estimate 
 import math
 from collections.abc import Callable
 
+from cfplan.flight.pilot.abort_monitor import FALLEN
 from cfplan.flight.pilot.abort_reasons import AbortReason
 from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
 from cfplan.flight.pilot.health import FRESH, Descent
@@ -26,13 +27,14 @@ _BENEATH_FLOOR = 0.3  # m below where it took off, and below the space, that set
 _NEAR_FLOOR = 0.15  # m above where it took off
 _NOT_FOLLOWING = 0.05  # m that a standing vehicle is above its setpoint, near the floor
 _NOT_HELD = 0.25  # m above its setpoint, where the controller asks for no thrust: what does not fall, stands
+_LIES_FOR, _LIES_WITHIN = 0.08, 0.02  # s and m: poses so near to where it took off from show that it is on the floor
 _STANDS_FOR = 0.3  # s
 _STANDS_WITHIN = 0.015  # m, the range of the heights of a standing body's poses
 _SETTLE = 0.3  # s at the end of a descent before the motors stop
 _BLIND_BENEATH = 2.0  # m below the floor that setpoints sink to without poses, so that their time ends first
 MAX_BLIND_LANDING = 3.0  # s without poses after which the motors stop, as the estimate may be metres off
 _CLEAR = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
-POSES_TRUSTED_AFTER = 0.2  # s of fresh poses, so several of them, after which they are believed again
+POSES_TRUSTED_AFTER = 0.2  # s of fresh poses, so several of them, after which they are trusted again
 MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
 _LOOK_AGAIN = 0.05  # s
 _BENEATH = 0.3  # m below the floor: an estimate that has the vehicle there is worth nothing
@@ -67,6 +69,7 @@ class Landing:
     def land(self) -> None:
         """Descend from where the vehicle is asked to be, and stop its motors. Raises AbortRaised if they do not."""
         self.begin()
+        self._stands |= self._loop.stream is None  # its motors are already being stopped, on the floor
         while not self._stands:
             if self._loop.descent is Descent.HELD:
                 self._loop.hold_where_it_is()
@@ -92,11 +95,12 @@ class Landing:
         def interrupted() -> bool:
             return self._blind_on_floor() or loop.descent is not Descent.BY_POSES
 
-        loop.until(
-            lambda: stands_by_poses(self._loop, self._floor, _NOT_HELD) or self._sunk() or interrupted(), math.inf
-        )
+        def stands() -> bool:
+            return stands_by_poses(loop, self._floor, _NOT_HELD) or self._lies()
+
+        loop.until(lambda: stands() or self._sunk() or interrupted(), math.inf)
         if not interrupted():
-            self._conclude(stands_by_poses(self._loop, self._floor, _NOT_HELD))
+            self._conclude(stands())
 
     def _descend_blindly(self) -> None:
         """Sink quickly, off the walls, until the estimate or the time says that it is enough, or poses are back."""
@@ -133,6 +137,15 @@ class Landing:
         rate = loop.mission.rate
         sinks = descent(position, yaw, -velocity[2], pace, self._floor, lowest, loop.limits, rate, aside)
         loop.begin(Stream(sinks, rate))
+
+    def _lies(self) -> bool:
+        """Return whether poses show the vehicle on the floor, far below its setpoint: it fell there.
+
+        It believes a motion that the floor has ended, and would fly off by that as its setpoint lifts it again.
+        """
+        heights = self._loop.heights(_LIES_FOR)
+        on_floor = bool(heights) and max(heights) - self._floor < _LIES_WITHIN
+        return on_floor and self._loop.asked()[0][2] - self._floor > FALLEN
 
     def _sunk(self) -> bool:
         stream = self._loop.stream
@@ -206,15 +219,20 @@ def stop_motors(loop: FlightLoop) -> bool:
 
 
 def stop_until_seen(loop: FlightLoop, send: Callable[[], object]) -> bool:
-    """Let `send` stop the motors, a few times until the vehicle says that it no longer flies; return whether they stop.
+    """Call `send`, which stops the motors, until the vehicle reports that it no longer flies; return whether they stop.
 
-    A vehicle that acknowledges but does not tell its status has had what was sent; then that counts.
+    There are TRIES calls at most. If the vehicle then acknowledges but does not report its status, the motors count as
+    stopped.
     """
+
+    def stopped() -> bool:
+        return loop.health.status is FRESH and not loop.bits(FLYING)
+
     loop.end_stream()
     loop.expect_stop()
     for _ in range(TRIES):
         send()
-        loop.until(lambda: not loop.bits(FLYING) or loop.health.status_unknown, MOTORS_STOP_WITHIN)
-        if not loop.bits(FLYING):
+        loop.until(lambda: stopped() or loop.health.status_unknown, MOTORS_STOP_WITHIN)
+        if stopped():
             return True
     return loop.health.status_unknown

@@ -18,7 +18,7 @@ from cfplan.flight.on_board.program import OnBoardProgram
 from cfplan.flight.pilot.abort_reasons import AbortReason
 from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
 from cfplan.flight.pilot.health import GONE
-from cfplan.flight.pilot.landing import stands_by_poses, stop_until_seen
+from cfplan.flight.pilot.landing import Landing, stands_by_poses, stop_until_seen
 from cfplan.flight.pilot.manoeuvres import begin_take_off, climb, settle_at
 from cfplan.flight.pilot.mission import manoeuvre_time
 from cfplan.flight.pilot.outcome import Rung
@@ -229,14 +229,16 @@ class OnBoardManoeuvres:
         duration = max(quick if loop.health.poses is GONE else way / self._limits.ground.land_speed, _SHORTEST_LANDING)
         down = self._way((x, y, z, yaw), (x, y, min(lowest, z), yaw), duration)
         down.stop_from = None
-        self._require_landing(_ask(loop, commands.land(lowest, duration), lambda: loop.begin(down)))
+        answer = _ask(loop, commands.land(lowest, duration), lambda: loop.begin(down))
+        if answer not in (commands.DONE, commands.BUSY):  # busy: it lands already
+            self._history.say(Level.WARNING, f"the vehicle does not land: {_what(answer)}; setpoints land it")
+            landing = Landing(loop, self._floor)
+            landing.begun = True
+            landing.land()
+            return
         end = loop.stream.end + _SETTLE
-        loop.until(lambda: loop.now() > end, math.inf)
+        loop.until(lambda: stands_by_poses(loop, self._floor) or loop.now() > end, math.inf)
         self._end_landing()
-
-    def _require_landing(self, answer: int | None) -> None:
-        if answer not in (commands.DONE, commands.BUSY):  # it lands already
-            raise AbortRaised(AbortReason.COMMAND_FAILED.abort(Rung.CUT, command="land", answer=_what(answer)))
 
     def _end_landing(self) -> None:
         """Stop the motors. Raises AbortRaised if they do not stop."""

@@ -13,6 +13,7 @@ from cfplan.flight.pilot.abort_monitor import fault_abort
 from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
 from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.flight_loop import LINK_LOST_AFTER, TRIES, AbortRaised, FlightLoop, LinkLost, OrderSource
+from cfplan.flight.pilot.health import FRESH
 from cfplan.flight.pilot.manoeuvres import Manoeuvres
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.on_board_manoeuvres import OnBoardManoeuvres
@@ -78,7 +79,7 @@ class Pilot:
         except LinkLost:
             raise
         except Exception as error:
-            if loop.airborne:  # whatever it is, it must not end in the air
+            if loop.airborne:  # no error may end the flight in the air
                 return self._leave_plan(fault_abort(error))
             if not isinstance(error, CfplanError) or not self._history.checks:
                 raise
@@ -90,7 +91,7 @@ class Pilot:
     def _leave_plan(self, abort: Abort) -> tuple[ExitCode, str]:
         """Go down the ladder to the ground; return how the flight counts, and why."""
         loop, flown = self._loop, self._manoeuvres
-        descents = [flown.land, flown.stop_and_land]  # the last one counts; one that breaks gives way to the other
+        descents = [flown.land, flown.stop_and_land]  # the last one is flown; one that fails is removed
         exit_code, reasons, self._history.hint = abort.exit_code, [abort.text], abort.cure
         while True:
             self._history.rung = max(self._history.rung, abort.rung)
@@ -99,7 +100,13 @@ class Pilot:
             self._history.say(level, f"{abort.rung.name.lower()}: {abort.text}")
             try:
                 if loop.airborne:
-                    {Rung.BRAKE: flown.brake, Rung.LAND: descents[-1], Rung.CUT: self._cut}[abort.rung]()
+                    match abort.rung:
+                        case Rung.BRAKE:
+                            flown.brake()
+                        case Rung.LAND:
+                            descents[-1]()
+                        case _:
+                            self._cut()
                 return exit_code, ", then ".join(reasons)
             except AbortRaised as graver:
                 abort = graver.abort
@@ -136,10 +143,8 @@ class Pilot:
             loop.tolerate(Rung.CUT)  # the flight is over: nothing can end it any more
             loop.end_stream()
             try:
-                for _ in range(TRIES):
-                    loop.link.arm(False)
-                    if loop.until(lambda: not loop.bits(ARMED), 0.2):
-                        break
+                if not self._disarm():
+                    self._history.say(Level.WARNING, "the vehicle does not say that it is disarmed")
             except (LinkLost, AbortRaised):
                 self._history.say(Level.WARNING, "the link went before the vehicle was disarmed")
             locked = loop.bits(LOCKED)
@@ -148,6 +153,17 @@ class Pilot:
                 self._restart()
         loop.close_poses()
         self._history.enter(Phase.CLOSED)
+
+    def _disarm(self) -> bool:
+        """Disarm the vehicle; return whether it says so. Where the radio is dead, wait for it: it may come back."""
+        loop, heard = self._loop, 0
+        give_up = loop.now() + LINK_LOST_AFTER
+        while heard < TRIES and loop.now() < give_up:
+            loop.link.arm(False)
+            if loop.until(lambda: loop.health.status is FRESH and not loop.bits(ARMED), 0.2):
+                return True
+            heard += loop.health.uplink is FRESH
+        return False
 
     def _restart(self) -> None:
         """Restart the vehicle, which its watchdog locks now that nothing feeds it, for the next flight."""

@@ -75,7 +75,7 @@ def check_firmware(snapshot: PreflightSnapshot) -> Check:
 
 
 def firmware_check(firmware: str, limits: Limits) -> Check:
-    """Compare the version with the oldest and the newest that may fly: of a newer one nothing is known."""
+    """Compare the version with the oldest and the newest that may fly; how a newer one behaves is unknown."""
     oldest, newest, found = limits.firmware.oldest, limits.firmware.newest, version_of(firmware)
     if found > newest:
         return Check(

@@ -30,7 +30,7 @@ from cfplan.flight.telemetry import Telemetry
 
 _SWITCH_INTERVAL = 0.0001  # s; the stream gets the interpreter back after at most this
 _THREAD_PRIORITY = STREAM_PRIORITY // 2
-_POLL_PERIOD = 0.02  # s between looks for orders that are no keys
+_POLL_PERIOD = 0.02  # s between two polls for orders that are not keys
 LANDING_TIMEOUT = 60.0  # s that a pilot without a main process has to land
 
 
@@ -111,9 +111,9 @@ def fly(
     `pilot` is a process that was started before, with `drivers`; without one it is started now. `pose_source` and
     `drivers` go there by pickle. `on_telemetry` gets every message, in order; what it raises is raised here after the
     vehicle has landed. `more_orders` returns the orders since its last call that came neither by key nor by signal; it
-    must not wait, and a thread calls it. `keyboard` is one that was entered before; without one it is entered for the
-    flight. Raises LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose source
-    raises.
+    is called in another thread, and must not wait. `keyboard` is one that was entered before; without one it is entered
+    for the flight. Raises LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose
+    source raises.
     """
     held = Keyboard() if keyboard is None else contextlib.nullcontext(keyboard)
     with held as entered, pilot or start_pilot(drivers) as started:
@@ -137,7 +137,7 @@ class Attendant:
         more_orders: Callable[[], Iterable[Order]],
     ):
         self._give, self._keyboard, self._on_telemetry, self._more_orders = give, keyboard, on_telemetry, more_orders
-        self.failure: BaseException | None = None  # the first of a listener or a source of orders
+        self.failure: BaseException | None = None  # the first one of a listener or a source of orders
 
     def pass_orders(self) -> None:
         """Give the pilot the orders since the last call."""
@@ -145,7 +145,7 @@ class Attendant:
             try:
                 for order in source():
                     self._give(order)
-            except BaseException as error:  # the other source is asked still
+            except BaseException as error:  # the other source is still asked
                 self._fail(error)
 
     def tell(self, messages: Sequence[Telemetry]) -> None:
@@ -173,7 +173,7 @@ class Attendant:
 
 @contextlib.contextmanager
 def _orders_passed(keyboard: Keyboard, attendant: Attendant) -> Iterator[None]:
-    """Pass orders to the pilot during the block, by a thread, so that none waits for a listener."""
+    """Pass orders to the pilot in a thread during the block, so that no order waits for a listener."""
     ended = threading.Event()
 
     def pass_orders() -> None:
@@ -229,7 +229,7 @@ def _signals_ignored():
 
 
 class OrderReceiver(HeldOrders):
-    """Orders of the main process to the pilot, read by a thread; `gone` when they end, however they do."""
+    """Orders of the main process to the pilot, read by a thread; `gone` once reading has ended, for any reason."""
 
     def __init__(self, connection: Connection):
         super().__init__()
@@ -237,7 +237,7 @@ class OrderReceiver(HeldOrders):
         threading.Thread(target=self._run, name="orders", daemon=True).start()
 
     def _run(self) -> None:
-        with contextlib.suppress(Exception):  # also of what is no order: after it none can be trusted to be read
+        with contextlib.suppress(Exception):  # also after a message that is not an order: later ones cannot be trusted
             while True:
                 self.give(self._connection.recv())
         self.gone = True
@@ -278,8 +278,8 @@ def _run(
         last = replace(pilot.fly(), telemetry_dropped=report.dropped)
     except CfplanError as error:
         last = error
-    except Exception as error:  # on the ground; in the air the pilot lands first
-        last = CfplanError(f"fault in the pilot: {error!r}", where=uri, hint="nothing was armed; please report this")
+    except Exception as error:  # before take-off, or where even cutting broke
+        last = CfplanError(f"fault in the pilot: {error!r}", where=uri, hint="please report this")
     report.close(last)
     os._exit(0)  # cflib leaves threads behind that never end
 

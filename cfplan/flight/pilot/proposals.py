@@ -122,7 +122,7 @@ class ReceivedProposals(HeldProposals):
         with contextlib.suppress(EOFError, OSError, TypeError):  # TypeError: it was closed here while it was read
             while True:
                 message, proposal = self._connection.recv_bytes(LONGEST_MESSAGE), None
-                with contextlib.suppress(Exception):  # what cannot be read is no proposal; the next one may be
+                with contextlib.suppress(Exception):  # skip a message that cannot be read
                     proposal = Proposal.of_bytes(message)
                 if proposal is not None:
                     self._came = proposal.checksum, REAL_CLOCK.now()

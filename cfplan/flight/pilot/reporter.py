@@ -38,7 +38,7 @@ class Reporter:
                 self._connection.send(batch)
         except OSError:
             return None  # no reader any more; the pilot learns that from its orders
-        except Exception:  # what cannot be sent is left out, not all that comes after it
+        except Exception:  # drop messages that cannot be sent, but none of the later ones
             self.dropped += len(batch)
         return _PERIOD
 

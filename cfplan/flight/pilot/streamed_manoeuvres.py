@@ -96,7 +96,7 @@ class StreamedManoeuvres:
     def _stop(self) -> None:
         """Brake along the path to a hover, or finish a stop that has begun; sink besides where poses are gone.
 
-        A vehicle that was left alone is no longer on its path, and one whose poses are not believed never was.
+        A vehicle that was left alone is no longer on its path, and one whose poses are distrusted never was.
         """
         loop, left = self._loop, self._loop.stream
         if left is None or self._landing.begun or loop.descent is Descent.HELD or loop.distrusted:

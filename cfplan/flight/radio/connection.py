@@ -19,6 +19,7 @@ from cfplan.flight.telemetry import Telemetry
 FIRST_ANSWER = 4.0  # s, from opening the link to the first packet
 WHOLE_CONNECTION = 30.0  # s, to the last parameter, over a lossy radio without a cache
 PATIENCE = 0.005  # s that a packet waits in flight for a busy radio; then it is dropped, as the next one is fresher
+_DEAD_AFTER = 1.0  # s that a packet of cflib's own waits for the radio; after 2 s the driver would end the link
 _RETRIES = 5000  # transmissions that may fail in a row, about 10 s: a vehicle that hovers alone is worth waiting for
 
 
@@ -50,7 +51,6 @@ def connect(
     set_retries_before_disconnect(_RETRIES)
     answered, complete, failed = threading.Event(), threading.Event(), threading.Event()
     reasons: list[str] = []
-    made: list[Link] = []
 
     def fail(_: str, reason: str = "the link was closed") -> None:
         reasons.append(reason)
@@ -62,14 +62,10 @@ def connect(
     crazyflie.connection_failed.add_callback(fail)
     crazyflie.disconnected.callbacks.insert(0, fail)  # before cflib's own, one of which may never return
 
-    def acknowledged() -> None:
-        for link in made:
-            link.note_acknowledgement()
-
     def open_link() -> None:
         crazyflie.open_link(uri)
         if crazyflie.link is not None:
-            empty_air(crazyflie.link, clock.now, acknowledged)
+            empty_air(crazyflie.link, clock.now)
             crazyflie.link = _Serialized(crazyflie.link, clock)
 
     threading.Thread(target=open_link, daemon=True).start()
@@ -91,7 +87,6 @@ def connect(
         raise
 
     link = Link(crazyflie, uri, report, clock, radio_lock=lock)
-    made.append(link)
     crazyflie.disconnected.callbacks.insert(0, link.note_loss)
     crazyflie.connection_lost.add_callback(link.note_loss)
     link.release_priority()
@@ -142,15 +137,22 @@ class _Serialized:
 
     def __init__(self, driver: Any, clock: Clock = REAL_CLOCK):
         self._driver, self._lock = driver, threading.Lock()
-        self.needs_resending = driver.needs_resending
         waiting = getattr(driver, "out_queue", None)
         self._queue = PerishableQueue(waiting, clock.now) if isinstance(waiting, queue.Queue) else None
 
+    @property
+    def needs_resending(self) -> bool:
+        """Return whether cflib must repeat unanswered packets, which the driver finds out after connecting."""
+        return bool(self._driver.needs_resending)
+
     def send_packet(self, packet: Any) -> None:
-        """Send a packet for cflib itself."""
+        """Send a packet for cflib itself; drop it where the radio is dead for long, as cflib would give the link up."""
         if self._lock.acquire(timeout=0.1):
             try:
-                self._driver.send_packet(packet)
+                if self._queue is not None:
+                    self._queue.put(packet, _DEAD_AFTER)
+                else:
+                    self._driver.send_packet(packet)
             finally:
                 self._lock.release()
 

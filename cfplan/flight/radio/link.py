@@ -55,7 +55,7 @@ class Link:
         self._crazyflie, self.uri, self._report, self._clock = crazyflie, uri, report, clock
         self._radio_lock = radio_lock
         self.lost = ""  # why the link is gone; empty while it stands
-        self.acknowledged = clock.now()  # s, when the vehicle last acknowledged that it had a packet
+        self.acknowledged = clock.now()  # s, when the vehicle last answered one of cflib's pings, ten a second
         self.estimate: Estimate | None = None
         self.status: VehicleStatus | None = None
         self.position_variance: Triple | None = None  # m² along x, y, z
@@ -63,10 +63,10 @@ class Link:
         self.replies: dict[int, int] = {}  # command of the on-board commander: the code that it answered, 0 for done
         self.firmware = ""
         self._preflight_blocks: list[Any] = []
-        self._revivals: dict[str, Iterator[bytes | None]] = {}  # of each log, by its name
+        self._revivals: dict[str, Iterator[bytes | None]] = {}  # packets that create a log anew, by its name
         # s, when the vehicle's clock of ms was zero, according to the quickest messages; when the last message came
         self._log_zero, self._log_heard = math.inf, 0.0
-        # The radio tells of each packet; other drivers have nothing but cflib's pings, ten a second.
+        # The radio chip acknowledges each packet by itself; a ping is answered by the processor that flies.
         crazyflie.link_statistics.latency_updated.add_callback(lambda _: self.note_acknowledgement())
         crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
         crazyflie.add_port_callback(PLATFORM_PORT, self._on_platform)
@@ -127,7 +127,7 @@ class Link:
             self._send(LOCALIZATION_PORT, 1, b"\x04")
 
     def revive_log(self, name: str) -> None:
-        """Send the next packet that creates `estimate` or `status` anew; called at each tick while that is silent."""
+        """Send the next packet that creates `estimate` or `status` anew; call it each tick while that is silent."""
         payload = next(self._revivals[name])
         if payload is not None:
             self._send(LOG_PORT, SETTINGS_CHANNEL, payload)
@@ -249,7 +249,7 @@ class Link:
         restart_vehicle(self.uri, self._clock)
 
     def note_acknowledgement(self) -> None:
-        """Remember that the vehicle has just acknowledged a packet; a callback of the radio."""
+        """Remember that the vehicle has just acknowledged a packet; a callback of cflib."""
         self.acknowledged = self._clock.now()
 
     def note_loss(self, _: str, reason: str = "the link was closed") -> None:

@@ -1,6 +1,6 @@
-"""Log blocks by their packets (CRTP port 5), for creating one in flight, where nothing may wait for answers.
+"""Packets that create a log block (CRTP port 5), also in flight, where nothing may wait for an answer.
 
-The firmware deletes all log blocks once it has had no packet for 1 s, and so does any client that resets the log.
+The firmware deletes all log blocks after 1 s without a packet, and when any client resets the log.
 """
 
 import itertools
@@ -17,14 +17,14 @@ _TYPES = {"uint8_t": 1, "uint16_t": 2, "uint32_t": 3, "int16_t": 5, "float": 7}
 
 @dataclass(frozen=True, slots=True)
 class LogBlock:
-    """A block of the vehicle's log as its firmware is told of it."""
+    """A block of the vehicle's log, as its firmware knows it."""
 
     number: int
     period_ms: int
     variables: tuple[tuple[str, int], ...]  # type in C, and number in the vehicle's table
 
     def creation(self) -> tuple[bytes, ...]:
-        """Return the payloads that create the block and start it, in order; each is answered by its first two bytes."""
+        """Return the payloads that create the block and start it, in order; answers begin with the first two bytes."""
         entries = [struct.pack("<BH", _TYPES[kind], number) for kind, number in self.variables]
         parts = [entries[at : at + _IN_ONE_PACKET] for at in range(0, len(entries), _IN_ONE_PACKET)]
         commands = (_CREATE, *(_APPEND for _ in parts[1:]))
@@ -34,8 +34,8 @@ class LogBlock:
         return *made, struct.pack("<BBH", _START, self.number, self.period_ms)
 
     def revival(self) -> Iterator[bytes | None]:
-        """Yield, tick by tick and without end, the payloads that create it anew whether or not it is there.
+        """Yield one payload a tick, without end; together they create the block anew, whether or not it exists.
 
-        None stands for a tick in which nothing is to be sent: the log is given time to come.
+        None stands for a tick without a packet, so that the log has time to come.
         """
         return itertools.cycle((bytes((_DELETE, self.number)), *self.creation(), *(None,) * _TICKS_BETWEEN))

@@ -59,11 +59,10 @@ class PerishableAir:
     """The dongle as cflib's driver thread sees it: it repeats what has perished in the air as an empty packet.
 
     The counters of the header stay: a vehicle that had the packet, whose acknowledgement was lost, sees a repetition.
-    `acknowledged` is called with each acknowledgement.
     """
 
-    def __init__(self, radio: Any, now: Callable[[], float], acknowledged: Callable[[], None]):
-        self._radio, self._now, self._acknowledged = radio, now, acknowledged
+    def __init__(self, radio: Any, now: Callable[[], float]):
+        self._radio, self._now = radio, now
         self._sent: Any = None  # the thread repeats the same array
         self._since = 0.0  # s
 
@@ -74,20 +73,14 @@ class PerishableAir:
             self._sent, self._since = data, now
         elif now - self._since > KEEPS_FOR and is_perishable(data[0], bytes(data[1:2])):
             data = array("B", [_EMPTY | data[0] & _COUNTERS])
-        answer = self._radio.send_packet(data)
-        if answer is not None and answer.ack:
-            self._acknowledged()
-        return answer
+        return self._radio.send_packet(data)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._radio, name)
 
 
-def empty_air(driver: Any, now: Callable[[], float], acknowledged: Callable[[], None]) -> None:
-    """Let a radio driver of cflib repeat perishable packets no longer than they keep; others are left as they are.
-
-    `acknowledged` is called in the driver's thread with each acknowledgement.
-    """
+def empty_air(driver: Any, now: Callable[[], float]) -> None:
+    """Let a radio driver of cflib repeat perishable packets no longer than they keep; others are left as they are."""
     thread: Any = getattr(driver, "_thread", None)
     if thread is not None and hasattr(thread, "_radio"):
-        thread._radio = PerishableAir(thread._radio, now, acknowledged)
+        thread._radio = PerishableAir(thread._radio, now)

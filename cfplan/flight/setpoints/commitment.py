@@ -7,8 +7,8 @@ be late, mistaken or broken, so the pilot verifies by itself, without trusting a
 - the bytes are those that were certified (checksum), and were made for just this commitment (order);
 - the splice is still ahead of the clock (time), and not farther than a minute;
 - position, velocity, acceleration, attitude and body rates there are the committed ones within a quantum (joint);
-- from each setpoint there is a stop, which begins there and ends at rest (stops), as the setpoints do (end);
-- from setpoint to setpoint the vehicle moves as the velocities say (motion), inside the space (space), and within the
+- the setpoints end at rest (end), and from each of them there is a stop that begins there and ends at rest (stops);
+- from setpoint to setpoint the vehicle moves as the velocities say (motion), inside the space (space), within the
   limits of plans, and in stops within those of stops (limits).
 
 Where anything of that fails, the old commitment is flown to its end. A commitment is a value: splicing makes a new one.
@@ -33,7 +33,7 @@ from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, turns_for
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import rotations_of
+from cfplan.vehicle.rotations import rotations_of, yaw_of
 
 SPLICE_AHEAD = math.ceil((LEAD + BRAKE_LEAD) * RATE)  # setpoints from a splice to its joint: so far ahead one looks
 LEAST_AHEAD = 0  # setpoints from the one just sent to a splice, at least: the first that is another comes behind that
@@ -44,10 +44,11 @@ QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
 LEVEL = 0.01  # rad of tilt, below which a vehicle hovers: twice what bytes round an attitude by
 LARGEST_JERK = 400.0  # m/s³, beyond which velocities do not belong together: ten times what plans reach
 _PERIOD = 1.0 / RATE
-# m between a position and what velocities say it is: by the trapezoidal rule the jerk times period³ / 12, and what is
-# rounded.
+# m between a position and the one that velocities give: the trapezoidal rule is off by the jerk times period³ / 12, and
+# packets are rounded.
 _JUMP = LARGEST_JERK * _PERIOD**3 / 12 + QUANTUM * (1.0 + _PERIOD)
 _ROUNDING = 1e-9
+_SAME_HEADING = 0.1  # rad; a stop trades other rates than its setpoint, which turns the heading by up to 0.02
 _MAGIC = b"proposal"
 _CHAIN = struct.Struct("<II")  # checksums of a commitment and of the proposal that continues it
 # magic, what it follows, checksum, splice, setpoints, setpoints of a stop, stops that are sent, whether it goes on
@@ -272,7 +273,7 @@ def _moves_at_end(proposal: Proposal) -> Refusal | None:
 
 
 def _unfit(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | None:
-    """Return why setpoints must not be flown; those of the stop that ends them are judged as that stop."""
+    """Return why the setpoints must not be flown; the stop at their end is judged with the other stops."""
     end = len(proposal.payloads) - proposal.ending
     if found := _first_wrong(proposal.payloads[None], before, end, limits, in_stop=False):
         fault, what, _, row = found
@@ -281,13 +282,14 @@ def _unfit(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | Non
 
 
 def _unfit_stops(asked: FullStateSetpoints, proposal: Proposal) -> Refusal | None:
-    """Return why stops are none of their setpoints, or not what the setpoints end with."""
+    """Return which stop does not begin at its setpoint or end at rest, or does not agree with the last setpoints."""
     stops, first, count = proposal.stops, proposal.splice, len(proposal.payloads)
     begin, end = decode(stops[:, 0]), decode(stops[:, -1])
     off = np.maximum(
         np.abs(begin.position - asked.position).max(axis=1), np.abs(begin.velocity - asked.velocity).max(axis=1)
     )
-    good = (off <= QUANTUM + _ROUNDING) & _rests(end)
+    turned = np.abs(np.remainder(yaw_of(begin.quaternion.T) - yaw_of(asked.quaternion.T) + np.pi, 2 * np.pi) - np.pi)
+    good = (off <= QUANTUM + _ROUNDING) & (turned <= _SAME_HEADING) & _rests(end)
     if not good.all():
         return Refusal(Fault.STOPS, f"the stop from setpoint {first + int(np.argmin(good))}")
     last = count - proposal.ending - 1
@@ -298,7 +300,7 @@ def _unfit_stops(asked: FullStateSetpoints, proposal: Proposal) -> Refusal | Non
 
 
 def _unfit_in_stops(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | None:
-    """Return why stops must not be flown."""
+    """Return why the stops must not be flown."""
     stops = proposal.stops
     if found := _first_wrong(stops, before, stops.shape[1], limits, in_stop=True):
         fault, what, number, row = found
@@ -309,7 +311,7 @@ def _unfit_in_stops(proposal: Proposal, before: NDArray, limits: Limits) -> Refu
 def _first_wrong(
     runs: NDArray, before: NDArray, end: int, limits: Limits, *, in_stop: bool
 ) -> tuple[Fault, str, int, int] | None:
-    """Return what is wrong with rows before `end` of runs, (R, L, 29), and the first run and row where it is."""
+    """Return the first fault in the rows before `end` of runs, (R, L, 29): its kind, its text, its run and its row."""
 
     def wrong(first: int, count: int, rows: int) -> tuple[Fault, str] | None:
         worst = motion_extremes(runs[first : first + count], before[first:], limits.airframe, end=rows)
@@ -324,8 +326,8 @@ def _first_wrong(
 
 
 def _wrong(worst: MotionExtremes, limits: Limits, *, in_stop: bool) -> tuple[Fault, str] | None:
-    """Return what is wrong with a motion by its worst values, of which one setpoint or more are at fault."""
-    # Stops lie on the chords between setpoints, which are off by an eighth of acceleration times period² at most.
+    """Return kind and text of the fault in a motion, by its worst values; None if there is no fault."""
+    # Stops lie on the chords between setpoints, where each position is off by acceleration times period² / 8 at most.
     chords = limits.flight.acceleration.brake * _PERIOD**2 / 4 if in_stop else 0.0
     if not worst.jump <= _JUMP + chords:
         return Fault.MOTION, f"jumps by {worst.jump:.3f} m"
@@ -348,7 +350,7 @@ def _rests(setpoints: FullStateSetpoints) -> NDArray:
 
 
 def warm_up(commitment: Commitment, limits: Limits) -> None:
-    """Verify a proposal for nobody: what that compiles or loads is there before the flight."""
+    """Verify a proposal and discard the answer, so that all code is compiled and loaded before the flight."""
     end = Commitment(0, commitment.payloads[-2:], commitment.stops[-2:])
     proposal = Proposal.of_bytes(propose(end, 0, end.payloads, end.stops).to_bytes())
     assert proposal is not None

@@ -1,14 +1,15 @@
-"""The motion that setpoints ask for, by their bytes alone: what a pilot certifies without the plan behind them.
+"""Motion certificate: holds the motion that setpoints ask for against limits, by their bytes alone, without the plan.
 
-The velocities SPAN setpoints before and behind one tell its acceleration, which makes, with gravity and drag, the
-thrust vector of the motion; the direction of that is the axis z of the attitude to fly. What is sent leans away from
-it, by the turn that stands for traded rates (see rate_trade.py). With f the thrust vector sent, and K = 2 kR / kw,
+The velocities SPAN setpoints before and after a setpoint give its acceleration. Acceleration, gravity and drag give the
+thrust vector of the motion, whose direction is the axis z of the attitude to fly. The thrust vector that is sent leans
+away from z, by the turn that replaces traded rates (see rate_trade.py). With f the thrust vector sent, K = 2 kR / kw,
+and τ the age of the attitude that the controller believes,
 
     thrust     T = f · z
-    body rate  ω = (ω_sent + K z × f / |f|) / (1 - K τ)        about body x and y; about z it is sent as it is
+    body rate  ω = (ω_sent + K z × f / |f|) / (1 - K τ)        about body x and y; about z it is ω_sent
 
-where the denominator makes up for the attitude that the controller believes, which is τ old. So far as setpoints are
-the bytes of a certified plan or stop, these values are the certified ones within TOLERANCES.
+where the denominator compensates for that age. For the bytes of a certified plan or stop, these values are the
+certified ones within TOLERANCES.
 """
 
 import math
@@ -31,38 +32,40 @@ from cfplan.vehicle.flatness import ROUNDING
 from cfplan.vehicle.panels import LANES
 from cfplan.vehicle.rotations import Vector, cross, dot, heading_of
 
-SPAN = 2  # setpoints on each side of one, whose velocities tell its acceleration
+SPAN = 2  # setpoints before and after one whose velocities give its acceleration
 _WIDTH = 128  # places in a row of a panel
-_MOST = 120  # setpoints looked at at once; those around them have a place too
-_LARGE = 1e9  # in place of what is no number
-# Rows of the panel of 16-bit words: position, velocity (from SPAN setpoints before on), acceleration, body rate, and
+_MOST = 120  # setpoints processed at once; their neighbours take the other places
+_LARGE = 1e9  # in place of NaN and of larger values
+# Rows of the panel of 16-bit words: position, velocity (beginning SPAN setpoints earlier), acceleration, body rate, and
 # the quaternion's lower and upper half.
 _PLACE, _SPEED, _FORCE, _RATE, _TURN, _WORDS = 0, 3, 6, 9, 12, 14
-# Rows of the panel of the largest values so far: measures, and those whose least value counts with the other sign.
-_LEAST_THRUST, _TRADED, _JUMP = of.MEASURES, of.MEASURES + 1, of.MEASURES + 2
-_HIGH, _LOW, _ROWS = of.MEASURES + 3, of.MEASURES + 6, of.MEASURES + 9
+# Rows of the panel of running maxima: the measures, then other values; those whose minimum counts are negated.
+_LEAST_THRUST, _TRADED, _JUMP, _TURNED = of.MEASURES, of.MEASURES + 1, of.MEASURES + 2, of.MEASURES + 3
+_HIGH, _LOW, _ROWS = of.MEASURES + 4, of.MEASURES + 7, of.MEASURES + 10
 TOLERANCES = {"m/s": 1e-3, "m/s²": 0.1, "rad": math.radians(0.5), "rad/s": 0.3, "N": 1e-3}
-"""By unit, what bytes of a certified motion may seem to exceed a limit by. Velocities rounded to 1 mm/s tell the
-acceleration to 0.043 m/s² and its direction to 0.25°; the worst of 48 plans at all kinds of limits were 0.018 m/s²,
-0.15° and 0.02 rad/s beyond, and of their stops 0.03 m/s², 0.13° and 0.1 rad/s."""
-LED_THRUST = 1.0  # m/s², besides, of acceleration in stops: the thrust whose certified value counts there is sent ahead
+"""By unit, how far the bytes of a certified motion may seem to exceed a limit. Velocities rounded to 1 mm/s give the
+acceleration within 0.043 m/s² and its direction within 0.25°. The largest excess of 48 plans at all kinds of limits was
+0.018 m/s², 0.15° and 0.02 rad/s, and that of their stops 0.03 m/s², 0.13° and 0.1 rad/s."""
+FASTEST_HEADING = 2.0  # times the largest body rate: how fast the heading of an attitude that leans by 60° may turn
+LED_THRUST = 1.0  # m/s², more for acceleration in stops, whose thrust is sent ahead of the certified motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionExtremes:
     """The worst values of runs of setpoints."""
 
-    high: NDArray  # (MEASURES,), of each measure the largest; NaN where bytes do not tell it
-    low: NDArray  # (MEASURES,), the least
-    traded: float  # rad/s, of body rates that are sent as a turn of the thrust
-    jump: float  # m, between a position and the next, beyond what the velocities there say
+    high: NDArray  # (MEASURES,), the largest value of each measure; NaN where bytes do not determine it
+    low: NDArray  # (MEASURES,), the least value of each measure
+    traded: float  # rad/s, the largest body rate that is sent as a turn of the thrust
+    turn: float  # rad, the largest turn of the heading between two setpoints
+    jump: float  # m, the largest difference of a step in position from the one that velocities give
     corners: NDArray  # (2, 3) m, the least and the largest coordinates
 
 
 def motion_extremes(runs: NDArray, before: NDArray, airframe: Airframe, end: int | None = None) -> MotionExtremes:
     """Return the worst values of rows before `end` of runs of setpoints, (R, L, 29) uint8, R and L at least 1.
 
-    Run r follows the setpoints r to r + SPAN of `before`, (R + SPAN, 29) or more; behind its last row, that goes on.
+    Run r follows the setpoints r to r + SPAN of `before`, (R + SPAN, 29) or more; its last row is repeated behind it.
     """
     panel, words = np.full(_ROWS * _WIDTH, -_LARGE), np.zeros(_WORDS * _WIDTH, dtype=np.int16)
     _raise_by_runs(
@@ -74,17 +77,21 @@ def motion_extremes(runs: NDArray, before: NDArray, airframe: Airframe, end: int
     high[of.ANGULAR_ACCELERATION] = np.nan
     low = np.full(of.MEASURES, np.nan)
     low[of.SPECIFIC_THRUST] = -worst[_LEAST_THRUST]
-    # Torque divides the thrust among the motors: one at least gives the mean, and one at most.
+    # Torque divides the thrust among the motors: one gives the mean or more, and one the mean or less.
     for each, thrust in ((high, high[of.SPECIFIC_THRUST]), (low, low[of.SPECIFIC_THRUST])):
         each[of.MOTOR_THRUST : of.MOTOR_THRUST + 4] = thrust * airframe.mass / 4
     corners = np.array([-worst[_LOW:_ROWS], worst[_HIGH:_LOW]])
-    return MotionExtremes(high, low, math.sqrt(worst[_TRADED]), float(worst[_JUMP]), corners)
+    turn = math.acos(max(1.0 - worst[_TURNED], -1.0))
+    return MotionExtremes(high, low, math.sqrt(worst[_TRADED]), turn, float(worst[_JUMP]), corners)
 
 
 def excess_of(worst: MotionExtremes, limits: Limits, *, in_stop: bool) -> str:
-    """Return which limit of plans a motion exceeds, or `in_stop` which of stops, and by which value; empty if none."""
+    """Return which limit of plans, or `in_stop` of stops, a motion exceeds, and its value there; empty if none."""
     if not worst.traded <= TRADED_RATE_MAX + TOLERANCES["rad/s"]:
         return f"sends {worst.traded:.3g} rad/s as a turn of the thrust; it may be at most {TRADED_RATE_MAX:.3g}"
+    most = FASTEST_HEADING * limits.plan.angular_velocity / RATE
+    if not worst.turn <= most:
+        return f"turns the heading by {math.degrees(worst.turn):.3g}°; it may be at most {math.degrees(most):.3g}"
     for quantity in QUANTITIES:
         if quantity.measure == of.ANGULAR_ACCELERATION or (in_stop and quantity.in_stop is None):
             continue
@@ -101,7 +108,7 @@ def excess_of(worst: MotionExtremes, limits: Limits, *, in_stop: bool) -> str:
 
 
 def _read_only(array: NDArray) -> NDArray:
-    """Return a view that cannot be written: of arrays that can, compiled code has another variant."""
+    """Return a read-only view: for writable arrays, another variant of the code would be compiled."""
     view = np.ascontiguousarray(array).view()
     view.setflags(write=False)
     return view
@@ -111,14 +118,14 @@ def _read_only(array: NDArray) -> NDArray:
 def _raise_by_runs(
     worst: NDArray, words: NDArray, runs: NDArray, before: NDArray, end: int, drag: float, full_rate: float
 ) -> None:
-    """Update the panel of the largest values, (_ROWS * _WIDTH,), by rows before `end` of all runs, (R, L * 29)."""
+    """Update the panel of running maxima, (_ROWS * _WIDTH,), with rows before `end` of all runs, (R, L * 29)."""
     for r in range(len(runs)):
         if r > 0 and _is_left_of(runs[r], runs[r - 1]):
-            continue  # all of it was looked at
+            continue  # all its rows have been processed
         begin = 0
         while begin < end:
             lanes = min(end - begin, _MOST) // LANES * LANES
-            if lanes == 0:  # a few are left: rather look at others again than at each alone
+            if lanes == 0:  # process some rows again rather than the last few one by one
                 begin = max(end - LANES, 0)
                 lanes = end - begin
             _take_words(words, runs[r], before[r : r + SPAN], begin, lanes)
@@ -128,12 +135,12 @@ def _raise_by_runs(
 
 @register_jitable
 def _is_left_of(run: NDArray, other: NDArray) -> bool:
-    """Return whether a run is what is left of another from its second row on, as stops within a stop are."""
+    """Return whether a run is the rest of another from its second row on, as for stops within a stop."""
     last = len(run) - PAYLOAD_SIZE
     differs = np.uint8(0)
     for at in range(PAYLOAD_SIZE):
         differs = np.uint8(differs | (run[at] ^ other[min(at + PAYLOAD_SIZE, len(run) - 1)]))
-    if differs:  # as it mostly does, so little is compared
+    if differs:  # the usual case, in which little is compared
         return False
     for at in range(last):
         differs = np.uint8(differs | (run[at] ^ other[at + PAYLOAD_SIZE]))
@@ -144,7 +151,7 @@ def _is_left_of(run: NDArray, other: NDArray) -> bool:
 
 @register_jitable
 def _take_words(words: NDArray, run: NDArray, before: NDArray, begin: int, lanes: int) -> None:
-    """Write so many rows of a run from `begin` on to the panel, and of those around them what is looked at."""
+    """Write `lanes` rows of a run from `begin` on to the panel, and the fields of their neighbours that count."""
     last = len(run) // PAYLOAD_SIZE - 1
     for n in range(lanes):
         row = PAYLOAD_SIZE * min(begin + n, last)
@@ -155,6 +162,8 @@ def _take_words(words: NDArray, run: NDArray, before: NDArray, begin: int, lanes
             words[(_RATE + axis) * _WIDTH + n] = _word(run, row + FIELD_PLACES[3] + 2 * axis)
         words[_TURN * _WIDTH + n] = _word(run, row + QUATERNION_PLACE)
         words[(_TURN + 1) * _WIDTH + n] = _word(run, row + QUATERNION_PLACE + 2)
+    ahead = PAYLOAD_SIZE * min(begin + lanes, last) + QUATERNION_PLACE
+    words[_TURN * _WIDTH + lanes], words[(_TURN + 1) * _WIDTH + lanes] = _word(run, ahead), _word(run, ahead + 2)
     for axis in range(3):
         place, speed = FIELD_PLACES[0] + 2 * axis, FIELD_PLACES[1] + 2 * axis
         words[(_PLACE + axis) * _WIDTH + lanes] = _word(run, PAYLOAD_SIZE * min(begin + lanes, last) + place)
@@ -179,7 +188,7 @@ def _raise_all(worst: NDArray, words: NDArray, lanes: int, drag: float, full_rat
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
 def _raise_worst(worst: NDArray, words: NDArray, n: int, drag: float, full_rate: float) -> None:
-    """Update the largest values with one setpoint."""
+    """Update the running maxima with one setpoint."""
     place, place_ahead = _triple(words, _PLACE, n), _triple(words, _PLACE, n + 1)
     velocity, velocity_ahead = _triple(words, _SPEED, n + SPAN), _triple(words, _SPEED, n + SPAN + 1)
     earlier, later = _triple(words, _SPEED, n), _triple(words, _SPEED, n + 2 * SPAN)
@@ -203,6 +212,9 @@ def _raise_worst(worst: NDArray, words: NDArray, n: int, drag: float, full_rate:
     _raise(worst, of.SPECIFIC_THRUST, n, thrust)
     _raise(worst, _LEAST_THRUST, n, -thrust)
     _raise(worst, _TRADED, n, dot(traded, traded))
+    (cos, sin), (cos_ahead, sin_ahead) = _heading(words, n), _heading(words, n + 1)
+    norm = math.sqrt((cos * cos + sin * sin) * (cos_ahead * cos_ahead + sin_ahead * sin_ahead))
+    _raise(worst, _TURNED, n, 1.0 - (cos * cos_ahead + sin * sin_ahead) / norm)
     _raise(worst, of.SPEED, n, dot(velocity, velocity))
     _raise_place(worst, 0, n, place[0], place_ahead[0], half * (velocity[0] + velocity_ahead[0]))
     _raise_place(worst, 1, n, place[1], place_ahead[1], half * (velocity[1] + velocity_ahead[1]))
@@ -211,7 +223,7 @@ def _raise_worst(worst: NDArray, words: NDArray, n: int, drag: float, full_rate:
 
 @register_jitable(forceinline=True)
 def _raise_place(worst: NDArray, axis: int, n: int, here: float, ahead: float, way: float) -> None:
-    """Update the largest values with one coordinate, of a setpoint and of the next, and the way between them."""
+    """Update the running maxima with a coordinate of a setpoint and of the next, and the way that velocities give."""
     _raise(worst, _JUMP, n, abs(ahead - here - way))
     _raise(worst, _HIGH + axis, n, here)
     _raise(worst, _LOW + axis, n, -here)
@@ -219,9 +231,8 @@ def _raise_place(worst: NDArray, axis: int, n: int, here: float, ahead: float, w
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
 def _body_rate(traded: Vector, sent: Vector, words: NDArray, n: int, full_rate: float) -> Vector:
-    """Return the body rates that a setpoint asks for, of which some are `traded`, along the axes of the world."""
-    lower, upper = int(words[_TURN * _WIDTH + n]) & 0xFFFF, int(words[(_TURN + 1) * _WIDTH + n]) & 0xFFFF
-    cos, sin = heading_of(decompressed(upper << 16 | lower))
+    """Return the body rates, rad/s, that a setpoint asks for; `traded` are those sent as a turn, in world axes."""
+    cos, sin = _heading(words, n)
     a, b, c = sent
     left = -c * sin, c * cos, a * sin - b * cos  # the controller's y axis, and x is left × sent
     about_x = dot(traded, cross(left, sent)) / math.sqrt(dot(left, left) * dot(sent, sent))
@@ -232,8 +243,15 @@ def _body_rate(traded: Vector, sent: Vector, words: NDArray, n: int, full_rate: 
 
 
 @register_jitable(forceinline=True)
+def _heading(words: NDArray, n: int) -> tuple[float, float]:
+    """Return the horizontal components of the body's x axis that a setpoint asks for."""
+    lower, upper = int(words[_TURN * _WIDTH + n]) & 0xFFFF, int(words[(_TURN + 1) * _WIDTH + n]) & 0xFFFF
+    return heading_of(decompressed(upper << 16 | lower))
+
+
+@register_jitable(forceinline=True)
 def _triple(words: NDArray, row: int, n: int) -> Vector:
-    """Return what three rows have at a place, in m, m/s, m/s² or rad/s."""
+    """Return the values of three rows at a place, in m, m/s, m/s² or rad/s."""
     return (
         1e-3 * words[row * _WIDTH + n],
         1e-3 * words[(row + 1) * _WIDTH + n],
@@ -243,7 +261,7 @@ def _triple(words: NDArray, row: int, n: int) -> Vector:
 
 @register_jitable(forceinline=True)
 def _raise(worst: NDArray, row: int, n: int, value: float) -> None:
-    """Update the largest value at a place; what is no number is larger than all."""
+    """Update the running maximum at a place; NaN is larger than any number."""
     before = worst[row * _WIDTH + n]
     value = value if value < _LARGE else _LARGE
     worst[row * _WIDTH + n] = value if value > before else before

@@ -23,7 +23,7 @@ LARGEST = 32.767  # the largest value that 16 bits hold, in m, m/s, m/s² or rad
 _WIRE_OF_ONE = Struct("<B9hI3h")
 PAYLOAD_SIZE = _WIRE_OF_ONE.size
 _IN_MILLI = ("position", "velocity", "acceleration", "body_rate")
-FIELD_PLACES = (1, 7, 13, 23)  # of these in a payload
+FIELD_PLACES = (1, 7, 13, 23)  # bytes where these begin in a payload
 QUATERNION_PLACE = 19
 _MAGNITUDES = 511  # nine bits for a component in [0, 1/√2]
 
@@ -174,7 +174,7 @@ def _decompressed(compressed: NDArray) -> NDArray:
 def decompressed(bits: int) -> tuple[float, float, float, float]:
     """Return the quaternion x, y, z, w of its 32 bits.
 
-    There are no branches, so that a compiler can take several at once.
+    Without branches, so that the compiler can vectorise it.
     """
     first, second, third = _small(bits >> 20), _small(bits >> 10), _small(bits)
     square = 1.0 - first * first - second * second - third * third
@@ -190,6 +190,6 @@ def decompressed(bits: int) -> tuple[float, float, float, float]:
 
 @register_jitable(forceinline=True)
 def _small(bits: int) -> float:
-    """Return a component that is not the largest: its sign and nine bits."""
+    """Return a component other than the largest, from its sign and nine bits."""
     size = (bits & 0x1FF) / (_MAGNITUDES * math.sqrt(2.0))
     return -size if bits & 0x200 else size

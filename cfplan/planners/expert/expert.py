@@ -134,7 +134,7 @@ def _plan(
     whole = _segment(task, task.nodes)
     joined = by_windows(whole, window, search)
     if isinstance(joined, str) and sum(window) < task.nodes and not task.deadline.passed:
-        joined = by_windows(whole, WindowSize(task.nodes, 0), search)  # nothing led on from where two windows met
+        joined = by_windows(whole, WindowSize(task.nodes, 0), search)  # no motion continues from a joint of two windows
     if isinstance(joined, str):
         return Solution(failed_status(task.deadline), None, joined)
     return solution_of(whole, joined, began)

@@ -51,9 +51,9 @@ def guess(
 def led_into(
     coefficients: NDArray, unit: float, step: float, start: BoundaryState | None, end: BoundaryState | None
 ) -> NDArray:
-    """Return (N+3,) coefficients of h over its `unit` that have the boundary states, and come away from them smoothly.
+    """Change (N+3,) coefficients of h over its `unit` to have the boundary states, and to leave them smoothly.
 
-    The given ones must be positive; `step` is of s, an interval.
+    The given coefficients must be positive; `step` is the length of an interval in s.
     """
     led, held = coefficients.copy(), []
     for state, here, there in ((start, led, coefficients), (end, led[::-1], coefficients[::-1])):

@@ -22,8 +22,8 @@ from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import node_values
 from cfplan.vehicle.yaw_spline import YawSpline
 
-# m that a window looks ahead at least, beyond twice what braking takes: attitude takes its time to turn, and curves
-# leave little to brake with. Windows then fail on 2 of 160 paths of 40 to 100 m, with 0.5 m on 8.
+# m that a window looks ahead beyond twice the braking distance: attitude takes time to turn, and curves leave little
+# acceleration to brake with. Windows then fail on 2 of 160 paths of 40 to 100 m; with 0.5 m they fail on 8.
 LOOKAHEAD = 2.5
 
 
@@ -48,14 +48,14 @@ class Joined(NamedTuple):
 
 
 def windows_of(path: Path, nodes: int, size: WindowSize, limits: PlanLimits) -> list[tuple[int, int, int]]:
-    """Return (first interval, first that it does not keep, first beyond) of each window; one where the path fits in.
+    """Return (first interval, first that is not kept, first beyond) of each window; one window if the path fits in it.
 
-    Windows are larger than `size` where so many of the path's `nodes` intervals are too short to brake in.
+    Windows are larger than `size` where that number of the path's `nodes` intervals is too short to brake in.
     """
     spacing = np.linalg.norm(path(np.linspace(0.0, path.end, nodes + 1), 1), axis=1) * (path.end / nodes)
     length = np.append(0.0, np.cumsum((spacing[1:] + spacing[:-1]) / 2.0))  # m, of the path up to each node
     far_enough = np.searchsorted(length, length + limits.speed**2 / limits.acceleration + LOOKAHEAD)
-    seen = np.minimum(far_enough, nodes).tolist()  # up to which node a window looks that keeps what is before this one
+    seen = np.minimum(far_enough, nodes).tolist()  # by node: how far a window looks that keeps the intervals before it
     windows: list[tuple[int, int, int]] = []
     first = 0
     while True:

@@ -127,7 +127,7 @@ class _Filter:
         if any(infeasible_after >= i and merit_after >= m for i, m in self.pairs):
             return ""
         rounding = 1e-12 * abs(merit)
-        # That is, (-slope)**SWITCH_COST > infeasible**SWITCH_FEASIBILITY; a power above 1 of a huge slope overflows.
+        # Equals (-slope)**SWITCH_COST > infeasible**SWITCH_FEASIBILITY, but a power above 1 of a huge slope overflows.
         steep = -slope > infeasible ** (SWITCH_FEASIBILITY / SWITCH_COST)
         if slope < 0 and steep and infeasible <= 1e-4 * self.most:
             return "descends" if merit_after <= merit + ARMIJO * slope + rounding else ""

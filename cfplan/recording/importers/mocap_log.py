@@ -1,14 +1,16 @@
-"""The poses of each subject in a log of motion capture or of a vehicle: what every importer returns."""
+"""The poses of each subject in a log of motion capture or of a vehicle, and what all importers assemble them with."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
 
 _LISTED = 12  # names that an error lists at most
+_LENGTH_TOLERANCE = 0.05  # of a quaternion whose length must be 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,23 +52,44 @@ class MocapLog:
         return tuple(by_name[name] for name in names) if names else self.subjects
 
 
-def unit_quaternions(quaternion: NDArray, *, tolerance: float = 0.05) -> NDArray:
-    """Return them (N, 4) with length 1; NaN where the length is 0 or NaN, as in logs where nothing was seen.
-
-    Raises ValueError naming the first row whose length is off by more than the tolerance: that is no quaternion.
-    """
-    with np.errstate(all="ignore"):  # what is absurd becomes NaN, or has a wrong length
-        length = np.linalg.norm(quaternion, axis=1)
-    wrong = np.flatnonzero((np.abs(length - 1) > tolerance) & (length > 0))
-    if len(wrong):
-        raise ValueError(int(wrong[0]), float(length[wrong[0]]))
-    with np.errstate(all="ignore"):
-        return quaternion / np.where((length > 0) & (length < np.inf), length, np.nan)[:, None]
-
-
-def ascending(time: NDArray) -> NDArray:
-    """Return which rows to keep so that time only grows: each that is later than all before it."""
-    if len(time) == 0:
-        return np.zeros(0, dtype=bool)
+def growing(time: NDArray, rows: str, notes: list[str]) -> NDArray:
+    """Return (N,) whether a time is later than all before it; a note counts the others of these `rows`."""
     latest = np.maximum.accumulate(np.where(np.isfinite(time), time, -np.inf))
-    return np.isfinite(time) & (time > np.r_[-np.inf, latest[:-1]])
+    keep = np.isfinite(time) & (time > np.r_[-np.inf, latest[:-1]])
+    if not keep.all():
+        notes.append(f"{np.sum(~keep)} {rows} left out, as their times do not grow")
+    return keep
+
+
+def unknown_rotations(count: int) -> NDArray:
+    """Return (N, 4) quaternions of NaN."""
+    return np.full((count, 4), np.nan)
+
+
+def quaternions(values: NDArray, rotation: Callable[[NDArray], Rotation]) -> NDArray:
+    """Return (N, 4) of the rotation that each row states, NaN where one of its values is not finite."""
+    quaternion = unknown_rotations(len(values))
+    known = np.isfinite(values).all(axis=1)
+    if known.any():
+        quaternion[known] = rotation(values[known]).as_quat()
+    return quaternion
+
+
+def unit_quaternions(quaternion: NDArray) -> NDArray:
+    """Return them (N, 4) with length 1; NaN where that is 0 or not finite, as in logs where nothing was seen."""
+    with np.errstate(all="ignore"):
+        length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+        return quaternion / np.where((length > 0) & (length < np.inf), length, np.nan)
+
+
+def check_lengths(quaternion: NDArray, time: NDArray, name: str, *, where: str) -> None:
+    """Raise InputError at the first quaternion, of (N, 4), whose length is neither 1 nor 0: it is something else."""
+    with np.errstate(all="ignore"):
+        length = np.linalg.norm(quaternion, axis=1)
+    wrong = np.flatnonzero((np.abs(length - 1) > _LENGTH_TOLERANCE) & (length > 0))
+    if len(wrong):
+        raise InputError(
+            f"the quaternion of {name!r} has length {length[wrong[0]]:.3g} at {time[wrong[0]]:.3f} s",
+            where=where,
+            hint="the file is damaged, or its columns are not those of a quaternion; export it again",
+        )

@@ -3,14 +3,18 @@
 crazyswarm2 writes `timestamp,x,y,z,qw,qx,qy,qz`, and `cfplan export --to samples` `t`, places, velocities and more.
 """
 
-import mmap
 from pathlib import Path
 
-import numpy as np
-
 from cfplan.errors import InputError
-from cfplan.recording.importers.csv_numbers import Lines, numbers
-from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, ascending, unit_quaternions
+from cfplan.recording.importers.csv_numbers import read_numbers
+from cfplan.recording.importers.mocap_log import (
+    LoggedSubject,
+    MocapLog,
+    check_lengths,
+    growing,
+    unit_quaternions,
+    unknown_rotations,
+)  # fmt: skip
 
 FORMAT = "CSV of t, x, y, z"
 TIMES = ("t", "time", "timestamp")  # what the column of times may be called
@@ -25,36 +29,27 @@ def recognises(file: Path, head: bytes) -> bool:
 
 def read(file: Path) -> MocapLog:
     """Read the one vehicle, named as the file is. Raises InputError where a column is missing or a number is none."""
-    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        begin = data.find(b"\n") + 1 or len(data)
-        names = _names(data[:begin])
-        time = next(name for name in TIMES if name in names)
-        columns = (time, *PLACE, *(QUATERNION if set(QUATERNION) & set(names) else ()))
-        missing = [name for name in columns if name not in names]
-        if missing:
-            raise InputError(
-                f"there is no column {', '.join(missing)}",
-                where=f"{file}:1",
-                hint="the first line names the columns t, x, y, z, and where attitudes are known qx, qy, qz and qw",
-            )
-        wanted = [names.index(name) for name in columns]
-        values, cut = numbers(data, Lines(begin, len(data), ",", len(names), wanted), file)
-    keep = ascending(values[:, 0])
-    notes = ["the last line is cut off and left out"] if cut else []
-    if not keep.all():
-        notes.append(f"{np.sum(~keep)} rows left out, as their times do not grow")
-    values = values[keep]
-    try:
-        quaternion = unit_quaternions(values[:, 4:]) if len(columns) > 4 else np.full((len(values), 4), np.nan)
-    except ValueError as error:
-        row, length = error.args
+    data = file.read_bytes()
+    begin = data.find(b"\n") + 1 or len(data)
+    names = _names(data[:begin])
+    turned = bool(set(QUATERNION) & set(names))
+    wanted = (next(name for name in TIMES if name in names), *PLACE, *(QUATERNION if turned else ()))
+    missing = [name for name in wanted if name not in names]
+    if missing:
         raise InputError(
-            f"the quaternion has length {length:.3g} at {values[row, 0]:.3f} s",
-            where=str(file),
-            hint="the file is damaged, or its columns are in another order",
-        ) from None
-    subject = LoggedSubject(file.stem, values[:, 0], values[:, 1:4], quaternion)
-    return MocapLog(FORMAT, (subject,), tuple(notes), truncated=cut)
+            f"there is no column {', '.join(missing)}",
+            where=f"{file}:1",
+            hint="the first line names the columns t, x, y, z, and where attitudes are known qx, qy, qz and qw",
+        )
+    columns = [names.index(name) for name in wanted]
+    values, cut = read_numbers(data, begin, len(data), columns, len(names), str(file))
+    notes = ["the last line is cut off and left out"] if cut else []
+    values = values[growing(values[:, 0], "rows", notes)]
+    time, position, quaternion = values[:, 0], values[:, 1:4], values[:, 4:]
+    if turned:
+        check_lengths(quaternion, time, file.stem, where=str(file))
+    quaternion = unit_quaternions(quaternion) if turned else unknown_rotations(len(time))
+    return MocapLog(FORMAT, (LoggedSubject(file.stem, time, position, quaternion),), tuple(notes), truncated=cut)
 
 
 def _names(head: bytes) -> list[str]:

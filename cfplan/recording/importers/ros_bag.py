@@ -1,26 +1,26 @@
 """Read ROS 2 bags (and ROS 1's) with poses, as crazyswarm2, motion_capture_tracking and vicon_bridge record them."""
 
-from collections.abc import Iterator
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from cfplan.errors import InputError
-from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, ascending, unit_quaternions
+from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, growing, unit_quaternions
 
 FORMAT = "ROS bag"
-_MCAP, _SQLITE, _ROS1 = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"#ROSBAG V"
-_SUFFIXES = {_MCAP: ".mcap", _SQLITE: ".db3", _ROS1: ".bag"}
-_TYPES = (
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/TransformStamped",
-    "nav_msgs/msg/Odometry",
-    "tf2_msgs/msg/TFMessage",
-    "motion_capture_tracking_interfaces/msg/NamedPoseArray",
-)
-_Row = tuple[float, float, float, float, float, float, float, float]
+_SUFFIXES = {b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3", b"#ROSBAG V": ".bag"}  # by a file's first bytes
+_POSE = attrgetter("pose.position", "pose.orientation")
+_COVARIANT_POSE = attrgetter("pose.pose.position", "pose.pose.orientation")
+_TRANSFORM = attrgetter("transform.translation", "transform.rotation")
+_TYPES = {  # the field with its poses if it holds several, the field with a pose's name, its place and turn
+    "geometry_msgs/msg/PoseStamped": ("", "", _POSE),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("", "", _COVARIANT_POSE),
+    "geometry_msgs/msg/TransformStamped": ("", "child_frame_id", _TRANSFORM),
+    "nav_msgs/msg/Odometry": ("", "", _COVARIANT_POSE),
+    "tf2_msgs/msg/TFMessage": ("transforms", "child_frame_id", _TRANSFORM),
+    "motion_capture_tracking_interfaces/msg/NamedPoseArray": ("poses", "name", _POSE),
+}
 
 
 def recognises(file: Path, head: bytes) -> bool:
@@ -39,12 +39,11 @@ def read(file: Path) -> MocapLog:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise InputError(
-            "ROS bags need the package rosbags", where=str(file), hint="pip install 'cfplan[ros]'"
-        ) from error
+        hint = "pip install 'cfplan[ros]'"
+        raise InputError("ROS bags need the package rosbags", where=str(file), hint=hint) from error
     if not file.is_dir():
         _check_suffix(file)
-    rows: dict[str, list[_Row]] = {}
+    tables: dict[str, list[tuple[float, ...]]] = {}
     try:
         with AnyReader([file], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             wanted = [connection for connection in reader.connections if connection.msgtype in _TYPES]
@@ -56,77 +55,41 @@ def read(file: Path) -> MocapLog:
                     hint=f"known: {', '.join(name.rpartition('/')[2] for name in _TYPES)}",
                 )
             for connection, received, raw in reader.messages(connections=wanted):
+                several, named, pose = _TYPES[connection.msgtype]
                 message = reader.deserialize(raw, connection.msgtype)
-                for name, row in _poses(connection.topic, connection.msgtype, message, received * 1e-9):
-                    rows.setdefault(name, []).append(row)
+                for item in getattr(message, several) if several else [message]:
+                    stamp = (item if hasattr(item, "header") else message).header.stamp
+                    stamped = stamp.sec or stamp.nanosec
+                    time = stamp.sec + stamp.nanosec * 1e-9 if stamped else received * 1e-9
+                    name = getattr(item, named).lstrip("/") if named else ""
+                    p, q = pose(item)
+                    tables.setdefault(name or connection.topic, []).append((time, p.x, p.y, p.z, q.x, q.y, q.z, q.w))
     except InputError:
         raise
     # on damaged bytes the readers raise what their parts raise: struct, sqlite, lz4, zstd, yaml, keys
     except Exception as error:
         raise InputError(
-            f"the bag cannot be read ({type(error).__name__}: {_one_line(error)})",
+            f"the bag cannot be read ({type(error).__name__}: {' '.join(str(error).split())[:160]})",
             where=str(file),
             hint="damaged or cut off; `ros2 bag reindex` repairs a bag that was not closed",
         ) from error
-    start = min((row[0] for table in rows.values() for row in table), default=0.0)
+    start = min((row[0] for table in tables.values() for row in table), default=0.0)
     notes: list[str] = []
-    subjects = tuple(_subject(name, table, start, notes) for name, table in sorted(rows.items()))
-    return MocapLog(FORMAT, subjects, tuple(notes), truncated=False)
+    subjects = []
+    for name, table in sorted(tables.items()):
+        values = np.array(table)
+        # Sorted first: a topic may have several writers, and a bag holds messages in the order in which they arrived.
+        values = values[np.argsort(values[:, 0], kind="stable")]
+        values = values[growing(values[:, 0], f"poses of {name}", notes)]
+        # motion_capture_tracking marks a lone point by an orientation of NaN.
+        subjects.append(LoggedSubject(name, values[:, 0] - start, values[:, 1:4], unit_quaternions(values[:, 4:])))
+    return MocapLog(FORMAT, tuple(subjects), tuple(notes), truncated=False)
 
 
 def _check_suffix(file: Path) -> None:
     with file.open("rb") as stream:
-        head = stream.read(len(_SQLITE))
+        head = stream.read(max(map(len, _SUFFIXES)))
     wanted = next(suffix for magic, suffix in _SUFFIXES.items() if head.startswith(magic))
     if file.suffix != wanted:
-        raise InputError(
-            "the suffix is not that of the bag's format", where=str(file), hint=f"give it the suffix {wanted}"
-        )
-
-
-def _poses(topic: str, kind: str, message: Any, received: float) -> Iterator[tuple[str, _Row]]:
-    name = kind.rpartition("/")[2]
-    if name == "TFMessage":
-        for transform in message.transforms:
-            yield transform.child_frame_id.lstrip("/"), _transform(transform, received)
-    elif name == "TransformStamped":
-        yield message.child_frame_id.lstrip("/") or topic, _transform(message, received)
-    elif name == "NamedPoseArray":
-        time = _stamp(message.header, received)
-        for item in message.poses:
-            yield item.name, _row(time, item.pose.position, item.pose.orientation)
-    else:
-        pose = message.pose if name == "PoseStamped" else message.pose.pose
-        yield topic, _row(_stamp(message.header, received), pose.position, pose.orientation)
-
-
-def _transform(message: Any, received: float) -> _Row:
-    transform = message.transform
-    return _row(_stamp(message.header, received), transform.translation, transform.rotation)
-
-
-def _stamp(header: Any, received: float) -> float:
-    """Return s; the time of receipt where the header has no stamp."""
-    stamp = header.stamp
-    return stamp.sec + stamp.nanosec * 1e-9 if stamp.sec or stamp.nanosec else received
-
-
-def _row(time: float, place: Any, turn: Any) -> _Row:
-    return time, place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
-
-
-def _subject(name: str, table: list[_Row], start: float, notes: list[str]) -> LoggedSubject:
-    values = np.array(table)
-    # Sorted first: a topic may have several writers, and a bag holds messages in the order in which they arrived.
-    values = values[np.argsort(values[:, 0], kind="stable")]
-    keep = ascending(values[:, 0])
-    if not keep.all():
-        notes.append(f"{np.sum(~keep)} poses of {name} left out, as their stamps repeat")
-    values = values[keep]
-    # motion_capture_tracking marks a lone point by an orientation of NaN.
-    quaternion = unit_quaternions(values[:, 4:], tolerance=np.inf)
-    return LoggedSubject(name, values[:, 0] - start, values[:, 1:4], quaternion)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:160]
+        hint = f"give it the suffix {wanted}"
+        raise InputError("the suffix is not that of the bag's format", where=str(file), hint=hint)

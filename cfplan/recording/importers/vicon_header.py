@@ -26,13 +26,16 @@ class Rotations(StrEnum):
     NONE = "none"  # a marker
 
 
+COLUMNS = {  # rotation and place of a subject
+    Rotations.QUATERNION: (("RX", "RY", "RZ", "RW"), ("TX", "TY", "TZ")),
+    Rotations.HELICAL: (("RX", "RY", "RZ"), ("TX", "TY", "TZ")),
+    Rotations.EULER: (("RX", "RY", "RZ"), ("TX", "TY", "TZ")),
+    Rotations.NONE: ((), ("X", "Y", "Z")),
+}
 LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 ANGLES = {"rad": 1.0, "deg": math.pi / 180}
 # The sections that hold poses or points; the others are forces, joint angles and the like.
 READ = ("objects", "segments", "trajectories")
-_QUATERNION, _ANGLES, _POSITION, _POINT = (
-    ("RX", "RY", "RZ", "RW"), ("RX", "RY", "RZ"), ("TX", "TY", "TZ"), ("X", "Y", "Z"),
-)  # fmt: skip
 _NAME = re.compile(r"^(?:(?P<frame>global|local)\s+)?angle\s*(?:\((?P<word>[^)]*)\))?\s+(?P<name>.+)$", re.IGNORECASE)
 
 
@@ -56,11 +59,9 @@ class Section:
     name: str
     rate: float  # Hz, of the rows
     delimiter: str
-    frame_column: int
-    sub_frame_column: int | None
+    frame_columns: tuple[int, ...]  # of Frame and, if there, Sub Frame
     groups: tuple[Group, ...]
     left_out: tuple[str, ...]  # names over columns that are neither a pose nor a point
-    headings: int  # columns that it names
 
 
 def read_head(lines: list[str], *, where: str, rotations: Rotations | None) -> Section:
@@ -75,40 +76,35 @@ def read_head(lines: list[str], *, where: str, rotations: Rotations | None) -> S
         )
     delimiter = max(",;\t", key=lines[3].count)
     try:
-        names, headings, units = (_cells(line, delimiter) for line in (lines[2], lines[3], (*lines, "")[4]))
+        titles, headings, units = (_cells(line, delimiter) for line in (lines[2], lines[3].upper(), (*lines, "")[4]))
     except csv.Error as error:
-        raise InputError(
-            f"the head of section {name!r} cannot be read: {error}", where=where, hint="export the section again"
-        ) from None
-    headings = [heading.upper() for heading in headings]
+        message = f"the head of section {name!r} cannot be read: {error}"
+        raise InputError(message, where=where, hint="export the section again") from None
     if "FRAME" not in headings:
         raise InputError(
             f"section {name!r} has no column Frame",
             where=where,
             hint="the lines of a section are: its name, its rate, the subjects, the columns, the units, then frames",
         )
+    frame_columns = tuple(headings.index(heading) for heading in ("FRAME", "SUB FRAME") if heading in headings)
+    if name.lower() not in READ:
+        return Section(name, rate, delimiter, frame_columns, (), (f"section {name}",))
+    starts = [index for index, cell in enumerate(titles) if cell]
+    if not starts:
+        raise InputError(
+            f"section {name!r} names no subject above its columns",
+            where=where,
+            hint="the line above the columns names each subject over its first column",
+        )
     groups, left_out = [], []
-    if name.lower() in READ:
-        starts = [index for index, cell in enumerate(names) if cell]
-        if not starts:
-            raise InputError(
-                f"section {name!r} names no subject above its columns",
-                where=where,
-                hint="the line above the columns names each subject over its first column",
-            )
-        for first, after in zip(starts, [*starts[1:], len(headings)], strict=True):
-            group = _group(names[first], headings, units, range(first, min(after, len(headings))), where, rotations)
-            if group is None:
-                left_out.append(names[first])
-            else:
-                groups.append(group)
-    else:
-        left_out.append(f"section {name}")
-    sub_frame = headings.index("SUB FRAME") if "SUB FRAME" in headings else None
-    used = [index for index, heading in enumerate(headings) if heading]
-    return Section(
-        name, rate, delimiter, headings.index("FRAME"), sub_frame, tuple(groups), tuple(left_out), used[-1] + 1
-    )
+    for first, after in zip(starts, [*starts[1:], len(headings)], strict=True):
+        columns = {headings[index]: index for index in reversed(range(first, min(after, len(headings))))}
+        group = _group(titles[first], columns, units, where, rotations)
+        if group is None:
+            left_out.append(titles[first])
+        else:
+            groups.append(group)
+    return Section(name, rate, delimiter, frame_columns, tuple(groups), tuple(left_out))
 
 
 def _first_cell(line: str) -> str:
@@ -121,54 +117,40 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 def _rate(line: str, section: str, where: str) -> float:
     text = _first_cell(line)
-    try:
-        rate = float(text.replace(",", "."))
-    except ValueError:
-        rate = math.nan
+    rate = float(text) if is_number(text) else math.nan
     if not 0 < rate < 1e6:
-        raise InputError(
-            f"the rate of section {section!r} is {text[:30]!r}, not a number of Hz",
-            where=where,
-            hint="the line below the name of a section holds its rate alone, as 100",
-        )
+        message = f"the rate of section {section!r} is {text[:30]!r}, not a number of Hz"
+        hint = "the line below the name of a section holds its rate alone, as 100"
+        raise InputError(message, where=where, hint=hint)
     return rate
 
 
 def _group(
-    title: str, headings: list[str], units: list[str], columns: range, where: str, rotations: Rotations | None
+    title: str, columns: dict[str, int], units: list[str], where: str, rotations: Rotations | None
 ) -> Group | None:
     """Return the subject under a title; None where it is no pose. Raises InputError where columns are missing."""
-    at = {headings[index]: index for index in reversed(columns) if headings[index]}
     match = _NAME.match(title)
-    word = (match["word"] or "").lower() if match else ""
-    name = _subject(match["name"] if match else title)
-    if set(_POINT) <= set(at):
-        scale = _unit(units, tuple(at[c] for c in _POINT), LENGTHS, name, where)
-        return Group(name, Rotations.NONE, (), 1.0, tuple(at[c] for c in _POINT), scale, False)
-    if (match and (match["frame"] or "").lower() == "local") or not set(at) & {*_QUATERNION, *_POSITION}:
-        return None
-    wanted = _QUATERNION if "RW" in at or word == Rotations.QUATERNION else _ANGLES
-    missing = [column for column in (*wanted, *_POSITION) if column not in at]
-    if missing:
-        raise InputError(
-            f"subject {name!r} has no column {', '.join(missing)}",
-            where=where,
-            hint="export its rotation and its translation, with all their axes",
-        )
-    turn, place = tuple(at[c] for c in wanted), tuple(at[c] for c in _POSITION)
-    length = _unit(units, place, LENGTHS, name, where)
-    if wanted is _QUATERNION:
-        return Group(name, Rotations.QUATERNION, turn, 1.0, place, length, False)
-    stated = Rotations.EULER if "euler" in word else Rotations.HELICAL if "helical" in word else None
-    kind = stated or rotations or Rotations.HELICAL
-    angle = _unit(units, turn, ANGLES, name, where)
-    return Group(name, kind, turn, angle, place, length, assumed=stated is None and rotations is None)
-
-
-def _subject(name: str) -> str:
-    """Return `cf1` for `cf1:cf1`, an object and its only segment; other names as they are."""
+    frame, word, name = (match[key] or "" for key in ("frame", "word", "name")) if match else ("", "", title)
     subject, _, segment = name.strip().partition(":")
-    return subject if subject == segment else name.strip()
+    name = subject if subject == segment else name.strip()  # an object and its only segment
+    stated = next((kind for kind in (Rotations.EULER, Rotations.HELICAL) if kind in word.lower()), None)
+    if {"X", "Y", "Z"} <= set(columns):
+        kind = Rotations.NONE
+    elif frame.lower() == "local" or not set(columns) & {"RX", "RY", "RZ", "RW", "TX", "TY", "TZ"}:
+        return None
+    elif "RW" in columns or word.lower() == Rotations.QUATERNION:
+        kind = Rotations.QUATERNION
+    else:
+        kind = stated or rotations or Rotations.HELICAL
+    missing = [column for part in COLUMNS[kind] for column in part if column not in columns]
+    if missing:
+        message = f"subject {name!r} has no column {', '.join(missing)}"
+        raise InputError(message, where=where, hint="export its rotation and its translation, with all their axes")
+    turn, place = (tuple(columns[column] for column in part) for part in COLUMNS[kind])
+    angles = kind in (Rotations.EULER, Rotations.HELICAL)
+    length = _unit(units, place, LENGTHS, name, where)
+    angle = _unit(units, turn, ANGLES, name, where) if angles else 1.0
+    return Group(name, kind, turn, angle, place, length, assumed=angles and stated is None and rotations is None)
 
 
 def _unit(units: list[str], columns: tuple[int, ...], known: dict[str, float], name: str, where: str) -> float:
@@ -177,13 +159,7 @@ def _unit(units: list[str], columns: tuple[int, ...], known: dict[str, float], n
     if len(found) == 1 and found[0] in known:
         return known[found[0]]
     if any(text == "" or is_number(text) for text in found):
-        raise InputError(
-            f"no unit over the columns of {name!r}",
-            where=where,
-            hint=f"the line after the columns' names says {' or '.join(known)} for each",
-        )
-    raise InputError(
-        f"the unit of {name!r} is {', '.join(found)}, not {' or '.join(known)}",
-        where=where,
-        hint="export it again in one of these",
-    )
+        hint = f"the line after the columns' names says {' or '.join(known)} for each"
+        raise InputError(f"no unit over the columns of {name!r}", where=where, hint=hint)
+    message = f"the unit of {name!r} is {', '.join(found)}, not {' or '.join(known)}"
+    raise InputError(message, where=where, hint="export it again in one of these")

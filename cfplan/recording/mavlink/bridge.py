@@ -72,7 +72,7 @@ class GroundStation:
     """The link to one ground station; sends and receives while it is entered.
 
     `show` takes a message of the pilot's and returns at once; `orders` returns the commands since the last call.
-    Only a ground station on this machine is heard where the place is one on this machine.
+    Only packets from the host and port of that place are heard.
     """
 
     def __init__(self, place: Place, log: Path | None = None, *, boot: float | None = None, clock: Clock = REAL_CLOCK):
@@ -86,7 +86,6 @@ class GroundStation:
         self._due = [0.0] * len(messages.RATES)
         self._text_number = 0
         self._socket, self._target = _open(place)
-        self._to = self._target
         self._log: IO[bytes] | None = None
         if log is not None:
             try:
@@ -141,7 +140,7 @@ class GroundStation:
         """Send a packet; the dialect's encoder calls this."""
         self._keep(packet)
         with contextlib.suppress(OSError):  # no one listens there now
-            self._socket.sendto(packet, self._to)
+            self._socket.sendto(packet, self._target)
 
     def _serve(self) -> float:
         """Hear what has come, send what is due, and return s until something is due again."""
@@ -188,19 +187,21 @@ class GroundStation:
                 data, sender = self._socket.recvfrom(_LARGEST_DATAGRAM)
             except OSError:  # what was sent before came back as not deliverable
                 continue
+            if sender[:2] != self._target[:2]:  # no other program may stop the flight
+                continue
             for packet, message in messages_in(data):
-                self._hear(packet, message, sender)
+                self._hear(packet, message)
 
-    def _hear(self, packet: bytes, message: Any, sender: Any) -> None:
+    def _hear(self, packet: bytes, message: Any) -> None:
         self.heard += 1
         self._keep(packet)
         command = command_of(message)
         if command is not None and self._is_for_us(message):
-            self._obey(command[0], answer(*command), message, sender)
+            self._obey(command[0], answer(*command), message)
         elif message.get_type() == "MISSION_REQUEST_LIST" and self._is_for_us(message):
-            self._reply(self._mav.mission_count_encode(message.get_srcSystem(), message.get_srcComponent(), 0), sender)
+            self._mav.send(self._mav.mission_count_encode(message.get_srcSystem(), message.get_srcComponent(), 0))
 
-    def _obey(self, command: int, found: Answer, message: Any, sender: Any) -> None:
+    def _obey(self, command: int, found: Answer, message: Any) -> None:
         if found.order is not None:
             self._orders.append(found.order)  # before anything that might fail
         acknowledgement = self._mav.command_ack_encode(
@@ -209,22 +210,14 @@ class GroundStation:
             target_system=message.get_srcSystem(),
             target_component=message.get_srcComponent(),
         )
-        self._reply(acknowledgement, sender)
+        self._mav.send(acknowledgement)
         if found.message is not None:
-            self._reply(messages.autopilot_version(self._mav, self._latest), sender)
+            self._mav.send(messages.autopilot_version(self._mav, self._latest))
         if found.text:
             self._texts.append((_WARNING, found.text))
 
     def _is_for_us(self, message: Any) -> bool:
         return message.target_system in (BROADCAST, SYSTEM) and message.target_component in (BROADCAST, COMPONENT)
-
-    def _reply(self, message: Any, sender: Any) -> None:
-        """Send a reply to the sender of the request, not to where the telemetry goes."""
-        self._to = sender
-        try:
-            self._mav.send(message)
-        finally:
-            self._to = self._target
 
     def _keep(self, packet: bytes) -> None:
         if self._log is None:

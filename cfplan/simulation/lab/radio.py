@@ -57,7 +57,7 @@ class Radio:
         self._down: deque[bytes] = deque()
         self._on_way_up: deque[tuple[float, bytes]] = deque()
         self._on_way_down: deque[tuple[float, bytes]] = deque()
-        self._repeated = False  # the vehicle has had the packet in the air, whose acknowledgement did not come
+        self._repeated = False  # the vehicle has the packet in the air, whose acknowledgement was lost
         self.dropped = 0  # packets dropped by a full queue
         self.acknowledged: Callable[[], None] = lambda: None  # called with each acknowledgement
 
@@ -102,7 +102,7 @@ class Radio:
         if not (self._up or self._down):
             if now > self._next:
                 self._next = now
-                self._transact(now)  # an empty packet, as cflib sends where there is nothing else
+                self._transact(now)  # an empty packet, as cflib sends if there is nothing else
             if not (self._on_way_up or self._on_way_down):
                 return [], []
         while self._next <= now and (self._up or self._down):
@@ -124,7 +124,7 @@ class Radio:
             sent, packet = self._up[0]
             if not self._repeated and not self._perished(sent, packet, time):
                 self._on_way_up.append((due, packet))
-            self._repeated = silent  # the vehicle takes what is repeated once
+            self._repeated = silent  # the vehicle takes a repeated packet once
             if not silent:
                 self._up.popleft()
         if silent:

@@ -46,7 +46,7 @@ class SteppedLink(Link):
             platform=SimpleNamespace(get_protocol_version=lambda: lab.vehicle.settings.protocol),
             link_statistics=SimpleNamespace(
                 latency=SimpleNamespace(latency=_ROUND_TRIP_MS),
-                latency_updated=SimpleNamespace(add_callback=lambda _: None),  # the radio tells of acknowledgements
+                latency_updated=SimpleNamespace(add_callback=lambda _: None),  # the radio reports acknowledgements
             ),
             add_port_callback=lambda port, note: self._callbacks.setdefault(port, []).append(note),
         )
@@ -141,7 +141,7 @@ class SteppedLink(Link):
         port, channel, data = datagram[0] >> 4, datagram[0] & 3, datagram[1:]
         if port == Port.LOG and channel == _DATA:
             names, layout, note = self._blocks[data[0]]
-            if len(data) == 4 + struct.calcsize(layout):  # else it is only partly created, which cflib drops too
+            if len(data) == 4 + struct.calcsize(layout):  # else the block is partly created; cflib drops that too
                 values = dict(zip(names, struct.unpack(layout, data[4:]), strict=True))
                 note(int.from_bytes(data[1:4], "little"), values, None)
             return

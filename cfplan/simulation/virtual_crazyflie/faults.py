@@ -21,7 +21,7 @@ class VehicleFaultKind(StrEnum):
     SILENT_STATUS = "status log silent"  # blocks with the supervisor's state are not sent
 
 
-# The variable by which a block is known that a fault silences.
+# A variable of the log block that each fault silences.
 SILENCED: Mapping[StrEnum, str] = {
     VehicleFaultKind.SILENT_ESTIMATE: "stateEstimateZ.x",
     VehicleFaultKind.SILENT_STATUS: "supervisor.info",

@@ -76,7 +76,7 @@ class VirtualCrazyflie:
         """Start the processor: everything is as after switching on."""
         airframe, without = self._airframe, lacking(self._version)
         self._commanded = -1  # the last tick at which the slower loops ran
-        self._heard = self.tick  # when the last packet came
+        self._heard = self.tick  # tick of the last packet
         self._silent: tuple[str, ...] = ()  # variables whose log blocks are not sent
         self.parameters = Parameters(DEFAULTS, without=without, stubborn=self.settings.stubborn)
         self.stabilizer = Stabilizer(

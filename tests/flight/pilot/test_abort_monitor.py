@@ -43,7 +43,7 @@ def test_old_poses_brake_and_then_land(monitor, poses, expected):
     assert rung(monitor, observation(age=0.3, health=Health(poses=poses))) is expected
 
 
-def test_poses_that_stay_late_and_those_that_are_not_believed_say_so(monitor):
+def test_poses_that_stay_late_or_are_distrusted_are_named(monitor):
     late = monitor.gravest(observation(age=0.12, health=Health(poses=GONE)))
     assert "0.12 s late" in late.text
     distrusted = monitor.gravest(observation(health=Health(poses=GONE), pose_fault="another body"))
@@ -57,7 +57,7 @@ def test_a_silent_log_lands_and_is_named(monitor, log):
     assert log in abort.text
 
 
-def test_what_a_log_that_is_gone_said_last_counts_no_more(monitor):
+def test_the_last_values_of_a_log_that_is_gone_do_not_count(monitor):
     fast, turning, empty = (9.0, 0.0, 0.0), (0.0, 40.0, 0.0), 2.0
     for now in (10.0, 10.2, 15.0):
         seen = observation(now=now, velocity=fast, rate=turning, voltage=empty, bits=1 << 6)

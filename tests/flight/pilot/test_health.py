@@ -1,4 +1,4 @@
-"""The table of health: what the pilot does when sources fall silent, alone and together, in every phase."""
+"""The table of health: the pilot's reactions to sources that fall silent, alone and together, in every phase."""
 
 import itertools
 
@@ -12,11 +12,11 @@ PHASES = (Phase.TAKE_OFF, Phase.GO_TO_START, Phase.STREAM, Phase.HOLD, Phase.LAN
 SILENT = {"uplink": "uplink_dead", "poses": "poses_stopped", "estimate": "estimate_silent", "status": "status_silent"}
 CELLS = [Health(*cell) for cell in itertools.product(Freshness, repeat=4)]
 LATE_FOR = 0.35  # s
-MOMENT = dict.fromkeys(Phase, 0.3) | {Phase.STREAM: 0.1}  # s; in the stream while it is slow, as what is not sent lags
+MOMENT = dict.fromkeys(Phase, 0.3) | {Phase.STREAM: 0.1}  # s; early in the stream, where it is slow and lags little
 
 
 def silence(world, source, phase, spans):
-    """Let a source be silent in each span, s after its MOMENT in the phase; None ends it never."""
+    """Silence a source in each span, s after its MOMENT in the phase; an end of None is never."""
     for begin, end in spans:
         world.when(phase, MOMENT[phase] + begin, lambda: setattr(world, SILENT[source], True))
         if end is not None:
@@ -31,7 +31,7 @@ def bring_about(world, cell, phase):
 
 
 def assert_reaction(world, outcome, cell):
-    """Assert what the table says of the cell."""
+    """Assert the reaction that the table has for the cell."""
     if cell.uplink is GONE:  # the vehicle is alone, and comes down by link loss
         assert outcome.exit_code is ExitCode.LINK_LOST
         assert not [call for call in world.calls if call in ("disarm", "emergency stop")]
@@ -75,9 +75,38 @@ def test_each_cell_in_the_other_phases(world, fly, cell, phase):
 @pytest.mark.parametrize("logs", [("estimate",), ("status",), ("estimate", "status")])
 def test_logs_that_come_back_for_a_moment_and_go_again_land_by_poses(world, fly, logs, phase):
     for log in logs:
-        silence(world, log, phase, [(0.0, 0.6), (0.7, None)])
+        silence(world, log, phase, [(0.0, 0.7), (0.8, None)])
     assert_reaction(world, fly(), Health(**dict.fromkeys(logs, GONE)))
     assert world.revived == list(logs)
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_poses_that_come_back_for_a_moment_and_go_again_land(world, fly, phase):
+    silence(world, "poses", phase, [(0.0, 0.7), (0.8, None)])
+    assert_reaction(world, fly(), Health(poses=GONE))
+
+
+@pytest.mark.parametrize("phase", [phase for phase in PHASES if phase is not Phase.LAND])
+def test_an_uplink_that_comes_back_for_a_moment_and_goes_again_is_lost(world, fly, phase):
+    silence(world, "uplink", phase, [(0.0, 0.7), (0.8, None)])
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.LINK_LOST
+    assert "emergency stop" not in world.calls
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_an_uplink_that_comes_back_lands_the_vehicle_where_it_is(world, fly, phase):
+    silence(world, "uplink", phase, [(0.0, 0.7)])
+    assert_reaction(world, fly(), Health(estimate=GONE))
+
+
+def test_an_armed_vehicle_whose_status_fell_silent_is_disarmed_by_more_than_one_packet(world, fly):
+    world.when(Phase.ARM, 0.0, lambda: vars(world).update(status_silent=True, arms_lost=0))
+    world.when(Phase.DISARM, 0.0, lambda: setattr(world, "arms_lost", 1))
+    fly()
+    assert world.calls.count("disarm") > 1
+    assert not world.armed
+    assert "does not say that it is disarmed" in world.said
 
 
 def test_a_silent_vehicle_that_acknowledges_flies_its_certified_stop(world, fly, mission):
@@ -108,7 +137,7 @@ def test_a_computer_that_stood_still_hears_before_it_judges(limits):
     heard = dict.fromkeys(("uplink", "estimate", "status", "poses"), 9.999)
     assert monitor.look(10.0, **heard) == Health()
     stalled = monitor.look(11.0, **heard)
-    assert (stalled.uplink, stalled.poses) == (FRESH, GONE)  # poses are old all the same
+    assert (stalled.uplink, stalled.poses) == (FRESH, GONE)  # poses have grown old all the same
     for step in range(1, 60):
         last = monitor.look(11.0 + step / 100, **heard)
     assert last == Health(GONE, GONE, GONE, GONE)
@@ -129,3 +158,15 @@ def test_a_status_that_falls_silent_while_the_vehicle_arms_keeps_it_on_the_floor
     assert outcome.exit_code is ExitCode.PREFLIGHT
     assert world.position[2] == world.floor
     assert not world.armed
+
+
+@pytest.mark.parametrize("silent_after", [0.4, 0.6, 0.8])
+def test_a_status_that_falls_silent_while_a_take_off_is_given_up_leaves_nothing_armed(world, fly, silent_after):
+    world.other_body = True
+    world.when(Phase.TAKE_OFF, silent_after, lambda: setattr(world, "status_silent", True))
+    outcome = fly()
+    assert outcome.exit_code in (ExitCode.PREFLIGHT, ExitCode.ENDED_BY_SAFETY)
+    assert "fault" not in outcome.reason
+    assert "emergency stop" not in world.calls
+    assert not world.armed
+    assert not world.motors_on

@@ -121,7 +121,7 @@ print("restored" if termios.tcgetattr(0) == before else "changed", flush=True)
 
 @pytest.fixture
 def typed(monkeypatch):
-    """A keyboard, and what types bytes on its terminal."""
+    """Yield a keyboard, and a function that types bytes on its terminal."""
     ours, theirs = pty.openpty()
     with os.fdopen(theirs) as terminal:
         monkeypatch.setattr("sys.stdin", terminal)

@@ -64,6 +64,22 @@ def test_a_late_tick_carries_the_setpoint_of_its_moment(world, mission, fly):
         assert message.index == pytest.approx((message.time - outcome.first_setpoint) * 100, abs=0.51)
 
 
+@pytest.mark.parametrize(("stall", "rung"), [(0.1, Rung.NONE), (0.3, Rung.BRAKE), (0.7, Rung.LAND)])
+def test_a_computer_that_stands_still_within_a_tick_is_noticed_as_in_its_sleep(world, fly, stall, rung):
+    poses = world.poses
+
+    def slow():
+        world.poses = poses
+        world.clock.reach(world.now + stall)
+        return poses()
+
+    world.when(Phase.STREAM, 0.3, lambda: setattr(world, "poses", slow))
+    outcome = fly()
+    assert outcome.rung is rung
+    assert world.position[2] < 0.05
+    assert not world.armed
+
+
 def stop_poses(world):
     world.poses_stopped = True
 
@@ -414,7 +430,7 @@ def test_a_lasting_fault_in_a_step_of_the_tick_lands_and_does_not_cut(world, fly
     assert not world.armed
 
 
-def test_a_fault_of_pose_handling_is_that_no_pose_comes(world, fly):
+def test_a_fault_of_pose_handling_counts_as_no_pose(world, fly):
     whole, failing = world.poses, []
 
     def fail():

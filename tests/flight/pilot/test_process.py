@@ -1,4 +1,4 @@
-"""What goes between the pilot's process and the main process: orders wait for nothing, and what fails is noticed."""
+"""Messages between the pilot's process and the main process: orders wait for nothing, and faults are noticed."""
 
 import multiprocessing
 import pickle
@@ -46,7 +46,7 @@ def test_a_proposal_whose_reading_fails_is_none_and_the_next_one_counts(monkeypa
 
 
 class StillPilot:
-    """A pilot's process that never says anything; `orders` are what it is given."""
+    """A pilot's process that sends nothing by itself; `orders` are those that it is given."""
 
     def __init__(self):
         telemetry, self.telemetry = multiprocessing.Pipe(duplex=False)
@@ -88,7 +88,7 @@ def test_an_order_waits_for_no_listener(still_pilot):
         assert flown.result() == "ended"
 
 
-def test_a_source_of_orders_that_fails_lands_and_the_other_counts_still(still_pilot):
+def test_a_source_of_orders_that_fails_lands_the_vehicle(still_pilot):
     with ThreadPoolExecutor() as beside:
         flown = beside.submit(fly_with, still_pilot, more_orders=lambda: 1 / 0)
         still_pilot.next_order()  # the mission

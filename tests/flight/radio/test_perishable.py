@@ -2,6 +2,7 @@
 
 import queue
 import struct
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -56,19 +57,13 @@ def dongle():
 
 
 @pytest.fixture
-def acknowledged():
-    """When acknowledgements came, s."""
-    return []
-
-
-@pytest.fixture
-def driver(dongle, acknowledged):
+def driver(dongle):
     driver = SimpleNamespace(out_queue=queue.Queue(1), needs_resending=False)
     driver._thread = _RadioDriverThread(
         dongle, queue.Queue(), driver.out_queue, lambda _: None, lambda _: None, driver, None
     )
     driver._thread._radio_link_statistics = SimpleNamespace(update=lambda *_: None)
-    empty_air(driver, lambda: dongle.now, lambda: acknowledged.append(dongle.now))
+    empty_air(driver, lambda: dongle.now)
     driver._thread.start()
     yield _Serialized(driver, SimpleNamespace(now=lambda: dongle.now))
     driver._thread.stop()
@@ -105,6 +100,19 @@ def test_what_a_dead_radio_held_does_not_come_when_it_returns(dongle, driver):
     wait(dongle, 0.1)
     (held,) = numbers(dongle)
     assert held >= 40 - KEEPS_FOR / 0.01 - 1
+
+
+def test_a_ping_of_cflibs_own_is_dropped_by_a_radio_that_is_dead_for_long_and_ends_no_link(dongle, driver):
+    ended = []
+    driver._driver.link_error_callback = ended.append
+    dongle.dead = True
+    driver.send_soon(packet(9, 1, b"\x04"))
+    wait(dongle, 0.05)
+    driver.send_soon(packet(9, 1, b"\x04"))  # fills the queue
+    begun = time.monotonic()
+    driver.send_packet(packet(15, 0, b"ping"))
+    assert time.monotonic() - begun < 2.0
+    assert not ended
 
 
 def test_an_order_to_cut_the_motors_does_not_perish(dongle, driver):

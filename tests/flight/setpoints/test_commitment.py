@@ -25,7 +25,7 @@ from cfplan.flight.setpoints.commitment import (
     splice,
 )
 from cfplan.flight.setpoints.encoding import LEAD, RATE, check_bytes, encode_trajectory
-from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.packets import QUATERNION_PLACE, compress_quaternion, decode
 from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.geometry.min_snap import min_snap
@@ -236,7 +236,7 @@ def at_most(limits, **plan):
     ],
 )
 def test_a_proposal_that_exceeds_a_limit_of_plans_is_refused(committed, spliced, limits, noun, lowered):
-    """One that was planned, certified and signed under others, as a planner with other limits would."""
+    """The proposal was planned, certified and signed under other limits."""
     _, proposal = spliced
     refused = splice(committed, proposal, 110, at_most(limits, **lowered(limits.plan)))
     assert isinstance(refused, Refusal)
@@ -265,7 +265,7 @@ def test_a_proposal_with_a_stop_that_exceeds_what_stops_may_reach_is_refused(com
     assert re.search(rf"^setpoint \d+ of the stop from setpoint \d+ reaches an? {noun} of", refused.detail)
 
 
-# By how much a number in a packet is changed, in thousandths: places, velocities, thrusts and rates that no plan has.
+# By byte, the change of a number in a packet, in thousandths: positions, velocities, thrusts and rates of no plan.
 COLUMNS = {
     1: 100,
     3: 100,
@@ -296,7 +296,28 @@ def test_one_number_of_any_setpoint_of_any_stop_counts(committed, spliced, limit
     assert f"of the stop from setpoint {120 + row}" in refused.detail
 
 
-def test_setpoints_that_only_say_they_are_a_stop_keep_the_limits_of_plans(committed, spliced, limits):
+def turned_round(rows):
+    """Return setpoints (..., 29) whose heading is turned by 180°."""
+    x, y, z, w = decode(rows.reshape(-1, rows.shape[-1])).quaternion.T
+    turned = rows.copy()
+    packed = compress_quaternion(np.column_stack([-y, x, w, -z])).astype("<u4").view(np.uint8)
+    turned[..., QUATERNION_PLACE : QUATERNION_PLACE + 4] = packed.reshape(*rows.shape[:-1], 4)
+    return turned
+
+
+@pytest.mark.parametrize("begin", [0, 40])
+def test_a_heading_that_turns_at_once_is_refused_in_setpoints_and_in_their_stops(committed, spliced, limits, begin):
+    _, proposal = spliced
+    payloads, stops = proposal.payloads.copy(), proposal.stops.copy()
+    payloads[50:52] = turned_round(payloads[50:52])
+    stops[30, begin:60] = turned_round(stops[30, begin:60])
+    for broken in (replace(proposal, payloads=payloads), replace(proposal, stops=stops)):
+        refused = splice(committed, resummed(broken), 110, limits)
+        assert isinstance(refused, Refusal)
+        assert refused.fault in (Fault.LIMITS, Fault.STOPS)
+
+
+def test_setpoints_that_only_claim_to_be_a_stop_are_refused(committed, spliced, limits):
     _, proposal = spliced
     refused = splice(committed, replace(proposal, ending=len(proposal.stops) - 1), 100, limits)
     assert refused.fault is Fault.STOPS

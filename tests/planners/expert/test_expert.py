@@ -63,8 +63,8 @@ def test_the_windows_of_a_path_do_not_depend_on_the_unit_of_s():
     assert [seconds for _, seconds in found] == pytest.approx([found[0][1]] * 3, rel=1e-3)
 
 
-# In the first three windows of a fixed count of intervals saw too little ahead; in the others, of 40 to 100 m, a window
-# begins where nothing leads on, and the path is planned at once.
+# On the first three paths, windows of a fixed number of intervals look too little ahead. On the others, a window begins
+# where no motion continues, and the path is planned as a whole.
 @pytest.mark.parametrize(("length", "seed"), [(60.0, 1), (60.0, 4), (60.0, 5), (40.0, 132), (60.0, 117), (100.0, 9)])
 def test_a_long_path_is_planned_wherever_its_windows_meet(length, seed):
     path = path_of_length(length, "10x10x10", seed)

@@ -15,7 +15,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
-from cfplan.recording.importers import usd_log
 from cfplan.recording.importers.formats import find_importer, read_log
 
 COUNT = 30
@@ -111,6 +110,15 @@ def test_mocap_and_estimate_are_two_subjects(tmp_path):
     assert_same(estimate, position, rotations)
 
 
+def test_kinds_of_records_of_one_name_are_all_read(tmp_path):
+    rows, position, rotations = estimate_rows()
+    file = tmp_path / "log00"
+    file.write_bytes(usd(ESTIMATE, rows, name="estTDOA"))
+    log = read_log(file)
+    assert [subject.name for subject in log.subjects] == ["estimate at estTDOA"]
+    assert_same(log.subjects[0], position, rotations)
+
+
 @pytest.mark.parametrize("lost", [4, 5, 20, 60])
 def test_a_microsd_log_that_lost_power_is_read_as_far_as_it_goes(tmp_path, lost):
     rows, position, _ = estimate_rows()
@@ -123,16 +131,6 @@ def test_a_microsd_log_that_lost_power_is_read_as_far_as_it_goes(tmp_path, lost)
     found = log.subjects[0].position
     assert len(found) == COUNT - math.ceil((lost - 4) / 38)
     np.testing.assert_allclose(found, position[: len(found)], atol=1e-6)
-
-
-@pytest.mark.parametrize("block", [7, 100])
-def test_a_microsd_log_of_many_blocks_is_read_like_one_of_few(tmp_path, block):
-    rows, position, rotations = estimate_rows()
-    file = tmp_path / "log00"
-    file.write_bytes(usd(ESTIMATE, rows))
-    log = usd_log.read(file, block=block)
-    assert not log.truncated
-    assert_same(log.subjects[0], position, rotations)
 
 
 @settings(deadline=None, max_examples=80)
@@ -496,4 +494,4 @@ def test_the_format_is_told_by_content_whatever_the_name(tmp_path):
         (b"SQLite format 3\0", "ROS bag"),
     ):
         file.write_bytes(content)
-        assert find_importer(file).name == name
+        assert name == find_importer(file).FORMAT

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
-from cfplan.recording.importers import vicon_csv
 from cfplan.recording.importers.formats import read_log
 from cfplan.recording.importers.vicon_header import Rotations
 
@@ -103,6 +102,13 @@ def test_blank_lines_line_ends_and_byte_order_marks_change_nothing(tmp_path, bla
     wanted = poses()
     log = read_log(write(tmp_path / "log", {"cf1": ("quaternion", wanted)}, blank=blank, end=end))
     assert_same(log.subjects[0], wanted)
+
+
+def test_decimal_commas_are_known_also_where_the_first_frame_sees_nothing(tmp_path):
+    position, rotations, seen = poses()
+    seen[0] = False
+    file = write(tmp_path / "log", {"cf1": ("quaternion", (position, rotations, seen))}, delimiter=";", point=",")
+    assert_same(read_log(file).subjects[0], (position, rotations, seen))
 
 
 def test_zeros_all_along_are_an_occlusion(tmp_path):
@@ -222,22 +228,6 @@ def test_what_is_wrong_is_named_with_its_place(tmp_path, text, message, line):
         read_log(file)
     assert caught.value.where == (f"{file}:{line}" if line else str(file))
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("block", [150, 1000, 4000])
-def test_a_file_of_many_blocks_is_read_like_one_of_few(tmp_path, block):
-    wanted = {"cf1": ("quaternion", poses()), "gate": ("euler", poses(seed=1))}
-    file = write(tmp_path / "log", wanted)
-    for subject in vicon_csv.read(file, block=block).subjects:
-        assert_same(subject, wanted[subject.name][1])
-    file.write_text(file.read_text()[:-60])
-    assert vicon_csv.read(file, block=block).truncated
-    lines = file.read_text().splitlines(keepends=True)
-    lines[30] = lines[30].replace(",0,", ",zero,", 1).replace(".", "!", 1)
-    file.write_text("".join(lines))
-    with pytest.raises(InputError, match="not a number") as caught:
-        vicon_csv.read(file, block=block)
-    assert caught.value.where == f"{file}:31"
 
 
 def test_a_subject_that_stands_twice_is_read_once_and_said(tmp_path):

@@ -348,6 +348,19 @@ def test_only_this_machine_is_heard_unless_told(station):
         assert link._socket.getsockname()[0] == "0.0.0.0"
 
 
+def test_nobody_but_the_ground_station_stops_a_flight(station, link):
+    station.listen(0.1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:  # as any user of this machine may open
+        other.bind(("127.0.0.1", 0))
+        other.sendto(packed(long(TERMINATE, 1)), station.vehicle)
+        station.clock.sleep(0.3)
+        assert link.orders() == []
+        assert link.heard == 0
+        assert station.clock.readable([other], 0.0) == []
+    assert station.command(TERMINATE, 1).result == common.MAV_RESULT_ACCEPTED
+    assert link.orders() == [Order.CUT]
+
+
 # the log
 
 

@@ -30,7 +30,7 @@ class DirectDriver(CRTPDriver):
     vehicle: VirtualCrazyflie
     silent = False
     guest = b""  # a packet that another client sends at each step: by the vehicle's time, which goes faster than ours
-    null = pack(Port.LINK, 3, b"")  # at each step, as cflib's pings are too rare by that time for a connection to last
+    null = pack(Port.LINK, 3, b"")  # sent at each step: cflib's pings are too rare by that time to keep the connection
 
     def connect(self, uri, statistics, error):
         if not uri.startswith("direct://"):

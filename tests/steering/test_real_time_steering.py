@@ -1,0 +1,49 @@
+"""Threads of the main process in a steered flight: none of them fails silently."""
+
+import pickle
+from contextlib import nullcontext
+from unittest.mock import Mock
+
+import pytest
+from waiting import until
+
+from cfplan.errors import CfplanError
+from cfplan.preparation.air_planner import PathAnswer, PathVerdict
+from cfplan.preparation.steps import ignore_steps
+from cfplan.steering import real_time_steering
+from cfplan.steering.flight_in_progress import Listeners
+from cfplan.steering.real_time_steering import RealTimeSteering
+
+
+def cannot_be_read():
+    raise pickle.UnpicklingError("truncated")
+
+
+def cannot_be_heard(_):
+    raise ZeroDivisionError
+
+
+@pytest.mark.parametrize(
+    ("answers", "listen", "fault"),
+    [
+        (cannot_be_read, lambda _: None, "UnpicklingError"),
+        (lambda: [PathAnswer(1, PathVerdict.REFUSED)], cannot_be_heard, "ZeroDivisionError"),
+    ],
+)
+def test_a_fault_in_hearing_the_planner_lands_the_vehicle_and_is_said(monkeypatch, answers, listen, fault):
+    planner = Mock(ready=True, alive=True, answers=lambda _: answers())
+
+    def fly_until_an_order(*_, more_orders, **__):
+        given = []
+        assert until(lambda: given.extend(more_orders()) or given)
+        return given
+
+    monkeypatch.setattr(real_time_steering, "StartingVehicle", lambda *_: nullcontext(Mock()))
+    monkeypatch.setattr(real_time_steering, "AirPlanner", lambda *_: nullcontext(planner))
+    monkeypatch.setattr(real_time_steering, "fly", fly_until_an_order)
+    flight = RealTimeSteering("sim://0", None, Mock(), ignore_steps, keys=False)
+    flight.start(Mock(), Mock(), Listeners(lambda _: None, listen))
+    assert until(lambda: flight.outcome is not None)
+    flight.close()
+    assert isinstance(flight.outcome, CfplanError)
+    assert fault in str(flight.outcome)
