@@ -24,16 +24,23 @@ def _without_middle(place: str) -> str:
 
 
 class ExitCode(IntEnum):
-    """How a command ends."""
+    """How a command ends: the code that the shell sees, and its meaning."""
 
-    OK = 0
-    USAGE = 2
-    INFEASIBLE = 3
-    NOT_CERTIFIED = 4  # certificate or dry run failed
-    PREFLIGHT = 5
-    ENDED_BY_OPERATOR = 6
-    ENDED_BY_SAFETY = 7
-    LINK_LOST = 8
+    meaning: str
+
+    def __new__(cls, code: int, meaning: str = "") -> "ExitCode":
+        member = int.__new__(cls, code)
+        member._value_, member.meaning = code, meaning
+        return member
+
+    OK = 0, "ok"
+    USAGE = 2, "a file, an option or the set-up is wrong"
+    INFEASIBLE = 3, "no flight keeps the limits"
+    NOT_CERTIFIED = 4, "certificate, dry run or link loss failed"
+    PREFLIGHT = 5, "a preflight check failed; nothing has flown"
+    ENDED_BY_OPERATOR = 6, "the operator ended the flight"
+    ENDED_BY_SAFETY = 7, "a safety rule ended the flight"
+    LINK_LOST = 8, "no connection to the vehicle or to motion capture, or the link was lost"
 
 
 class CfplanError(Exception):

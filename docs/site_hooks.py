@@ -1,10 +1,11 @@
-"""Lets the site show what lies outside docs/: README and changes as pages, and every file that pages link to."""
+"""Adds to the site README, the changes, every file outside docs/ that pages link to, and the tables of the code."""
 
 import posixpath
 import re
 from pathlib import Path
 from typing import Any
 
+from code_tables import rendered  # beside this file
 from mkdocs.structure.files import File, Files
 
 REPOSITORY = Path(__file__).parent.parent
@@ -27,8 +28,8 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Lead the links of docs/ that leave it to what on_files added, and show commands as a shell's."""
-    uri = page.file.src_uri
+    """Render the tables of the code, lead the links of docs/ that leave it to what on_files added, mark commands."""
+    uri, markdown = page.file.src_uri, rendered(markdown)
     text = markdown if uri in PAGES.values() else _with_links_led(markdown, f"docs/{uri}", uri)
     return COMMANDS.sub(_as_shell, text + "\n")
 

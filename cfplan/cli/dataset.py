@@ -30,7 +30,7 @@ def _box(text: str) -> tuple[float, ...]:
     except ValueError:
         sides = ()
     if len(sides) != 3:
-        raise click.BadParameter(f"{text!r} is not of the form 4.5x8x2")
+        raise click.BadParameter(f"{text!r} is not a box: write length x width x height in metres, as 4.5x8x2")
     return sides
 
 
@@ -40,7 +40,7 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
     except ValueError:
         bounds = ()
     if len(bounds) != 2:
-        raise click.BadParameter(f"{text!r} is not of the form 3-6")
+        raise click.BadParameter(f"{text!r} is not a range: write the smallest and the largest number, as 3-6")
     return bounds
 
 

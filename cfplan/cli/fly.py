@@ -151,10 +151,12 @@ def _print_result(prepared: "Prepared", flown: "RecordedFlight", as_json: bool) 
         click.echo(f"report: cfplan report {shlex.quote(folder)}")
         if summary["deviation_grows_with_speed"]:
             click.echo("the deviation grows with speed: fly flights/identify.yaml, then `cfplan identify` its record")
+    hint = why_late(outcome.exit_code, summary) or outcome.hint
+    reason = f"{outcome.reason} (hint: {hint})" if hint else outcome.reason
     if outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:  # as asked: no error
-        click.echo(f"{styled('ended:', 'yellow')} {outcome.reason}", err=True)
+        click.echo(f"{styled('ended:', 'yellow')} {reason}", err=True)
     elif outcome.exit_code is not ExitCode.OK:
-        click.echo(f"{styled('error:', 'red')} {outcome.reason}{why_late(outcome.exit_code, summary)}", err=True)
+        click.echo(f"{styled('error:', 'red')} {reason}", err=True)
 
 
 def why_late(exit_code: ExitCode, summary: dict[str, Any]) -> str:
@@ -163,8 +165,8 @@ def why_late(exit_code: ExitCode, summary: dict[str, Any]) -> str:
     if exit_code is not ExitCode.ENDED_BY_SAFETY or late is None or late < BUSY:
         return ""
     return (
-        f" (hint: setpoints were sent up to {1e3 * late:.0f} ms late: this computer was busy, which may be the cause; "
-        "run nothing else on it)"
+        f"setpoints were sent up to {1e3 * late:.0f} ms late: this computer was busy, which may be the cause; "
+        "run nothing else on it"
     )
 
 

@@ -96,7 +96,9 @@ def warm_up(safety_file: Path, processes: int) -> None:
         for worker in workers:
             worker.stop()
     if any(worker.process.returncode for worker in workers):
-        raise click.ClickException("compiling failed")
+        raise click.ClickException(
+            "compiling failed: see `cfplan doctor`; flights work without it, and plan more slowly"
+        )
     click.echo(f"compiled in {time.perf_counter() - begun:.0f} s by {processes} processes", err=True)
 
 

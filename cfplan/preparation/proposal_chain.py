@@ -23,7 +23,7 @@ from cfplan.preparation.replan import HeldFlight, Replanned, accepted
 from cfplan.preparation.request_queue import RequestQueue
 
 NO_ANSWER = "the pilot does not answer; where it still accepts what was proposed last, that is flown"
-_ANSWER_WITHIN = 1.0  # s in which a pilot answers; what comes later counts as well
+PILOT_ANSWER_TIMEOUT = 1.0  # s in which a pilot answers; what comes later counts as well
 _LOOK_SOON = 0.0005  # s, until it is seen whether what is waited for is simulated
 
 
@@ -111,7 +111,7 @@ class ProposalChain:
 
     def wait_for_answer(self, *, or_request: bool = False) -> PilotAnswer | None:
         """Wait for the pilot's answer to a proposal, or for a request; None where the answer does not come soon."""
-        return self.read(_ANSWER_WITHIN, or_request=or_request)
+        return self.read(PILOT_ANSWER_TIMEOUT, or_request=or_request)
 
     def propose_meanwhile(self, proposed: Proposed) -> None:
         """Send a proposal, which counts as accepted from now on."""

@@ -39,7 +39,7 @@ from cfplan.steering.recorded_steering import SteeringRecord, answer_text
 
 MOST_WAYPOINTS = 200  # of a request
 _TAKE_OFF_WITHIN = 120.0  # s, preflight and its waits included
-_ANSWER_WITHIN = 15.0  # s, after which a planner does not answer
+PLANNER_ANSWER_TIMEOUT = 15.0  # s, after which a planner does not answer
 _LAND_WITHIN = 120.0  # s
 _FLYING = (Phase.STREAM, Phase.HOLD)
 
@@ -215,11 +215,11 @@ class SteeredVehicle:
 
     def answer_to(self, number: int) -> PathAnswer:
         """Wait for the answer to a request and return it; where the planner does not answer, one that says so."""
-        self._flight.wait(lambda: number in self._answers, _ANSWER_WITHIN)
+        self._flight.wait(lambda: number in self._answers, PLANNER_ANSWER_TIMEOUT)
         answer = self._answers.get(number)
         if answer is None:
             self._require_flying()
-            answer = PathAnswer(number, PathVerdict.LATE, "the planner does not answer", seconds=_ANSWER_WITHIN)
+            answer = PathAnswer(number, PathVerdict.LATE, "the planner does not answer", seconds=PLANNER_ANSWER_TIMEOUT)
             self._hear_answer(answer)
         self._unread = [other for other in self._unread if other.number != number]
         return answer
@@ -379,5 +379,8 @@ def _ended(outcome: FlightOutcome) -> FlightEndedError:
             "; ".join(failed), where="preflight", hint="; ".join(hints), exit_code=outcome.exit_code
         )
     return FlightEndedError(
-        outcome.reason, where="flight", hint="the record tells what happened", exit_code=outcome.exit_code
+        outcome.reason,
+        where="flight",
+        hint=outcome.hint or "the record tells what happened",
+        exit_code=outcome.exit_code,
     )

@@ -128,7 +128,8 @@ def _ask_until_the_end(vehicle: SteeredVehicle, lines: LineSource, waiting: list
     """Make the requests in lines until the lines or the flight end; those that are `waiting` are made together."""
     while not lines.ending:
         if vehicle.outcome is not None:
-            raise FlightEndedError(vehicle.outcome.reason, where="flight", hint="the record tells what happened")
+            hint = vehicle.outcome.hint or "the record tells what happened"
+            raise FlightEndedError(vehicle.outcome.reason, where="flight", hint=hint)
         try:
             line = lines.next(0.0 if waiting else _PATIENCE)
         except EOFError:

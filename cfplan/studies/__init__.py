@@ -3,9 +3,9 @@
 Studies: bench, feasibility, scaling, learned, unseen_limits, ablation, proposals, long_paths, hard_paths; flights,
 dry_runs, exports, lateness, latency, faults, random_faults, link_losses, giving_way, identification, steering, horizon,
 physics; in paper/ the paper's tables. They stand on result, provenance, machine and docs_tables (what a study returns,
-and where it goes), items and time_left (how its parts are worked through), error_tables, error_texts (docs/errors.md)
-and time_outs (docs/what-breaks.md), trials (one planner on one path), adversarial_paths, real_time and sleeper (flights
-in the virtual lab), fault_scenarios (the faults), flown_sequence (what a steered flight streamed).
+and where it goes), items and time_left (how its parts are worked through), trials (one planner on one path),
+adversarial_paths, real_time and sleeper (flights in the virtual lab), fault_scenarios (the faults), flown_sequence
+(what a steered flight streamed).
 """
 
 __all__ = [

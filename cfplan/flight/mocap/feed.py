@@ -18,7 +18,7 @@ from cfplan.flight.real_time import use_ordinary_scheduling
 _CHUNK = 1 << 16  # bytes
 _CHECK_PERIOD = 0.05  # s between checks of the child
 _LONGEST_SILENCE = CONNECT_ALARM + 1.0  # s, after which a child is killed that the kernel's alarm did not end
-_BACKOFF = 0.2  # s before a new child
+RESTART_BACKOFF = 0.2  # s before a new child
 
 
 class Feed:
@@ -140,7 +140,7 @@ class Feed:
             if self._process is not None and self._process.poll() is None and not self._is_silent():
                 continue
             self._end_child()
-            if self._closed.wait(_BACKOFF):
+            if self._closed.wait(RESTART_BACKOFF):
                 return
             self.restarts += 1
             try:

@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 from cfplan.errors import ExitCode
 from cfplan.flight.mocap.poses import Pose
+from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
 from cfplan.flight.pilot.health import FRESH, GONE, LOG_GONE, UPLINK_GONE, Health
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.outcome import Rung
@@ -19,15 +20,6 @@ from cfplan.safety.space import inside
 LATEST_SETPOINT = 0.25  # s that a setpoint may be late; the vehicle stops following after 0.5 s
 DISAGREEMENT_FACTOR = 5.0  # times preflight's limit that estimate and pose may be apart in the air
 FALLEN = 0.15  # m below its setpoint, of a vehicle on the floor that got there without being asked
-
-
-@dataclass(frozen=True, slots=True)
-class Abort:
-    """A reason to leave the plan, and how."""
-
-    rung: Rung
-    exit_code: ExitCode
-    text: str
 
 
 @dataclass(slots=True)
@@ -77,34 +69,33 @@ class AbortMonitor:
         yield from self._motion(observation)
         yield from self._fallen(observation)
         if observation.late > LATEST_SETPOINT:
-            yield safety_abort(Rung.BRAKE, f"a setpoint was {observation.late:.2f} s late")
+            yield AbortReason.LATE_SETPOINT.abort(Rung.BRAKE, seconds=observation.late)
 
     def _silence(self, observation: Observation) -> Abort:
         """Return the abort that the present health calls for; its text names the most important silent source."""
         health, pose = observation.health, observation.pose
         rung, age_brake = health.reaction.rung, self._limits.pose.age_brake
         if health.uplink is GONE:
-            return safety_abort(rung, f"the vehicle has acknowledged nothing for {UPLINK_GONE:g} s")
+            return AbortReason.UPLINK_GONE.abort(rung, seconds=UPLINK_GONE)
         if health.poses is not FRESH and pose is None:
-            return safety_abort(rung, "there is no pose")
+            return AbortReason.NO_POSE.abort(rung)
         if health.poses is not FRESH and pose is not None:
             age, why = observation.now - pose.time, observation.pose_fault
             if age <= age_brake:
-                return safety_abort(rung, f"no pose goes to the vehicle: {why or f'they come {age:.2f} s late'}")
-            bracket = f" ({why})" if why else ""
-            return safety_abort(rung, f"the last good pose is {age:.2f} s old{bracket}")
+                return AbortReason.POSE_NOT_SENT.abort(rung, reason=why or f"they come {age:.2f} s late")
+            return AbortReason.POSE_OLD.abort(rung, seconds=age, reason=f" ({why})" if why else "")
         silent = " and ".join(name for name in ("estimate", "status") if getattr(health, name) is GONE)
-        return safety_abort(rung, f"the vehicle's log of its {silent} has been silent for {LOG_GONE:g} s")
+        return AbortReason.LOG_GONE.abort(rung, log=silent, seconds=LOG_GONE)
 
     def _vehicle(self, observation: Observation) -> Iterator[Abort]:
         if observation.status is None:
             return
         for bit, fault in FAULTS.items():
             if observation.status.supervisor & bit:
-                yield safety_abort(Rung.CUT, f"the vehicle {fault}")
+                yield AbortReason.SUPERVISOR_FAULT.abort(Rung.CUT, fault=fault)
         voltage = self._loaded_voltage(observation.status)
         if voltage < self._limits.battery.under_load:
-            yield safety_abort(Rung.LAND, f"the battery is down to {voltage:.2f} V")
+            yield AbortReason.BATTERY_LOW.abort(Rung.LAND, volts=voltage)
 
     def _loaded_voltage(self, status: VehicleStatus) -> float:
         """Return the voltage, V, averaged with a time constant of under_load_seconds."""
@@ -120,10 +111,10 @@ class AbortMonitor:
         limits = self._limits.flight
         if observation.pose is not None:
             beyond = self._beyond_fence(observation.pose.position)
-            yield _rung(limits.fence, 0.0 if inside(beyond) else beyond, "{:.2f} m beyond the fence")
+            yield _ladder_abort(limits.fence, 0.0 if inside(beyond) else beyond, AbortReason.BEYOND_FENCE)
             if observation.wanted is not None:
                 deviation = math.dist(observation.pose.position, observation.wanted)
-                yield _rung(limits.deviation, deviation, "{:.2f} m from the setpoint")
+                yield _ladder_abort(limits.deviation, deviation, AbortReason.DEVIATION)
         estimate = observation.estimate
         if (
             observation.pose is not None
@@ -133,12 +124,14 @@ class AbortMonitor:
         ):
             apart = math.dist(observation.pose.position, estimate.position)
             if apart > DISAGREEMENT_FACTOR * self._limits.pose.agreement:
-                yield safety_abort(Rung.BRAKE, f"pose and estimate are {apart:.2f} m apart")
+                yield AbortReason.ESTIMATE_DISAGREES.abort(Rung.BRAKE, metres=apart)
         for quantity in ON_LADDER:
             measured, exceeded = MEASURED[quantity.ladder](observation), _NO_ABORT
             if measured is not None:
-                text = f"{quantity.name} of {{:.1f}} {quantity.unit}"
-                exceeded = _rung(getattr(limits, quantity.ladder), math.hypot(*measured), text)
+                exceeded = _ladder_abort(
+                    getattr(limits, quantity.ladder), math.hypot(*measured), AbortReason.MOTION_LIMIT,
+                    quantity=quantity.name, unit=quantity.unit,
+                )  # fmt: skip
             yield self._lasting(quantity.name, observation.now, exceeded)
 
     def _fallen(self, observation: Observation) -> Iterator[Abort]:
@@ -148,7 +141,7 @@ class AbortMonitor:
             return
         floor, below = self._limits.space.low[2], asked[2] - estimate.position[2]
         if estimate.position[2] < floor < asked[2] and below > FALLEN:  # landings ask for places beneath the floor
-            yield safety_abort(Rung.CUT, f"it is on the floor without poses, {below:.2f} m below its setpoint")
+            yield AbortReason.FALLEN.abort(Rung.CUT, metres=below)
 
     def _beyond_fence(self, position: Triple) -> float:
         """Return how far, m, a position is beyond the space less its margin; the floor does not count."""
@@ -162,37 +155,32 @@ class AbortMonitor:
             self._since.pop(name, None)
             return abort
         since = self._since.setdefault(name, now)
-        return abort if now - since >= self._limits.flight.patience else Abort(Rung.NONE, abort.exit_code, abort.text)
+        return abort if now - since >= self._limits.flight.patience else _NO_ABORT
 
 
 def ordered(order: Order | None, *, main_gone: bool) -> Abort | None:
     """Return an abort for an operator command or the loss of the main process; both also count on the ground."""
     if order is Order.CUT:
-        return Abort(Rung.CUT, ExitCode.ENDED_BY_OPERATOR, "the operator cut the motors")
+        return AbortReason.OPERATOR_CUT.abort(Rung.CUT)
     if order is Order.LAND:
-        return Abort(Rung.LAND, ExitCode.ENDED_BY_OPERATOR, "the operator ended the flight")
-    return safety_abort(Rung.LAND, "the main process is gone") if main_gone else None
-
-
-def safety_abort(rung: Rung, text: str) -> Abort:
-    """Return an abort that counts as ended by a safety rule."""
-    return Abort(rung, ExitCode.ENDED_BY_SAFETY, text)
+        return AbortReason.OPERATOR_LAND.abort(Rung.LAND)
+    return AbortReason.MAIN_PROCESS_GONE.abort(Rung.LAND) if main_gone else None
 
 
 def fault_abort(error: Exception, rung: Rung = Rung.LAND) -> Abort:
     """Return the abort for a fault of this program or an unexpected error."""
-    return safety_abort(rung, f"fault in the pilot: {error!r}")
+    return AbortReason.PILOT_FAULT.abort(rung, error=error)
 
 
-_NO_ABORT = safety_abort(Rung.NONE, "")
+_NO_ABORT = Abort(Rung.NONE, ExitCode.OK, "")
 
 
-def _rung(ladder: Ladder, value: float, text: str) -> Abort:
-    """Return the abort of a measured value, and write the value into the text.
+def _ladder_abort(ladder: Ladder, value: float, reason: AbortReason, **texts: str) -> Abort:
+    """Return the abort of a measured value, with the value in its message.
 
     Not a number means that the measurement cannot be trusted: land.
     """
     if value <= ladder.brake:
         return _NO_ABORT
     rung = Rung.CUT if value > ladder.cut else Rung.LAND if value > ladder.land or math.isnan(value) else Rung.BRAKE
-    return safety_abort(rung, text.format(value))
+    return reason.abort(rung, value=value, **texts)

@@ -27,6 +27,7 @@ class FlightHistory:
         self.first_setpoint = 0.0  # s, when the plan's first setpoint was due; 0 before
         self.stopped_at = 0.0  # s, when the plan was left for a stop; 0 where it was not
         self.rung = Rung.NONE  # how far down the abort ladder it went
+        self.hint = ""  # what to do about the reason that ended the flight
 
     def enter(self, phase: Phase) -> None:
         """Note and report that a phase begins now."""
@@ -52,5 +53,6 @@ class FlightHistory:
             lateness=Lateness.of(self.late, self.skipped),
             deviation=Deviation.of([sample for sample in self.off_plan if sample[0] <= ends]),
             settled_after=settle_time([(t - ends, off) for t, off in self.off_plan if t > ends], SETTLED_WITHIN),
+            hint=self.hint,
             end_position=last_pose.position if last_pose is not None else (math.nan, math.nan, math.nan),
         )

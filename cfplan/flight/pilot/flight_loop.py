@@ -21,7 +21,8 @@ from cfplan.flight.mocap.pose_gate import PoseGate
 from cfplan.flight.mocap.pose_predictor import FARTHEST, PosePredictor
 from cfplan.flight.mocap.pose_steps import SMALLEST, PoseSteps
 from cfplan.flight.mocap.poses import Pose, PoseSource
-from cfplan.flight.pilot.abort_monitor import Abort, AbortMonitor, Observation, fault_abort, ordered
+from cfplan.flight.pilot.abort_monitor import AbortMonitor, Observation, fault_abort, ordered
+from cfplan.flight.pilot.abort_reasons import Abort
 from cfplan.flight.pilot.deadlines import Deadlines
 from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.health import FRESH, GONE, UPLINK_GONE, Descent, Health, HealthMonitor

@@ -13,7 +13,8 @@ stop once its setpoint is on the floor, the motors stop at once: by an estimate 
 import math
 from collections.abc import Callable
 
-from cfplan.flight.pilot.abort_monitor import FALLEN, safety_abort
+from cfplan.flight.pilot.abort_monitor import FALLEN
+from cfplan.flight.pilot.abort_reasons import AbortReason
 from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
 from cfplan.flight.pilot.health import FRESH, Descent
 from cfplan.flight.pilot.outcome import Rung
@@ -31,9 +32,9 @@ _STANDS_FOR = 0.3  # s
 _STANDS_WITHIN = 0.015  # m, the range of the heights of a standing body's poses
 _SETTLE = 0.3  # s at the end of a descent before the motors stop
 _BLIND_BENEATH = 2.0  # m below the floor that setpoints sink to without poses, so that their time ends first
-_BLIND_FOR = 3.0  # s without poses after which the motors stop, as the estimate may be metres off
+MAX_BLIND_LANDING = 3.0  # s without poses after which the motors stop, as the estimate may be metres off
 _CLEAR = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
-_SEEN_FOR = 0.2  # s of fresh poses, so several of them, after which they are trusted again
+POSES_TRUSTED_AFTER = 0.2  # s of fresh poses, so several of them, after which they are trusted again
 MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
 _LOOK_AGAIN = 0.05  # s
 _BENEATH = 0.3  # m below the floor: an estimate that has the vehicle there is worth nothing
@@ -80,7 +81,7 @@ class Landing:
             else:
                 self._descend()
         if not stop_motors(self._loop):
-            raise AbortRaised(safety_abort(Rung.CUT, "the vehicle does not land"))
+            raise AbortRaised(AbortReason.MOTORS_DO_NOT_STOP.abort(Rung.CUT))
         self._loop.touch_down()
 
     def _descend(self) -> None:
@@ -112,10 +113,10 @@ class Landing:
         def seen() -> bool:
             nonlocal seen_since
             seen_since = min(seen_since, loop.now()) if loop.health.poses is FRESH else math.inf
-            return loop.now() - seen_since > _SEEN_FOR
+            return loop.now() - seen_since > POSES_TRUSTED_AFTER
 
         def over() -> bool:
-            return self._sunk() or loop.blind_for > _BLIND_FOR or self._beneath_by_estimate()
+            return self._sunk() or loop.blind_for > MAX_BLIND_LANDING or self._beneath_by_estimate()
 
         def interrupted() -> bool:
             return seen() or loop.descent is Descent.HELD

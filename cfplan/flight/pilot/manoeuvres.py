@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from cfplan.errors import PreflightError
-from cfplan.flight.pilot.abort_monitor import safety_abort
+from cfplan.flight.pilot.abort_reasons import AbortReason
 from cfplan.flight.pilot.flight_loop import AbortRaised, FlightLoop
 from cfplan.flight.pilot.mission import manoeuvre_time
 from cfplan.flight.pilot.outcome import Rung
@@ -17,7 +17,7 @@ from cfplan.vehicle.rotations import yaw_of
 Place = tuple[float, float, float, float]  # m, m, m, and yaw, rad
 _AT_PLACE_WITHIN = 0.06  # m
 _AT_START_FOR = 0.5  # s
-_READY_WITHIN = 1.0  # s; a vehicle that arms itself is briefly not ready now and then
+READY_TIMEOUT = 1.0  # s; a vehicle that arms itself is briefly not ready now and then
 # m above the floor: when the setpoint has reached the first, the pose must have reached the second
 _ASKED_TO_RISE, _RISEN = 0.12, 0.015
 
@@ -49,7 +49,7 @@ def _require_ready(loop: FlightLoop) -> None:
 
     Raises PreflightError if it does not say so.
     """
-    if loop.until(lambda: loop.status is not None and loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, _READY_WITHIN):
+    if loop.until(lambda: loop.status is not None and loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, READY_TIMEOUT):
         return
     if loop.status is None:
         raise PreflightError("the vehicle does not tell its status", where="vehicle", hint="restart it and try again")
@@ -94,7 +94,7 @@ def climb(loop: FlightLoop, way: Stream, floor: float, height: float, stop: Call
         _stay_down(loop, stop)
     loop.until(lambda: abs(loop.pose().position[2] - height) < _AT_PLACE_WITHIN, 2.0)
     if loop.pose().position[2] - floor < (height - floor) / 2:
-        raise AbortRaised(safety_abort(Rung.LAND, "the vehicle does not rise"))
+        raise AbortRaised(AbortReason.DOES_NOT_RISE.abort(Rung.LAND))
 
 
 def _pose_stays(loop: FlightLoop, way: Stream, floor: float) -> bool:
@@ -139,4 +139,4 @@ def settle_at(loop: FlightLoop, start: Triple) -> None:
 
     if not loop.until(settled, 5.0):
         away = math.dist(loop.pose().position, start)
-        raise AbortRaised(safety_abort(Rung.LAND, f"still {away:.2f} m from the start"))
+        raise AbortRaised(AbortReason.NOT_AT_START.abort(Rung.LAND, metres=away))

@@ -15,7 +15,7 @@ from cfplan.errors import PreflightError
 from cfplan.flight.on_board import commands
 from cfplan.flight.on_board.go_to import STOP_DURATION, go_to_states, motion_of, stop_targets
 from cfplan.flight.on_board.program import OnBoardProgram
-from cfplan.flight.pilot.abort_monitor import safety_abort
+from cfplan.flight.pilot.abort_reasons import AbortReason
 from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
 from cfplan.flight.pilot.health import GONE
 from cfplan.flight.pilot.landing import Landing, stands_by_poses, stop_until_seen
@@ -31,7 +31,7 @@ from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import Level, Phase
 from cfplan.vehicle.rotations import yaw_of
 
-_ANSWERS_WITHIN = 0.3  # s
+ANSWER_TIMEOUT = 0.3  # s
 _KEPT_ALIVE_FOR = 0.4  # s before the motors turn: some packets, one of which starts the watchdog
 _QUICK_DESCENT = 1.5  # m/s², at most about, of a landing without poses, where the estimate goes wrong with time
 _SHORTEST_LANDING = 1.2  # s
@@ -74,7 +74,7 @@ def _ask(
         loop.link.replies.pop(number, None)
         loop.link.command(command)
         sent()
-        loop.until(lambda: number in loop.link.replies, _ANSWERS_WITHIN)
+        loop.until(lambda: number in loop.link.replies, ANSWER_TIMEOUT)
         answer = loop.link.replies.get(number)
         if taken() or (attempt and answer == commands.BUSY):  # the first one came, and its answer did not
             return commands.DONE
@@ -167,7 +167,7 @@ class OnBoardManoeuvres:
     def _require(self, answer: int | None, what: str) -> None:
         """Raise AbortRaised unless the vehicle does as it is asked."""
         if answer != commands.DONE:
-            raise AbortRaised(safety_abort(Rung.LAND, f"the vehicle does not {what}: {_what(answer)}"))
+            raise AbortRaised(AbortReason.COMMAND_FAILED.abort(Rung.LAND, command=what, answer=_what(answer)))
 
     def _way(self, begin: tuple[float, ...], end: tuple[float, ...], duration: float) -> Stream:
         """Return what the commander flies from hover to hover, m and rad, as setpoints, with a stop from each."""
@@ -243,7 +243,7 @@ class OnBoardManoeuvres:
     def _end_landing(self) -> None:
         """Stop the motors. Raises AbortRaised if they do not stop."""
         if not self._stop_motors():
-            raise AbortRaised(safety_abort(Rung.CUT, "the vehicle does not land"))
+            raise AbortRaised(AbortReason.MOTORS_DO_NOT_STOP.abort(Rung.CUT))
         self._loop.touch_down()
 
     def _stop_motors(self) -> bool:

@@ -75,6 +75,7 @@ class FlightOutcome:
     settled_after: float  # s after the last moving setpoint; inf where it did not settle, or was not asked to
     end_position: Triple  # m, where it was last seen
     telemetry_dropped: int = 0  # messages that found the main process too slow
+    hint: str = ""  # what to do about the first reason
 
     def to_dict(self) -> dict[str, Any]:
         """Return how it ended, for JSON; a record's summary measures the flight itself by its streams."""

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from cfplan.errors import CfplanError, ExitCode, LinkError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.poses import PoseSource
-from cfplan.flight.pilot.abort_monitor import Abort, fault_abort
+from cfplan.flight.pilot.abort_monitor import fault_abort
+from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
 from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.flight_loop import LINK_LOST_AFTER, TRIES, AbortRaised, FlightLoop, LinkLost, OrderSource
 from cfplan.flight.pilot.health import FRESH
@@ -24,7 +25,7 @@ from cfplan.flight.radio.link import Link
 from cfplan.flight.radio.supervisor_bits import ARMED, LOCKED
 from cfplan.flight.telemetry import Level, Phase, Telemetry
 
-_LOCKED_WITHIN = 2.5  # s for a cut to arrive; without setpoints the vehicle stops its motors after 2 s by itself
+CUT_TIMEOUT = 2.5  # s for a cut to arrive; without setpoints the vehicle stops its motors after 2 s by itself
 
 
 class Pilot:
@@ -55,7 +56,8 @@ class Pilot:
             exit_code, reason = self._fly()
         except LinkLost:
             why = loop.link.lost or f"nothing was acknowledged for {LINK_LOST_AFTER:g} s"
-            exit_code, reason = ExitCode.LINK_LOST, f"the link was lost: {why}"
+            lost = AbortReason.LINK_LOST.abort(self._history.rung, reason=why)
+            exit_code, reason, self._history.hint = lost.exit_code, lost.text, lost.cure
             self._history.say(Level.ERROR, reason)
         finally:
             self._finish()
@@ -90,7 +92,7 @@ class Pilot:
         """Go down the ladder to the ground; return how the flight counts, and why."""
         loop, flown = self._loop, self._manoeuvres
         descents = [flown.land, flown.stop_and_land]  # the last one is flown; one that fails is removed
-        exit_code, reasons = abort.exit_code, [abort.text]
+        exit_code, reasons, self._history.hint = abort.exit_code, [abort.text], abort.cure
         while True:
             self._history.rung = max(self._history.rung, abort.rung)
             loop.tolerate(self._history.rung)
@@ -127,7 +129,7 @@ class Pilot:
             loop.link.emergency_stop()
             return bool(loop.bits(LOCKED))
 
-        if not locked() and not loop.until(locked, _LOCKED_WITHIN):
+        if not locked() and not loop.until(locked, CUT_TIMEOUT):
             self._history.say(Level.ERROR, "the vehicle does not say that its motors were cut")
         loop.touch_down()
 

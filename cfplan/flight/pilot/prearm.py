@@ -20,7 +20,7 @@ from cfplan.vehicle.rotations import yaw_of
 CONVERGED_WITHIN = 0.03  # m, estimate from pose
 CONVERGED_FOR = 1.0  # s
 _OBSERVED_FOR = 1.0  # s
-_LISTENS_ARMED_FOR = 0.2  # s, some messages of each log
+LISTEN_WHILE_ARMED = 0.2  # s, some messages of each log
 _ALL = 0xFFFF  # bits of supervisor.info
 
 
@@ -178,7 +178,7 @@ def _listen(loop: FlightLoop, duration: float) -> Traffic:
 
 def _listen_while_armed(loop: FlightLoop) -> None:
     """Listen once more: a vehicle that is not armed drops setpoints and shows none. Raises PreflightError."""
-    heard = check_traffic(_listen(loop, _LISTENS_ARMED_FOR))
+    heard = check_traffic(_listen(loop, LISTEN_WHILE_ARMED))
     loop.link.stop_preflight_logs()
     _require(heard, "vehicle")
 

@@ -31,7 +31,7 @@ from cfplan.flight.telemetry import Telemetry
 _SWITCH_INTERVAL = 0.0001  # s; the stream gets the interpreter back after at most this
 _THREAD_PRIORITY = STREAM_PRIORITY // 2
 _POLL_PERIOD = 0.02  # s between two polls for orders that are not keys
-_LANDING_TIME = 60.0  # s that a pilot without a main process has to land
+LANDING_TIMEOUT = 60.0  # s that a pilot without a main process has to land
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class PilotProcess:
         self.orders.close()  # if this end fails, the pilot notices and lands
         self.telemetry.close()
         self.proposals.close()
-        self.process.join(_LANDING_TIME if self._assigned else 0.0)
+        self.process.join(LANDING_TIMEOUT if self._assigned else 0.0)
         if self.process.is_alive():
             self.process.kill()
 

@@ -149,6 +149,7 @@ def test_a_fault_in_the_stream_takes_its_rung(world, fly, fault, rung, exit_code
     assert outcome.exit_code is exit_code
     assert outcome.rung is rung
     assert text in outcome.reason
+    assert bool(outcome.hint) is (fault is not land)  # the operator's landing needs no cure
     assert world.closed
     assert not world.armed
     if rung is Rung.CUT:
@@ -258,6 +259,7 @@ def test_a_lost_link_is_reported_and_nothing_is_closed_in_the_air(world, fly, ph
     outcome = fly()
     assert outcome.exit_code is ExitCode.LINK_LOST
     assert "too many packets lost" in outcome.reason
+    assert "antenna" in outcome.hint
     assert not [call for call in world.calls if call in ("disarm", "emergency stop")]
 
 

@@ -64,6 +64,12 @@ def test_a_vehicle_in_order_passes_every_line(ground):
     assert failures(ground) == []
 
 
+def test_the_page_on_preflight_explains_every_line(ground):
+    page = (Path(__file__).parents[3] / "docs" / "preflight.md").read_text(encoding="utf-8")
+    for check in run_checks(ground):
+        assert check.name in PARAMETER_GROUPS or f"| {check.name} | " in page
+
+
 @pytest.mark.parametrize(
     ("name", "change"),
     [
