@@ -21,7 +21,7 @@ from cfplan.cli.replay import replay
 from cfplan.cli.report import report
 from cfplan.cli.robustness import robustness
 from cfplan.cli.sim import sim
-from cfplan.cli.study import study
+from studies.commands.study import study
 from cfplan.cli.train import train
 from cfplan.cli.virtual import virtual
 from cfplan.errors import CfplanError

@@ -2,7 +2,7 @@
 
 import click
 
-from cfplan.cli.measured import BOXES, NODES, SETS, YAW, Study, count, measured, seed
+from studies.commands.measured import BOXES, NODES, SETS, YAW, Study, count, measured, seed
 
 
 @measured(
@@ -19,6 +19,6 @@ from cfplan.cli.measured import BOXES, NODES, SETS, YAW, Study, count, measured,
 )
 def bench() -> Study:
     """Compare the planners on the same paths, in one run, on one thread."""
-    from cfplan.studies.bench import bench as run
+    from studies.bench import bench as run
 
     return run

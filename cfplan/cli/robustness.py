@@ -33,7 +33,7 @@ def robustness(
     with steps.waiting("loading planners and simulator"):
         from cfplan.geometry.path_file import load_path_file
         from cfplan.machine_code import compile_from_here
-        from cfplan.studies.path_robustness import path_robustness
+        from studies.path_robustness import path_robustness
 
     compile_from_here()  # without, simulating takes minutes
     with steps.step("robustness") as results:

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from stepped_flight import fly_stepped
 
 from cfplan.cli import cfplan as command_line
-from cfplan.cli.study import study
+from studies.commands.study import study
 from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.prepare_flight import prepare_flight
 from cfplan.recording.header import header_of_plan

@@ -6,7 +6,7 @@ import pytest
 
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
-from cfplan.studies.identification import draw_vehicle, fly_drawn
+from studies.identification import draw_vehicle, fly_drawn
 
 REPOSITORY = Path(__file__).parents[2]
 SEED = 4

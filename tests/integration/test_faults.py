@@ -21,9 +21,9 @@ from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
-from cfplan.studies.fault_scenarios import ASKED, ASKED_AFTER, FOR_GOOD, SCENARIOS, Scenario
-from cfplan.studies.faults import fly_scenario, fly_stepped, judge, prepare_held
-from cfplan.studies.random_faults import fly_random, prepare_missions, random_flights, random_scenario, with_silence
+from studies.fault_scenarios import ASKED, ASKED_AFTER, FOR_GOOD, SCENARIOS, Scenario
+from studies.faults import fly_scenario, fly_stepped, judge, prepare_held
+from studies.random_faults import fly_random, prepare_missions, random_flights, random_scenario, with_silence
 from cfplan.vehicle.airframe import GRAVITY
 
 REPOSITORY = Path(__file__).parents[2]

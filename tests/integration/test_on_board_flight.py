@@ -23,8 +23,8 @@ from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.wire import Port
-from cfplan.studies.fault_scenarios import FOR_GOOD, SCENARIOS, Scenario
-from cfplan.studies.faults import fly_scenario
+from studies.fault_scenarios import FOR_GOOD, SCENARIOS, Scenario
+from studies.faults import fly_scenario
 
 REPOSITORY = Path(__file__).parents[2]
 LIMITS = load_limits(REPOSITORY / "safety.yaml")

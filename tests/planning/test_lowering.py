@@ -10,7 +10,7 @@ from cfplan.planners.task import PlanningTask
 from cfplan.planning.lowering import lower_locally
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
-from cfplan.studies.trials import random_path
+from studies.drawn_paths import random_path
 from cfplan.vehicle.trajectory import Trajectory
 
 HARDWARE = LIMIT_SETS["hardware"]

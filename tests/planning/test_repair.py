@@ -16,7 +16,7 @@ from cfplan.planning import repair as repairing
 from cfplan.planning.repair import repair
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
-from cfplan.studies.trials import random_path
+from studies.drawn_paths import random_path
 from cfplan.vehicle.trajectory import Trajectory
 
 HARDWARE = LIMIT_SETS["hardware"]

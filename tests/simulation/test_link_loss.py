@@ -26,8 +26,8 @@ from cfplan.simulation.link_loss import (
     link_loss_within_stops,
     simulate_link_loss,
 )
-from cfplan.studies.fault_scenarios import SCENARIOS
-from cfplan.studies.faults import fly_stepped
+from studies.fault_scenarios import SCENARIOS
+from studies.faults import fly_stepped
 from cfplan.vehicle.airframe import GRAVITY
 
 REPOSITORY = Path(__file__).parents[2]

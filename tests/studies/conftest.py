@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from cfplan.studies import lateness
-from cfplan.studies.lateness import WakeUps, lateness_study
+from studies import lateness
+from studies.lateness import WakeUps, lateness_study
 
 REPOSITORY = Path(__file__).parents[2]
 

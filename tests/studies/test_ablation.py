@@ -6,7 +6,7 @@ import pytest
 from cfplan.geometry.min_snap import min_snap
 from cfplan.learning.features import REFERENCE, node_features, scaled_limits
 from cfplan.safety.limit_sets import LIMIT_SETS
-from cfplan.studies.ablation import speed_alone, without_limits, without_scaling
+from studies.ablation import speed_alone, without_limits, without_scaling
 
 PATH = min_snap([[0, 0, 1], [1.5, 1, 1.4], [1, -1.5, 0.6], [-1, 0.5, 1.2]])
 

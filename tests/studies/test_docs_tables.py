@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.studies.docs_tables import pages_of, with_tables
-from cfplan.studies.provenance import provenance
-from cfplan.studies.result import Column, StudyResult, Table, collect, read_result
+from studies.runner.docs_tables import pages_of, with_tables
+from studies.runner.provenance import provenance
+from studies.runner.result import Column, StudyResult, Table, collect, read_result
 
 pytestmark = pytest.mark.unit
 REPOSITORY = Path(__file__).parents[2]

@@ -1,6 +1,5 @@
 """The study of dry runs: by motor lag, how far the vehicle deviates from plans of flights/."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +7,8 @@ import pytest
 
 from cfplan.preparation.prepare_flight import prepare_flight
 from cfplan.safety.limits_file import load_limits
-from cfplan.studies.dry_runs import dry_runs
+from studies.dry_runs import STUDY, Settings
+from studies.runner.cases import run_study
 
 REPOSITORY = Path(__file__).parents[2]
 SAFETY = REPOSITORY / "safety.yaml"
@@ -17,7 +17,8 @@ MOST = {"line": (1.43, 1.61, 2.00), "random": (1.40, 1.75, 4.21)}  # cm, with al
 
 @pytest.fixture(scope="module")
 def result():
-    return dry_runs([REPOSITORY / "flights" / f"{name}.yaml" for name in MOST], lambda _: SAFETY)
+    files = tuple(REPOSITORY / "flights" / f"{name}.yaml" for name in MOST)
+    return run_study("dry-runs", "studies.dry_runs", STUDY, Settings(files))
 
 
 def test_no_path_deviates_more_than_with_all_rates_sent_as_rates(result):
@@ -33,8 +34,3 @@ def test_it_is_what_preparation_finds_for_a_vehicle_of_that_lag(result):
     assert replace(limits.airframe, motor_time_constant=0.105) == limits.airframe
     found = prepare_flight(REPOSITORY / "flights" / "line.yaml", limits).dry_run.deviation
     assert result.table("dry-runs").rows[0]["deviation_105_ms"] == pytest.approx(found, abs=1e-9)
-
-
-def test_the_result_survives_json(result):
-    (table,) = json.loads(json.dumps(result.to_json(), allow_nan=False))["tables"]
-    assert [row[0] for row in table["rows"]] == ["line", "random"]

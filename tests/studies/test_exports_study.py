@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE
-from cfplan.studies.exports import exports
+from studies.exports import exports
 
 REPOSITORY = Path(__file__).parents[2]
 WORSE = 0.02  # m, by which the deviation is at most larger than that of the same plan, streamed

@@ -12,9 +12,9 @@ from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.outcome import Check, Deviation, FlightOutcome, Rung
 from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent
 from cfplan.simulation.lab.lab import Truth
-from cfplan.studies import flights, real_time
-from cfplan.studies.flights import JudgedFlight, fly_each
-from cfplan.studies.real_time import LATENESS_CHECK, RETRIES, Conditions
+from studies import flights, real_time
+from studies.flights import JudgedFlight, fly_each
+from studies.real_time import LATENESS_CHECK, RETRIES, Conditions
 
 pytestmark = pytest.mark.unit
 REPOSITORY = Path(__file__).parents[2]

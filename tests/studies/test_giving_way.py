@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from cfplan.safety.limits_file import load_limits
-from cfplan.studies.giving_way import giving_way, random_paths
+from studies.giving_way import giving_way, random_paths
 
 REPOSITORY = Path(__file__).parents[2]
 SAFETY = REPOSITORY / "safety.yaml"

@@ -7,10 +7,10 @@ import pytest
 
 from cfplan.errors import InputError
 from cfplan.safety.limit_sets import LIMIT_SETS
-from cfplan.studies import hard_paths as study
-from cfplan.studies.adversarial_paths import FACTORS, FAMILIES, SCALED, adversarial_path
-from cfplan.studies.hard_paths import CERTIFIED, hard_paths
-from cfplan.studies.machine import process_memory
+from studies import hard_paths as study
+from studies.adversarial_paths import FACTORS, FAMILIES, SCALED, adversarial_path
+from studies.hard_paths import CERTIFIED, hard_paths
+from studies.runner.machine import process_memory
 
 USUAL = LIMIT_SETS["hardware"].limits
 

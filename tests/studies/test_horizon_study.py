@@ -9,7 +9,7 @@ import pytest
 
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.studies.horizon import fly_knowing, horizon
+from studies.horizon import fly_knowing, horizon
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"
 CORNERS = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -0.5, 1.0]])

@@ -17,9 +17,9 @@ from waiting import until
 from cfplan.cli import cfplan
 from cfplan.errors import InputError
 from cfplan.learning.workers import SchedulerError
-from cfplan.studies import items as module
-from cfplan.studies import machine
-from cfplan.studies.items import (
+from studies import items as module
+from studies import machine
+from studies.runner.items import (
     HERE,
     Running,
     count_unfinished,
@@ -27,10 +27,10 @@ from cfplan.studies.items import (
     unfinished_file,
     work_through,
 )
-from cfplan.studies.paper.robustness import robustness
-from cfplan.studies.paper.yaw_consistency import yaw_consistency
-from cfplan.studies.provenance import provenance
-from cfplan.studies.result import read_result
+from studies.paper.robustness import robustness
+from studies.paper.yaw_consistency import yaw_consistency
+from studies.runner.provenance import provenance
+from studies.runner.result import read_result
 
 REPOSITORY = Path(__file__).parents[2]
 ITEMS = {name: k for k, name in enumerate("abcd")}

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.studies.latency import Replan, budget_table, first_change, latency_table
-from cfplan.studies.result import StudyResult
+from studies.latency import Replan, budget_table, first_change, latency_table
+from studies.runner.result import StudyResult
 
 
 def rows(*values):

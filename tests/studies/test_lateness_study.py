@@ -13,16 +13,16 @@ from cfplan.errors import ExitCode, InputError
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.outcome import Deviation, FlightOutcome, Rung
 from cfplan.flight.telemetry import SetpointSent
-from cfplan.studies import lateness
-from cfplan.studies.lateness import FIRST, ORDINARY, WakeUps, lateness_table
-from cfplan.studies.real_time import RealTimeFlight
+from studies import lateness
+from studies.lateness import FIRST, ORDINARY, WakeUps, lateness_table
+from studies.real_time import RealTimeFlight
 
 REPOSITORY = Path(__file__).parents[2]
 STILL, LEVEL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 GIVES_UP = """
 import subprocess, sys
-from cfplan.studies.lateness import give_up_priority
+from studies.lateness import give_up_priority
 give_up_priority()
 sys.exit(subprocess.run([sys.executable, "-c",
     "import sys; from cfplan.flight import real_time; sys.exit(real_time.may_use_fifo_scheduling())"]).returncode)

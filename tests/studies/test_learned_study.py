@@ -7,8 +7,8 @@ import pytest
 
 from cfplan.errors import InputError
 from cfplan.safety.limit_sets import LIMIT_SETS
-from cfplan.studies.learned import CONVEX_EVERY, FIGURES, figures_table, fly_unseen, learned_study
-from cfplan.studies.result import Table
+from studies.learned import CONVEX_EVERY, FIGURES, figures_table, fly_unseen, learned_study
+from studies.runner.result import Table
 
 
 @pytest.fixture(scope="module")

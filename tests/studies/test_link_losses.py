@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from cfplan.studies.link_losses import link_losses
+from studies.link_losses import link_losses
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -6,9 +6,9 @@ import math
 import pytest
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.studies import long_paths as study
-from cfplan.studies.long_paths import BESIDE, COLUMNS, long_paths
-from cfplan.studies.result import Table
+from studies import long_paths as study
+from studies.long_paths import BESIDE, COLUMNS, long_paths
+from studies.runner.result import Table
 
 LENGTHS = (20.0, 60.0)
 

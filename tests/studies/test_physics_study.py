@@ -21,7 +21,7 @@ from cfplan.simulation.dynamics.body import (
     step_body,
 )
 from cfplan.simulation.other_bodies import fly_on, identified_body, rotorpy_body
-from cfplan.studies import physics
+from studies import physics
 from cfplan.vehicle.airframes import AIRFRAMES
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cfplan.studies.sleeper import Sleeper
+from studies.sleeper import Sleeper
 
 pytestmark = pytest.mark.slow
 

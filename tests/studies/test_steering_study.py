@@ -11,8 +11,8 @@ from cfplan.preparation.air_planner import Wish
 from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.steering.steered_vehicle import SteeredVehicle
-from cfplan.studies import steering as study
-from cfplan.studies.flown_sequence import judge_sequence
+from studies import steering as study
+from studies.flown_sequence import judge_sequence
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from cfplan.studies.stops import stops
+from studies.stops import stops
 
 ROOT = Path(__file__).parents[2]
 

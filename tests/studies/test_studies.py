@@ -10,11 +10,11 @@ import pytest
 from cfplan.errors import InputError
 from cfplan.planners.solution import Solution, Status
 from cfplan.planning import planners
-from cfplan.studies import feasibility, proposals, scaling, trials
-from cfplan.studies.bench import bench
-from cfplan.studies.machine import this_machine
-from cfplan.studies.result import Column
-from cfplan.studies.trials import quantiles, random_path
+from studies import feasibility, proposals, scaling, trials
+from studies.bench import bench
+from studies.runner.machine import this_machine
+from studies.runner.result import Column
+from studies.trials import quantiles, random_path
 
 pytestmark = pytest.mark.unit
 SMALL = {"boxes": ["4.5x8x2"], "limit_sets": ["hardware"], "planners": ["convex", "minsnap"]}

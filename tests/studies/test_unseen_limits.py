@@ -11,8 +11,8 @@ from cfplan.learning.learned import plan_learned
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.repair import refine, repair
-from cfplan.studies import unseen_limits
-from cfplan.studies.unseen_limits import LIMITS, VEHICLES, WITHIN, Neighbourhoods
+from studies import unseen_limits
+from studies.unseen_limits import LIMITS, VEHICLES, WITHIN, Neighbourhoods
 
 SPEC = DatasetSpec(count=300, seed=5)
 

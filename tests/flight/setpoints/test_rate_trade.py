@@ -27,7 +27,7 @@ from cfplan.planners.baselines.convex import plan_convex
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.repair import repair
 from cfplan.safety.limit_sets import BOXES, LIMIT_SETS
-from cfplan.studies.trials import random_path
+from studies.drawn_paths import random_path
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import rotations_of
 

@@ -18,7 +18,7 @@ from cfplan.planning.planners import default_nodes
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.safety.limits import PlanLimits
-from cfplan.studies.scaling import path_of_length
+from studies.drawn_paths import path_of_length
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory

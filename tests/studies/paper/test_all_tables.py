@@ -6,10 +6,10 @@ from types import MappingProxyType
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.studies.paper import all_tables
-from cfplan.studies.paper.all_tables import QUICK, TABLES, paper_tables
-from cfplan.studies.provenance import provenance
-from cfplan.studies.result import StudyResult, read_result
+from studies.paper import all_tables
+from studies.paper.all_tables import QUICK, TABLES, paper_tables
+from studies.runner.provenance import provenance
+from studies.runner.result import StudyResult, read_result
 
 NOW = replace(provenance(), commit="a" * 40, modified=False)
 

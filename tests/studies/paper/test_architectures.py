@@ -9,10 +9,10 @@ from click.testing import CliRunner
 from cfplan.cli import cfplan
 from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
-from cfplan.studies import machine
-from cfplan.studies.paper.architectures import amid, architectures
-from cfplan.studies.paper.printed import ABOVE_IN_TEXT, ARCHITECTURES, INPUTS
-from cfplan.studies.paper.trials import PaperTrial, planner_row
+from studies import machine
+from studies.paper.architectures import amid, architectures
+from studies.paper.printed import ABOVE_IN_TEXT, ARCHITECTURES, INPUTS
+from studies.paper.trials import PaperTrial, planner_row
 
 
 def trial(row, *, time=5.0, deviation=0.1, planner="LSTM", reason=""):

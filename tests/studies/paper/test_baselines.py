@@ -7,7 +7,7 @@ from cfplan.errors import InputError
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planning.planners import PLANNERS, Finish
 from cfplan.safety.certificate import certify
-from cfplan.studies.paper.baselines import (
+from studies.paper.baselines import (
     ALLOCATION,
     BAYESIAN,
     CONVEX,
@@ -17,8 +17,8 @@ from cfplan.studies.paper.baselines import (
     baselines,
     random_course,
 )
-from cfplan.studies.paper.printed import BASELINES
-from cfplan.studies.paper.trials import paper_task, profile_of, shipped_profile
+from studies.paper.printed import BASELINES
+from studies.paper.trials import paper_task, profile_of, shipped_profile
 from cfplan.vehicle.timing import duration_of
 from cfplan.vehicle.trajectory import Trajectory
 

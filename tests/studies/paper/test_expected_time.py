@@ -7,13 +7,13 @@ from click.testing import CliRunner
 
 from cfplan.cli import cfplan
 from cfplan.errors import InputError
-from cfplan.studies import machine
-from cfplan.studies.items import Running, unfinished_file, work_table, work_through
-from cfplan.studies.paper import expected_time
-from cfplan.studies.paper.all_tables import TABLES
-from cfplan.studies.paper.expected_time import USUALLY_SEEN, WHOLE, ResultState, expected
-from cfplan.studies.provenance import provenance
-from cfplan.studies.result import Column, StudyResult, Table, detail_table
+from studies import machine
+from studies.runner.items import Running, unfinished_file, work_table, work_through
+from studies.paper import expected_time
+from studies.paper.all_tables import TABLES
+from studies.paper.expected_time import USUALLY_SEEN, WHOLE, ResultState, expected
+from studies.runner.provenance import provenance
+from studies.runner.result import Column, StudyResult, Table, detail_table
 
 EARLIER = replace(provenance(), commit="b" * 40)
 

@@ -5,8 +5,8 @@ import pytest
 
 from cfplan.errors import InputError
 from cfplan.planners.baselines.corridors import BOXES, box_corners, corridor_about
-from cfplan.studies.paper.baselines import ALLOCATION, DRAWN, random_course
-from cfplan.studies.paper.figures import (
+from studies.paper.baselines import ALLOCATION, DRAWN, random_course
+from studies.paper.figures import (
     EDGES,
     NETWORKS,
     draw_baselines,
@@ -15,10 +15,10 @@ from cfplan.studies.paper.figures import (
     draw_yaw_consistency,
     write_figures,
 )
-from cfplan.studies.paper.hardware import CERTIFIED, LONG, RAW, SHIPPED, TRACKED
-from cfplan.studies.paper.trials import TOPPQUAD
-from cfplan.studies.paper.yaw_consistency import WAYS, yaw_consistency
-from cfplan.studies.result import StudyResult, detail_table
+from studies.paper.hardware import CERTIFIED, LONG, RAW, SHIPPED, TRACKED
+from studies.paper.trials import TOPPQUAD
+from studies.paper.yaw_consistency import WAYS, yaw_consistency
+from studies.runner.result import StudyResult, detail_table
 
 SEEDS = (60_000, 60_001)
 

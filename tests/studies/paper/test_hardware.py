@@ -7,8 +7,8 @@ import pytest
 from cfplan.errors import CfplanError, InputError
 from cfplan.safety.limits_file import DEFAULTS, load_limits
 from cfplan.safety.space import check_space
-from cfplan.studies.paper import hardware as study
-from cfplan.studies.paper.hardware import (
+from studies.paper import hardware as study
+from studies.paper.hardware import (
     CERTIFIED,
     LIMITS,
     LONG,
@@ -21,7 +21,7 @@ from cfplan.studies.paper.hardware import (
     long_path,
     paper_limits,
 )
-from cfplan.studies.paper.trials import TOPPQUAD
+from studies.paper.trials import TOPPQUAD
 
 USUAL = load_limits(DEFAULTS)
 

@@ -11,9 +11,9 @@ from cfplan.cli import cfplan
 from cfplan.errors import InputError
 from cfplan.geometry.path_file import load_path_file
 from cfplan.safety.limits_file import load_limits
-from cfplan.studies.paper.robustness import robustness
-from cfplan.studies.paper.robustness_tables import SCALES, SHIPPED, SHIPPED_FIXED
-from cfplan.studies.path_robustness import path_robustness
+from studies.paper.robustness import robustness
+from studies.paper.robustness_tables import SCALES, SHIPPED, SHIPPED_FIXED
+from studies.path_robustness import path_robustness
 
 REPOSITORY = Path(__file__).parents[3]
 

@@ -5,8 +5,8 @@ import pytest
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.safety.limit_sets import PAPER
-from cfplan.studies.paper.baselines import random_course
-from cfplan.studies.paper.segment_times import (
+from studies.paper.baselines import random_course
+from studies.paper.segment_times import (
     QUICK_BUDGET,
     bayesian_motion,
     is_followed,

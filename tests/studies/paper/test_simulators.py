@@ -7,9 +7,9 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STILL_AIR, TIME_STEP, pack_body, step_body
 from cfplan.simulation.geometric_flight import fly_geometric, positions_by_both
-from cfplan.studies.paper.simulators import HARDWARE, PLANNED, BodyFlight, bodies_table
-from cfplan.studies.paper.trials import FLOWN, PAPER_LAG, TOPPQUAD, profile_by, trajectory_by
-from cfplan.studies.physics import bodies_for
+from studies.paper.simulators import HARDWARE, PLANNED, BodyFlight, bodies_table
+from studies.paper.trials import FLOWN, PAPER_LAG, TOPPQUAD, profile_by, trajectory_by
+from studies.physics import bodies_for
 
 LAGS = [f"RotorPy, {lag:g} s" for lag in (0.072, 0.005)]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cfplan.studies.paper.yaw_consistency import (
+from studies.paper.yaw_consistency import (
     PENALISED,
     PLAIN,
     WAYS,

@@ -1,0 +1,15 @@
+"""Studies of cfplan: each measures one thing, makes one result with its tables, and is one command.
+
+Run one by `python -m studies NAME`. Studies need a checkout; cfplan itself needs none of them.
+"""
+
+STUDIES = {
+    name.rpartition(".")[2].replace("_", "-"): f"studies.{name}"
+    for name in (
+        "dry_runs", "exports", "faults", "flights", "giving_way", "horizon", "identification", "lateness", "latency",
+        "link_losses", "physics", "planners", "random_faults", "steering", "stops",
+        "paper.architectures", "paper.baselines", "paper.hardware", "paper.inputs", "paper.robustness",
+        "paper.simulators", "paper.yaw_consistency",
+    )
+}  # fmt: skip
+"""The module of each study by its name on the command line."""

@@ -1,0 +1,70 @@
+"""Fly the setpoints of each PATH in the dry run at several motor lags: largest deviation from the plan.
+
+Plans and setpoints are those for the vehicle of safety.yaml, whatever lag the simulated one has.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cfplan.preparation.plan_flight import plan_flight
+from cfplan.preparation.prepare_flight import encode_flight
+from cfplan.simulation.dry_run import dry_run
+from studies.runner.limits import limits_for
+from studies.runner.options import argument
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
+
+LAGS = (0.07, 0.105, 0.13)  # s, time constants of the motors
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which paths are flown."""
+
+    path_files: tuple[Path, ...] = argument()
+
+
+def _key(lag: float) -> str:
+    return f"deviation_{1000 * lag:g}_ms"
+
+
+COLUMNS = (
+    Column("path", "path"),
+    Column("planner", "planner"),
+    Column("duration", "planned", "s", ".2f"),
+    Column("time_lost", "time lost", "%", ".2f", meaning="by giving way to link loss and gaps"),
+    *(Column(_key(lag), f"at {lag:g} s", "cm", ".2f", meaning="largest deviation at that motor lag") for lag in LAGS),
+    Column("saturation", "at a motor's limit", "%", ".2f", meaning=f"fraction of the time, at {LAGS[-1]:g} s"),
+)
+
+
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case a path."""
+    return Work({file.stem: file for file in settings.path_files}, measure)
+
+
+def measure(path_file: Path) -> dict[str, Any]:
+    """Plan a path and fly its setpoints at each of LAGS. Raises what planning and encoding raise."""
+    limits = limits_for(path_file)
+    planned = plan_flight(path_file, limits)
+    encoded, trajectory = encode_flight(planned), planned.plan.trajectory
+    airframes = [replace(limits.airframe, motor_time_constant=lag) for lag in LAGS]
+    flown = [dry_run(encoded, trajectory, airframe, limits.flight) for airframe in airframes]
+    return {
+        "path": path_file.stem,
+        "planner": planned.plan.planner,
+        "duration": planned.duration,
+        "time_lost": planned.plan.time_lost,
+        **{_key(lag): run.deviation for lag, run in zip(LAGS, flown, strict=True)},
+        "saturation": flown[-1].saturation,
+    }
+
+
+def tables(settings: Settings, rows: list[dict[str, Any]]) -> Iterator[Table]:
+    """Yield a line a path."""
+    yield table("dry-runs", "Dry run: largest deviation by motor lag", COLUMNS, rows)
+
+
+STUDY = Study(Settings, work, tables, "flights/line.yaml flights/helix.yaml -o results/dry-runs.json")

@@ -1,0 +1,345 @@
+"""Fly with one fault a flight and judge what the pilot does about it by the truth of the virtual lab.
+
+In the stepped lab (`cfplan.simulation.lab.stepped_lab`) the pilot, the packets, the pose gate, the virtual Crazyflie
+and the virtual cameras are those of a flight in real time; there are no processes and no sockets.
+"""
+
+import math
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cfplan.errors import CfplanError, ExitCode, InputError
+from cfplan.flight.pilot.keys import HeldOrders
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import FlightOutcome, Rung
+from cfplan.flight.pilot.pilot import Pilot
+from cfplan.flight.pilot.proposals import NO_PROPOSALS
+from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry, Triple
+from cfplan.geometry.path_file import load_path_file
+from cfplan.preparation.air_planner import PathAnswer, Wish
+from cfplan.preparation.plan_flight import plan_flight
+from cfplan.preparation.replan import HeldFlight, hold
+from cfplan.preparation.stepped_planner import SteppedPlanner
+from cfplan.recording.header import RecordHeader, header_under
+from cfplan.recording.reader import read_record
+from cfplan.recording.writer import RecordWriter, new_file
+from cfplan.safety.limits import Limits
+from cfplan.simulation.lab.lab import Truth
+from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
+from cfplan.simulation.virtual_crazyflie.supervisor import State
+from studies.fault_scenarios import ASKED, SCENARIOS, Scenario
+from studies.runner.result import Column, StudyResult, Table, detail_table
+
+COLUMNS = (
+    Column("name", "fault"),
+    Column("expected", "must end in", meaning="the rung of the abort ladder that the fault must lead to"),
+    Column("rung", "rung", meaning="the lowest rung that the pilot took; *none*: the flight went on to its end"),
+    Column("reaction", "reacts after", "s", ".2f", meaning="from the fault to the rung"),
+    Column(
+        "off_plan", "off the path", "cm", ".0f",
+        meaning="largest distance of the true position from the planned path, horizontally once landing has begun",
+    ),
+    Column(
+        "off_setpoint", "from the setpoint", "cm", ".0f",
+        meaning="largest distance of the true position from the setpoint of that moment, until landing begins",
+    ),
+    Column(
+        "to_wall", "to the wall", "m", ".2f",
+        meaning="least distance of the true position from walls and ceiling; negative beyond them",
+    ),
+    Column("end", "end", meaning="on the floor, disarmed, and how long all motors were off in the air"),
+    Column("record", "record", meaning="whether it can be read"),
+    Column("why", "why"),
+)  # fmt: skip
+_DOWN = 0.05  # m
+_SETTLING = 0.1  # s in which the supervisor notices that it was disarmed
+_AFTERWARDS = 6.0  # s after the pilot ended, in which the vehicle comes to rest
+_LONGEST = 100.0  # s; a vehicle that is left alone on the floor disarms 30 s after it was armed
+_ARMED = (State.ARMING, State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
+_RUNGS = {f"{rung.name.lower()}:": rung for rung in Rung}
+
+
+class PilotKilled(BaseException):
+    """The pilot's process ends at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultFlight:
+    """One flight with a fault, judged by the truth."""
+
+    name: str
+    expected: str
+    rung: str
+    reaction: float | None  # s from the fault to the rung; None where there was none
+    off_plan: float  # m, largest distance of the true position from the planned path, from landing on horizontally
+    off_setpoint: float  # m, largest distance of the true position from the setpoint, until landing begins
+    to_wall: float  # m, least distance of the true position from walls and ceiling; negative beyond them
+    motors_off: int  # ms with all motors off in the air
+    landed: bool  # on the floor, motors off
+    disarmed: bool
+    readable: bool  # what was recorded can be read
+    reason: str
+    planner: str  # its answer; empty where it was asked nothing or did not answer
+
+    def row(self) -> dict[str, Any]:
+        """Return it by the keys of COLUMNS, with the fields that those are made of."""
+        ends = [text for text, holds in (("landed", self.landed), ("disarmed", self.disarmed)) if holds]
+        without = f", {self.motors_off} ms without motors" if self.motors_off else ""
+        return asdict(self) | {
+            "end": (", ".join(ends) or "in the air") + without,
+            "record": "readable" if self.readable else "not readable",
+            "why": self.planner if self.reason == "landed" else self.reason,
+        }
+
+
+@dataclass(slots=True)
+class SteppedFlight:
+    """What a flight in the stepped lab left behind."""
+
+    outcome: FlightOutcome | None  # None where the pilot was killed, or never flew
+    reason: str
+    truth: Truth
+    struck: float  # s, when the fault began; NaN where it was there from the start, or never began
+    events: list[tuple[float, str]] = field(default_factory=list)
+    answers: list[PathAnswer] = field(default_factory=list)  # of the planner
+    sent: list[tuple[float, Triple]] = field(default_factory=list)  # s, m, each setpoint from the plan's first on
+    landing: float = math.inf  # s, when the last phase of landing began
+    killed: bool = False  # the pilot, in flight or before
+    ended: bool = False  # the pilot, whatever it ended by
+
+
+def fault_table(
+    mission: Mission,
+    path: str,
+    *,
+    scenarios: Iterable[Scenario] = SCENARIOS,
+    held: HeldFlight | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> StudyResult:
+    """Fly every scenario; those with a fault of the planner fly what is `held`, as prepare_held() makes it."""
+    flights, chosen = [], tuple(scenarios)
+    for done, scenario in enumerate(chosen):
+        progress(done, len(chosen))
+        flights.append(fly_scenario(scenario, mission, held=held))
+    progress(len(chosen), len(chosen))
+    table = Table("faults", "Faults at full speed", COLUMNS, tuple(flight.row() for flight in flights))
+    return StudyResult("faults", {"path": path}, (table,), (detail_table("flights", flights),))
+
+
+def prepare_held(source: Path, limits: Limits) -> HeldFlight:
+    """Return the flight along a path file as a planner holds it. Raises what planning raises."""
+    return hold(plan_flight(source, limits).plan, load_path_file(source).waypoints)
+
+
+def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0, *, held: HeldFlight | None = None) -> FaultFlight:
+    """Fly one, with a record, and judge it by the truth. A fault of the planner needs what is held."""
+    if scenario.planner is not None:
+        if held is None:
+            raise InputError(
+                "no planner flies with a mission alone", where=scenario.name, hint="give what prepare_held() returns"
+            )
+        mission = Mission(held.commitment.payloads, held.commitment.stops, mission.limits)
+    lab = _lab(scenario, mission, seed)
+    with tempfile.TemporaryDirectory() as folder:
+        writer = RecordWriter(
+            Path(folder),
+            _header(mission),
+            warn=lambda _: None,
+            open_file=_FullDisk if scenario.disk_full else new_file,
+            clock=lab.clock,
+        )
+        with writer:
+            flown = fly_stepped(scenario, mission, listen=writer.write, lab=lab, held=held)
+        try:
+            readable = len(read_record(Path(folder)).phases.time) > 0
+        except CfplanError:
+            readable = False
+    return judge(scenario, flown, mission, readable)
+
+
+def fly_stepped(
+    scenario: Scenario,
+    mission: Mission,
+    *,
+    listen: Callable[[Telemetry], None] = lambda _: None,
+    seed: int = 0,
+    lab: SteppedLab | None = None,
+    held: HeldFlight | None = None,
+) -> SteppedFlight:
+    """Fly one in a stepped lab, by default a new one with that seed, until everything has come to rest."""
+    lab = lab or _lab(scenario, mission, seed)
+    orders, flown, begin = HeldOrders(), SteppedFlight(None, "", lab.truth(), math.nan), lab.now
+    planner = None
+    if scenario.planner is not None and held is not None:
+        planner = SteppedPlanner(held, mission.limits, lab.clock, flown.answers.append)
+
+    def strike() -> None:
+        flown.struck = lab.now
+        for fault in scenario.faults if not scenario.from_start else ():
+            lab.disturb(fault)
+        orders.worst = scenario.order
+        if planner is not None:
+            planner.fault = scenario.planner
+            planner.request(Wish.REPLACE, [ASKED])
+        if scenario.stall:
+            lab.clock.at(lab.now + scenario.stall_after, lambda: lab.clock.stall(scenario.stall))
+        if scenario.main_killed:
+            lab.clock.at(lab.now + scenario.main_killed_after, lambda: setattr(orders, "gone", True))
+        if scenario.pilot_killed:
+            lab.clock.at(lab.now + scenario.pilot_killed_after, kill)
+
+    def kill() -> None:
+        if flown.ended:
+            return
+        flown.killed = True
+        lab.disturb(RadioFault(RadioFaultKind.DEAD))  # what is left of the pilot's code cannot disarm any more
+        raise PilotKilled
+
+    def hear(message: Telemetry) -> None:
+        if flown.killed:
+            return
+        listen(message)
+        if isinstance(message, Event):
+            flown.events.append((message.time, message.text))
+        elif isinstance(message, SetpointSent):
+            flown.sent.append((message.time, message.position))
+        elif isinstance(message, PhaseEntered):
+            if message.phase is Phase.LAND:
+                flown.landing = message.time
+            if message.phase is scenario.phase and math.isnan(flown.struck):
+                lab.clock.at(message.time + scenario.moment, strike)
+
+    if scenario.from_start:
+        for fault in scenario.faults:
+            lab.disturb(fault)
+    pilot = Pilot(
+        mission,
+        connect=lambda waiting: connect(lab, hear),
+        source=SteppedPoses(lab, mission.limits.pose),
+        report=hear,
+        orders=orders,
+        proposals=planner or NO_PROPOSALS,
+        clock=lab.clock,
+    )
+    try:
+        flown.outcome = pilot.fly()
+        flown.reason = flown.outcome.reason
+    except PilotKilled:
+        flown.reason = "the pilot was killed"
+    except CfplanError as error:
+        flown.reason = str(error)
+    flown.ended = True
+    lab.clock.sleep(_SETTLING)
+    flown.truth = lab.truth()
+    if flown.truth.position[-1, 2] > _DOWN or flown.truth.motor[-1].any():
+        lab.clock.sleep(_AFTERWARDS)
+        flown.truth = lab.truth()
+    while scenario.leaves_alone and flown.truth.supervisor[-1] in _ARMED and lab.now < begin + _LONGEST:
+        lab.clock.sleep(_AFTERWARDS)
+        flown.truth = lab.truth()
+    return flown
+
+
+def _lab(scenario: Scenario, mission: Mission, seed: int) -> SteppedLab:
+    return SteppedLab(mission.limits.airframe, vehicle=scenario.vehicle, cameras=scenario.cameras, seed=seed)
+
+
+def judge(scenario: Scenario, flown: SteppedFlight, mission: Mission, readable: bool) -> FaultFlight:
+    """Judge a flight by the truth."""
+    truth, outcome = flown.truth, flown.outcome
+    rung = outcome.rung if outcome is not None else Rung.NONE
+    reaction = next(
+        (time - flown.struck for time, text in flown.events if time >= flown.struck and _rung_of(text)), None
+    )
+    flew = (
+        outcome is not None and Phase.TAKE_OFF in dict(outcome.phases) and outcome.exit_code is not ExitCode.PREFLIGHT
+    )
+    return FaultFlight(
+        name=scenario.name,
+        expected="no take-off" if scenario.grounded else scenario.rung.name.lower(),
+        rung=rung.name.lower() if flew or flown.killed else "no take-off",
+        reaction=reaction,
+        off_plan=_off_plan(flown, mission),
+        off_setpoint=_off_setpoint(flown, mission),
+        to_wall=float(-_beyond_walls(truth, mission).max()),
+        motors_off=int(truth.off_in_air[-1]),
+        landed=bool(truth.position[-1, 2] < _DOWN and not truth.motor[-1].any()),
+        disarmed=truth.supervisor[-1] not in _ARMED,
+        readable=readable,
+        reason=flown.reason,
+        planner=", ".join(answer.reason or answer.verdict.value for answer in flown.answers),
+    )
+
+
+def _rung_of(text: str) -> Rung | None:
+    return next((rung for name, rung in _RUNGS.items() if text.startswith(name)), None)
+
+
+def _off_plan(flown: SteppedFlight, mission: Mission) -> float:
+    outcome, truth = flown.outcome, flown.truth
+    begin = flown.struck if not math.isnan(flown.struck) else outcome.first_setpoint if outcome is not None else 0.0
+    if outcome is None and (not flown.sent or begin < flown.sent[0][0]):
+        return 0.0
+    if outcome is not None and (not outcome.first_setpoint or begin < outcome.first_setpoint):
+        return 0.0
+    planned = decode(mission.payloads).position
+    after = truth.time >= begin
+    flying = after & (truth.time < flown.landing) & (truth.position[:, 2] > 0.02)
+    down = after & (truth.time >= flown.landing)
+    near = cKDTree(planned).query(truth.position[flying])[0]
+    beside = cKDTree(planned[:, :2]).query(truth.position[down][:, :2])[0]
+    return float(max(near.max(initial=0.0), beside.max(initial=0.0)))
+
+
+def _off_setpoint(flown: SteppedFlight, mission: Mission) -> float:
+    """Return the largest distance in time: a vehicle that is late on its path is off its setpoint."""
+    if not flown.sent:
+        return 0.0
+    sent, truth = np.array([time for time, _ in flown.sent]), flown.truth
+    begin = sent[0] if math.isnan(flown.struck) else max(sent[0], flown.struck)
+    during = (truth.time >= begin) & (truth.time <= min(sent[-1], flown.landing))
+    places = np.array([place for _, place in flown.sent])
+    due = truth.time[during] - mission.lead
+    wanted = np.column_stack([np.interp(due, sent, places[:, axis]) for axis in range(3)])
+    return float(np.linalg.norm(truth.position[during] - wanted, axis=1).max(initial=0.0))
+
+
+def _beyond_walls(truth: Truth, mission: Mission) -> np.ndarray:
+    space = mission.limits.space
+    low, high = np.array(space.low), np.array(space.high)
+    low[2] = -np.inf  # the floor is where it lands
+    return np.maximum(low - truth.position, truth.position - high).max(axis=1)
+
+
+class _FullDisk:
+    """A file on a disk that is full after the header."""
+
+    def __init__(self, path: Path):
+        self._file = path.open("xb", buffering=0)
+        self._left = 200_000
+
+    def write(self, data: bytes, /) -> int | None:
+        if len(data) > self._left:
+            raise OSError(28, "No space left on device")
+        self._left -= len(data)
+        return self._file.write(data)
+
+    def truncate(self, size: int, /) -> int:
+        return self._file.truncate(size)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _header(mission: Mission) -> RecordHeader:
+    path = decode(mission.payloads).position[::5]
+    return header_under(mission.limits, name="fault", uri="stepped://0", path=path, travel_time=mission.motion_ends)

@@ -1,0 +1,156 @@
+"""The commands of `python -m studies`: one for each study, and those that make pages and figures of their results."""
+
+import importlib
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import click
+
+from cfplan.errors import CfplanError, InputError
+from studies import STUDIES
+from studies.runner.cases import Effort, run_study, unfinished_file
+from studies.runner.options import parameters, settings_of
+from studies.runner.result import StudyResult, Table
+from studies.runner.study import Progress, Study
+
+
+class _Studies(click.Group):
+    """Imports a study when it is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of all studies, then of what makes pages of them."""
+        return [*sorted(STUDIES), *sorted(self.commands)]
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        """Return the command of that name. Raises InputError where there is none."""
+        if name in self.commands:
+            return self.commands[name]
+        if name not in STUDIES:
+            near = get_close_matches(name, self.list_commands(ctx), n=1)
+            meant = f"did you mean {near[0]}? " if near else ""
+            raise InputError(
+                f"no study {name!r}", where="studies", hint=f"{meant}known: {', '.join(self.list_commands(ctx))}"
+            )
+        return study_command(name, STUDIES[name])
+
+
+def study_command(name: str, module: str) -> click.Command:
+    """Return the command of the study in a module."""
+    found = importlib.import_module(module)
+    study: Study = found.STUDY
+
+    def run(output: Path | None, workers: int, scheduler: str | None, minutes: float | None, **given: Any) -> None:
+        if output is not None and not output.parent.is_dir():  # before an hour is spent measuring
+            raise InputError("no such folder", where=str(output.parent), hint="make it first")
+        settings = settings_of(study.settings, given)
+        with progress_bars() as bar:
+            effort = Effort(workers, scheduler, minutes or float("inf"), output, _note, bar)
+            result = run_study(name, module, study, settings, effort)
+        if output is not None:
+            result.write(output)
+            if not result.interrupted:
+                unfinished_file(output).unlink(missing_ok=True)
+        print_result(result)
+
+    callback: Callable[..., Any] = run
+    for parameter in reversed([*parameters(study.settings), *_EFFORT]):
+        callback = parameter(callback)
+    example = f"Example: python -m studies {name} {study.example}"
+    return click.command(name, help=found.__doc__, epilog=example)(callback)
+
+
+_EFFORT = (
+    click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine."),
+    click.option("--scheduler", metavar="ADDRESS", help="Dask cluster that works instead: tcp://host:port."),
+    click.option("--minutes", type=click.FloatRange(0, min_open=True), help="Time after which no case is begun."),
+    click.option("-o", "--output", type=click.Path(path_type=Path), help="JSON file for the result."),
+)
+
+
+@click.group(cls=_Studies, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+def studies() -> None:
+    """Measure cfplan: each study makes one result with its tables. Nobody who only flies needs them."""
+
+
+@studies.command()
+@click.argument("folder", metavar="[REPOSITORY]", type=click.Path(path_type=Path), default=Path())
+@click.option("--fresh", is_flag=True, help="Fail where README shows a figure of other sources, as before a release.")
+def pages(folder: Path, fresh: bool) -> None:
+    """Write the figures of README and docs/ anew from results/, and list the results that are out of date."""
+    from studies.runner.pages import stale_results, write_figures
+
+    for page in write_figures(folder):
+        click.echo(page)
+    for file in stale_results(folder):
+        click.echo(f"{file}: measured with other sources")
+    if fresh and (old := stale_results(folder, [folder / "README.md"])):
+        raise InputError(
+            f"README shows figures of {', '.join(old)}, measured with other sources", where="README.md",
+            hint="measure them anew; each result names its command",
+        )  # fmt: skip
+
+
+def print_result(result: StudyResult) -> None:
+    """Print the tables of a result."""
+    for each in result.tables:
+        print_table(each)
+
+
+def print_table(table: Table) -> None:
+    """Print a table, as wide as it is where standard output is no terminal."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table as RichTable
+
+    titles, rows = table.cells()
+    shown = RichTable(title=table.title, title_justify="left", box=box.SIMPLE_HEAD)
+    for number, title in enumerate(titles):
+        shown.add_column(title, justify="right" if number else "left")
+    for row in rows:
+        shown.add_row(*row)
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = 500
+    console.print(shown)
+
+
+@contextmanager
+def progress_bars() -> Iterator[Callable[[str], Progress]]:
+    """Yield a function from a name to what is told of its progress: a bar on stderr, with the time left."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+
+        def begin(name: str) -> Callable[[int, int], None]:
+            task = bars.add_task(name, total=None, visible=False)
+            return lambda done, total: bars.update(task, completed=done, total=total, visible=True)
+
+        yield begin
+
+
+def _note(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def main() -> None:
+    """Run the command line; a user's mistake ends in one line, never in a traceback."""
+    try:
+        sys.exit(studies.main(prog_name="python -m studies", standalone_mode=False) or 0)
+    except click.exceptions.Exit as ending:
+        sys.exit(ending.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except CfplanError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(int(error.exit_code))
+    except (click.Abort, KeyboardInterrupt):
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        sys.exit(130)

@@ -1,0 +1,405 @@
+"""Steer with random requests in the stepped lab: any kind, at any moment, in bursts. No limit may be exceeded.
+
+By the seed of a flight are drawn where the vehicle stands, how long its planner takes, and its requests: to extend,
+replace, stop, fly slower or faster; such as cannot be flown, lie outside or are garbage; and faults of the planner.
+Every flight is judged by the whole sequence of setpoints that it streamed, and by the truth.
+"""
+
+import contextlib
+import itertools
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cfplan.errors import CfplanError, ExitCode, InputError
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry
+from cfplan.preparation.air_planner import PathAnswer, PathVerdict, Wish
+from cfplan.preparation.certified_flight import STOP
+from cfplan.preparation.replan import HeldFlight
+from cfplan.preparation.stepped_planner import PlannerFault
+from cfplan.safety.limits import Limits
+from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.steering.flight_in_progress import Listeners
+from cfplan.steering.steered_vehicle import SteeredVehicle
+from cfplan.steering.stepped_steering import SteppedSteering
+from cfplan.steering.waypoint_lines import parse_line
+from studies.flown_sequence import Committed, SequenceVerdict, judge_sequence
+from studies.runner.result import Column, StudyResult, Table, collect, detail_table
+from cfplan.vehicle.joint import JoinedTrajectory
+
+REQUESTS = 250  # of a flight, the last of a burst besides
+SECONDS = 90.0  # of a flight, in which they are asked for
+_PLANNING = (0.02, 0.05, 0.1, 0.3)  # s, that the planner of a flight takes for a plan
+_BURST_SHARE, _BURST, _BURST_PERIOD = 0.02, (10, 30), 0.02  # of the requests, how many together, s between them
+_FAULT_SHARE = 0.03  # of the requests: the planner fails with it
+_TAKE_OFF_HEIGHT = (0.5, 1.2)  # m
+_NEAR = 0.3  # m before or behind the vehicle, where waypoints are too near to turn at speed
+_SHARES = {"extend": 0.30, "replace": 0.28, "stop": 0.07, "slower": 0.05, "faster": 0.08, "near": 0.08, "outside": 0.07,
+           "garbage": 0.07}  # fmt: skip
+_GARBAGE: tuple[Any, ...] = (
+    [[math.nan, 0.0, 1.0]], [[0.0, math.inf, 1.0]], [], [1.0, 2.0, 3.0], [["a", "b", "c"]], None, "fly home",
+    np.ones((1000, 3)), [[0.0, 1.0]], [[1.0, 2.0, 3.0], [1.0, 2.0]], {"x": 1.0}, [[1e300, 0.0, 1.0]], [[0.0, 0.0, 1e9]],
+)  # fmt: skip
+_TEXTS = ("1 2", "replace", "stop now", "\x00\xff", "fly 1 2 3", "nan nan", "1,2,3,4", "stop 1 2 3", "1.0 0.0 one")
+_RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)
+_ENDS = ("flown", "landed", "stopped and landed")  # how a flight is ended: at its end, in motion, after a stop
+_BAD_SHOWN = 20
+_STANDING = 1e-9  # m/s, up to which a motion stands still
+
+
+@dataclass(frozen=True, slots=True)
+class SteeredFlight:
+    """One flight with random requests."""
+
+    seed: int
+    planning: float  # s, that a plan takes
+    seconds: float  # of flight along what was committed
+    requests: int
+    accepted: int
+    refused: int  # by the planner or the pilot, in words
+    late: int
+    superseded: int
+    invalid: int  # refused before they were asked for, as no waypoints
+    unanswered: int
+    stops: int  # accepted
+    ended: str
+    end: str  # in words, as the pilot says it
+    landed: bool  # on the floor, disarmed, by the operator or at its end
+    deviation: float  # m, the largest from the setpoint
+    to_wall: float  # m, least distance of the true position from walls and ceiling
+    setpoints: int
+    missing: int
+    differing: int
+    plan_share: float
+    speed: float
+    acceleration: float
+    stop_acceleration: float
+    share_fast: float
+    joint: float
+    without_stop: int
+    faults: str  # joined by "; "
+
+    @property
+    def bad(self) -> bool:
+        """Return whether anything of it went wrong."""
+        return bool(self.faults) or not self.landed or self.unanswered > 0 or self.to_wall <= 0.0
+
+
+COLUMNS = (
+    Column("group", "planner takes"),
+    Column("flights", "flights"),
+    Column("hours", "flown", "h", ".2f"),
+    Column("requests", "requests"),
+    Column("accepted", "accepted"),
+    Column("refused", "refused", meaning="in words: no way leads there, outside, or no waypoints at all"),
+    Column("late", "late"),
+    Column("superseded", "superseded", meaning="as another request came before it was planned"),
+    Column("unanswered", "not answered", goal="0"),
+)
+SEQUENCE_COLUMNS = (
+    Column("group", "planner takes"),
+    Column("setpoints", "setpoints"),
+    Column("differing", "not as committed", goal="0"),
+    Column("without_stop", "without a stop", goal="0", meaning="setpoints without a committed stop that rests inside"),
+    Column("plan_share", "of a limit", "%", ".2f", goal="100 %", meaning="the most, by the dense certificate"),
+    Column("speed", "speed", "m/s", ".3f"),
+    Column("acceleration", "acceleration", "m/s²", ".2f", meaning="by differences of the velocities streamed"),
+    Column("stop_acceleration", "in stops", "m/s²", ".2f", meaning="likewise, in stops that were asked for"),
+    Column("joint", "joint", "quanta", ".2f", goal="1", meaning="the most that a field jumps by at a splice"),
+    Column("deviation_mean", "deviation, mean", "cm", ".1f", meaning="of each flight's largest"),
+    Column("deviation", "largest", "cm", ".1f"),
+    Column("to_wall", "to the wall", "m", ".2f", meaning="least distance of the true position"),
+    Column("bad", "flights with a fault", goal="0"),
+)
+BAD_COLUMNS = (
+    Column("seed", "seed"),
+    Column("ended", "ended"),
+    Column("end", "end"),
+    Column("to_wall", "to the wall", "m", ".3f"),
+    Column("unanswered", "not answered"),
+    Column("faults", "faults"),
+)
+
+
+class _WatchedSteering(SteppedSteering):
+    """A flight in the stepped lab whose setpoints and commitments are kept."""
+
+    def __init__(self, limits: Limits, *, planning: float, seed: int, vehicle: VehicleSettings):
+        super().__init__(limits, planning=planning, seed=seed, vehicle=vehicle)
+        self.commitments: list[Committed] = []
+        self.sent: dict[int, SetpointSent] = {}
+        self.answered: Counter[int] = Counter()
+        self._flies_plan = False
+
+    def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
+        def hear(message: Telemetry) -> None:
+            if isinstance(message, PhaseEntered):
+                self._flies_plan = message.phase in (Phase.STREAM, Phase.HOLD)
+            elif isinstance(message, Event) and message.text.startswith(_RUNGS):
+                self._flies_plan = False  # it leaves the plan, for a stop or a landing
+            elif isinstance(message, SetpointSent) and self._flies_plan:
+                self.sent.setdefault(message.index, message)
+            listeners.telemetry(message)
+
+        def hear_answer(answer: PathAnswer) -> None:
+            if answer.verdict not in (PathVerdict.CUT_SHORT, PathVerdict.CHANGED):
+                self.answered[answer.number] += 1
+            listeners.answer(answer)
+
+        self._keep(held, 0)
+        super().start(mission, held, Listeners(hear, hear_answer))
+        assert self.planner is not None
+        self.planner.on_committed = lambda made: self._keep(made.held, made.proposal.splice)
+
+    def _keep(self, held: HeldFlight, splice: int) -> None:
+        """Keep what is held with a commitment from a splice on, of its stops their ends.
+
+        In a hover the pilot takes a proposal that begins elsewhere than it was made for: all of it is flown later then.
+        """
+        commitment, flown = held.commitment, held.flown
+        later = commitment.splices[-1] - splice if commitment.splices else 0
+        if later:
+            flown = flown_later(flown, splice, later)
+        elif self.commitments:
+            known, flown = {id(each) for each in self.commitments[-1].flown.trajectories}, self.commitments[-1].flown
+            for start, leg in zip(held.flown.starts, held.flown.trajectories, strict=True):
+                if id(leg) not in known:
+                    flown = flown.continued(start, leg)
+        rows = slice(splice + later - commitment.first, None)
+        ends = np.array(commitment.stops[rows][:, [0, -1]])
+        payloads = np.array(commitment.payloads[rows])
+        if held.exact_from > 0:  # a stop that was asked for
+            stop = splice + later, held.exact_from + later
+        else:
+            stop = (0, 0) if held.stops_from is None else (held.stops_from + later, held.stops_from + STOP + later)
+        self.commitments.append(Committed(splice + later, payloads, ends, flown, *stop))
+
+
+def flown_later(flown: JoinedTrajectory, splice: int, later: int) -> JoinedTrajectory:
+    """Return a motion that was proposed from setpoint `splice` on, as it is flown so many setpoints later.
+
+    The vehicle hovers on until then: also what was committed to begin meanwhile is flown by nobody. What the proposal
+    leaves moves later too where it moves already, by less than the pilot tells from a hover.
+    """
+    begins = splice / RATE
+    if np.linalg.norm(flown.at(begins).velocity) > _STANDING:
+        begins = max(start for start in flown.starts if start <= begins)
+    starts = tuple(start + later / RATE if start >= begins else start for start in flown.starts)
+    return JoinedTrajectory(flown.trajectories, starts)
+
+
+def fly_steered(seed: int, limits: Limits, *, requests: int = REQUESTS, seconds: float = SECONDS) -> SteeredFlight:
+    """Fly number `seed`, with so many requests in so many s."""
+    chance = np.random.default_rng(seed)
+    planning = float(chance.choice(_PLANNING))
+    flight = _WatchedSteering(limits, planning=planning, seed=seed, vehicle=_vehicle(seed, limits, chance))
+    ended, invalid, asked = str(chance.choice(_ENDS)), 0, list[int]()
+    vehicle = SteeredVehicle(flight, limits, uri="sim://0")
+    failure = ""
+    try:
+        with vehicle:
+            vehicle.take_off(float(chance.uniform(*_TAKE_OFF_HEIGHT)))
+            for wish, waypoints, pause in _requests(chance, vehicle, flight, limits, requests, seconds):
+                try:
+                    asked.append(vehicle.request(wish, waypoints))
+                except InputError:
+                    invalid += 1
+                vehicle.sleep(pause)
+            asked += _end(vehicle, ended)
+    except CfplanError as error:
+        failure = str(error)
+    answers = Counter(answer.verdict for answer in vehicle.answers())
+    pending = frozenset() if flight.planner is None else flight.planner.pending  # as the flight ends
+    verdict = judge_sequence(flight.sent, flight.commitments, limits)
+    outcome = vehicle.outcome
+    well = outcome is not None and outcome.exit_code in (ExitCode.OK, ExitCode.ENDED_BY_OPERATOR)
+    return SteeredFlight(
+        seed=seed,
+        planning=planning,
+        seconds=verdict.setpoints / RATE,
+        requests=len(asked) + invalid,
+        accepted=answers[PathVerdict.ACCEPTED],
+        refused=answers[PathVerdict.REFUSED],
+        late=answers[PathVerdict.LATE],
+        superseded=answers[PathVerdict.SUPERSEDED],
+        invalid=invalid,
+        unanswered=sum(flight.answered[number] != (number not in pending) for number in asked),
+        stops=sum(0 < each.stop_from <= each.splice for each in flight.commitments),
+        ended=ended,
+        end=failure or (outcome.reason if outcome is not None else "no outcome"),
+        landed=well and not failure and _is_down(flight),
+        deviation=outcome.deviation.max if outcome is not None else math.nan,
+        to_wall=_to_wall(flight, limits),
+        **_kept(verdict),
+    )
+
+
+def _vehicle(seed: int, limits: Limits, chance: np.random.Generator) -> VehicleSettings:
+    """Return a vehicle that stands somewhere in the middle half of the room."""
+    low, high = np.array(limits.space.low[:2]), np.array(limits.space.high[:2])
+    x, y = ((low + high) / 2 + chance.uniform(-0.25, 0.25, 2) * (high - low)).tolist()
+    return VehicleSettings(seed=seed, position=(x, y, 0.0), yaw=float(chance.uniform(-1.0, 1.0)))
+
+
+def _requests(
+    chance: np.random.Generator,
+    vehicle: SteeredVehicle,
+    flight: SteppedSteering,
+    limits: Limits,
+    count: int,
+    seconds: float,
+) -> Iterator[tuple[Wish, Any, float]]:
+    """Yield wishes with their waypoints and the pause after each, s, and let the planner fail now and then."""
+    mean_burst = sum(_BURST) / 2.0
+    apart = seconds / count * (1.0 + _BURST_SHARE * mean_burst)
+    made = 0
+    while made < count:
+        together = int(chance.integers(*_BURST)) if chance.random() < _BURST_SHARE else 1
+        for number in range(together):
+            assert flight.planner is not None
+            faults = [*PlannerFault]
+            faults.remove(PlannerFault.KILLED)  # it would answer nothing any more
+            flight.planner.fault = faults[chance.integers(len(faults))] if chance.random() < _FAULT_SHARE else None
+            last = number == together - 1
+            pause = float(chance.exponential(apart)) if last else _BURST_PERIOD
+            yield *_drawn(chance, vehicle, limits), pause
+        made += together
+    assert flight.planner is not None
+    flight.planner.fault = None
+
+
+def _drawn(chance: np.random.Generator, vehicle: SteeredVehicle, limits: Limits) -> tuple[Wish, Any]:
+    kind = str(chance.choice(list(_SHARES), p=list(_SHARES.values())))
+    space = limits.space
+    low, high = np.array(space.low) + space.margin, np.array(space.high) - space.margin
+    points = chance.uniform(low, high, (int(chance.integers(1, 5)), 3))
+    wish = Wish.EXTEND if chance.random() < 0.5 else Wish.REPLACE
+    match kind:
+        case "extend" | "replace" | "stop" | "slower" | "faster":
+            return Wish(kind), points
+        case "near":
+            points[0] = np.clip(np.array(vehicle.target) + chance.uniform(-_NEAR, _NEAR, 3), low, high)
+        case "outside":
+            points[chance.integers(len(points)), chance.integers(3)] = chance.choice([-1.0, 1.0]) * chance.uniform(4, 9)
+        case "garbage":
+            with contextlib.suppress(InputError):
+                parse_line(_TEXTS[chance.integers(len(_TEXTS))])
+                raise AssertionError("a line that is none was read")
+            return wish, _GARBAGE[chance.integers(len(_GARBAGE))]
+    return wish, points
+
+
+def _end(vehicle: SteeredVehicle, how: str) -> list[int]:
+    """End a flight; return the numbers of the requests that this took."""
+    asked = []
+    if how == "stopped and landed":
+        asked.append(vehicle.request(Wish.STOP))
+        vehicle.sleep(0.4)
+    if how == "flown":
+        vehicle.wait()
+        vehicle.finish()
+    else:
+        vehicle.land()
+    return asked
+
+
+def _is_down(flight: SteppedSteering) -> bool:
+    truth = flight.lab.truth()
+    return bool(truth.position[-1, 2] < 0.05 and not truth.motor[-1].any())
+
+
+def _to_wall(flight: SteppedSteering, limits: Limits) -> float:
+    low, high = np.array(limits.space.low), np.array(limits.space.high)
+    low[2] = -np.inf  # the floor is where it lands
+    position = flight.lab.truth().position
+    return float(np.minimum(position - low, high - position).min())
+
+
+def _kept(verdict: SequenceVerdict) -> dict[str, Any]:
+    return {**asdict(verdict), "faults": "; ".join(verdict.faults)}
+
+
+def steering(
+    safety_file: Path,
+    *,
+    seeds: Sequence[int],
+    requests: int = REQUESTS,
+    seconds: float = SECONDS,
+    jobs: int = 1,
+    minutes: float = math.inf,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> StudyResult:
+    """Fly with random requests for each seed, on `jobs` processes; begin no flight once `minutes` have passed."""
+    limits = load_limits(safety_file)
+    flown, interrupted = collect(_fly_all(limits, seeds, requests, seconds, jobs, minutes, progress))
+    flights = sorted(flown, key=lambda flight: flight.seed)
+    settings = {
+        "requests": requests,
+        "seconds": seconds,
+        "seeds": [flown[0].seed, flown[-1].seed] if flown else [],
+    }
+    return StudyResult("steering", settings, steering_tables(flights), (detail_table("flights", flights),), interrupted)
+
+
+def _fly_all(
+    limits: Limits,
+    seeds: Sequence[int],
+    requests: int,
+    seconds: float,
+    jobs: int,
+    minutes: float,
+    progress: Callable[[int, int], None],
+) -> Iterator[SteeredFlight]:
+    from joblib import Parallel, delayed
+
+    end = time.monotonic() + 60.0 * minutes
+    in_time = itertools.takewhile(lambda _: time.monotonic() < end, seeds)
+    work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch=jobs)(
+        delayed(fly_steered)(seed, limits, requests=requests, seconds=seconds) for seed in in_time
+    )
+    for done, flight in enumerate(work, 1):
+        progress(done, len(seeds))
+        yield flight
+
+
+def steering_tables(flights: Sequence[SteeredFlight]) -> tuple[Table, ...]:
+    """Return the tables: what became of requests, what was streamed, and every flight that went wrong."""
+    groups = [("all", list(flights))] if flights else []
+    groups += [
+        (f"{planning:g} s", [flight for flight in flights if flight.planning == planning])
+        for planning in sorted({flight.planning for flight in flights})
+    ]
+    rows = [_row(*group) for group in groups]
+    bad = [flight for flight in flights if flight.bad]
+    requests, hours = sum(flight.requests for flight in flights), sum(flight.seconds for flight in flights) / 3600.0
+    return (
+        Table("requests", f"{requests} random requests in {hours:.2f} h of flight", COLUMNS, tuple(rows)),
+        Table("sequence", "What was streamed", SEQUENCE_COLUMNS, tuple(rows)),
+        Table("bad", f"{len(bad)} flights went wrong", BAD_COLUMNS, tuple(map(asdict, bad[:_BAD_SHOWN]))),
+    )
+
+
+def _row(group: str, flights: Sequence[SteeredFlight]) -> dict[str, Any]:
+    total = ("requests", "accepted", "late", "superseded", "unanswered", "setpoints", "differing", "without_stop")
+    largest = ("plan_share", "speed", "acceleration", "stop_acceleration", "joint", "deviation")
+    return {
+        "group": group,
+        "flights": len(flights),
+        "hours": sum(flight.seconds for flight in flights) / 3600.0,
+        "refused": sum(flight.refused + flight.invalid for flight in flights),
+        **{key: sum(getattr(flight, key) for flight in flights) for key in total},
+        **{key: max(getattr(flight, key) for flight in flights) for key in largest},
+        "deviation_mean": float(np.mean([flight.deviation for flight in flights])),
+        "to_wall": min(flight.to_wall for flight in flights),
+        "bad": sum(flight.bad for flight in flights),
+    }
