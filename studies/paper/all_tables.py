@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from cfplan.errors import InputError
-from studies.runner.items import HERE, Progress, Running, forget_unfinished
+from cfplan.version import UNKNOWN
 from studies.long_paths import long_paths
 from studies.paper.architectures import architectures
 from studies.paper.baselines import baselines
@@ -20,9 +20,9 @@ from studies.paper.inputs import inputs_study
 from studies.paper.robustness import robustness
 from studies.paper.simulators import simulators
 from studies.paper.yaw_consistency import yaw_consistency
+from studies.runner.items import HERE, Progress, Running, forget_unfinished
 from studies.runner.provenance import provenance
 from studies.runner.result import StudyResult, read_result
-from cfplan.version import UNKNOWN
 
 TABLES: MappingProxyType[str, Callable[..., StudyResult]] = MappingProxyType({
     "architectures": architectures, "inputs": inputs_study, "robustness": robustness,

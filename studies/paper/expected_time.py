@@ -7,14 +7,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from cfplan.errors import InputError
 from cfplan.learning.paper.training import SequenceOptions
-from studies.runner.items import SHORT, count_unfinished
+
+from cfplan.errors import InputError
+from cfplan.version import REPOSITORY
 from studies.paper.all_tables import TABLES, is_current
 from studies.paper.hardware import LEARNED_FROM
 from studies.paper.robustness import perturbed_paths, step_names
+from studies.runner.items import SHORT, count_unfinished
 from studies.runner.result import StudyResult, read_result
-from cfplan.version import REPOSITORY
 
 SHIPPED_RESULTS = REPOSITORY / "results"  # what is known of a study that the folder has no result of
 _EPOCHS = SequenceOptions().epochs

@@ -7,6 +7,8 @@ from cfplan.errors import InputError
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planning.planners import PLANNERS, Finish
 from cfplan.safety.certificate import certify
+from cfplan.vehicle.timing import duration_of
+from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.baselines import (
     ALLOCATION,
     BAYESIAN,
@@ -19,8 +21,6 @@ from studies.paper.baselines import (
 )
 from studies.paper.printed import BASELINES
 from studies.paper.trials import paper_task, profile_of, shipped_profile
-from cfplan.vehicle.timing import duration_of
-from cfplan.vehicle.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")

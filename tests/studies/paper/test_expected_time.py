@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
+from studies.runner.items import Running, unfinished_file, work_table, work_through
 
 from cfplan.cli import cfplan
 from cfplan.errors import InputError
 from studies import machine
-from studies.runner.items import Running, unfinished_file, work_table, work_through
 from studies.paper import expected_time
 from studies.paper.all_tables import TABLES
 from studies.paper.expected_time import USUALLY_SEEN, WHOLE, ResultState, expected

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.planners.baselines.corridors import BOXES, box_corners, corridor_about
 from studies.paper.baselines import ALLOCATION, DRAWN, random_course
+from studies.paper.corridors import BOXES, box_corners, corridor_about
 from studies.paper.figures import (
     EDGES,
     NETWORKS,
