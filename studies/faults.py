@@ -1,4 +1,4 @@
-"""Fly with one fault a flight and judge what the pilot does about it by the truth of the virtual lab.
+"""Fly along PATH with one fault a flight, at full speed, and judge by the simulated truth what the pilot does about it.
 
 In the stepped lab (`cfplan.simulation.lab.stepped_lab`) the pilot, the packets, the pose gate, the virtual Crazyflie
 and the virtual cameras are those of a flight in real time; there are no processes and no sockets.
@@ -6,10 +6,10 @@ and the virtual cameras are those of a flight in real time; there are no process
 
 import math
 import tempfile
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,19 +25,24 @@ from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Te
 from cfplan.geometry.path_file import load_path_file
 from cfplan.preparation.air_planner import PathAnswer, Wish
 from cfplan.preparation.plan_flight import plan_flight
+from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.preparation.replan import HeldFlight, hold
 from cfplan.preparation.stepped_planner import SteppedPlanner
 from cfplan.recording.header import RecordHeader, header_under
 from cfplan.recording.reader import read_record
 from cfplan.recording.writer import RecordWriter, new_file
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import Space
 from cfplan.simulation.lab.lab import Truth
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from studies.fault_scenarios import ASKED, SCENARIOS, Scenario
-from studies.runner.result import Column, StudyResult, Table, detail_table
+from studies.runner.limits import limits_for
+from studies.runner.options import argument, option
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
 
 COLUMNS = (
     Column("name", "fault"),
@@ -65,7 +70,15 @@ _SETTLING = 0.1  # s in which the supervisor notices that it was disarmed
 _AFTERWARDS = 6.0  # s after the pilot ended, in which the vehicle comes to rest
 _LONGEST = 100.0  # s; a vehicle that is left alone on the floor disarms 30 s after it was armed
 _ARMED = (State.ARMING, State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
-_RUNGS = {f"{rung.name.lower()}:": rung for rung in Rung}
+_RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)  # begin the events that name one
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which faults are flown, and where."""
+
+    path_file: Path = argument()
+    only: tuple[str, ...] = option((), "Faults whose name contains this text.")
 
 
 class PilotKilled(BaseException):
@@ -74,31 +87,49 @@ class PilotKilled(BaseException):
 
 @dataclass(frozen=True, slots=True)
 class FaultFlight:
-    """One flight with a fault, judged by the truth."""
+    """One flight with faults, judged by the truth."""
 
-    name: str
+    name: str  # of the scenario
+    phase: str  # in which the fault begins
     expected: str
     rung: str
     reaction: float | None  # s from the fault to the rung; None where there was none
     off_plan: float  # m, largest distance of the true position from the planned path, from landing on horizontally
     off_setpoint: float  # m, largest distance of the true position from the setpoint, until landing begins
     to_wall: float  # m, least distance of the true position from walls and ceiling; negative beyond them
+    highest: float  # m above the floor
+    rest: Triple  # m, where it came to rest
     motors_off: int  # ms with all motors off in the air
     landed: bool  # on the floor, motors off
     disarmed: bool
+    locked: bool  # by its supervisor, at any time
     readable: bool  # what was recorded can be read
     reason: str
     planner: str  # its answer; empty where it was asked nothing or did not answer
+    seed: int = 0  # of the random faults
+    path: str = ""  # of several
 
-    def row(self) -> dict[str, Any]:
-        """Return it by the keys of COLUMNS, with the fields that those are made of."""
+    @property
+    def bad(self) -> bool:
+        """Return whether it was outside the walls, not landed, not disarmed, or left no readable record."""
+        return not (self.to_wall > 0.0 and self.landed and self.disarmed and self.readable)
+
+    @property
+    def end(self) -> str:
+        """Return how it ended, in words."""
         ends = [text for text, holds in (("landed", self.landed), ("disarmed", self.disarmed)) if holds]
         without = f", {self.motors_off} ms without motors" if self.motors_off else ""
-        return asdict(self) | {
-            "end": (", ".join(ends) or "in the air") + without,
-            "record": "readable" if self.readable else "not readable",
-            "why": self.planner if self.reason == "landed" else self.reason,
-        }
+        return (", ".join(ends) or "in the air") + without
+
+    @property
+    def record(self) -> str:
+        """Return whether its record can be read, in words."""
+        return "readable" if self.readable else "not readable"
+
+    @property
+    def why(self) -> str:
+        """Return the reason for the rung; where the flight went on to its end, what the planner answered."""
+        return self.planner if self.reason == "landed" else self.reason
 
 
 @dataclass(slots=True)
@@ -117,22 +148,18 @@ class SteppedFlight:
     ended: bool = False  # the pilot, whatever it ended by
 
 
-def fault_table(
-    mission: Mission,
-    path: str,
-    *,
-    scenarios: Iterable[Scenario] = SCENARIOS,
-    held: HeldFlight | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> StudyResult:
-    """Fly every scenario; those with a fault of the planner fly what is `held`, as prepare_held() makes it."""
-    flights, chosen = [], tuple(scenarios)
-    for done, scenario in enumerate(chosen):
-        progress(done, len(chosen))
-        flights.append(fly_scenario(scenario, mission, held=held))
-    progress(len(chosen), len(chosen))
-    table = Table("faults", "Faults at full speed", COLUMNS, tuple(flight.row() for flight in flights))
-    return StudyResult("faults", {"path": path}, (table,), (detail_table("flights", flights),))
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case a fault; all fly the same mission. Raises what preparing raises."""
+    limits = limits_for(settings.path_file)
+    mission, held = prepare_mission(settings.path_file, limits), prepare_held(settings.path_file, limits)
+    wanted = [row for row in SCENARIOS if not settings.only or any(text in row.name for text in settings.only)]
+    measure = partial(fly_scenario, mission=mission, held=held)
+    return Work({scenario.name: scenario for scenario in wanted}, measure, FaultFlight)
+
+
+def tables(settings: Settings, rows: list[FaultFlight]) -> Iterator[Table]:
+    """Yield a line a fault."""
+    yield table("faults", "Faults at full speed", COLUMNS, rows)
 
 
 def prepare_held(source: Path, limits: Limits) -> HeldFlight:
@@ -240,7 +267,7 @@ def fly_stepped(
     flown.ended = True
     lab.clock.sleep(_SETTLING)
     flown.truth = lab.truth()
-    if flown.truth.position[-1, 2] > _DOWN or flown.truth.motor[-1].any():
+    if not on_floor(flown.truth):
         lab.clock.sleep(_AFTERWARDS)
         flown.truth = lab.truth()
     while scenario.leaves_alone and flown.truth.supervisor[-1] in _ARMED and lab.now < begin + _LONGEST:
@@ -257,31 +284,42 @@ def judge(scenario: Scenario, flown: SteppedFlight, mission: Mission, readable: 
     """Judge a flight by the truth."""
     truth, outcome = flown.truth, flown.outcome
     rung = outcome.rung if outcome is not None else Rung.NONE
-    reaction = next(
-        (time - flown.struck for time, text in flown.events if time >= flown.struck and _rung_of(text)), None
-    )
+    rungs = (time for time, text in flown.events if time >= flown.struck and text.startswith(_RUNGS))
+    reaction = next((time - flown.struck for time in rungs), None)
     flew = (
         outcome is not None and Phase.TAKE_OFF in dict(outcome.phases) and outcome.exit_code is not ExitCode.PREFLIGHT
     )
     return FaultFlight(
         name=scenario.name,
+        phase=str(scenario.phase),
         expected="no take-off" if scenario.grounded else scenario.rung.name.lower(),
         rung=rung.name.lower() if flew or flown.killed else "no take-off",
         reaction=reaction,
         off_plan=_off_plan(flown, mission),
         off_setpoint=_off_setpoint(flown, mission),
-        to_wall=float(-_beyond_walls(truth, mission).max()),
+        to_wall=to_wall(truth, mission.limits.space),
+        highest=float(truth.position[:, 2].max()),
+        rest=tuple(truth.position[-1].tolist()),
         motors_off=int(truth.off_in_air[-1]),
-        landed=bool(truth.position[-1, 2] < _DOWN and not truth.motor[-1].any()),
+        landed=on_floor(truth),
         disarmed=truth.supervisor[-1] not in _ARMED,
+        locked=truth.locked,
         readable=readable,
         reason=flown.reason,
         planner=", ".join(answer.reason or answer.verdict.value for answer in flown.answers),
     )
 
 
-def _rung_of(text: str) -> Rung | None:
-    return next((rung for name, rung in _RUNGS.items() if text.startswith(name)), None)
+def to_wall(truth: Truth, space: Space) -> float:
+    """Return the least distance, m, of the true position from walls and ceiling; negative beyond them."""
+    low, high = np.array(space.low), np.array(space.high)
+    low[2] = -np.inf  # the floor is where it lands
+    return float(np.minimum(truth.position - low, high - truth.position).min())
+
+
+def on_floor(truth: Truth) -> bool:
+    """Return whether the vehicle came to rest on the floor with its motors off."""
+    return bool(truth.position[-1, 2] < _DOWN and not truth.motor[-1].any())
 
 
 def _off_plan(flown: SteppedFlight, mission: Mission) -> float:
@@ -313,13 +351,6 @@ def _off_setpoint(flown: SteppedFlight, mission: Mission) -> float:
     return float(np.linalg.norm(truth.position[during] - wanted, axis=1).max(initial=0.0))
 
 
-def _beyond_walls(truth: Truth, mission: Mission) -> np.ndarray:
-    space = mission.limits.space
-    low, high = np.array(space.low), np.array(space.high)
-    low[2] = -np.inf  # the floor is where it lands
-    return np.maximum(low - truth.position, truth.position - high).max(axis=1)
-
-
 class _FullDisk:
     """A file on a disk that is full after the header."""
 
@@ -343,3 +374,6 @@ class _FullDisk:
 def _header(mission: Mission) -> RecordHeader:
     path = decode(mission.payloads).position[::5]
     return header_under(mission.limits, name="fault", uri="stepped://0", path=path, travel_time=mission.motion_ends)
+
+
+STUDY = Study(Settings, work, tables, "flights/line.yaml -o results/faults.json")

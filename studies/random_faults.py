@@ -1,19 +1,21 @@
-"""Fly with random faults in the stepped lab, death among them. None may leave the walls, each must end disarmed.
+"""Fly along each PATH in turn with random faults, by seeds: none may leave the walls, each must end disarmed.
 
 The seed of a flight determines its path, the phase and moment of the first fault, one to three faults at once with
-their lengths and sizes, whether logs or acknowledgements fall silent as well, and whether the pilot or the radio dies
-for good. The vehicle is then alone and comes down by its own time-outs; its last setpoint must have been harmless.
+their lengths and sizes, whether logs or acknowledgements fall silent as well, and in two flights of five the death of
+the pilot or the radio. The vehicle is then alone and comes down by its own time-outs; its last setpoint must have been
+harmless. A flight of the tables is flown again by its seed, with the same paths.
 """
 
 import contextlib
 import itertools
 import math
 import tempfile
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,26 +25,28 @@ from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.preparation.prepare_flight import prepare_flight
-from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.lab import Fault
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from studies.fault_scenarios import FOR_GOOD, Scenario
-from studies.faults import fly_scenario
-from studies.runner.result import Column, StudyResult, Table, collect, detail_table
+from studies.faults import FaultFlight, fly_scenario
+from studies.runner.limits import limits_for
+from studies.runner.options import argument, option
+from studies.runner.reductions import count, largest, smallest
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
 
 _LENGTH, _SPREAD = 0.5, 1.2  # s and its logarithm's deviation: a twentieth of a second to some seconds
-_SHARE_FOR_GOOD = 0.1  # of the faults
-_SHARE_DEAD = 0.4  # of the flights: the pilot or the radio dies
-_MANY = (0.5, 0.3, 0.2)  # share of flights with one, two, three faults
+_FRACTION_FOR_GOOD = 0.1  # of the faults
+_FRACTION_DEAD = 0.4  # of the flights: the pilot or the radio dies
+_MANY = (0.5, 0.3, 0.2)  # fraction of flights with one, two, three faults
 _APART = 1.5  # s within which several faults begin
 _BESIDE_START = 0.4  # m from the path's start at which the vehicle stands
 _INSIDE = 0.02  # m that it stands inside the margin, as preflight measures its place
 _GROUPS = {FaultKind: "pose", RadioFaultKind: "radio", VehicleFaultKind: "vehicle"}
 _LONGEST_STALL = 5.0  # s
-_GROUP_SIZE = 10  # flights that a process flies before it reports
 _WORST = 10
 
 # In which something goes wrong, as likely as they are often here, and up to how many s after each began.
@@ -61,8 +65,8 @@ _PHASES: tuple[tuple[Phase, float], ...] = (
     (Phase.LAND, 6.0),  # until it lies on the floor
 )
 
-_SHARE_SILENT = 0.35  # of the flights: logs or acknowledgements fall silent
-_SHARE_FLAPPING = 0.4  # of those: they come back for a moment
+_FRACTION_SILENT = 0.35  # of the flights: logs or acknowledgements fall silent
+_FRACTION_FLAPPING = 0.4  # of those: they come back for a moment
 _BACK_FOR = 0.1  # s
 # Sources that fall silent together.
 _SILENCES: tuple[tuple[Any, ...], ...] = (
@@ -100,74 +104,70 @@ _KINDS: tuple[tuple[Any, float, float], ...] = (
 
 
 @dataclass(frozen=True, slots=True)
-class RandomFlight:
-    """One flight with random faults, judged by the truth."""
+class Settings:
+    """Which flights are drawn."""
 
-    seed: int
-    path: str
-    phase: str
-    faults: str  # joined by " + "
-    rung: str
-    to_wall: float  # m, least distance of the true position from walls and ceiling; negative beyond them
-    off_plan: float  # m, largest distance of the true position from the planned path, from landing on horizontally
-    landed: bool  # on the floor, motors off
-    disarmed: bool
-    readable: bool  # its record
-    reason: str
+    path_files: tuple[Path, ...] = argument()
+    flights: int = option(10_000, "Flights with random faults.", least=1)
+    seed: int = option(0, "Seed of the first flight.", least=0)
+    random_paths: int = option(0, "Small paths of two or three waypoints, beside those given.", least=0)
 
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Return the kinds of its faults, each once."""
-        return tuple(dict.fromkeys(fault.split(" ", 1)[0] for fault in self.faults.split(" + ")))
 
-    @property
-    def bad(self) -> bool:
-        """Return whether it was outside the walls, not landed, not disarmed, or left no readable record."""
-        return not (self.to_wall > 0.0 and self.landed and self.disarmed and self.readable)
+class _Grouped(NamedTuple):
+    """A flight as one of a group; it may be of several."""
 
-    def row(self) -> dict[str, Any]:
-        """Return it by the keys of FLIGHT_COLUMNS."""
-        ends = (("landed", self.landed), ("disarmed", self.disarmed), ("readable record", self.readable))
-        ended = ", ".join(text if holds else f"not {text}" for text, holds in ends)
-        shown = ("seed", "path", "phase", "faults", "rung", "to_wall")
-        return {key: getattr(self, key) for key in shown} | {"end": ended}
+    group: str
+    flight: FaultFlight
 
 
 COLUMNS = (
     Column("group", "flights with"),
-    Column("flights", "flights"),
-    Column("to_wall", "to the wall", "m", ".2f", meaning="the least of all flights; negative: beyond it"),
-    Column("off_plan", "off the path", "cm", ".0f", meaning="the largest of all flights"),
-    Column("outside", "outside the walls"),
-    Column("armed", "not disarmed", meaning="or not on the floor with its motors off"),
-    Column("unreadable", "record not readable"),
-)
+    Column("flights", "flights", value=count()),
+    Column("to_wall", "to the wall", "m", ".2f", meaning="the least of all flights; negative: beyond it",
+           value=smallest("flight.to_wall")),
+    Column("off_plan", "off the path", "cm", ".0f", meaning="the largest of all flights",
+           value=largest("flight.off_plan")),
+    Column("outside", "outside the walls", value=count(lambda row: row.flight.to_wall <= 0.0)),
+    Column("armed", "not disarmed", meaning="or not on the floor with its motors off",
+           value=count(lambda row: not (row.flight.landed and row.flight.disarmed))),
+    Column("unreadable", "record not readable", value=count(lambda row: not row.flight.readable)),
+)  # fmt: skip
 FLIGHT_COLUMNS = (
     Column("seed", "seed"),
     Column("path", "path"),
     Column("phase", "phase"),
-    Column("faults", "faults", meaning="size, length, and when it began after the first"),
+    Column("faults", "faults", meaning="size, length, and when it began after the first",
+           value=lambda rows: rows[0].name),
     Column("rung", "rung", meaning="the lowest of the abort ladder that the pilot took"),
     Column("to_wall", "to the wall", "m", ".3f", meaning="least distance of the true position; negative: beyond"),
-    Column("end", "end"),
-)
+    Column("end", "end", value=lambda rows: _end(rows[0])),
+)  # fmt: skip
 
 
-def prepare_missions(
-    path_files: Iterable[Path], find_safety_file: Callable[[Path], Path], random_paths: int = 0
-) -> dict[str, Mission]:
-    """Prepare each path once, as for a flight, link loss and all, and so many random ones under the first's limits.
+def _end(flight: FaultFlight) -> str:
+    ends = (("landed", flight.landed), ("disarmed", flight.disarmed), ("readable record", flight.readable))
+    return ", ".join(text if holds else f"not {text}" for text, holds in ends)
+
+
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case a seed; the missions are the same for all. Raises what preparing raises."""
+    missions = prepare_missions(settings.path_files, settings.random_paths)
+    seeds = range(settings.seed, settings.seed + settings.flights)
+    return Work({str(seed): seed for seed in seeds}, partial(fly_random, missions=missions), FaultFlight)
+
+
+def prepare_missions(path_files: Sequence[Path], random_paths: int = 0) -> dict[str, Mission]:
+    """Prepare each path once, as for a flight, and small random ones under the limits of the first.
 
     A random path that may not fly is left out. Raises what preparing raises for the others.
     """
-    files = tuple(path_files)
-    missions = {file.stem: prepare_flight(file, load_limits(find_safety_file(file))).mission for file in files}
-    limits = load_limits(find_safety_file(files[0]))
+    missions = {file.stem: prepare_flight(file, limits_for(file)).mission for file in path_files}
+    limits = limits_for(path_files[0])
     space = limits.space
     box = np.array([np.array(space.low) + space.margin, np.array(space.high) - space.margin])
     with tempfile.TemporaryDirectory() as folder:
         for seed in itertools.count():
-            if len(missions) >= len(files) + random_paths:
+            if len(missions) >= len(path_files) + random_paths:
                 break
             file = Path(folder) / f"small-{seed}.yaml"
             points = random_waypoints(seed, box, (2, 3)).round(3).tolist()
@@ -187,7 +187,9 @@ def random_scenario(seed: int, mission: Mission) -> Scenario:
     for place, number in enumerate(chance.choice(len(_KINDS), size=many, replace=False)):
         kind, least, most = _KINDS[number]
         start = float(chance.uniform(0.0, _APART)) if place else 0.0
-        length = FOR_GOOD if chance.random() < _SHARE_FOR_GOOD else float(_LENGTH * np.exp(_SPREAD * chance.normal()))
+        length = (
+            FOR_GOOD if chance.random() < _FRACTION_FOR_GOOD else float(_LENGTH * np.exp(_SPREAD * chance.normal()))
+        )
         size = float(chance.uniform(least, most)) if most > least else None
         if kind is _STALL:
             length = min(length, _LONGEST_STALL)
@@ -197,7 +199,7 @@ def random_scenario(seed: int, mission: Mission) -> Scenario:
         else:
             faults.append(_fault(kind, start, length, size))
         texts.append(_text(kind, start, length, size))
-    if chance.random() < _SHARE_DEAD:
+    if chance.random() < _FRACTION_DEAD:
         start = float(chance.uniform(0.0, _APART)) if chance.random() < 0.5 else 0.0
         if chance.random() < 0.5:
             changes |= {"pilot_killed": True, "pilot_killed_after": start}
@@ -216,13 +218,13 @@ def random_scenario(seed: int, mission: Mission) -> Scenario:
 def with_silence(scenario: Scenario, seed: int) -> Scenario:
     """Return the scenario; in a fraction of the flights, logs or acknowledgements fall silent as well."""
     chance = np.random.default_rng((seed, 1))
-    if chance.random() > _SHARE_SILENT:
+    if chance.random() > _FRACTION_SILENT:
         return scenario
     kinds = _SILENCES[chance.integers(len(_SILENCES))]
     start = float(chance.uniform(0.0, _APART))
     length = FOR_GOOD if chance.random() < 0.5 else float(_LENGTH * np.exp(_SPREAD * chance.normal()))
     spans = [(start, length)]
-    if chance.random() < _SHARE_FLAPPING:
+    if chance.random() < _FRACTION_FLAPPING:
         spans = [(start, 2.0 * _LENGTH), (start + 2.0 * _LENGTH + _BACK_FOR, length)]
     silences = [(kind, *span) for span in spans for kind in kinds]
     return replace(
@@ -257,100 +259,32 @@ def _text(kind: Any, start: float, length: float, size: float | None) -> str:
     return f"{text} after {start:.2f} s" if start else text
 
 
-def fly_random(seed: int, missions: Mapping[str, Mission]) -> RandomFlight:
+def fly_random(seed: int, missions: Mapping[str, Mission]) -> FaultFlight:
     """Fly flight number `seed` along one of the paths, with a record."""
     names = sorted(missions)
     name = names[seed % len(names)]
     scenario = with_silence(random_scenario(seed, missions[name]), seed)
-    flown = fly_scenario(scenario, missions[name], seed)
-    return RandomFlight(
-        seed=seed,
-        path=name,
-        phase=str(scenario.phase),
-        faults=flown.name,
-        rung=flown.rung,
-        to_wall=round(flown.to_wall, 4),
-        off_plan=round(flown.off_plan, 4),
-        landed=flown.landed,
-        disarmed=flown.disarmed,
-        readable=flown.readable,
-        reason=flown.reason,
-    )
+    return replace(fly_scenario(scenario, missions[name], seed), seed=seed, path=name)
 
 
-def random_flights(
-    missions: Mapping[str, Mission],
-    *,
-    seeds: Sequence[int],
-    jobs: int = 1,
-    minutes: float = math.inf,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> StudyResult:
-    """Fly with random faults for each seed, on `jobs` processes; begin no flight once `minutes` have passed."""
-    flown, interrupted = collect(_fly_all(missions, seeds, jobs, minutes, progress))
-    settings = {"paths": sorted(missions), "seeds": [seeds[0], seeds[len(flown) - 1]] if flown else []}
-    flights = sorted(flown, key=lambda flight: flight.seed)
-    detail = detail_table("flights", [_kept(flight) for flight in flights])
-    return StudyResult("random-faults", settings, fault_tables(flights), (detail,), interrupted)
+def tables(settings: Settings, rows: list[FaultFlight]) -> Iterator[Table]:
+    """Yield the flights by number of faults, kind and phase, those nearest to a wall, and all that went wrong."""
+    outside, bad = sum(row.to_wall <= 0.0 for row in rows), [row for row in rows if row.bad]
+    title, phases = f"{len(rows)} flights, {outside} outside the walls", list(map(str, Phase))
+    counted = sorted(((len(_kinds(row)), row) for row in rows), key=itemgetter(0))
+    by_count = [_Grouped("1 fault" if many == 1 else f"{many} faults", row) for many, row in counted]
+    by_kind = [_Grouped(kind, row) for row in rows for kind in dict.fromkeys(_kinds(row))]
+    by_phase = [_Grouped(row.phase, row) for row in sorted(rows, key=lambda row: phases.index(row.phase))]
+    yield table("all", title, COLUMNS, by_count, by=("group",), last="random faults")
+    yield table("kinds", "By kind of fault", COLUMNS, sorted(by_kind, key=attrgetter("group")), by=("group",))
+    yield table("phases", "By the phase in which it began", COLUMNS, by_phase, by=("group",))
+    yield table("worst", "Nearest to a wall", FLIGHT_COLUMNS, sorted(rows, key=attrgetter("to_wall"))[:_WORST])
+    yield table("bad", f"{len(bad)} flights went wrong", FLIGHT_COLUMNS, bad)
 
 
-def _fly_all(
-    missions: Mapping[str, Mission],
-    seeds: Sequence[int],
-    jobs: int,
-    minutes: float,
-    progress: Callable[[int, int], None],
-) -> Iterator[RandomFlight]:
-    from joblib import Parallel, delayed
-
-    end, done = time.monotonic() + 60.0 * minutes, 0
-    groups = (seeds[begin : begin + _GROUP_SIZE] for begin in range(0, len(seeds), _GROUP_SIZE))
-    in_time = itertools.takewhile(lambda _: time.monotonic() < end, groups)
-    for group in Parallel(n_jobs=jobs, return_as="generator")(delayed(_fly_group)(part, missions) for part in in_time):
-        done += len(group)
-        progress(done, len(seeds))
-        yield from group
+def _kinds(flight: FaultFlight) -> list[str]:
+    """Return the kind of each of its faults."""
+    return [fault.split(" ", 1)[0] for fault in flight.name.split(" + ")]
 
 
-def _fly_group(seeds: Sequence[int], missions: Mapping[str, Mission]) -> list[RandomFlight]:
-    return [fly_random(seed, missions) for seed in seeds]
-
-
-def fault_tables(flights: Sequence[RandomFlight]) -> tuple[Table, ...]:
-    """Return the tables: by kind and phase, the flights nearest to a wall, and every flight that went wrong."""
-    kinds = list(dict.fromkeys(kind for flight in flights for kind in flight.kinds))
-    by_kind = [_row(kind, [flight for flight in flights if kind in flight.kinds]) for kind in sorted(kinds)]
-    phases = [phase for phase in map(str, Phase) if any(flight.phase == phase for flight in flights)]
-    by_phase = [_row(phase, [flight for flight in flights if flight.phase == phase]) for phase in phases]
-    counts = sorted({flight.faults.count(" + ") + 1 for flight in flights})
-    many = {count: [flight for flight in flights if flight.faults.count(" + ") + 1 == count] for count in counts}
-    by_count = [_row(f"{count} faults" if count > 1 else "1 fault", of) for count, of in many.items() if of]
-    worst = sorted(flights, key=lambda flight: flight.to_wall)[:_WORST]
-    bad = [flight for flight in flights if flight.bad]
-    total = (_row("random faults", flights),) if flights else ()
-    outside = sum(flight.to_wall <= 0.0 for flight in flights)
-    return (
-        Table("all", f"{len(flights)} flights, {outside} outside the walls", COLUMNS, (*total, *by_count)),
-        Table("kinds", "By kind of fault", COLUMNS, tuple(by_kind)),
-        Table("phases", "By the phase in which it began", COLUMNS, tuple(by_phase)),
-        Table("worst", "Nearest to a wall", FLIGHT_COLUMNS, tuple(flight.row() for flight in worst)),
-        Table("bad", f"{len(bad)} flights went wrong", FLIGHT_COLUMNS, tuple(flight.row() for flight in bad)),
-    )
-
-
-def _row(group: str, flights: Sequence[RandomFlight]) -> dict[str, Any]:
-    return {
-        "group": group,
-        "flights": len(flights),
-        "to_wall": min(flight.to_wall for flight in flights),
-        "off_plan": max(flight.off_plan for flight in flights),
-        "outside": sum(flight.to_wall <= 0.0 for flight in flights),
-        "armed": sum(not (flight.landed and flight.disarmed) for flight in flights),
-        "unreadable": sum(not flight.readable for flight in flights),
-    }
-
-
-def _kept(flight: RandomFlight) -> dict[str, Any]:
-    """Return a flight's fields for the JSON, the reason only where it went wrong: there are thousands."""
-    row = {field.name: getattr(flight, field.name) for field in fields(flight)}
-    return row | {"reason": flight.reason if flight.bad else ""}
+STUDY = Study(Settings, work, tables, "flights/*.yaml --random-paths 12 --workers 2 -o results/random-faults.json")

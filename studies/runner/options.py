@@ -65,7 +65,7 @@ def _type(kind: type, each: Field) -> click.ParamType:
     if kind is Path:
         return click.Path(path_type=Path)
     if issubclass(kind, StrEnum):
-        return click.Choice([*kind])
+        return click.Choice([each.value for each in kind])
     if kind is int:
         return click.IntRange(min=None if least is None else int(least))
     if kind is float:
