@@ -4,7 +4,7 @@ Whenever a waypoint is passed another one is told, and the plan goes on through 
 flight do. It always ends at rest at the last waypoint known. The whole path is the one that is planned before take-off.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path as FilePath
@@ -56,7 +56,7 @@ class ShortSighted:
         return self.duration / self.complete - 1.0
 
 
-def _lost_of_all(rows: list[ShortSighted]) -> float:
+def _lost_of_all(rows: Sequence[ShortSighted]) -> float:
     return total("duration")(rows) / total("complete")(rows) - 1.0
 
 

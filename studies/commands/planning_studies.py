@@ -102,23 +102,6 @@ def long() -> Study:
 
 
 @measured(
-    "planning", "cfplan study horizon --known 3 --known 5 -o results/horizon.json",
-    count(100, "Random paths."),
-    click.option("--waypoints", type=click.IntRange(3), default=20, show_default=True, help="Of each path."),
-    click.option(
-        "--known", type=click.IntRange(1), multiple=True,
-        help="Waypoints ahead that are known; may be given several times.  [default: 3]",
-    ),
-    seed(0), JOBS,
-)  # fmt: skip
-def horizon() -> Study:
-    """Plan along paths of which only the next waypoints are known, against knowing them all: time lost."""
-    from studies.horizon import horizon as run
-
-    return partial(run, safety_file_of(Path()))
-
-
-@measured(
     "planning", "cfplan study hard-paths --jobs 2 -o results/hard-paths.json",
     count(1000, "Families take turns."), seed(0),
     click.option(
@@ -134,4 +117,4 @@ def hard_paths() -> Study:
     return partial(run, safety_file_of(Path()))
 
 
-COMMANDS = (feasibility, learned, proposals, unseen_limits, ablation, scaling, long, horizon, hard_paths)
+COMMANDS = (feasibility, learned, proposals, unseen_limits, ablation, scaling, long, hard_paths)

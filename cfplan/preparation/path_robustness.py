@@ -1,7 +1,7 @@
 """How a plan changes with its path: the same path perturbed, planned again, and flown in the dry run.
 
 A path that was measured, or drawn a little differently the next day, should give nearly the same flight. This says
-whether it does, as the paper asks it of its networks (see paper/robustness.py).
+whether it does, as the paper asks it of its networks.
 """
 
 import pathlib
@@ -21,7 +21,6 @@ from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import dry_run
-from studies.runner.result import Column, StudyResult, Table, collect, detail_table
 
 SCALES = (0.001, 0.01, 0.1)  # m
 SAMPLES = 500  # places along the path at which speed and yaw are compared
@@ -36,23 +35,37 @@ class PerturbedPlan:
     reason: str = ""  # why it was not planned, or why its setpoints or its dry run are refused
     flight: float = np.nan  # s
     longer: float = np.nan  # relative change of the time of flight
-    faster: float = np.nan  # m/s, largest change of speed at a share of the path, either way
+    faster: float = np.nan  # m/s, largest change of speed at a fraction of the path, either way
     turned: float = np.nan  # rad, likewise of yaw
     deviation: float = np.nan  # m, in the dry run
 
 
-COLUMNS = (
-    Column("epsilon", "perturbed by at most", "cm", "g"),
-    Column("plans"),
-    Column("certified", "certified", of="plans"),
-    Column("flown", "dry run passed", of="plans"),
-    Column("longer", "time of flight: mean change", "%", "+.2f"),
-    Column("longer_most", "largest", "%", "+.2f"),
-    Column("faster", "speed: largest change", "m/s", ".2f", meaning="at a share of the path's s; mean of the draws"),
-    Column("turned", "yaw: largest change", "rad", ".3f", meaning="likewise"),
-    Column("deviation", "dry run: deviation", "cm", ".1f", meaning="mean of the draws"),
-    Column("deviation_most", "largest", "cm", ".1f"),
-)
+@dataclass(frozen=True, slots=True)
+class ScaleSummary:
+    """All plans whose paths were perturbed by the same distance; NaN where there was nothing to measure."""
+
+    epsilon: float  # m
+    plans: int
+    certified: int
+    flown: int  # passed the dry run
+    longer: float  # relative change of the time of flight, mean
+    longer_most: float  # the one farthest from 0
+    faster: float  # m/s, mean over the draws of the largest change of speed
+    turned: float  # rad, likewise of yaw
+    deviation: float  # m, mean
+    deviation_most: float  # m
+
+
+@dataclass(frozen=True, slots=True)
+class PathRobustness:
+    """A path as it is, and perturbed."""
+
+    path: str
+    length: float  # m
+    flight: float  # s, as it is
+    interrupted: bool  # by the user: has what was measured until then
+    scales: tuple[ScaleSummary, ...]
+    plans: tuple[PerturbedPlan, ...]
 
 
 def path_robustness(
@@ -64,8 +77,7 @@ def path_robustness(
     seed: int = 0,
     planner: str = AUTO,
     models: tuple[pathlib.Path, ...] = (),
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> StudyResult:
+) -> PathRobustness:
     """Perturb the path `draws` times by at most each of `scales`, m; an interrupt keeps what is measured by then.
 
     Raises:
@@ -84,22 +96,16 @@ def path_robustness(
             speed_factor=factor, models=models,
         )  # fmt: skip
 
-    total = len(scales) * draws + 1
-    clean = planned(path_file.path)
-    progress(1, total)
-
-    def trials() -> Iterator[PerturbedPlan]:
+    clean, done, interrupted = planned(path_file.path), [], False
+    try:
         for k, scale in enumerate(scales):
             for draw in range(draws):
                 moved = perturbed(path_file.path, scale, np.random.SeedSequence(seed, spawn_key=(k, draw)))
-                yield _trial(scale, draw, moved, clean, planned)
-                progress(k * draws + draw + 2, total)
-
-    done, interrupted = collect(trials())
-    title = f"{path_file.name}, {path_file.path.length:.1f} m, {clean.trajectory.duration:.2f} s: the path perturbed"
-    table = Table("robustness", title, COLUMNS, tuple(_rows(done)))
-    settings = {"path": path_file.name, "draws": draws, "seed": seed, "planner": planner}
-    return StudyResult("path-robustness", settings, (table,), (detail_table("plans", done),), interrupted)
+                done.append(_trial(scale, draw, moved, clean, planned))
+    except KeyboardInterrupt:
+        interrupted = True
+    duration, length = clean.trajectory.duration, path_file.path.length
+    return PathRobustness(path_file.name, length, duration, interrupted, tuple(_summaries(done)), tuple(done))
 
 
 def _trial(scale: float, draw: int, path: Path, clean: Plan, planned: Callable[[Path], Plan]) -> PerturbedPlan:
@@ -122,30 +128,30 @@ def _trial(scale: float, draw: int, path: Path, clean: Plan, planned: Callable[[
 
 
 def _along(found: Plan) -> tuple[np.ndarray, np.ndarray]:
-    """Return speed, m/s, and yaw, rad, at the same shares of the path, (SAMPLES,) each."""
+    """Return speed, m/s, and yaw, rad, at the same fractions of the path, (SAMPLES,) each."""
     places = np.linspace(0.0, found.path.end, SAMPLES)
     state = found.trajectory.at(found.trajectory.time_at(places))
     return np.linalg.norm(state.velocity, axis=1), state.yaw
 
 
-def _rows(done: Sequence[PerturbedPlan]) -> Iterator[dict[str, Any]]:
+def _summaries(done: Sequence[PerturbedPlan]) -> Iterator[ScaleSummary]:
     for scale in dict.fromkeys(trial.epsilon for trial in done):
         own = [trial for trial in done if trial.epsilon == scale]
-        longer, away = _known(trial.longer for trial in own), _known(trial.deviation for trial in own)
-        yield {
-            "epsilon": scale,
-            "plans": len(own),
-            "certified": sum(np.isfinite(trial.flight) for trial in own),
-            "flown": sum(not trial.reason for trial in own),
-            "longer": longer.mean(),
-            "longer_most": longer[np.argmax(np.abs(longer))],
-            "faster": _known(trial.faster for trial in own).mean(),
-            "turned": _known(trial.turned for trial in own).mean(),
-            "deviation": away.mean(),
-            "deviation_most": away.max(),
-        }
+        longer, deviation = _finite(trial.longer for trial in own), _finite(trial.deviation for trial in own)
+        yield ScaleSummary(
+            scale,
+            plans=len(own),
+            certified=sum(bool(np.isfinite(trial.flight)) for trial in own),
+            flown=sum(not trial.reason for trial in own),
+            longer=float(longer.mean()),
+            longer_most=float(longer[np.argmax(np.abs(longer))]),
+            faster=float(_finite(trial.faster for trial in own).mean()),
+            turned=float(_finite(trial.turned for trial in own).mean()),
+            deviation=float(deviation.mean()),
+            deviation_most=float(deviation.max()),
+        )
 
 
-def _known(values: Iterable[float]) -> np.ndarray:
-    """Return those that are finite as an array that is never empty."""
+def _finite(values: Iterable[float]) -> np.ndarray:
+    """Return those that are finite as an array that is never empty: of none it holds NaN."""
     return np.array([value for value in values if np.isfinite(value)] or [np.nan])
