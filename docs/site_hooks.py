@@ -7,6 +7,7 @@ from typing import Any
 
 from code_tables import rendered  # beside this file
 from mkdocs.structure.files import File, Files
+
 from studies.runner.pages import with_results
 
 REPOSITORY = Path(__file__).parent.parent

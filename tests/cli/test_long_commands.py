@@ -43,7 +43,7 @@ SMALL_STUDIES = {
     "inputs": QUICK,
     "latency": "--requests 2 --seconds 3",
     "lateness": f"{LINE} --seconds 2",
-    "link-losses": LINE,
+    "link-loss": LINE,
     "physics": LINE,
     "planners": "--paths 1",
     "random-faults": f"{LINE} --flights 2",
