@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 import pytest
 
+import cfplan as top_level
 from cfplan.cli import cfplan
 from cfplan.flight.telemetry import Phase
 from cfplan.learning import features
@@ -83,3 +84,11 @@ def test_the_version_is_the_same_wherever_it_is_written():
     assert tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["version"] == __version__
     assert f"\nversion: {__version__}\n" in (REPOSITORY / "CITATION.cff").read_text()
     assert f"\n## {__version__}" in (REPOSITORY / "CHANGELOG.md").read_text()
+
+
+def test_the_page_of_the_programming_interface_has_every_name_of_cfplan():
+    page = (REPOSITORY / "docs" / "api.md").read_text()
+    for name in set(top_level.__all__) - {"__version__"}:
+        value = getattr(top_level, name)
+        assert value.__module__ == "cfplan.errors" or f"::: {value.__module__}.{value.__name__}\n" in page
+    assert "::: cfplan.errors\n" in page
