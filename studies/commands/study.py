@@ -5,8 +5,8 @@ from pathlib import Path
 
 import click
 
-from studies.commands import flying_studies, paper_studies, planning_studies
 from cfplan.errors import InputError
+from studies.commands import flying_studies, planning_studies
 
 
 class _Studies(click.Group):
@@ -47,5 +47,5 @@ def docs(folder: Path) -> None:
         click.echo(page)
 
 
-for command in (*planning_studies.COMMANDS, *flying_studies.COMMANDS, *paper_studies.COMMANDS):
+for command in (*planning_studies.COMMANDS, *flying_studies.COMMANDS):
     study.add_command(command)
