@@ -96,6 +96,7 @@ class BaselineTrial:
     thrust_least: float = np.nan  # N, planned, of a motor
     thrust_most: float = np.nan  # N
     violation: float = np.nan  # N, planned beyond a motor's range, mean over time
+    top_speed: float = np.nan  # m/s, planned
     retraining: float | None = None  # s of the processor, once for a vehicle and its limits
     points: list[list[float]] = field(default_factory=list)  # m, along the motion, where that is drawn
 

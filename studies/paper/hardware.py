@@ -170,9 +170,9 @@ def work(settings: Settings, run: Run) -> Work:
 def _networks(settings: Settings, run: Run, name: str) -> list[TrainedNetwork]:
     """Return the networks for one set of limits."""
     spec = hardware_spec(paper_limits(load_limits(DEFAULTS), name), settings.learned_from)
-    folder, noises, epochs = settings.data / name, NOISES, settings.epochs
+    folder, noises, epochs = settings.data / name, NOISES[: 1 if settings.quick else None], settings.epochs
     if settings.quick:
-        spec, folder, noises, epochs = replace(spec, count=QUICK_PATHS // 2), run.scratch, NOISES[:1], QUICK_EPOCHS
+        spec, folder, epochs = replace(spec, count=QUICK_PATHS // 2), run.scratch, QUICK_EPOCHS
     done = 0
 
     def show(rows: int) -> None:

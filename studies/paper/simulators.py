@@ -38,7 +38,7 @@ from studies.paper.printed import TEST
 from studies.paper.trained import NODES, NetworkSettings, TrainedNetwork, paper_data
 from studies.paper.training import SequenceOptions
 from studies.paper.trials import EXPERT, TOPPQUAD, network_plan, paper_task, profile_by, profile_of, shipped_profile
-from studies.physics import OtherBody, bodies_for, compared
+from studies.physics import BODIES, OtherBody, compared
 from studies.runner.options import option
 from studies.runner.reductions import among, count, largest, mean
 from studies.runner.result import Column, Table, table
@@ -129,9 +129,8 @@ def work(settings: Settings, run: Run) -> Work:
     Raises:
         InputError: neither RotorPy nor drone-models is installed; as `paper_data`.
     """
-    usual, missing = load_limits(DEFAULTS), list[str]()
-    if not bodies_for(usual.airframe, missing):
-        raise InputError("; ".join(dict.fromkeys(missing)), hint="pip install rotorpy==3.0.0 drone-models==0.1.0")
+    usual = load_limits(DEFAULTS)
+    bodies_for(usual.airframe)
     data = paper_data(settings, run, [SequenceOptions()])
     tested = {str(each.row): each.path for each in data.part(TEST).values()}
     room = hardware_paths(usual, len(tested))
@@ -145,7 +144,7 @@ def work(settings: Settings, run: Run) -> Work:
 
 def measure(network: TrainedNetwork, flown: Flown) -> list[BodyFlight]:
     """Plan a path, and fly it by each body."""
-    bodies = bodies_for(_airframe(flown.table), [])
+    bodies = bodies_for(_airframe(flown.table))
     begun = [BodyFlight(flown.table, flown.planner, flown.name, body.name) for body in bodies]
     try:
         if flown.table == PLANNED:
@@ -157,12 +156,27 @@ def measure(network: TrainedNetwork, flown: Flown) -> list[BodyFlight]:
         return [replace(flight, reason=str(error)) for flight in begun]
 
 
+def bodies_for(airframe: Airframe) -> list[OtherBody]:
+    """Return the bodies that can be had for a vehicle. Raises InputError where there is none."""
+    found, reasons = [], []
+    for body in BODIES:
+        try:
+            body.make(airframe)
+            found.append(body)
+        except InputError as error:
+            reasons.append(error.what)
+    if not found:
+        raise InputError("; ".join(dict.fromkeys(reasons)), hint="pip install rotorpy==3.0.0 drone-models==0.1.0")
+    return found
+
+
 def _airframe(kind: str) -> Airframe:
     return {PLANNED: PAPER.airframe, SHIPPED: SHIPPED_LIMITS.airframe, HARDWARE: load_limits(DEFAULTS).airframe}[kind]
 
 
 def _by_geometric_controller(trajectory: Trajectory, begun: BodyFlight, body: OtherBody) -> BodyFlight:
-    wanted, theirs, own = positions_by_both(body.step, trajectory, body.airframe)
+    airframe = trajectory.airframe
+    wanted, theirs, own = positions_by_both(body.make(airframe), trajectory, body.beside(airframe))
     return replace(
         begun, deviation=_largest(theirs - wanted), own_deviation=_largest(own - wanted), apart=_largest(theirs - own)
     )
@@ -173,7 +187,7 @@ def _largest(errors: NDArray) -> float:
 
 
 def _by_bytes(sent: Sent, begun: BodyFlight, body: OtherBody) -> BodyFlight:
-    flown = compared(begun.path, sent.encoded, sent.trajectory, body, sent.trajectory.airframe, lost_alone())
+    flown = compared(begun.path, body, sent.encoded, sent.trajectory, sent.trajectory.airframe, lost_alone())
     return replace(begun, deviation=flown.deviation, own_deviation=flown.own_deviation, apart=flown.apart)
 
 
