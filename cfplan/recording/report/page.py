@@ -27,8 +27,11 @@ td.n, th.n { text-align: right; } .note { background: #fff6e0; padding: .4em .8e
 .fail, .error { color: #b02020; font-weight: 600; } .warning { color: #9a6700; }
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(440px, 100%), 1fr)); gap: 1em 1.5em; }
 .heads { display: flex; flex-wrap: wrap; gap: 0 5em; align-items: start; } summary { cursor: pointer; color: #555; }
-.charts svg { width: 100%; height: auto; } .scroll { overflow-x: auto; } footer { color: #777; margin-top: 3em; }
-@media print { body { max-width: none; margin: 0; } .charts svg, table { break-inside: avoid; } }
+.charts svg { width: 100%; height: auto; } figure { margin: 0; } figcaption { padding-left: 8%; color: #444; }
+figcaption b { display: block; } figcaption span { font-size: .75em; margin-right: 1.3em; overflow-wrap: anywhere; }
+figcaption i { display: inline-block; width: 14px; margin-right: .4em; vertical-align: middle; }
+.scroll { overflow-x: auto; } footer { color: #777; margin-top: 3em; }
+@media print { body { max-width: none; margin: 0; } figure, table { break-inside: avoid; } }
 """
 
 
