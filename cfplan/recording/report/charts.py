@@ -20,7 +20,7 @@ from cfplan.planning.active_limits import on_white
 from cfplan.recording.plots import FAR_LIMIT, LIMIT, Colour
 
 WIDTH, HEIGHT = 496.0, 170.0  # points, of what is drawn
-LEFT, RIGHT, TOP, BOTTOM = 52.0, 12.0, 18.0, 34.0  # points around it
+LEFT, RIGHT, TOP, BOTTOM = 52.0, 12.0, 8.0, 34.0  # points around it
 LOWEST, TALLEST = 60.0, 320.0  # points, of a chart of places
 NARROWEST = 1.0  # m across a chart of places, or millimetres of noise would fill it
 _BAND, _GRID, _TEXT = "#f3f6fb", "#e3e3e3", "#444"
@@ -64,12 +64,12 @@ def time_chart(
     reach = FAR_LIMIT * (high - low)
     near = [limit for limit in limits if low - reach <= limit <= high + reach]
     for limit in near:
-        axes.axhline(limit, color=_css(LIMIT), linewidth=1.0, dashes=(6, 3))
+        axes.axhline(limit, color=on_white(LIMIT), linewidth=1.0, dashes=(6, 3))
     if band is not None:
         axes.axvspan(*band, color=_BAND, zorder=0)
     if min([low, *near]) == 0.0:
         axes.set_ylim(bottom=0.0)
-    axes.set(xlim=span, xlabel="s")
+    axes.set(xlim=span, xlabel="time, s")
     named = [("limit", LIMIT, True)] * bool(near)
     named += [(f"limit {limit:g} (off the chart)", LIMIT, True) for limit in limits if limit not in near]
     return _figure(title, curves, named, figure)
@@ -101,7 +101,7 @@ def _axes(curves: Sequence[Curve], tall: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(width / 72, height / 72), facecolor="none")
     axes = figure.add_axes((LEFT / width, BOTTOM / height, WIDTH / width, tall / height), facecolor="none")
     for curve in curves:
-        axes.plot(curve.x, curve.y, color=_css(curve.colour), linestyle="--" if curve.dashed else "-")
+        axes.plot(curve.x, curve.y, color=on_white(curve.colour), linestyle="--" if curve.dashed else "-")
     return figure, axes
 
 
@@ -109,7 +109,7 @@ def _figure(title: str, curves: Sequence[Curve], named: Sequence[tuple[str, Colo
     """Return the chart with its title and legend."""
     entries = dict.fromkeys([*((curve.label, curve.colour, curve.dashed) for curve in curves), *named])
     legend = "".join(
-        f'<span><i style="border-top: 3px {"dashed" if dashed else "solid"} {_css(colour)}"></i>'
+        f'<span><i style="border-top: 3px {"dashed" if dashed else "solid"} {on_white(colour)}"></i>'
         f"{html.escape(label)}</span>"
         for label, colour, dashed in entries
     )
@@ -118,7 +118,3 @@ def _figure(title: str, curves: Sequence[Curve], named: Sequence[tuple[str, Colo
     svg = file.getvalue()
     svg = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d)\d+", r"\1", path[0]), svg[svg.index("<svg") :])
     return f"<figure><figcaption><b>{html.escape(title)}</b>{legend}</figcaption>{svg}</figure>"
-
-
-def _css(colour: Colour) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*on_white(colour))
