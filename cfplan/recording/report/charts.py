@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cfplan.planning.active_limits import on_white
-from cfplan.recording.plots import FAR_LIMIT, LIMIT, Colour
+from cfplan.recording.plots import LIMIT, Colour, near_limits
 
 WIDTH, HEIGHT = 496.0, 170.0  # points, of what is drawn
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 12.0, 8.0, 34.0  # points around it
@@ -60,14 +60,13 @@ def time_chart(
     drawn, or nothing else could be seen.
     """
     figure, axes = _axes(curves, HEIGHT)
-    low, high = _range([curve.y for curve in curves])
-    reach = FAR_LIMIT * (high - low)
-    near = [limit for limit in limits if low - reach <= limit <= high + reach]
+    values = [curve.y for curve in curves]
+    near = near_limits(limits, values)
     for limit in near:
         axes.axhline(limit, color=on_white(LIMIT), linewidth=1.0, dashes=(6, 3))
     if band is not None:
         axes.axvspan(*band, color=_BAND, zorder=0)
-    if min([low, *near]) == 0.0:
+    if min(*_range(values), *near) == 0.0:
         axes.set_ylim(bottom=0.0)
     axes.set(xlim=span, xlabel="time, s")
     named = [("limit", LIMIT, True)] * bool(near)
