@@ -65,7 +65,7 @@ def draw_plan(plan: Plan, name: str, flown: Flown | None = None) -> "Figure":
     rows[-1].set_xlabel("time from the start of the path, s")
     for axes in (above, aside, *rows):
         axes.grid(alpha=0.25)
-    figure.suptitle(caption(plan, name), fontsize=11)
+    figure.suptitle(caption(plan, name), fontsize=11, parse_math=False)
     handles, labels = above.get_legend_handles_labels()
     names = _shown(active) + ([FREE] if FREE in active.name else [])
     handles += [Line2D([], [], color=limit_colour(name), lw=2.6) for name in names]

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MultipleLocator
+from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from cfplan.files.whole import check_new_file, write_whole
@@ -130,7 +130,7 @@ class _Scene:
 def _draw_still(figure: Figure, plan: Plan, name: str) -> tuple[Any, Axes]:
     """Draw what does not move; return the axes of the room and of the speed."""
     active = active_limits(plan)
-    figure.text(0.02, 0.94, caption(plan, name), size=10)
+    figure.text(0.02, 0.94, caption(plan, name), size=10, parse_math=False)
     limits = dict.fromkeys(str(name) for name in active.name if name != FREE)
     handles = [Line2D([], [], color=limit_colour(limit), lw=2.6, label=limit) for limit in limits]
     figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.01, 0.94), ncols=5, fontsize=7, frameon=False)
@@ -153,7 +153,7 @@ def _draw_room(figure: Figure, space: Space) -> Any:
     room.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     room.set_box_aspect(high - low)
     for axis in (room.xaxis, room.yaxis, room.zaxis):
-        axis.set_major_locator(MultipleLocator(1.0))
+        axis.set_major_locator(MaxNLocator(9, integer=True))
     corners = [(*corner, 1.0) for corner in product(*zip(low, high, strict=True))]
     x, y, _, away = room.get_proj() @ np.transpose(corners)
     drawn = (room.transData - figure.transFigure).transform(np.stack([x / away, y / away], axis=1))
