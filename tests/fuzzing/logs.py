@@ -123,8 +123,8 @@ def _spoil_sd(_: None, chance: Random, folder: Path) -> None:
 # .tlog
 
 
-def _tlog(folder: Path) -> bytes:
-    return logs.sound(folder, "tlog")
+def _tlog(_: Path) -> bytes:
+    return logs.SOUND["tlog"]
 
 
 def _spoil_tlog(sound: bytes, chance: Random, folder: Path) -> None:
