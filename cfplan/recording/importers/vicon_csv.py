@@ -21,7 +21,7 @@ HEAD = re.compile(  # a section's name and its rate, or in some line the columns
 _BLANK = re.compile(rb"\n[ \t,;\r]+(?=\n|\Z)")
 _LEADING = re.compile(rb"[\s,;]*")
 _SECTION = re.compile(rb"\n\n+(?=[^\n\d\"-])")  # what begins with a number goes on with the frames before
-_HEAD = re.compile(rb"(?:[^\n]*\n?){5}")
+_FIVE_LINES = re.compile(rb"(?:[^\n]*\n?){5}")
 
 
 def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
@@ -39,7 +39,7 @@ def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
     origin, truncated = None, False
     first = _LEADING.match(data).end()  # type: ignore[union-attr]  # it always matches
     for begin, end in pairwise([first, *(match.end() for match in _SECTION.finditer(data, first)), len(data)]):
-        head: re.Match[bytes] = _HEAD.match(data, begin, end)  # type: ignore[assignment]  # it always matches
+        head: re.Match[bytes] = _FIVE_LINES.match(data, begin, end)  # type: ignore[assignment]  # it always matches
         lines = head[0].decode("utf-8", errors="replace").removesuffix("\n").split("\n")
         section = read_head(lines, where=f"{file}:{line_at(data, begin)}", rotations=rotations)
         notes += [f"left out, as it holds no pose: {name}" for name in section.left_out]
