@@ -35,6 +35,7 @@ def assert_same(subject, seed=0, atol=1e-6):
 # microSD
 
 ESTIMATE = [f"stateEstimate.{name}(f)" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+KALMAN = [f"kalman.{name}(f)" for name in ("stateX", "stateY", "stateZ", "q1", "q2", "q3", "q0")]
 MOCAP = [name.replace("stateEstimate", "locSrv") for name in ESTIMATE]
 
 
@@ -194,11 +195,8 @@ OF_ONE_FILE = [  # format, content, subjects
     ("Crazyflie microSD log", usd(ESTIMATE, ROWS, other=True), ["estimate"]),
     ("Crazyflie microSD log", usd(ESTIMATE, ROWS, version=1, other=True), ["estimate"]),
     ("Crazyflie microSD log", usd(ESTIMATE, ROWS, name="estTDOA"), ["estimate at estTDOA"]),
-    (
-        "Crazyflie microSD log",
-        usd(ESTIMATE + MOCAP, np.hstack([estimate_rows(1)[0], ROWS])),
-        ["mocap", "estimate"],
-    ),
+    ("Crazyflie microSD log", usd(ESTIMATE + MOCAP, np.hstack([estimate_rows(1)[0], ROWS])), ["mocap", "estimate"]),
+    ("Crazyflie microSD log", usd(KALMAN, ROWS), ["kalman"]),
     ("CSV of t, x, y, z", SOUND["crazyswarm"], ["log"]),
     ("CSV of t, x, y, z", swarm(("qx", "qy", "qz", "qw", "z", "y", "x", "timestamp")).encode(), ["log"]),
     ("MAVLink .tlog", SOUND["odometry"], ["vehicle 7 odometry"]),
@@ -311,6 +309,7 @@ def test_what_is_left_out_of_a_tlog_is_said(tmp_path, content, rows, note):
         (SOUND["microSD"].replace(b"x(f)", b"x(Q)"), "head of the log is damaged"),
         (b"\xbc\x07\x00\x01\x00", "version 7"),
         (SOUND["microSD"][:30], "head of the log is damaged or cut off"),
+        (SOUND["microSD"][: -38 * COUNT - 4], "ends before its first record"),
         (SOUND["microSD"][:-10] + b"\x12" + SOUND["microSD"][-9:], "checksum is wrong"),
         (SOUND["crazyswarm"].replace(b",qz", b"", 1), ":1: .*no column qz"),
         (SOUND["crazyswarm"].replace(b"0.01", b"soon", 1), ":3: 'soon.*in column 1 is not a number"),
