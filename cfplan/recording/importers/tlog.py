@@ -30,10 +30,11 @@ from cfplan.recording.importers.mocap_log import (
 )  # fmt: skip
 
 FORMAT, EXTRA = "MAVLink .tlog", "mavlink"
-HEAD = re.compile(  # a time between 1996 and 2103, and the length, flags and kind of a packet of version 2 or 1
-    rb"\0[\x03-\x0e].{6}(?:\xfd(?P<size>.)(?P<flags>.).{4}(?P<kind>...)|\xfe(?P<size_1>.)...(?P<kind_1>.))", re.DOTALL
+_TIME = rb"\0[\x03-\x0e].{6}"  # between 1996 and 2103
+HEAD = re.compile(_TIME + rb"(?:[\xfd\xfe]|\Z)", re.DOTALL)  # the packet after it may be cut off
+_PACKET = re.compile(  # length, flags and kind of version 2; length and kind of version 1
+    _TIME + rb"(?:\xfd(?P<size>.)(?P<flags>.).{4}(?P<kind>...)|\xfe(?P<size_1>.)...(?P<kind_1>.))", re.DOTALL
 )
-_CUT = re.compile(rb"\0[\x03-\x0e].{6}(?:[\xfd\xfe]|\Z)", re.DOTALL)  # a packet that ends within its head
 _STAMP = 8  # bytes before each packet
 _SIGNED = 0x01  # of a v2 packet's incompatibility flags: 13 bytes of signature follow
 _LOCAL_FRD = 20
@@ -88,7 +89,7 @@ def read(file: Path) -> MocapLog:
 def _packets(data: bytes, notes: list[str]) -> tuple[list[tuple[float, bytes]], bool]:
     """Return (time in s, bytes) of each packet of a kind that is read, and whether the last packet is cut off."""
     packets, skipped, place = [], 0, 0
-    while head := HEAD.search(data, place):
+    while head := _PACKET.search(data, place):
         skipped += head.start() - place
         size = 12 + head["size"][0] + 13 * (head["flags"][0] & _SIGNED) if head["size"] else 8 + head["size_1"][0]
         place = head.start() + _STAMP + size
@@ -96,7 +97,7 @@ def _packets(data: bytes, notes: list[str]) -> tuple[list[tuple[float, bytes]], 
         if kind in _MESSAGES and place <= len(data):
             time = int.from_bytes(head[0][:_STAMP], "big") * 1e-6
             packets.append((time, data[head.start() + _STAMP : place]))
-    cut = place > len(data) or _CUT.match(data, place) is not None
+    cut = place > len(data) or HEAD.match(data, place) is not None
     skipped += 0 if cut else len(data) - place
     if skipped:
         notes.append(f"{skipped} bytes skipped that are no packet")
