@@ -26,8 +26,8 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
     try:
         log: MocapLog = vicon_csv.read(file, rotations) if importer is vicon_csv else importer.read(file)
     except ImportError as error:
-        hint = f"pip install 'cfplan[{importer.EXTRA}]'"
-        raise InputError(f"a {importer.FORMAT} needs the package {error.name}", where=str(file), hint=hint) from error
+        message = f"a {importer.FORMAT} needs the package {str(error.name).partition('.')[0]}"
+        raise InputError(message, where=str(file), hint=f"pip install 'cfplan[{importer.EXTRA}]'") from error
     except OSError as error:
         message = f"cannot be read ({error.strerror or error})"
         raise InputError(message, where=str(file), hint="check its permissions, or copy it again") from error

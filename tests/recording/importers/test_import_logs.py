@@ -2,6 +2,7 @@
 
 import math
 import struct
+import sys
 import zlib
 
 import numpy as np
@@ -323,6 +324,17 @@ def test_what_is_left_out_of_a_tlog_is_said(tmp_path, content, rows, note):
 def test_what_is_wrong_with_a_log_is_named(tmp_path, content, message):
     with pytest.raises(InputError, match=message):
         read_log(written(tmp_path, content))
+
+
+@pytest.mark.parametrize(
+    ("package", "content", "extra"), [("pymavlink", SOUND["tlog"], "mavlink"), ("rosbags", b"#ROSBAG V2.0\n", "ros")]
+)
+def test_a_log_whose_package_is_missing_names_the_extra(tmp_path, monkeypatch, package, content, extra):
+    for module in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=f"needs the package {package} ") as caught:
+        read_log(written(tmp_path, content))
+    assert f"cfplan[{extra}]" in caught.value.hint
 
 
 def test_a_file_that_is_not_there_is_an_error(tmp_path):
