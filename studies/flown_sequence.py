@@ -47,6 +47,7 @@ class Committed:
     flown: JoinedTrajectory  # all motion of the flight with it, on a clock that is 0 at setpoint 0
     stop_from: int = 0  # number of the first setpoint of the stop at its end, or that it is; 0 where there is none
     stop_until: int = 0  # number of the setpoint at which that rests
+    later: int = 0  # setpoints, by which all of it is flown later than proposed
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +57,11 @@ class SequenceVerdict:
     setpoints: int  # that were sent
     missing: int  # between the first and the last, that were not sent, of those that move
     differing: int  # from those that were committed
-    plan_share: float  # of a limit, the most that the dense certificate finds in a committed plan
+    plan_usage: float  # of a limit, the most that the dense certificate finds in a committed plan
     speed: float  # m/s
     acceleration: float  # m/s², by differences of velocity outside stops, less what packets round
     stop_acceleration: float  # m/s², likewise in stops
-    share_fast: float  # of the time, faster than nine tenths of the limit
+    fraction_fast: float  # of the time, faster than nine tenths of the limit
     joint: float  # quanta, the most that a field jumps by at a splice
     without_stop: int  # setpoints that were sent without a committed stop that begins there and rests inside
     faults: tuple[str, ...]  # what exceeds a limit, in words
@@ -87,11 +88,11 @@ def judge_sequence(
         setpoints=len(numbers),
         missing=_missing(sequence, numbers),
         differing=int((off > 1e-9).sum()),
-        plan_share=_plan_share(commitments, limits),
+        plan_usage=_plan_usage(commitments, limits),
         speed=float(speed.max()),
         acceleration=float(accelerating[~stopping].max(initial=0.0)),
         stop_acceleration=float(accelerating[stopping].max(initial=0.0)),
-        share_fast=float((speed > 0.9 * limits.plan.speed).mean()),
+        fraction_fast=float((speed > 0.9 * limits.plan.speed).mean()),
         joint=joint,
         without_stop=_without_stop(flown, stops[rows], limits),
         faults=(),
@@ -108,7 +109,7 @@ def _missing(sequence: NDArray, numbers: NDArray) -> int:
 
 def _exceeded(verdict: SequenceVerdict, limits: Limits) -> list[str]:
     bounds = (
-        ("share of a limit in a plan", verdict.plan_share, 1.0),
+        ("usage of a limit in a plan", verdict.plan_usage, 1.0),
         ("speed", verdict.speed, limits.plan.speed + 2.0 * HALF_QUANTUM),
         ("acceleration by differences", verdict.acceleration, limits.plan.acceleration),
         ("acceleration by differences in a stop", verdict.stop_acceleration, limits.flight.acceleration.brake),
@@ -141,8 +142,8 @@ def _jump(before: NDArray, after: NDArray) -> float:
     return float(max(round(fields, 6), turned / (2.0 * ATTITUDE_QUANTUM)))
 
 
-def _plan_share(commitments: Sequence[Committed], limits: Limits) -> float:
-    """Return the largest share of a limit that the dense certificate finds in any motion that was committed."""
+def _plan_usage(commitments: Sequence[Committed], limits: Limits) -> float:
+    """Return the largest usage of a limit that the dense certificate finds in any motion that was committed."""
     trajectories = {id(each): each for committed in commitments for each in committed.flown.trajectories}
     return max(certify(each, limits.plan, limits.space).worst.share for each in trajectories.values())
 

@@ -177,7 +177,7 @@ def latency(
 def latency_table(replans: Sequence[Replan]) -> Table:
     """Return a row for each kind of delay. Raises InputError where nothing was accepted."""
     if not replans:
-        raise InputError("no request was accepted", hint="is the computer too busy? see `cfplan study lateness`")
+        raise InputError("no request was accepted", hint="is the computer too busy? see `python -m studies lateness`")
     kinds = (
         ("first changed setpoint", [each.first_changed for each in replans]),
         ("change of the motion", [each.motion for each in replans]),

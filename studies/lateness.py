@@ -1,17 +1,20 @@
-"""Measure how late setpoints are sent while everything else runs, and how late this computer wakes a sleeper.
+"""Measure how late setpoints are sent, with record, live view and Vicon, and how late this computer wakes a sleeper.
 
-Each flight is one of the real pilot in the virtual lab, with Vicon's protocol, a record and a live view, all on this
-computer. Before it and meanwhile, a process that only sleeps until deadlines shows what the computer itself adds.
+The real pilot flies PATH in the virtual lab; behind its end the vehicle hovers. Before the flight and meanwhile, a
+process that only sleeps until deadlines shows what the computer itself adds. First by SCHED_FIFO, where the system
+permits it; then without, for which this command gives the permission up.
 """
 
 import contextlib
 import ctypes
+import math
 import os
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +22,6 @@ import numpy as np
 import rerun as rr
 
 from cfplan.errors import ExitCode, InputError
-from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.real_time import may_use_fifo_scheduling
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.preparation.plan_flight import FlightOptions
@@ -27,9 +29,11 @@ from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.recording.header import RecordHeader
 from cfplan.recording.rerun.live import LiveView, live_blueprint
 from cfplan.recording.rerun.viewer import APPLICATION, free_port, lay_out, viewer_program
-from cfplan.safety.limits_file import load_limits
-from studies.real_time import Conditions, fly_in_real_time
-from studies.runner.result import Column, StudyResult, Table
+from studies.real_time import Conditions, RealTimeFlight, fly_in_real_time, patient
+from studies.runner.limits import limits_for
+from studies.runner.options import argument, option
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
 from studies.sleeper import Sleeper
 
 COLUMNS = (
@@ -48,14 +52,19 @@ COLUMNS = (
         meaning="what the host of a virtual machine took from all its processors meanwhile",
     ),
     Column("remark", "remark"),
-    Column("reason"),
-    Column("refusals"),
-    Column("view_failure"),
 )  # fmt: skip
 FIRST, ORDINARY = "SCHED_FIFO", "ordinary"
 QUEUED = "stream, of that waiting for a processor"  # behind other programs, per period, as the system counts it
 _DROP_CAPABILITY, _NICE_CAPABILITY = 24, 23  # PR_CAPBSET_DROP, CAP_SYS_NICE
 _VIEWER_STARTS = 2.0  # s
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is flown, and for how long."""
+
+    path_file: Path = argument()
+    seconds: float = option(60.0, "Shortest time of streaming, s; behind the end of PATH the vehicle hovers.", least=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +74,13 @@ class WakeUps:
     what: str
     priority: str
     reason: str  # why there is no measurement, or why it is short; "" where all went well
-    seconds: float = 0.0
-    p50: float = 0.0  # s, as p99, p999 and max
-    p99: float = 0.0
-    p999: float = 0.0
-    max: float = 0.0
+    seconds: float = math.nan
+    p50: float = math.nan  # s, as p99, p999 and max
+    p99: float = math.nan
+    p999: float = math.nan
+    max: float = math.nan
     count: int = 0
-    above: int = 0  # by more than 1 ms
+    above: float = math.nan  # of the count, by more than 1 ms
     skipped: int = 0  # deadlines that passed altogether
     stolen: float = 0.0  # s that the host took from this virtual machine meanwhile, over all its processors
     refusals: int = 0  # tries before it that preflight refused for lateness
@@ -87,42 +96,10 @@ class WakeUps:
             len(late), above, **others,
         )  # fmt: skip
 
-    def row(self) -> dict[str, Any]:
-        """Return it by the keys of COLUMNS, with the fields that those are made of."""
-        row = asdict(self) | {"remark": "; ".join(filter(None, (self.reason, self.view_failure)))}
-        return row if self.count else row | dict.fromkeys(("seconds", "p50", "p99", "p999", "max", "above"), np.nan)
-
-
-def lateness_study(
-    path_file: Path,
-    safety_file: Path,
-    seconds: float,
-    *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> StudyResult:
-    """Measure with and without SCHED_FIFO. Afterwards this process and its children may not use it any more."""
-    options = FlightOptions(stream_for=seconds)
-    mission = _patient(prepare_mission(path_file, load_limits(safety_file), options))
-    rows: list[WakeUps] = []
-    with contextlib.suppress(KeyboardInterrupt):
-        for step, priority in enumerate((FIRST, ORDINARY)):
-            if priority == ORDINARY:
-                give_up_priority()
-            elif not may_use_fifo_scheduling():
-                rows.append(WakeUps("stream", priority, "not permitted here"))
-                continue
-            progress(2 * step, 4)
-            rows.append(_asleep(priority, seconds))
-            progress(2 * step + 1, 4)
-            rows += _streaming(priority, mission)
-        progress(4, 4)
-    settings = {"path": path_file.stem, "seconds": seconds, "window": _has_screen()}
-    return StudyResult("lateness", settings, (lateness_table(rows),))
-
-
-def lateness_table(measured: Sequence[WakeUps]) -> Table:
-    """Return one row for each kind of waking and each priority."""
-    return Table("lateness", f"Lateness at {RATE:.0f} Hz", COLUMNS, tuple(one.row() for one in measured))
+    @property
+    def remark(self) -> str:
+        """Return why it is short, or the live view was."""
+        return "; ".join(filter(None, (self.reason, self.view_failure)))
 
 
 def give_up_priority() -> None:
@@ -135,57 +112,77 @@ def give_up_priority() -> None:
         ctypes.CDLL(None).prctl(_DROP_CAPABILITY, _NICE_CAPABILITY, 0, 0, 0)
 
 
-def _patient(mission: Mission) -> Mission:
-    """Return the same mission, not refused or ended by the lateness that is measured."""
-    pose = replace(mission.limits.pose, age_warning=0.15, age_brake=0.5, age_land=1.5)
-    return replace(mission, limits=replace(mission.limits, pose=pose, lateness=1.0))
+def work(
+    settings: Settings,
+    run: Run,
+    *,
+    fly: Callable[..., RealTimeFlight] = fly_in_real_time,
+    sleeper: Callable[..., Any] = Sleeper,
+    permitted: Callable[[], bool] = may_use_fifo_scheduling,
+    give_up: Callable[[], None] = give_up_priority,
+) -> Work:
+    """Return a case for the sleeper alone and one for the flight, by SCHED_FIFO and then without.
+
+    Afterwards this process and its children may not use it any more. Others than the real ones may be given.
+    """
+    options = FlightOptions(stream_for=settings.seconds)
+    mission = prepare_mission(settings.path_file, limits_for(settings.path_file), options)
+    patiently = replace(mission, limits=patient(mission.limits))
+
+    def measure(case: tuple[str, bool]) -> list[WakeUps]:
+        priority, streaming = case
+        if priority == ORDINARY:
+            give_up()
+        elif not permitted():
+            return [WakeUps("stream", priority, "not permitted here")] if streaming else []
+        with sleeper(RATE, first=priority == FIRST) as asleep:
+            if streaming:
+                return _streaming(priority, asleep, partial(fly, patiently, Conditions(vicon=True)))
+            stolen = _stolen()
+            time.sleep(settings.seconds)
+            late = asleep.late()
+            return [WakeUps.of("asleep, nothing else", priority, late, stolen=_stolen() - stolen)]
+
+    cases = {f"{priority}, {name}": (priority, name == "stream") for priority in (FIRST, ORDINARY)
+             for name in ("asleep", "stream")}  # fmt: skip
+    return Work(cases, measure, WakeUps)
 
 
-def _asleep(priority: str, seconds: float) -> WakeUps:
-    """Measure a sleeper alone."""
-    stolen = _stolen()
-    with Sleeper(RATE, first=priority == FIRST) as sleeper:
-        time.sleep(seconds)
-        return WakeUps.of("asleep, nothing else", priority, sleeper.late(), stolen=_stolen() - stolen)
+def tables(settings: Settings, rows: list[WakeUps]) -> Iterator[Table]:
+    """Yield a line for each kind of waking and each priority."""
+    yield table("lateness", f"Lateness at {RATE:.0f} Hz", COLUMNS, rows)
 
 
-def _streaming(priority: str, mission: Mission) -> list[WakeUps]:
+def _streaming(priority: str, sleeper: Sleeper, fly: Callable[..., RealTimeFlight]) -> list[WakeUps]:
     """Measure the stream of a flight, and a sleeper over the same seconds."""
     stolen = _stolen()
-    with Sleeper(RATE, first=priority == FIRST) as sleeper:
-        flight = fly_in_real_time(mission, Conditions(vicon=True), name="lateness", view=_view, on_stream=sleeper.watch)
-        if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:
-            raise KeyboardInterrupt  # who ends the flight ends the study
-        if not flight.sent or flight.outcome is None:
-            return [WakeUps("stream", priority, flight.reason, refusals=flight.refusals)]
-        begin, end = flight.sent[0].due, flight.sent[-1].due
-        queued, asleep = sleeper.queued(begin, end), sleeper.late(begin, end)
-    late = [message.time - message.due for message in flight.sent]
-    reason, stolen = "" if flight.landed else flight.reason, _stolen() - stolen
-    return [
-        WakeUps.of(
-            "stream",
-            priority,
-            late,
-            reason,
-            skipped=flight.outcome.lateness.skipped,
-            stolen=stolen,
-            refusals=flight.refusals,
-            view_failure=flight.view_failure,
-        ),
-        *([WakeUps.of(QUEUED, priority, queued, stolen=stolen)] if queued else []),
-        WakeUps.of("asleep meanwhile", priority, asleep, stolen=stolen),
-    ]
+    flight = fly(name="lateness", view=open_view, on_stream=sleeper.watch)
+    if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:
+        raise KeyboardInterrupt  # who ends the flight ends the study
+    if not flight.sent or flight.outcome is None:
+        return [WakeUps("stream", priority, flight.reason, refusals=flight.refusals)]
+    begin, end = flight.sent[0].due, flight.sent[-1].due
+    queued, asleep = sleeper.queued(begin, end), sleeper.late(begin, end)
+    late, stolen = [message.time - message.due for message in flight.sent], _stolen() - stolen
+    stream = WakeUps.of(
+        "stream", priority, late, "" if flight.landed else flight.reason, skipped=flight.outcome.lateness.skipped,
+        stolen=stolen, refusals=flight.refusals, view_failure=flight.view_failure,
+    )  # fmt: skip
+    waiting = [WakeUps.of(QUEUED, priority, queued, stolen=stolen)] if queued else []
+    return [stream, *waiting, WakeUps.of("asleep meanwhile", priority, asleep, stolen=stolen)]
 
 
 @contextlib.contextmanager
-def _view(header: RecordHeader) -> Iterator[LiveView]:
-    """Open the live view with its own viewer, which ends with it; without a screen, one without a window."""
-    port = free_port()
+def open_view(header: RecordHeader, program: str | None = None) -> Iterator[LiveView]:
+    """Open the live view with its own viewer, which ends with it; without a screen, one without a window.
+
+    Raises InputError where the viewer does not run.
+    """
+    port, screen = free_port(), os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     with tempfile.TemporaryDirectory(prefix="cfplan-") as folder:
         command = [
-            "nice", "-n", "10", str(viewer_program()), "--port", str(port), "--bind", "127.0.0.1",
-            "--hide-welcome-screen", *([] if _has_screen() else ["--headless"]),
+            "nice", "-n", "10", program or str(viewer_program()), "--port", str(port), "--bind", "127.0.0.1",
+            "--hide-welcome-screen", *([] if screen else ["--headless"]),
         ]  # fmt: skip
         viewer = subprocess.Popen(
             command,
@@ -209,10 +206,6 @@ def _view(header: RecordHeader) -> Iterator[LiveView]:
             viewer.wait()
 
 
-def _has_screen() -> bool:
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
 def _stolen() -> float:
     """Return s so far in which the host of this virtual machine ran something else; 0 where the system does not say."""
     try:
@@ -220,3 +213,6 @@ def _stolen() -> float:
         return int(fields[8]) / os.sysconf("SC_CLK_TCK")
     except (OSError, IndexError, ValueError):
         return 0.0
+
+
+STUDY = Study(Settings, work, tables, "flights/figure8.yaml -o results/lateness.json", one_at_a_time=True)

@@ -14,11 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
+from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
+from cfplan.safety.limits import FlightLimits
 from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.other_bodies import BodyStep, fly_on, identified_body, rotorpy_body
 from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.trajectory import Trajectory
 from studies.runner.limits import limits_for
 from studies.runner.options import argument
 from studies.runner.reductions import among, largest
@@ -42,6 +45,10 @@ class OtherBody:
     name: str
     make: Callable[[Airframe], BodyStep]  # raises InputError where the body cannot be had
     motor_lag: float | None = None  # s, of cfplan's body beside it; None: the airframe's
+
+    def beside(self, airframe: Airframe) -> Airframe:
+        """Return the airframe of cfplan's body beside it."""
+        return airframe if self.motor_lag is None else replace(airframe, motor_time_constant=self.motor_lag)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,26 +86,33 @@ def measure(path_file: Path, bodies: Sequence[OtherBody] = BODIES) -> list[Compa
     rows = []
     for body in bodies:
         try:
-            step = body.make(airframe)
+            rows.append(compared(path_file.stem, body, encoded, trajectory, airframe, limits.flight))
         except InputError as error:
             rows.append(ComparedFlight(path_file.stem, body.name, reason=error.what))
-            continue
-        lag = airframe.motor_time_constant if body.motor_lag is None else body.motor_lag
-        times, theirs = fly_on(step, encoded, trajectory, airframe)
-        own_body = replace(airframe, motor_time_constant=lag)
-        loop = dry_run(encoded, trajectory, own_body, limits.flight, believed=airframe).loop
-        own = loop.position[np.minimum(np.searchsorted(loop.time, times - 1e-9), len(loop.time) - 1)]
-        wanted, apart = trajectory.at(times).position, np.linalg.norm(theirs - own, axis=1)
-        flight = ComparedFlight(
-            path_file.stem, body.name, motor_lag=lag, duration=trajectory.duration,
-            deviation=_largest(theirs - wanted), own_deviation=_largest(own - wanted), apart=float(apart.max()),
-            apart_time=float(times[np.argmax(apart)]), apart_rms=float(np.sqrt(np.mean(apart**2))),
-        )  # fmt: skip
-        rows.append(flight)
     if all(row.reason for row in rows):
         reasons = "; ".join(dict.fromkeys(row.reason for row in rows))
         raise InputError(reasons, hint="pip install rotorpy==3.0.0 drone-models==0.1.0")
     return rows
+
+
+def compared(
+    path: str, body: OtherBody, encoded: EncodedFlight, trajectory: Trajectory, airframe: Airframe,
+    limits: FlightLimits,
+) -> ComparedFlight:  # fmt: skip
+    """Return how setpoints are followed by a body and by cfplan's; the controller believes in `airframe`.
+
+    Raises InputError where the body cannot be had.
+    """
+    own_body = body.beside(airframe)
+    times, theirs = fly_on(body.make(airframe), encoded, trajectory, airframe)
+    loop = dry_run(encoded, trajectory, own_body, limits, believed=airframe).loop
+    own = loop.position[np.minimum(np.searchsorted(loop.time, times - 1e-9), len(loop.time) - 1)]
+    wanted, apart = trajectory.at(times).position, np.linalg.norm(theirs - own, axis=1)
+    return ComparedFlight(
+        path, body.name, motor_lag=own_body.motor_time_constant, duration=trajectory.duration,
+        deviation=_largest(theirs - wanted), own_deviation=_largest(own - wanted), apart=float(apart.max()),
+        apart_time=float(times[np.argmax(apart)]), apart_rms=float(np.sqrt(np.mean(apart**2))),
+    )  # fmt: skip
 
 
 def _largest(errors: NDArray) -> float:

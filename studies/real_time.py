@@ -4,11 +4,11 @@ import multiprocessing
 import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from cfplan.errors import CfplanError, ExitCode, InputError
-from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
@@ -18,6 +18,7 @@ from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent, Telemetry
 from cfplan.recording.header import RecordHeader, header_under
 from cfplan.recording.rerun.live import LiveView
 from cfplan.recording.writer import RecordWriter, wall_time_at_zero
+from cfplan.safety.limits import Limits
 from cfplan.simulation.lab.lab import Lab, Truth, start_lab
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.room import RoomPoseSource, RoomSettings
@@ -34,7 +35,7 @@ _MOST_NOISE = 1.0  # m
 class Conditions:
     """What the lab is like."""
 
-    loss: float = 0.0  # share of the radio's transmissions
+    loss: float = 0.0  # fraction of the radio's transmissions
     pose_noise: float = 0.001  # m, standard deviation of each axis
     vicon: bool = False  # poses by Vicon's protocol, through its client in its own process; else straight from the room
     seed: int = 0  # of all noise
@@ -43,7 +44,7 @@ class Conditions:
         if not (0 <= self.loss < 1 and 0 <= self.pose_noise < _MOST_NOISE):
             raise InputError(
                 f"a loss of {self.loss} and pose noise of {self.pose_noise} m make no sense",
-                hint=f"loss is a share from 0 to less than 1, noise less than {_MOST_NOISE:g} m",
+                hint=f"loss is a fraction from 0 to less than 1, noise less than {_MOST_NOISE:g} m",
             )
 
 
@@ -72,6 +73,20 @@ class RealTimeFlight:
 View = Callable[[RecordHeader], AbstractContextManager[LiveView]]
 
 
+def simulated_lab(mission: Mission, conditions: Conditions) -> Lab:
+    """Start the lab of these conditions."""
+    noise, seed = conditions.pose_noise, conditions.seed
+    cameras = ViconSettings(position_noise=noise, seed=seed) if conditions.vicon else None
+    lab = start_lab(
+        mission.limits.airframe,
+        vehicle=VehicleSettings(seed=seed),
+        room=RoomSettings(position_noise=noise, seed=seed, vicon=cameras),
+    )
+    if conditions.loss:
+        lab.disturb(RadioFault(RadioFaultKind.LOSS, size=conditions.loss))
+    return lab
+
+
 def fly_in_real_time(
     mission: Mission,
     conditions: Conditions,
@@ -79,18 +94,27 @@ def fly_in_real_time(
     name: str,
     view: View | None = None,
     on_stream: Callable[[int], None] = lambda _: None,
+    pilot: Callable[..., FlightOutcome] = fly,
+    start: Callable[[Mission, Conditions], Lab] = simulated_lab,
 ) -> RealTimeFlight:
     """Fly it; again where preflight refused for lateness alone. A failure is in the result's reason, not raised.
 
-    `on_stream` is called with the number of the pilot's process when the stream begins.
+    `on_stream` is called with the number of the pilot's process when the stream begins. `pilot` flies like `fly` in
+    the lab that `start` returns.
     """
     refusals = 0
     while True:
-        flight = _fly_once(mission, conditions, name, view, on_stream)
+        flight = _fly_once(mission, conditions, name, view, on_stream, partial(pilot, mission), start)
         flight.refusals = refusals
         if refusals == RETRIES or not _refused_for_lateness(flight.outcome):
             return flight
         refusals += 1
+
+
+def patient(limits: Limits) -> Limits:
+    """Return the limits, so that lateness neither refuses nor ends a flight in which it is measured."""
+    pose = replace(limits.pose, age_warning=0.15, age_brake=0.5, age_land=1.5)
+    return replace(limits, pose=pose, lateness=1.0)
 
 
 def _refused_for_lateness(outcome: FlightOutcome | None) -> bool:
@@ -100,7 +124,13 @@ def _refused_for_lateness(outcome: FlightOutcome | None) -> bool:
 
 
 def _fly_once(
-    mission: Mission, conditions: Conditions, name: str, view: View | None, on_stream: Callable[[int], None]
+    mission: Mission,
+    conditions: Conditions,
+    name: str,
+    view: View | None,
+    on_stream: Callable[[int], None],
+    pilot: Callable[..., FlightOutcome],
+    start: Callable[[Mission, Conditions], Lab],
 ) -> RealTimeFlight:
     flight = RealTimeFlight(None, "")
     header, phase = _header(mission, name), Phase.CLOSED
@@ -120,17 +150,12 @@ def _fly_once(
     try:
         with (
             tempfile.TemporaryDirectory(prefix="cfplan-") as folder,
-            _lab(mission, conditions) as lab,
+            start(mission, conditions) as lab,
             RecordWriter(Path(folder), header) as writer,
             view(header) if view is not None else nullcontext() as watching,
         ):
-            flight.outcome = fly(
-                mission,
-                uri=lab.uri,
-                drivers=[SimDriver],
-                pose_source=_poses(lab, mission, conditions),
-                on_telemetry=hear,
-            )
+            poses = pose_source(lab.mocap_uri, mission.limits.pose) if conditions.vicon else RoomPoseSource(lab.number)
+            flight.outcome = pilot(uri=lab.uri, drivers=[SimDriver], pose_source=poses, on_telemetry=hear)
             flight.truth = lab.truth()
         flight.reason = flight.outcome.reason
         flight.view_failure = watching.failure if watching is not None else ""
@@ -143,23 +168,6 @@ def _pilot() -> int:
     """Return the number of the pilot's process."""
     pilots = (child.pid for child in multiprocessing.active_children() if child.name == "pilot")
     return next(pilots, 0) or 0
-
-
-def _lab(mission: Mission, conditions: Conditions) -> Lab:
-    noise, seed = conditions.pose_noise, conditions.seed
-    cameras = ViconSettings(position_noise=noise, seed=seed) if conditions.vicon else None
-    lab = start_lab(
-        mission.limits.airframe,
-        vehicle=VehicleSettings(seed=seed),
-        room=RoomSettings(position_noise=noise, seed=seed, vicon=cameras),
-    )
-    if conditions.loss:
-        lab.disturb(RadioFault(RadioFaultKind.LOSS, size=conditions.loss))
-    return lab
-
-
-def _poses(lab: Lab, mission: Mission, conditions: Conditions) -> PoseSource:
-    return pose_source(lab.mocap_uri, mission.limits.pose) if conditions.vicon else RoomPoseSource(lab.number)
 
 
 def _header(mission: Mission, name: str) -> RecordHeader:

@@ -1,17 +1,17 @@
-"""Steer with random requests in the stepped lab: any kind, at any moment, in bursts. No limit may be exceeded.
+"""Steer the virtual Crazyflie by random requests in the stepped lab, and judge every setpoint that was streamed.
 
-By the seed of a flight are drawn where the vehicle stands, how long its planner takes, and its requests: to extend,
-replace, stop, fly slower or faster; such as cannot be flown, lie outside or are garbage; and faults of the planner.
-Every flight is judged by the whole sequence of setpoints that it streamed, and by the truth.
+The seed of a flight determines where the vehicle stands, how long its planner takes, and the requests, at any moment
+and in bursts: to extend, replace, stop, fly slower or faster; some lie outside, cannot be flown, or are garbage; some
+meet a fault of the planner. No limit may be exceeded.
 """
 
 import contextlib
-import itertools
 import math
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +27,27 @@ from cfplan.preparation.certified_flight import STOP
 from cfplan.preparation.replan import HeldFlight
 from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.safety.limits import Limits
-from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.steering.flight_in_progress import Listeners
 from cfplan.steering.steered_vehicle import SteeredVehicle
 from cfplan.steering.stepped_steering import SteppedSteering
 from cfplan.steering.waypoint_lines import parse_line
-from studies.flown_sequence import Committed, SequenceVerdict, judge_sequence
-from studies.runner.result import Column, StudyResult, Table, collect, detail_table
 from cfplan.vehicle.joint import JoinedTrajectory
+from studies.faults import on_floor, to_wall
+from studies.flown_sequence import Committed, judge_sequence
+from studies.runner.limits import limits_for
+from studies.runner.options import option
+from studies.runner.reductions import count, largest, mean, smallest, total
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
 
-REQUESTS = 250  # of a flight, the last of a burst besides
-SECONDS = 90.0  # of a flight, in which they are asked for
 _PLANNING = (0.02, 0.05, 0.1, 0.3)  # s, that the planner of a flight takes for a plan
-_BURST_SHARE, _BURST, _BURST_PERIOD = 0.02, (10, 30), 0.02  # of the requests, how many together, s between them
-_FAULT_SHARE = 0.03  # of the requests: the planner fails with it
+_BURST_FRACTION, _BURST, _BURST_PERIOD = 0.02, (10, 30), 0.02  # of the requests, how many together, s between them
+_FAULT_FRACTION = 0.03  # of the requests: the planner fails with it
 _TAKE_OFF_HEIGHT = (0.5, 1.2)  # m
 _NEAR = 0.3  # m before or behind the vehicle, where waypoints are too near to turn at speed
-_SHARES = {"extend": 0.30, "replace": 0.28, "stop": 0.07, "slower": 0.05, "faster": 0.08, "near": 0.08, "outside": 0.07,
-           "garbage": 0.07}  # fmt: skip
+_FRACTIONS = {"extend": 0.30, "replace": 0.28, "stop": 0.07, "slower": 0.05, "faster": 0.08, "near": 0.08,
+              "outside": 0.07, "garbage": 0.07}  # fmt: skip
 _GARBAGE: tuple[Any, ...] = (
     [[math.nan, 0.0, 1.0]], [[0.0, math.inf, 1.0]], [], [1.0, 2.0, 3.0], [["a", "b", "c"]], None, "fly home",
     np.ones((1000, 3)), [[0.0, 1.0]], [[1.0, 2.0, 3.0], [1.0, 2.0]], {"x": 1.0}, [[1e300, 0.0, 1.0]], [[0.0, 0.0, 1e9]],
@@ -55,6 +57,16 @@ _RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)
 _ENDS = ("flown", "landed", "stopped and landed")  # how a flight is ended: at its end, in motion, after a stop
 _BAD_SHOWN = 20
 _STANDING = 1e-9  # m/s, up to which a motion stands still
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which flights are drawn."""
+
+    flights: int = option(40, "Flights.", least=1)
+    requests: int = option(250, "Requests of each flight; the last may be those of a burst.", least=1)
+    seconds: float = option(90.0, "Time of each flight in which they are made, s.", least=1)
+    seed: int = option(0, "Seed of the first flight.", least=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +92,24 @@ class SteeredFlight:
     setpoints: int
     missing: int
     differing: int
-    plan_share: float
+    plan_usage: float
     speed: float
     acceleration: float
     stop_acceleration: float
-    share_fast: float
+    fraction_fast: float
     joint: float
     without_stop: int
-    faults: str  # joined by "; "
+    faults: Sequence[str]
+
+    @property
+    def planner(self) -> str:
+        """Return the planner's time in words."""
+        return f"{self.planning:g} s"
+
+    @property
+    def hours(self) -> float:
+        """Return the time of flight, h."""
+        return self.seconds / 3600.0
 
     @property
     def bad(self) -> bool:
@@ -96,42 +118,51 @@ class SteeredFlight:
 
 
 COLUMNS = (
-    Column("group", "planner takes"),
-    Column("flights", "flights"),
-    Column("hours", "flown", "h", ".2f"),
-    Column("requests", "requests"),
-    Column("accepted", "accepted"),
-    Column("refused", "refused", meaning="in words: no way leads there, outside, or no waypoints at all"),
-    Column("late", "late"),
-    Column("superseded", "superseded", meaning="as another request came before it was planned"),
-    Column("unanswered", "not answered", goal="0"),
-)
+    Column("group", "planner takes", value=lambda rows: rows[0].planner),
+    Column("flights", "flights", value=count()),
+    Column("hours", "flown", "h", ".2f", value=total("hours")),
+    Column("requests", "requests", format=".0f", value=total("requests")),
+    Column("accepted", "accepted", format=".0f", value=total("accepted")),
+    Column("refused", "refused", format=".0f", meaning="in words: no way leads there, outside, or no waypoints at all",
+           value=total(lambda row: row.refused + row.invalid)),
+    Column("late", "late", format=".0f", value=total("late")),
+    Column("superseded", "superseded", format=".0f", meaning="as another request came before it was planned",
+           value=total("superseded")),
+    Column("unanswered", "not answered", format=".0f", goal="0", value=total("unanswered")),
+)  # fmt: skip
 SEQUENCE_COLUMNS = (
-    Column("group", "planner takes"),
-    Column("setpoints", "setpoints"),
-    Column("differing", "not as committed", goal="0"),
-    Column("without_stop", "without a stop", goal="0", meaning="setpoints without a committed stop that rests inside"),
-    Column("plan_share", "of a limit", "%", ".2f", goal="100 %", meaning="the most, by the dense certificate"),
-    Column("speed", "speed", "m/s", ".3f"),
-    Column("acceleration", "acceleration", "m/s²", ".2f", meaning="by differences of the velocities streamed"),
-    Column("stop_acceleration", "in stops", "m/s²", ".2f", meaning="likewise, in stops that were asked for"),
-    Column("joint", "joint", "quanta", ".2f", goal="1", meaning="the most that a field jumps by at a splice"),
-    Column("deviation_mean", "deviation, mean", "cm", ".1f", meaning="of each flight's largest"),
-    Column("deviation", "largest", "cm", ".1f"),
-    Column("to_wall", "to the wall", "m", ".2f", meaning="least distance of the true position"),
-    Column("bad", "flights with a fault", goal="0"),
-)
+    Column("group", "planner takes", value=lambda rows: rows[0].planner),
+    Column("setpoints", "setpoints", format=".0f", value=total("setpoints")),
+    Column("differing", "not as committed", format=".0f", goal="0", value=total("differing")),
+    Column("without_stop", "without a stop", format=".0f", goal="0",
+           meaning="setpoints without a committed stop that rests inside", value=total("without_stop")),
+    Column("plan_share", "of a limit", "%", ".2f", goal="100 %", meaning="the most, by the dense certificate",
+           value=largest("plan_usage")),
+    Column("speed", "speed", "m/s", ".3f", value=largest("speed")),
+    Column("acceleration", "acceleration", "m/s²", ".2f", meaning="by differences of the velocities streamed",
+           value=largest("acceleration")),
+    Column("stop_acceleration", "in stops", "m/s²", ".2f", meaning="likewise, in stops that were asked for",
+           value=largest("stop_acceleration")),
+    Column("joint", "joint", "quanta", ".2f", goal="1", meaning="the most that a field jumps by at a splice",
+           value=largest("joint")),
+    Column("deviation_mean", "deviation, mean", "cm", ".1f", meaning="of each flight's largest",
+           value=mean("deviation")),
+    Column("deviation", "largest", "cm", ".1f", value=largest("deviation")),
+    Column("to_wall", "to the wall", "m", ".2f", meaning="least distance of the true position",
+           value=smallest("to_wall")),
+    Column("bad", "flights with a fault", goal="0", value=count("bad")),
+)  # fmt: skip
 BAD_COLUMNS = (
     Column("seed", "seed"),
     Column("ended", "ended"),
     Column("end", "end"),
     Column("to_wall", "to the wall", "m", ".3f"),
     Column("unanswered", "not answered"),
-    Column("faults", "faults"),
+    Column("faults", "faults", value=lambda rows: "; ".join(rows[0].faults)),
 )
 
 
-class _WatchedSteering(SteppedSteering):
+class WatchedSteering(SteppedSteering):
     """A flight in the stepped lab whose setpoints and commitments are kept."""
 
     def __init__(self, limits: Limits, *, planning: float, seed: int, vehicle: VehicleSettings):
@@ -182,7 +213,7 @@ class _WatchedSteering(SteppedSteering):
             stop = splice + later, held.exact_from + later
         else:
             stop = (0, 0) if held.stops_from is None else (held.stops_from + later, held.stops_from + STOP + later)
-        self.commitments.append(Committed(splice + later, payloads, ends, flown, *stop))
+        self.commitments.append(Committed(splice + later, payloads, ends, flown, *stop, later=later))
 
 
 def flown_later(flown: JoinedTrajectory, splice: int, later: int) -> JoinedTrajectory:
@@ -198,49 +229,67 @@ def flown_later(flown: JoinedTrajectory, splice: int, later: int) -> JoinedTraje
     return JoinedTrajectory(flown.trajectories, starts)
 
 
-def fly_steered(seed: int, limits: Limits, *, requests: int = REQUESTS, seconds: float = SECONDS) -> SteeredFlight:
+@dataclass(slots=True)
+class Steered:
+    """What a flight with random requests left behind."""
+
+    seed: int
+    planning: float  # s, that a plan takes
+    ended: str  # as drawn
+    flight: WatchedSteering
+    vehicle: SteeredVehicle
+    asked: list[int] = field(default_factory=list)  # numbers of the requests
+    invalid: int = 0  # refused before they were asked for, as no waypoints
+    failure: str = ""
+
+
+def steer(seed: int, limits: Limits, requests: int, seconds: float) -> Steered:
     """Fly number `seed`, with so many requests in so many s."""
     chance = np.random.default_rng(seed)
     planning = float(chance.choice(_PLANNING))
-    flight = _WatchedSteering(limits, planning=planning, seed=seed, vehicle=_vehicle(seed, limits, chance))
-    ended, invalid, asked = str(chance.choice(_ENDS)), 0, list[int]()
-    vehicle = SteeredVehicle(flight, limits, uri="sim://0")
-    failure = ""
+    flight = WatchedSteering(limits, planning=planning, seed=seed, vehicle=_vehicle(seed, limits, chance))
+    ended = str(chance.choice(_ENDS))
+    steered = Steered(seed, planning, ended, flight, SteeredVehicle(flight, limits, uri="sim://0"))
     try:
-        with vehicle:
+        with steered.vehicle as vehicle:
             vehicle.take_off(float(chance.uniform(*_TAKE_OFF_HEIGHT)))
             for wish, waypoints, pause in _requests(chance, vehicle, flight, limits, requests, seconds):
                 try:
-                    asked.append(vehicle.request(wish, waypoints))
+                    steered.asked.append(vehicle.request(wish, waypoints))
                 except InputError:
-                    invalid += 1
+                    steered.invalid += 1
                 vehicle.sleep(pause)
-            asked += _end(vehicle, ended)
+            steered.asked += _end(vehicle, ended)
     except CfplanError as error:
-        failure = str(error)
-    answers = Counter(answer.verdict for answer in vehicle.answers())
+        steered.failure = str(error)
+    return steered
+
+
+def judge_steered(steered: Steered, limits: Limits) -> SteeredFlight:
+    """Judge a flight by what it streamed, and by the truth."""
+    flight, outcome = steered.flight, steered.vehicle.outcome
+    answers = Counter(answer.verdict for answer in steered.vehicle.answers())
     pending = frozenset() if flight.planner is None else flight.planner.pending  # as the flight ends
-    verdict = judge_sequence(flight.sent, flight.commitments, limits)
-    outcome = vehicle.outcome
+    verdict, truth = judge_sequence(flight.sent, flight.commitments, limits), flight.lab.truth()
     well = outcome is not None and outcome.exit_code in (ExitCode.OK, ExitCode.ENDED_BY_OPERATOR)
     return SteeredFlight(
-        seed=seed,
-        planning=planning,
+        seed=steered.seed,
+        planning=steered.planning,
         seconds=verdict.setpoints / RATE,
-        requests=len(asked) + invalid,
+        requests=len(steered.asked) + steered.invalid,
         accepted=answers[PathVerdict.ACCEPTED],
         refused=answers[PathVerdict.REFUSED],
         late=answers[PathVerdict.LATE],
         superseded=answers[PathVerdict.SUPERSEDED],
-        invalid=invalid,
-        unanswered=sum(flight.answered[number] != (number not in pending) for number in asked),
+        invalid=steered.invalid,
+        unanswered=sum(flight.answered[number] != (number not in pending) for number in steered.asked),
         stops=sum(0 < each.stop_from <= each.splice for each in flight.commitments),
-        ended=ended,
-        end=failure or (outcome.reason if outcome is not None else "no outcome"),
-        landed=well and not failure and _is_down(flight),
+        ended=steered.ended,
+        end=steered.failure or (outcome.reason if outcome is not None else "no outcome"),
+        landed=well and not steered.failure and on_floor(truth),
         deviation=outcome.deviation.max if outcome is not None else math.nan,
-        to_wall=_to_wall(flight, limits),
-        **_kept(verdict),
+        to_wall=to_wall(truth, limits.space),
+        **asdict(verdict),
     )
 
 
@@ -261,15 +310,15 @@ def _requests(
 ) -> Iterator[tuple[Wish, Any, float]]:
     """Yield wishes with their waypoints and the pause after each, s, and let the planner fail now and then."""
     mean_burst = sum(_BURST) / 2.0
-    apart = seconds / count * (1.0 + _BURST_SHARE * mean_burst)
+    apart = seconds / count * (1.0 + _BURST_FRACTION * mean_burst)
     made = 0
     while made < count:
-        together = int(chance.integers(*_BURST)) if chance.random() < _BURST_SHARE else 1
+        together = int(chance.integers(*_BURST)) if chance.random() < _BURST_FRACTION else 1
         for number in range(together):
             assert flight.planner is not None
             faults = [*PlannerFault]
             faults.remove(PlannerFault.KILLED)  # it would answer nothing any more
-            flight.planner.fault = faults[chance.integers(len(faults))] if chance.random() < _FAULT_SHARE else None
+            flight.planner.fault = faults[chance.integers(len(faults))] if chance.random() < _FAULT_FRACTION else None
             last = number == together - 1
             pause = float(chance.exponential(apart)) if last else _BURST_PERIOD
             yield *_drawn(chance, vehicle, limits), pause
@@ -279,7 +328,7 @@ def _requests(
 
 
 def _drawn(chance: np.random.Generator, vehicle: SteeredVehicle, limits: Limits) -> tuple[Wish, Any]:
-    kind = str(chance.choice(list(_SHARES), p=list(_SHARES.values())))
+    kind = str(chance.choice(list(_FRACTIONS), p=list(_FRACTIONS.values())))
     space = limits.space
     low, high = np.array(space.low) + space.margin, np.array(space.high) - space.margin
     points = chance.uniform(low, high, (int(chance.integers(1, 5)), 3))
@@ -313,93 +362,26 @@ def _end(vehicle: SteeredVehicle, how: str) -> list[int]:
     return asked
 
 
-def _is_down(flight: SteppedSteering) -> bool:
-    truth = flight.lab.truth()
-    return bool(truth.position[-1, 2] < 0.05 and not truth.motor[-1].any())
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case a seed, under the limits of this folder."""
+    seeds = range(settings.seed, settings.seed + settings.flights)
+    measure = partial(fly_steered, limits=limits_for(Path()), requests=settings.requests, seconds=settings.seconds)
+    return Work({str(seed): seed for seed in seeds}, measure, SteeredFlight)
 
 
-def _to_wall(flight: SteppedSteering, limits: Limits) -> float:
-    low, high = np.array(limits.space.low), np.array(limits.space.high)
-    low[2] = -np.inf  # the floor is where it lands
-    position = flight.lab.truth().position
-    return float(np.minimum(position - low, high - position).min())
+def fly_steered(seed: int, limits: Limits, requests: int, seconds: float) -> SteeredFlight:
+    """Fly number `seed`, with so many requests in so many s, and judge it."""
+    return judge_steered(steer(seed, limits, requests, seconds), limits)
 
 
-def _kept(verdict: SequenceVerdict) -> dict[str, Any]:
-    return {**asdict(verdict), "faults": "; ".join(verdict.faults)}
+def tables(settings: Settings, rows: list[SteeredFlight]) -> Iterator[Table]:
+    """Yield what became of requests and what was streamed, by the planner's time, and the flights that went wrong."""
+    flights, bad = sorted(rows, key=attrgetter("planning")), [row for row in rows if row.bad]
+    requests, hours = sum(row.requests for row in rows), sum(row.hours for row in rows)
+    title = f"{requests} random requests in {hours:.2f} h of flight"
+    yield table("requests", title, COLUMNS, flights, by=("planning",), last="all")
+    yield table("sequence", "What was streamed", SEQUENCE_COLUMNS, flights, by=("planning",), last="all")
+    yield table("bad", f"{len(bad)} flights went wrong", BAD_COLUMNS, bad[:_BAD_SHOWN])
 
 
-def steering(
-    safety_file: Path,
-    *,
-    seeds: Sequence[int],
-    requests: int = REQUESTS,
-    seconds: float = SECONDS,
-    jobs: int = 1,
-    minutes: float = math.inf,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> StudyResult:
-    """Fly with random requests for each seed, on `jobs` processes; begin no flight once `minutes` have passed."""
-    limits = load_limits(safety_file)
-    flown, interrupted = collect(_fly_all(limits, seeds, requests, seconds, jobs, minutes, progress))
-    flights = sorted(flown, key=lambda flight: flight.seed)
-    settings = {
-        "requests": requests,
-        "seconds": seconds,
-        "seeds": [flown[0].seed, flown[-1].seed] if flown else [],
-    }
-    return StudyResult("steering", settings, steering_tables(flights), (detail_table("flights", flights),), interrupted)
-
-
-def _fly_all(
-    limits: Limits,
-    seeds: Sequence[int],
-    requests: int,
-    seconds: float,
-    jobs: int,
-    minutes: float,
-    progress: Callable[[int, int], None],
-) -> Iterator[SteeredFlight]:
-    from joblib import Parallel, delayed
-
-    end = time.monotonic() + 60.0 * minutes
-    in_time = itertools.takewhile(lambda _: time.monotonic() < end, seeds)
-    work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch=jobs)(
-        delayed(fly_steered)(seed, limits, requests=requests, seconds=seconds) for seed in in_time
-    )
-    for done, flight in enumerate(work, 1):
-        progress(done, len(seeds))
-        yield flight
-
-
-def steering_tables(flights: Sequence[SteeredFlight]) -> tuple[Table, ...]:
-    """Return the tables: what became of requests, what was streamed, and every flight that went wrong."""
-    groups = [("all", list(flights))] if flights else []
-    groups += [
-        (f"{planning:g} s", [flight for flight in flights if flight.planning == planning])
-        for planning in sorted({flight.planning for flight in flights})
-    ]
-    rows = [_row(*group) for group in groups]
-    bad = [flight for flight in flights if flight.bad]
-    requests, hours = sum(flight.requests for flight in flights), sum(flight.seconds for flight in flights) / 3600.0
-    return (
-        Table("requests", f"{requests} random requests in {hours:.2f} h of flight", COLUMNS, tuple(rows)),
-        Table("sequence", "What was streamed", SEQUENCE_COLUMNS, tuple(rows)),
-        Table("bad", f"{len(bad)} flights went wrong", BAD_COLUMNS, tuple(map(asdict, bad[:_BAD_SHOWN]))),
-    )
-
-
-def _row(group: str, flights: Sequence[SteeredFlight]) -> dict[str, Any]:
-    total = ("requests", "accepted", "late", "superseded", "unanswered", "setpoints", "differing", "without_stop")
-    largest = ("plan_share", "speed", "acceleration", "stop_acceleration", "joint", "deviation")
-    return {
-        "group": group,
-        "flights": len(flights),
-        "hours": sum(flight.seconds for flight in flights) / 3600.0,
-        "refused": sum(flight.refused + flight.invalid for flight in flights),
-        **{key: sum(getattr(flight, key) for flight in flights) for key in total},
-        **{key: max(getattr(flight, key) for flight in flights) for key in largest},
-        "deviation_mean": float(np.mean([flight.deviation for flight in flights])),
-        "to_wall": min(flight.to_wall for flight in flights),
-        "bad": sum(flight.bad for flight in flights),
-    }
+STUDY = Study(Settings, work, tables, "--flights 40 --workers 2 -o results/steering.json")

@@ -84,7 +84,7 @@ FAMILIES: dict[str, tuple[Callable[[Draw], tuple[Fault, ...]], int]] = {
 @pytest.fixture(scope="module")
 def missions():
     files = [REPOSITORY / "flights" / f"{name}.yaml" for name in PATHS]
-    return prepare_missions(files, lambda _: REPOSITORY / "safety.yaml", RANDOM_PATHS)
+    return prepare_missions(files, RANDOM_PATHS)
 
 
 def flown(number: int, faults: Callable[[Draw], tuple[Fault, ...]], missions) -> FaultFlight:

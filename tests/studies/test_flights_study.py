@@ -1,20 +1,21 @@
 """Flights in real time: what failed is counted and told, the rest is measured, and an interrupt keeps it."""
 
-import json
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cfplan.cli import run_command
 from cfplan.errors import ExitCode, InputError, LinkError
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.outcome import Check, Deviation, FlightOutcome, Rung
+from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent
 from cfplan.simulation.lab.lab import Truth
-from studies import flights, real_time
-from studies.flights import JudgedFlight, fly_each
-from studies.real_time import LATENESS_CHECK, RETRIES, Conditions
+from studies.flights import STUDY, Settings, work
+from studies.real_time import LATENESS_CHECK, RETRIES, Conditions, fly_in_real_time
+from studies.runner.cases import run_study
 
 pytestmark = pytest.mark.unit
 REPOSITORY = Path(__file__).parents[2]
@@ -50,13 +51,12 @@ class Lab:
         return self._truth
 
 
-@pytest.fixture
-def flown(monkeypatch):
-    """Flights that are not flown: each ends as the next of the list does, a setpoint late every hundred."""
-    ends, labs = [], []
+def study(*ends, files=(LINE,), **settings):
+    """The result of flights that are not flown, each ends as the next of `ends` does, and the labs of each."""
+    left, labs = list(ends), []
 
     def fly(mission, *, on_telemetry, **_):
-        end = ends.pop(0)
+        end = left.pop(0)
         if isinstance(end, BaseException):
             raise end
         on_telemetry(PhaseEntered(START, Phase.STREAM))
@@ -68,123 +68,85 @@ def flown(monkeypatch):
 
     def lab(mission, conditions):
         labs.append(conditions)
-        told = real_time.decode(mission.payloads)
+        told = decode(mission.payloads)
         time = START + mission.lead + np.arange(len(mission.payloads)) / 100  # setpoints are ahead of the plan
         beside = told.position + np.array([OFF, 0.0, 0.0])
         zero = np.zeros(len(time))
         return Lab(Truth(time, beside, told.velocity, told.quaternion, told.body_rate, zero, zero, zero, False))
 
-    monkeypatch.setattr(real_time, "fly", fly)
-    monkeypatch.setattr(real_time, "_lab", lab)
-    return ends, labs
+    parts = partial(work, fly=partial(fly_in_real_time, pilot=fly, start=lab))
+    result = run_study("flights", "studies.flights", replace(STUDY, work=parts), Settings(files, **settings))
+    assert result.interrupted or not left
+    return result, labs
 
 
-def study(files=(LINE,), **options):
-    return fly_each(files, lambda _: REPOSITORY / "safety.yaml", **options)
-
-
-def flown_of(result):
-    return [JudgedFlight(**row) for row in result.table("flights").rows]
-
-
-def test_each_flight_of_a_path_has_noise_of_its_own_under_the_same_conditions(flown):
-    ends, labs = flown
-    ends += [outcome(), outcome()]
-    result = study(repeats=2, conditions=Conditions(loss=0.05, seed=7))
+def test_each_flight_of_a_path_has_noise_of_its_own_under_the_same_conditions():
+    result, labs = study(outcome(), outcome(), repeats=2, loss=0.05, seed=7)
     assert labs == [Conditions(loss=0.05, seed=7), Conditions(loss=0.05, seed=8)]
-    assert [flight.seed for flight in flown_of(result)] == [7, 8]
+    assert [flight.seed for flight in result.rows] == [7, 8]
 
 
-def test_deviation_is_by_poses_and_by_the_truth_and_time_is_that_of_the_setpoints(flown):
-    ends, _ = flown
-    ends.append(outcome(deviation=0.05))
-    (flight,) = flown_of(study())
+def test_deviation_is_by_poses_and_by_the_truth_and_time_is_that_of_the_setpoints():
+    (flight,) = study(outcome(deviation=0.05))[0].rows
     assert flight.deviation_max == 0.05
     assert flight.true_deviation_max == pytest.approx(OFF, abs=1e-3)
     assert flight.streamed == pytest.approx(flight.planned, abs=0.011)
     assert flight.off_plan < 0.01
 
 
-def test_mean_and_worst_are_over_the_flights_that_landed_and_the_others_are_told(flown):
-    ends, _ = flown
-    ends += [outcome(deviation=0.02), outcome(deviation=0.06), outcome(ExitCode.ENDED_BY_SAFETY), LinkError("gone")]
-    result = study(repeats=4)
-    plans, table, failures = (table.cells() for table in result.tables)
-    assert all(len(row) == len(titles) for titles, rows in (plans, table, failures) for row in rows)
+def test_mean_and_worst_are_over_the_flights_that_landed_and_the_others_are_told():
+    ends = outcome(deviation=0.02), outcome(deviation=0.06), outcome(ExitCode.ENDED_BY_SAFETY), LinkError("gone")
+    plans, table, failures = (table.cells() for table in study(*ends, repeats=4)[0].tables)
+    assert len(plans[1]) == 1
     assert table[1][-1][:4] == ["all", "2/4", "4.0 cm", "6.0 cm"]
     assert failures[1] == [["line", "2", "ended_by_safety"], ["line", "3", "gone"]]
-    json.dumps(result.to_json(), allow_nan=False)
 
 
-def test_what_preflight_refuses_for_lateness_alone_is_tried_again_at_most_twice(flown):
-    ends, _ = flown
+def test_what_preflight_refuses_for_lateness_alone_is_tried_again_at_most_twice():
     late = outcome(ExitCode.PREFLIGHT, failed=[LATENESS_CHECK])
-    ends += [late, late, outcome()]
-    (flight,) = flown_of(study())
+    (flight,) = study(late, late, outcome())[0].rows
     assert (flight.landed, flight.refusals) == (True, 2)
-    ends += [late] * (RETRIES + 1)
-    (flight,) = flown_of(study())
+    (flight,) = study(*[late] * (RETRIES + 1))[0].rows
     assert (flight.landed, flight.refusals) == (False, RETRIES)
-    assert not ends
 
 
-def test_any_other_refusal_is_final(flown):
-    ends, _ = flown
-    ends.append(outcome(ExitCode.PREFLIGHT, failed=[LATENESS_CHECK, "battery at rest"]))
-    (flight,) = flown_of(study())
+def test_any_other_refusal_is_final():
+    (flight,) = study(outcome(ExitCode.PREFLIGHT, failed=[LATENESS_CHECK, "battery at rest"]))[0].rows
     assert (flight.landed, flight.refusals) == (False, 0)
 
 
-def test_a_path_that_cannot_be_planned_does_not_end_the_study(flown, tmp_path):
-    ends, _ = flown
-    ends.append(outcome())
+def test_a_path_that_cannot_be_planned_does_not_end_the_study(tmp_path):
     outside = tmp_path / "outside.yaml"
     outside.write_text("waypoints: [[0, 0, 1], [0, 50, 1]]\n")
-    result = study((outside, LINE))
-    assert [(flight.path, flight.landed) for flight in flown_of(result)] == [("outside", False), ("line", True)]
-    assert "outside" in result.tables[2].cells()[1][0][0]
+    result, _ = study(outcome(), files=(outside, LINE))
+    assert [(flight.path, flight.landed) for flight in result.rows] == [("outside", False), ("line", True)]
+    assert "outside" in result.table("not-landed").cells()[1][0][0]
 
 
-def test_a_file_that_is_no_path_is_an_error_before_anything_flies(flown, tmp_path):
-    ends, _ = flown
-    ends.append(outcome())
+def test_a_file_that_is_no_path_is_an_error_before_anything_flies(tmp_path):
     with pytest.raises(InputError, match=r"gone\.yaml"):
-        study((LINE, tmp_path / "gone.yaml"))
-    assert len(ends) == 1
+        study(files=(LINE, tmp_path / "gone.yaml"))
 
 
-def test_the_operators_stop_ends_the_study_and_keeps_what_was_flown(flown):
-    ends, _ = flown
-    ends += [outcome(), outcome(ExitCode.ENDED_BY_OPERATOR), outcome()]
-    result = study(repeats=3)
+def test_the_operators_stop_ends_the_study_and_keeps_what_was_flown():
+    result, labs = study(outcome(), outcome(ExitCode.ENDED_BY_OPERATOR), outcome(), repeats=3)
     assert result.interrupted
-    assert [flight.landed for flight in flown_of(result)] == [True, False]
+    assert [flight.landed for flight in result.rows] == [True]
+    assert len(labs) == 2
 
 
-def test_without_what_makes_up_for_drag_the_dry_run_is_farther_off(flown):
-    ends, _ = flown
-    ends.append(outcome())
-    (plan,) = study().table("plans").rows
+def test_without_what_makes_up_for_drag_the_dry_run_is_farther_off():
+    (plan,) = study(outcome())[0].table("plans").rows
     assert plan["dry_run_without_drag"] > 2 * plan["dry_run"]
 
 
-def test_no_flight_at_all_is_a_table_too(flown):
-    ends, _ = flown
-    ends.append(outcome(ExitCode.LINK_LOST))
-    assert study().table("flights-by-path").cells()[1][-1][1] == "0/1"
+def test_no_flight_at_all_is_a_table_too():
+    assert study(outcome(ExitCode.LINK_LOST))[0].table("flights-by-path").cells()[1][-1][1] == "0/1"
 
 
-@pytest.mark.parametrize("wrong", [["--loss", "1"], ["--pose-noise", "-1"], ["--repeats", "0"]])
-def test_conditions_that_cannot_be_are_refused_before_anything_is_planned(wrong, monkeypatch, capsys):
-    monkeypatch.setattr(flights, "plan_flight", None)
-    monkeypatch.setattr("sys.argv", ["cfplan", "study", "flights", str(LINE), *wrong])
-    with pytest.raises(SystemExit) as ended:
-        run_command()
-    assert ended.value.code == 2
-    assert wrong[0] in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("wrong", [{"loss": float("nan")}, {"pose_noise": float("inf")}, {"pose_noise": float("nan")}])
-def test_what_is_no_number_is_no_condition(wrong):
-    with pytest.raises(InputError):
-        Conditions(**wrong)
+@pytest.mark.parametrize(
+    "wrong", [{"loss": 1.0}, {"loss": float("nan")}, {"pose_noise": float("inf")}, {"pose_noise": float("nan")}]
+)
+def test_conditions_that_cannot_be_are_refused_before_anything_is_planned(wrong, tmp_path):
+    with pytest.raises(InputError, match="make no sense"):
+        study(files=(tmp_path / "gone.yaml",), **wrong)

@@ -1,10 +1,10 @@
 """Lateness: of a sleeper and of the stream, with and without going first; who gives that up has given it up."""
 
-import json
 import math
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,9 +13,9 @@ from cfplan.errors import ExitCode, InputError
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.outcome import Deviation, FlightOutcome, Rung
 from cfplan.flight.telemetry import SetpointSent
-from studies import lateness
-from studies.lateness import FIRST, ORDINARY, WakeUps, lateness_table
+from studies.lateness import FIRST, ORDINARY, STUDY, Settings, WakeUps, open_view, work
 from studies.real_time import RealTimeFlight
+from studies.runner.cases import run_study
 
 REPOSITORY = Path(__file__).parents[2]
 STILL, LEVEL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
@@ -30,7 +30,7 @@ sys.exit(subprocess.run([sys.executable, "-c",
 
 
 def refused(reason):
-    return lambda: RealTimeFlight(None, reason)
+    return RealTimeFlight(None, reason)
 
 
 class KnownSleeper:
@@ -63,21 +63,30 @@ def streamed(late, skipped):
         ExitCode.OK, "landed", Rung.NONE, (), (), due[0], 0.2, Lateness(late, late, late, 20, skipped),
         Deviation(0.0, 0.0, 0.0, 0), 0.0, STILL,
     )  # fmt: skip
-    return lambda: RealTimeFlight(outcome, "landed", sent=sent)
+    return RealTimeFlight(outcome, "landed", sent=sent)
 
 
-def test_a_sleeper_stands_before_each_stream_and_beside_it_over_the_same_seconds(study, measured, monkeypatch):
-    monkeypatch.setattr(lateness, "Sleeper", KnownSleeper)
-    result = study(streamed(1e-3, 3), streamed(2e-3, 0))
-    rows = measured(result)
+def study(*flights, permitted=True):
+    """The study of flights that are not flown; nothing is given up, as other tests may need it."""
+    ends, given_up = list(flights), []
+    parts = partial(
+        work, fly=lambda *_, **__: ends.pop(0), sleeper=KnownSleeper, permitted=lambda: permitted,
+        give_up=lambda: given_up.append(True),
+    )  # fmt: skip
+    settings = Settings(REPOSITORY / "flights" / "line.yaml", 0.1)
+    result = run_study("lateness", "studies.lateness", replace(STUDY, work=parts), settings)
+    assert given_up
+    assert all(len(row) == len(result.tables[0].cells()[0]) for row in result.tables[0].cells()[1])
+    return result
+
+
+def test_a_sleeper_stands_before_each_stream_and_beside_it_over_the_same_seconds():
+    rows = study(streamed(1e-3, 3), streamed(2e-3, 0)).rows
     assert [(row.what, row.priority, row.count, row.skipped) for row in rows] == [
         ("asleep, nothing else", FIRST, 11, 0), ("stream", FIRST, 20, 3), ("asleep meanwhile", FIRST, 20, 0),
         ("asleep, nothing else", ORDINARY, 11, 0), ("stream", ORDINARY, 20, 0), ("asleep meanwhile", ORDINARY, 20, 0),
     ]  # fmt: skip
     assert [row.p50 for row in rows] == pytest.approx([3e-3, 1e-3, 3e-3, 3e-3, 2e-3, 3e-3])
-    titles, cells = result.table("lateness").cells()
-    assert all(len(row) == len(titles) for row in cells)
-    json.dumps(result.to_json(), allow_nan=False)
 
 
 def test_percentiles_are_those_of_the_setpoints():
@@ -89,34 +98,29 @@ def test_percentiles_are_those_of_the_setpoints():
     assert row.seconds == 10.0
 
 
-def test_what_did_not_fly_is_told(study, measured):
+def test_what_did_not_fly_is_told():
     result = study(refused("the vehicle is gone"), refused("too late"))
-    assert [row.reason for row in measured(result)] == ["", "the vehicle is gone", "", "too late"]
-    titles, cells = result.table("lateness").cells()
-    assert all(len(row) == len(titles) for row in cells)
+    assert [row.reason for row in result.rows] == ["", "the vehicle is gone", "", "too late"]
+    assert "the vehicle is gone" in result.tables[0].cells()[1][1]
 
 
-def test_where_it_is_not_permitted_to_go_first_the_rest_is_measured(study, measured):
-    result = study(refused("too late"), permitted=False)
-    assert measured(result)[0].reason == "not permitted here"
-    assert [row.priority for row in measured(result)[1:]] == [ORDINARY, ORDINARY]
+def test_where_it_is_not_permitted_to_go_first_the_rest_is_measured():
+    rows = study(refused("too late"), permitted=False).rows
+    assert rows[0].reason == "not permitted here"
+    assert [row.priority for row in rows[1:]] == [ORDINARY, ORDINARY]
 
 
 def test_after_giving_priority_up_no_child_can_have_it():
     assert subprocess.run([sys.executable, "-c", GIVES_UP], check=False, timeout=60).returncode == 0
 
 
-def test_a_stream_that_ends_early_is_measured_as_far_as_it_came():
-    row = replace(WakeUps.of("stream", ORDINARY, [1e-4] * 300), reason="poses stopped")
-    assert {"3 s", "poses stopped"} <= set(lateness_table([row]).cells()[1][0])
+@pytest.mark.parametrize("shortened", [{"reason": "poses stopped"}, {"view_failure": "the live view ended: closed"}])
+def test_a_stream_or_view_that_ends_early_is_measured_as_far_as_it_came_and_told(shortened):
+    row = replace(WakeUps.of("stream", ORDINARY, [1e-4] * 300), **shortened)
+    (table,) = STUDY.tables(None, [row])
+    assert {"3 s", *shortened.values()} <= set(table.cells()[1][0])
 
 
-def test_a_live_view_that_ended_early_is_told():
-    row = replace(WakeUps.of("stream", ORDINARY, [1e-4] * 300), view_failure="the live view ended: closed")
-    assert {"3 s", "the live view ended: closed"} <= set(lateness_table([row]).cells()[1][0])
-
-
-def test_a_viewer_that_does_not_run_is_an_error_and_no_quieter_computer(monkeypatch):
-    monkeypatch.setattr(lateness, "viewer_program", lambda: "/bin/false")
-    with pytest.raises(InputError, match="graphics driver"), lateness._view(None):
+def test_a_viewer_that_does_not_run_is_an_error_and_no_quieter_computer():
+    with pytest.raises(InputError, match="graphics driver"), open_view(None, "/bin/false"):
         pass

@@ -1,7 +1,6 @@
 """The study of random requests: a flight passes, and what is wrong with a flown sequence is found."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,25 +10,16 @@ from cfplan.preparation.air_planner import Wish
 from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.steering.steered_vehicle import SteeredVehicle
-from studies import steering as study
 from studies.flown_sequence import judge_sequence
-
-SAFETY = Path(__file__).parents[2] / "safety.yaml"
+from studies.runner.cases import run_study
+from studies.steering import STUDY, Settings, WatchedSteering, judge_steered, steer
 
 
 @pytest.fixture(scope="module")
 def flown(limits):
-    """A flight of some requests, and what was sent and committed in it."""
-    kept = []
-
-    def judge(*given):
-        kept.append(given)
-        return judge_sequence(*given)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study, "judge_sequence", judge)
-        flight = study.fly_steered(4, limits, requests=14, seconds=8.0)
-    return flight, *kept[0][:2]
+    """A flight of some requests as judged, and what was sent and committed in it."""
+    steered = steer(4, limits, 14, 8.0)
+    return judge_steered(steered, limits), steered.flight.sent, steered.flight.commitments
 
 
 def test_random_requests_are_flown_or_refused_within_every_limit(flown):
@@ -39,14 +29,21 @@ def test_random_requests_are_flown_or_refused_within_every_limit(flown):
     assert answered == flight.requests >= 14
     assert len(commitments) > 4
     assert len(sent) > 300
-    assert 0.5 < flight.plan_share <= 1.0
+    assert 0.5 < flight.plan_usage <= 1.0
     assert 0.5 < flight.speed <= 2.001
     assert 0.0 < flight.deviation < 0.1
     assert flight.to_wall > 0.0
 
 
-def test_the_same_seed_flies_the_same(flown, limits):
-    assert study.fly_steered(4, limits, requests=14, seconds=8.0) == flown[0]
+def test_the_study_flies_the_same_by_the_same_seed(flown):
+    result = run_study("steering", "studies.steering", STUDY, Settings(flights=1, requests=14, seconds=8.0, seed=4))
+    (row,) = result.rows
+    assert dataclasses.replace(row, faults=tuple(row.faults)) == flown[0]
+    by_planner, together = result.table("requests").rows
+    assert (by_planner["group"], together["group"]) == (f"{flown[0].planning:g} s", "all")
+    assert together["requests"] == flown[0].requests
+    assert result.table("sequence").rows[1]["plan_share"] == flown[0].plan_usage
+    assert result.table("bad").rows == ()
 
 
 @pytest.mark.parametrize(
@@ -84,21 +81,14 @@ def test_what_is_wrong_with_a_commitment_is_found(flown, limits):
         spoilt = [*commitments[:at], dataclasses.replace(each, **change), *commitments[at + 1 :]]
         assert any(words in fault for fault in judge_sequence(sent, spoilt, limits).faults), words
     slower = dataclasses.replace(limits, plan=dataclasses.replace(limits.plan, acceleration=2.0))
-    assert any("share of a limit" in fault for fault in judge_sequence(sent, commitments, slower).faults)
+    assert any("usage of a limit" in fault for fault in judge_sequence(sent, commitments, slower).faults)
     gone = {number: one for number, one in sent.items() if number != max(sent) // 2}
     assert any("left out: 1" in fault for fault in judge_sequence(gone, commitments, limits).faults)
 
 
 def test_what_is_flown_later_than_proposed_is_judged_without_what_it_replaced(limits):
     """A plan from rest, replaced before it begins by one that arrives for three setpoints later: nobody flies it."""
-    later: list[int] = []  # setpoints, by which each is flown later than proposed
-
-    class Noting(study._WatchedSteering):
-        def _keep(self, held, splice):
-            later.append(held.commitment.splices[-1] - splice if held.commitment.splices else 0)
-            super()._keep(held, splice)
-
-    flight = Noting(limits, planning=0.1, seed=5, vehicle=VehicleSettings(seed=5))
+    flight = WatchedSteering(limits, planning=0.1, seed=5, vehicle=VehicleSettings(seed=5))
     with SteeredVehicle(flight, limits, uri="sim://0") as vehicle:
         vehicle.take_off(1.0)
         for _ in range(5):
@@ -115,6 +105,6 @@ def test_what_is_flown_later_than_proposed_is_judged_without_what_it_replaced(li
         flight.planner.fault = None
         vehicle.sleep(0.5)
         vehicle.land()
-    splices = [each.splice for each in flight.commitments]
+    splices, later = zip(*((each.splice, each.later) for each in flight.commitments), strict=True)
     assert splices[later.index(3)] < splices[later.index(3) - 1]
     assert judge_sequence(flight.sent, flight.commitments, limits).faults == ()

@@ -5,7 +5,7 @@ import pytest
 from sklearn.gaussian_process import GaussianProcessClassifier
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
-from cfplan.learning.paper.classifier import fit
+from studies.paper.classifier import fit
 
 KERNEL = ConstantKernel(30.0) * RBF([0.4, 0.9])
 

@@ -5,7 +5,7 @@ import pytest
 
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.min_snap import min_snap
-from cfplan.planners.baselines.corridors import (
+from studies.paper.corridors import (
     ACCELERATION,
     PADDING,
     SPEED,

@@ -1,7 +1,7 @@
 """Segment times learned from corridors, as AllocNet does: an LSTM over the boxes, the least times as labels.
 
 AllocNet learns through its quadratic program, without labels. Here each corridor's label is searched for: the shares of
-its segments for which the motion keeps SPEED and ACCELERATION in the least time (see planners/baselines/corridors.py).
+its segments for which the motion keeps SPEED and ACCELERATION in the least time (corridors.py beside this file).
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from cfplan.errors import InfeasibleError, InputError
-from cfplan.planners.baselines.corridors import BOXES, Corridor, least_time, min_jerk
+from studies.paper.corridors import BOXES, Corridor, least_time, min_jerk
 
 WIDTH, EPOCHS, BATCH, RATE = 64, 100, 50, 3e-3
 FEATURES = 12  # of a box: its middle and the goal from the start, and its shape

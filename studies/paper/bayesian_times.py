@@ -24,7 +24,7 @@ from scipy.special import expit
 from scipy.stats import qmc
 
 from cfplan.errors import InfeasibleError, InputError
-from cfplan.learning.paper.classifier import fit
+from studies.paper.classifier import fit
 
 Check = Callable[[NDArray], bool]  # whether a motion with these segment times, (S,) s, passes
 LEAST, MOST = 0.1, 1.9  # factors on the nominal times that are considered

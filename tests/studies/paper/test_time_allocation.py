@@ -6,14 +6,14 @@ import pytest
 from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.random_paths import random_waypoints
-from cfplan.learning.paper.time_allocation import (
+from studies.paper.corridors import Corridor, corridor_about, least_time, min_jerk
+from studies.paper.time_allocation import (
     allotted_times,
     box_features,
     fastest_times,
     time_label,
     train_times,
 )
-from cfplan.planners.baselines.corridors import Corridor, corridor_about, least_time, min_jerk
 
 BOX = np.array([[-5.0, -5.0, -2.5], [5.0, 5.0, 2.5]])
 

@@ -11,15 +11,15 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.learning.checkpoints import Epoch
 from cfplan.learning.dataset import make_dataset
 from cfplan.learning.dataset_spec import DatasetSpec, Relabel
-from cfplan.learning.paper import sequences as paper_sequences
-from cfplan.learning.paper.networks import Kind, Size, build_network
-from cfplan.learning.paper.recovery import nodal_time, recover_profile, yaw_of_cosines
-from cfplan.learning.paper.sequences import Inputs, path_inputs, read_sequences, select_inputs
-from cfplan.learning.paper.training import SequenceOptions, answer, load_network, train_network
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.limit_sets import PAPER
 from cfplan.vehicle.timing import duration_of
+from studies.paper import sequences as paper_sequences
+from studies.paper.networks import Kind, Size, build_network
+from studies.paper.recovery import nodal_time, recover_profile, yaw_of_cosines
+from studies.paper.sequences import Inputs, path_inputs, read_sequences, select_inputs
+from studies.paper.training import SequenceOptions, answer, load_network, train_network
 
 SMALL = Size(8, 1)
 FED = [Kind.LSTM, Kind.TRANSFORMER, Kind.MLP]

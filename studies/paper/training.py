@@ -24,9 +24,9 @@ from cfplan.errors import InputError
 from cfplan.files.whole import whole
 from cfplan.learning.checkpoints import CHECKPOINT, Epoch, resume, save_checkpoint
 from cfplan.learning.dataset_spec import Relabel
-from cfplan.learning.paper.networks import Kind, SequenceNetwork, build_network
-from cfplan.learning.paper.recovery import nodal_time
-from cfplan.learning.paper.sequences import Inputs, Sequences, select_inputs
+from studies.paper.networks import Kind, SequenceNetwork, build_network
+from studies.paper.recovery import nodal_time
+from studies.paper.sequences import Inputs, Sequences, select_inputs
 
 WEIGHTS = "weights.safetensors"
 FORCED = (Kind.TRANSFORMER, Kind.MLP)  # that learn from the true answers before

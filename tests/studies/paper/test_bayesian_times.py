@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InfeasibleError, InputError
-from cfplan.learning.paper.bayesian_times import Budget, optimise_times, require_library
+from studies.paper.bayesian_times import Budget, optimise_times, require_library
 
 NOMINAL = np.array([2.0, 4.0])
 SMALL = Budget(low=80, high=10, iterations=15, more_low=10)
