@@ -17,7 +17,7 @@ endef
 PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
 PROCESSORS := own older plain mixed
 
-.PHONY: install fly test test-processors slow fuzz dist site pictures lint clean
+.PHONY: install fly test test-processors slow fuzz dist release site pictures lint clean
 
 install: $(VENV)/installed
 
@@ -56,9 +56,14 @@ fuzz: $(VENV)/installed-tests
 dist: $(VENV)/installed-tests
 	$(BIN)/python -m build
 
+# What a release needs: README's figures are of these sources, and everything passes.
+release: $(VENV)/installed-tests
+	$(BIN)/python -m studies pages --fresh
+	$(MAKE) lint site test dist
+
 # The documentation as a site, in build/site.
 site: $(VENV)/installed-tests
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 # The pictures of docs/; needs a Vulkan driver (mesa-vulkan-drivers) and chromium, and a computer that does nothing else.
 pictures: install
@@ -71,7 +76,7 @@ pictures: install
 	$(BIN)/cfplan replay build/pictures/figure8/* --gif docs/images/flight.gif --force
 	$(BIN)/cfplan fly flights/loop3d.yaml --records build/pictures/loop3d
 	$(BIN)/cfplan replay build/pictures/loop3d/* --figure docs/images/flight.png --force
-	$(BIN)/cfplan study figures
+	$(BIN)/python -m studies figures
 	$(BIN)/cfplan report build/pictures/figure8/* -o build/pictures/report.html --force
 	chromium --headless --no-sandbox --hide-scrollbars --window-size=1200,1500 \
 		--screenshot=docs/images/report.png file://$(CURDIR)/build/pictures/report.html

@@ -3,18 +3,54 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from cfplan.errors import (
+    CfplanError,
+    FlightEndedError,
+    InfeasibleError,
+    InputError,
+    LinkError,
+    NotCertifiedError,
+    PreflightError,
+    RequestRefusedError,
+)
 from cfplan.version import __version__
 
 if TYPE_CHECKING:
+    from cfplan.preparation.air_planner import PathAnswer, PathVerdict, Wish
     from cfplan.preparation.from_programs import load_path, plan, rehearse
     from cfplan.preparation.plan_flight import PlannedFlight as Plan
     from cfplan.safety.limits_file import load_limits
     from cfplan.steering.connect import connect
+    from cfplan.steering.steered_vehicle import SteeredVehicle
 
-__all__ = ["Plan", "__version__", "connect", "load_limits", "load_path", "plan", "rehearse"]
+__all__ = [
+    "CfplanError",
+    "FlightEndedError",
+    "InfeasibleError",
+    "InputError",
+    "LinkError",
+    "NotCertifiedError",
+    "PathAnswer",
+    "PathVerdict",
+    "Plan",
+    "PreflightError",
+    "RequestRefusedError",
+    "SteeredVehicle",
+    "Wish",
+    "__version__",
+    "connect",
+    "load_limits",
+    "load_path",
+    "plan",
+    "rehearse",
+]
 
 _PLACES = {
+    "PathAnswer": ("cfplan.preparation.air_planner", "PathAnswer"),
+    "PathVerdict": ("cfplan.preparation.air_planner", "PathVerdict"),
     "Plan": ("cfplan.preparation.plan_flight", "PlannedFlight"),
+    "SteeredVehicle": ("cfplan.steering.steered_vehicle", "SteeredVehicle"),
+    "Wish": ("cfplan.preparation.air_planner", "Wish"),
     "connect": ("cfplan.steering.connect", "connect"),
     "load_limits": ("cfplan.safety.limits_file", "load_limits"),
     "load_path": ("cfplan.preparation.from_programs", "load_path"),

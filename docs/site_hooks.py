@@ -1,4 +1,4 @@
-"""Adds to the site README, the changes, every file outside docs/ that pages link to, and the tables of the code."""
+"""Adds to the site README, the changes, linked files outside docs/, and the tables of the code and of results."""
 
 import posixpath
 import re
@@ -7,6 +7,8 @@ from typing import Any
 
 from code_tables import rendered  # beside this file
 from mkdocs.structure.files import File, Files
+
+from studies.runner.pages import with_results
 
 REPOSITORY = Path(__file__).parent.parent
 PAGES = {"README.md": "begin.md", "CHANGELOG.md": "changes.md"}  # and what they are called on the site
@@ -28,8 +30,8 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Render the tables of the code, lead the links of docs/ that leave it to what on_files added, mark commands."""
-    uri, markdown = page.file.src_uri, rendered(markdown)
+    """Render the tables, lead the links of docs/ that leave it to what on_files added, mark commands."""
+    uri, markdown = page.file.src_uri, with_results(rendered(markdown), REPOSITORY)
     text = markdown if uri in PAGES.values() else _with_links_led(markdown, f"docs/{uri}", uri)
     return COMMANDS.sub(_as_shell, text + "\n")
 

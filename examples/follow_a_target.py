@@ -11,8 +11,6 @@ import argparse
 import math
 
 import cfplan
-from cfplan.preparation.air_planner import PathVerdict, Wish
-from cfplan.steering.steered_vehicle import SteeredVehicle
 
 ABOVE = 0.5  # m
 LOOK_PERIOD = 0.25  # s
@@ -25,16 +23,16 @@ def target(time: float) -> tuple[float, float, float]:
     return 1.2 * math.cos(angle), 2.0 * math.sin(angle), 0.5
 
 
-def fly(vehicle: SteeredVehicle, seconds: float) -> tuple[int, float]:
+def fly(vehicle: cfplan.SteeredVehicle, seconds: float) -> tuple[int, float]:
     """Follow for so many s; return how many requests were accepted, and the mean distance at the end, m."""
     vehicle.take_off(1.0)
     begun, distances = vehicle.time, []
     accepted = 0
     while (now := vehicle.time - begun) < seconds:
         x, y, z = target(now + AHEAD)
-        vehicle.request(Wish.REPLACE, [(x, y, z + ABOVE)])
+        vehicle.request(cfplan.Wish.REPLACE, [(x, y, z + ABOVE)])
         vehicle.sleep(LOOK_PERIOD)
-        accepted += sum(answer.verdict is PathVerdict.ACCEPTED for answer in vehicle.answers())
+        accepted += sum(answer.verdict is cfplan.PathVerdict.ACCEPTED for answer in vehicle.answers())
         there, here = target(vehicle.time - begun), vehicle.position
         distances.append(math.hypot(here[0] - there[0], here[1] - there[1]))
     late = distances[len(distances) // 2 :]

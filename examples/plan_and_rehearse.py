@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import cfplan
 
-POINTS = [[0, 0, 1], [1, 0.5, 1.2], [0, 1, 1.4], [-1, 0, 1]]  # m
+POINTS = [[0.0, 0.0, 1.0], [1.0, 0.5, 1.2], [0.0, 1.0, 1.4], [-1.0, 0.0, 1.0]]  # m
 
 
 def plan_and_rehearse(points: Sequence[Sequence[float]], safety: str, output: str) -> tuple[float, float]:

@@ -10,8 +10,6 @@ import argparse
 import math
 
 import cfplan
-from cfplan.errors import RequestRefusedError
-from cfplan.steering.steered_vehicle import SteeredVehicle
 
 LAP = [(1.0, 0.8, 1.0), (0.0, 2.0, 1.2), (-1.0, 0.8, 1.0)]  # m, behind the gate and around
 GATE_Y, GATE_HEIGHT = -1.2, 1.0  # m, where the gate slides along x
@@ -27,16 +25,17 @@ def gate(time: float) -> tuple[float, float, float]:
     return SWING * math.sin(2.0 * math.pi * time / PERIOD), GATE_Y, GATE_HEIGHT
 
 
-def expected(vehicle: SteeredVehicle, begun: float) -> tuple[float, float, float]:
+def expected(vehicle: cfplan.SteeredVehicle, begun: float) -> tuple[float, float, float]:
     """Return where the gate will be when the vehicle comes there, m."""
     now = vehicle.time - begun
     return gate(now + math.dist(vehicle.position, gate(now)) / SPEED)
 
 
-def fly(vehicle: SteeredVehicle, laps: int) -> list[float]:
+def fly(vehicle: cfplan.SteeredVehicle, laps: int) -> list[float]:
     """Fly laps; return by how much the vehicle missed the middle of the gate each time, m."""
     vehicle.take_off(1.0)
-    begun, missed = vehicle.time, []
+    begun = vehicle.time
+    missed: list[float] = []
     while len(missed) < laps:
         seen = expected(vehicle, begun)
         ask(vehicle, [seen, *LAP])
@@ -56,11 +55,11 @@ def fly(vehicle: SteeredVehicle, laps: int) -> list[float]:
     return missed
 
 
-def ask(vehicle: SteeredVehicle, waypoints: list[tuple[float, float, float]]) -> None:
+def ask(vehicle: cfplan.SteeredVehicle, waypoints: list[tuple[float, float, float]]) -> None:
     """Ask for another way; where there is none from this motion, the old one is flown on."""
     try:
         vehicle.replace(waypoints)
-    except RequestRefusedError as why:
+    except cfplan.RequestRefusedError as why:
         print(f"as before: {why.what}")
 
 

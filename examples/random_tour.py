@@ -9,15 +9,13 @@ import argparse
 import random
 
 import cfplan
-from cfplan.errors import RequestRefusedError
-from cfplan.steering.steered_vehicle import SteeredVehicle
 
 LOW, HIGH = (-1.4, -2.5, 0.8), (1.4, 2.5, 1.3)  # m, inside the shipped safety.yaml's walls
 IN_TIME = 2.5  # s before the end of what is committed, when more is asked for
 TOGETHER = 3  # waypoints
 
 
-def fly(vehicle: SteeredVehicle, seconds: float, seed: int = 0) -> tuple[int, int]:
+def fly(vehicle: cfplan.SteeredVehicle, seconds: float, seed: int = 0) -> tuple[int, int]:
     """Tour for so many s; return how many requests were accepted and refused."""
     chance = random.Random(seed)
     vehicle.take_off(1.0)
@@ -26,7 +24,7 @@ def fly(vehicle: SteeredVehicle, seconds: float, seed: int = 0) -> tuple[int, in
         places = [[chance.uniform(low, high) for low, high in zip(LOW, HIGH, strict=True)] for _ in range(TOGETHER)]
         try:
             answer = vehicle.extend(places)
-        except RequestRefusedError as why:
+        except cfplan.RequestRefusedError as why:
             print(f"another one: {why.what}")
             refused += 1
             continue

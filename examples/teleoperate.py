@@ -13,8 +13,6 @@ import math
 from collections.abc import Callable, Iterable
 
 import cfplan
-from cfplan.preparation.air_planner import PathVerdict, Wish
-from cfplan.steering.steered_vehicle import SteeredVehicle
 
 STEP = 0.1  # m for each key
 REACH = 1.2  # m from where the vehicle is asked to be now, that the place may be ahead
@@ -25,7 +23,7 @@ MOVES = {
 }  # fmt: skip
 
 
-def fly(vehicle: SteeredVehicle, keys: Callable[[], Iterable[str]]) -> int:
+def fly(vehicle: cfplan.SteeredVehicle, keys: Callable[[], Iterable[str]]) -> int:
     """Fly as the keys say until one of them is q; return how many requests were flown."""
     vehicle.take_off(1.0)
     place, asked, accepted = vehicle.target, vehicle.target, 0
@@ -35,18 +33,18 @@ def fly(vehicle: SteeredVehicle, keys: Callable[[], Iterable[str]]) -> int:
                 vehicle.land()
                 return accepted
             if key == "x":
-                vehicle.request(Wish.STOP)
+                vehicle.request(cfplan.Wish.STOP)
                 place = asked = vehicle.target
             elif key in MOVES:
                 place = within_reach(vehicle.target, [p + STEP * m for p, m in zip(place, MOVES[key], strict=True)])
         if place != asked:
-            vehicle.request(Wish.REPLACE, [place])
+            vehicle.request(cfplan.Wish.REPLACE, [place])
             asked = place
         vehicle.sleep(LOOK_PERIOD)
         for answer in vehicle.answers():
-            if answer.verdict is PathVerdict.ACCEPTED:
+            if answer.verdict is cfplan.PathVerdict.ACCEPTED:
                 accepted += 1
-            elif answer.verdict is not PathVerdict.SUPERSEDED:
+            elif answer.verdict is not cfplan.PathVerdict.SUPERSEDED:
                 print(answer.reason)
                 place = asked = vehicle.target
 

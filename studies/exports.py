@@ -1,11 +1,12 @@
-"""Export path files for the vehicle's memory and fly them on board: deviations, beside the same plans streamed.
+"""Export each PATH for the vehicle's memory and fly it on board: deviations, beside the same plans streamed.
 
 Exports are flown in the dry run, flights by the pilot on the virtual Crazyflie of the stepped lab.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from cfplan.errors import CfplanError
 from cfplan.flight.pilot.mission import Mission, mission_of
@@ -15,11 +16,45 @@ from cfplan.preparation.on_board_flight import prepare_on_board_flight
 from cfplan.preparation.plan_flight import FlightOptions
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits import Limits
-from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dry_run import dry_run
 from studies.fault_scenarios import Scenario
 from studies.faults import fly_stepped
-from studies.runner.result import Column, StudyResult, Table, collect
+from studies.runner.limits import limits_for
+from studies.runner.options import argument
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which paths are flown."""
+
+    path_files: tuple[Path, ...] = argument()
+
+
+@dataclass(frozen=True, slots=True)
+class OnBoard:
+    """A path flown on board, in one of two ways, or why it is not."""
+
+    path: str
+    what: str  # exports: in the dry run; on-board: in the stepped lab
+    reason: str = ""  # why it is not flown
+    kind: str = ""  # of the pieces
+    pieces: int = 0
+    bytes: int = 0
+    planned: float = math.nan  # s, the plan to which polynomials are fitted
+    duration: float = math.nan  # s, of what is flown
+    slowed: float = math.nan  # until polynomials keep the limits; relative
+    time_lost: float = math.nan  # for the fall, relative
+    on_board: float = math.nan  # m, largest deviation from the plan
+    streamed: float = math.nan  # m, that of the same plan, streamed
+    end: str = ""  # how the flight ended
+
+    @property
+    def difference(self) -> float:
+        """Return by how much it deviates more on board than streamed, m."""
+        return self.on_board - self.streamed
+
 
 _SIZE = (
     Column("kind", "kind", meaning="of the pieces: *raw* as polynomials, or *compressed*"),
@@ -43,93 +78,73 @@ FLIGHT_COLUMNS = (
     Column("path", "path"),
     *_SIZE,
     Column("duration", "plan", "s", ".1f", meaning="its duration, as slow as the polynomials are"),
-    Column("time_lost", "slower for the fall", "%", ".0f", meaning="the share of time that it costs"),
+    Column("time_lost", "slower for the fall", "%", ".0f", meaning="the fraction of time that it costs"),
     *_DEVIATIONS,
     Column("end", "end", meaning="of the flight on board"),
 )
 REFUSED_COLUMNS = (Column("path", "path"), Column("what", "what"), Column("reason", "why not"))
 
 
-class _Deviations(NamedTuple):
-    """Largest deviations from one plan, m."""
-
-    on_board: float
-    streamed: float
-
-    def row(self) -> dict[str, float]:
-        return {**self._asdict(), "difference": self.on_board - self.streamed}
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case a path."""
+    return Work({str(file): file for file in settings.path_files}, measure, OnBoard)
 
 
-def exports(
-    path_files: Sequence[Path],
-    find_safety_file: Callable[[Path], Path],
-    *,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> StudyResult:
-    """Export each path and fly it on board, and the same plans streamed. An interrupt keeps what is done by then.
+def measure(path_file: Path) -> list[OnBoard]:
+    """Export a path and fly it on board, and the same plans streamed.
 
-    What cannot be planned, fitted or prepared is a row of the table `refused`. Raises InputError where there is no
-    safety.yaml, or a mistake in it.
+    What cannot be planned, fitted or prepared says why. Raises what reading the limits raises.
     """
-
-    def measure() -> Iterator[tuple[str, dict[str, Any]]]:
-        for done, file in enumerate(path_files):
-            progress(done, len(path_files))
-            limits = load_limits(find_safety_file(file))
-            for name, make in (("exports", _exported), ("on-board", _flown)):
-                try:
-                    yield name, make(file, limits)
-                except CfplanError as error:
-                    yield "refused", {"path": file.stem, "what": name, "reason": str(error)}
-
-    rows, interrupted = collect(measure())
-    tables = [
-        Table(name, title, columns, tuple(row for table, row in rows if table == name))
-        for name, title, columns in (
-            ("exports", "Exports for the vehicle's memory, in the dry run", EXPORT_COLUMNS),
-            ("on-board", "Flights on board, in the stepped lab", FLIGHT_COLUMNS),
-            ("refused", "Neither exported nor flown on board", REFUSED_COLUMNS),
-        )
-    ]
-    tables = [table for table in tables if table.rows or table.name != "refused"]
-    return StudyResult("exports", {"paths": [file.stem for file in path_files]}, tuple(tables), interrupted=interrupted)
+    limits, rows = limits_for(path_file), []
+    for what, fly in (("exports", _exported), ("on-board", _flown)):
+        try:
+            rows.append(fly(path_file, limits))
+        except CfplanError as error:
+            rows.append(OnBoard(path_file.stem, what, reason=str(error)))
+    return rows
 
 
-def _exported(path_file: Path, limits: Limits) -> dict[str, Any]:
+def _exported(path_file: Path, limits: Limits) -> OnBoard:
     exported = fit_polynomials(plan_for_polynomials(path_file, limits, FlightOptions()), Form.MEMORY)
     made, planned = exported.on_board, exported.planned
     streamed = dry_run(encode_flight(planned), planned.plan.trajectory, limits.airframe, limits.flight)
-    return {
-        "path": path_file.stem,
-        **_size(len(made.pieces.durations), made.compressed, made.memory),
-        "planned": planned.duration,
-        "duration": made.duration,
-        "slowed": made.reference.slowing - 1.0,
-        **_Deviations(exported.dry_run.deviation, streamed.deviation).row(),
-    }
+    return OnBoard(
+        path_file.stem, "exports", kind=_kind(made.compressed), pieces=len(made.pieces.durations),
+        bytes=len(made.memory), planned=planned.duration, duration=made.duration, slowed=made.reference.slowing - 1.0,
+        on_board=exported.dry_run.deviation, streamed=streamed.deviation,
+    )  # fmt: skip
 
 
-def _flown(path_file: Path, limits: Limits) -> dict[str, Any]:
+def _flown(path_file: Path, limits: Limits) -> OnBoard:
     prepared = prepare_on_board_flight(path_file, limits)
     program = prepared.mission.on_board
     assert program is not None
     on_board, end = _fly(prepared.mission)
     streamed, _ = _fly(mission_of(encode_flight(prepared.planned), prepared.mission.limits))
-    return {
-        "path": path_file.stem,
-        **_size(program.pieces, program.compressed, program.memory),
-        "duration": prepared.planned.duration,
-        "time_lost": prepared.plan.time_lost,
-        **_Deviations(on_board, streamed).row(),
-        "end": end,
-    }
+    return OnBoard(
+        path_file.stem, "on-board", kind=_kind(program.compressed), pieces=program.pieces, bytes=len(program.memory),
+        duration=prepared.planned.duration, time_lost=prepared.plan.time_lost, on_board=on_board, streamed=streamed,
+        end=end,
+    )  # fmt: skip
 
 
-def _size(pieces: int, compressed: bool, memory: bytes) -> dict[str, Any]:
-    return {"kind": "compressed" if compressed else "raw", "pieces": pieces, "bytes": len(memory)}
+def _kind(compressed: bool) -> str:
+    return "compressed" if compressed else "raw"
 
 
 def _fly(mission: Mission) -> tuple[float, str]:
     """Fly a mission in the stepped lab; return the largest deviation by the poses, m, and how the flight ended."""
     flown = fly_stepped(Scenario("none", Rung.NONE), mission)
-    return float("nan") if flown.outcome is None else flown.outcome.deviation.max, flown.reason
+    return math.nan if flown.outcome is None else flown.outcome.deviation.max, flown.reason
+
+
+def tables(settings: Settings, rows: list[OnBoard]) -> Iterator[Table]:
+    """Yield what flew in the dry run, what flew in the stepped lab, and what did not fly."""
+    exported, flown = ([row for row in rows if row.what == what and not row.reason] for what in ("exports", "on-board"))
+    yield table("exports", "Exports for the vehicle's memory, in the dry run", EXPORT_COLUMNS, exported)
+    yield table("on-board", "Flights on board, in the stepped lab", FLIGHT_COLUMNS, flown)
+    if refused := [row for row in rows if row.reason]:
+        yield table("refused", "Neither exported nor flown on board", REFUSED_COLUMNS, refused)
+
+
+STUDY = Study(Settings, work, tables, "flights/line.yaml flights/helix.yaml -o results/exports.json")

@@ -1,13 +1,13 @@
-"""Plan along random waypoints of which only the next few are known, and compare with knowing them all at once.
+"""Plan along random waypoints of which only the next few are known, and compare with knowing all: time lost.
 
 Whenever a waypoint is passed another one is told, and the plan goes on through it from a joint there, as requests in
 flight do. It always ends at rest at the last waypoint known. The whole path is the one that is planned before take-off.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path as FilePath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,72 +17,80 @@ from cfplan.geometry.random_paths import random_waypoints
 from cfplan.planning.continuation import NoWayError, continue_plan
 from cfplan.planning.plan import plan
 from cfplan.safety.limits import Limits
-from cfplan.safety.limits_file import load_limits
 from cfplan.safety.space import Space
-from studies.runner.result import Column, StudyResult, Table, detail_table
-from studies.trials import quantile_values
 from cfplan.vehicle.trajectory import Trajectory
+from studies.runner.limits import limits_for
+from studies.runner.options import option
+from studies.runner.reductions import count, largest, quantile, total
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
 
 LATER = (0.0, 0.15, 0.35)  # s after a waypoint, at which the plan is continued: where it cannot be at once, later
 WALL_DISTANCE = 0.3  # m beyond the margin, that random waypoints keep
 ROOM = 5.0  # m by which the walls are moved outwards: what is compared are times, not whether curves swing too far out
-COLUMNS = (
-    Column("known", "waypoints known"),
-    Column("paths", "paths"),
-    Column("lost_all", "time lost, all paths", "%", ".2f", goal="3 %", meaning="of the sum of all times"),
-    Column("lost_median", "median path", "%", ".2f", meaning="negative: the curve laid piece by piece is faster"),
-    Column("lost_p90", "p90", "%", ".2f"),
-    Column("lost_max", "most", "%", ".2f"),
-    Column("stops", "stops between", meaning="where no plan could be continued, so the vehicle came to rest"),
-)
 
 
 @dataclass(frozen=True, slots=True)
-class _Trial:
+class Settings:
+    """Which paths are planned."""
+
+    paths: int = option(100, "Random paths.", least=1)
+    seed: int = option(0, "Of the first path.")
+    waypoints: int = option(20, "Of each path.", least=3)
+    known: tuple[int, ...] = option((3,), "Waypoints ahead that are known.", least=1)
+
+
+@dataclass(frozen=True, slots=True)
+class ShortSighted:
+    """One path, planned with few of its waypoints known."""
+
     seed: int
     known: int
-    whole: float  # s, knowing all waypoints
+    complete: float  # s, knowing all waypoints
     duration: float  # s, knowing some
     stops: int  # between
 
     @property
     def lost(self) -> float:
-        return self.duration / self.whole - 1.0
+        """Return the time lost by knowing only some, relative."""
+        return self.duration / self.complete - 1.0
 
 
-def horizon(
-    safety_file: FilePath,
-    *,
-    paths: int = 100,
-    first_seed: int = 0,
-    waypoints: int = 20,
-    known: tuple[int, ...] = (3,),
-    jobs: int = 1,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> StudyResult:
-    """Plan along so many random paths, each time knowing `known` waypoints ahead, on `jobs` processes."""
-    from joblib import Parallel, delayed
-
-    limits = load_limits(safety_file)
-    work = [(seed, waypoints, ahead) for seed in range(first_seed, first_seed + paths) for ahead in known]
-    trials: list[_Trial] = []
-    for trial in Parallel(n_jobs=jobs, return_as="generator")(delayed(_trial)(*each, limits) for each in work):
-        trials.append(trial)
-        progress(len(trials), len(work))
-    rows = tuple(_row(ahead, [trial for trial in trials if trial.known == ahead]) for ahead in known)
-    title = f"Time lost by knowing only the next waypoints of {waypoints}"
-    settings = {"paths": paths, "first_seed": first_seed, "waypoints": waypoints, "known": list(known)}
-    return StudyResult("horizon", settings, (Table("horizon", title, COLUMNS, rows),), (detail_table("paths", trials),))
+def _lost_of_all(rows: Sequence[ShortSighted]) -> float:
+    return total("duration")(rows) / total("complete")(rows) - 1.0
 
 
-def _trial(seed: int, waypoints: int, known: int, limits: Limits) -> _Trial:
+COLUMNS = (
+    Column("known", "waypoints known"),
+    Column("paths", "paths", value=count()),
+    Column("lost_all", "time lost, all paths", "%", ".2f", goal="3 %", meaning="of the sum of all times",
+           value=_lost_of_all),
+    Column("lost_median", "median path", "%", ".2f", meaning="negative: the curve laid piece by piece is faster",
+           value=quantile("lost", 0.5)),
+    Column("lost_p90", "p90", "%", ".2f", value=quantile("lost", 0.9)),
+    Column("lost_max", "most", "%", ".2f", value=largest("lost")),
+    Column("stops", "stops between", meaning="where no plan could be continued, so the vehicle came to rest",
+           value=lambda rows: sum(row.stops for row in rows)),
+)  # fmt: skip
+
+
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case for each path and number of known waypoints."""
+    seeds = range(settings.seed, settings.seed + settings.paths)
+    cases = {f"{seed}, {known} known": (seed, known) for seed in seeds for known in settings.known}
+    return Work(cases, partial(measure, waypoints=settings.waypoints, limits=limits_for(FilePath())), ShortSighted)
+
+
+def measure(case: tuple[int, int], waypoints: int, limits: Limits) -> ShortSighted:
+    """Plan the path of a seed knowing some of its waypoints. Raises a CfplanError where it cannot be planned."""
+    seed, known = case
     space = limits.space
     away = space.margin + WALL_DISTANCE
     low, high = np.array(space.low), np.array(space.high)
     points = random_waypoints(seed, np.array([low + away, high - away]), (waypoints, waypoints))
     roomy = replace(limits, space=Space(tuple((low - ROOM).tolist()), tuple((high + ROOM).tolist()), space.margin))
     duration, stops = fly_knowing(points, known, roomy)
-    return _Trial(seed, known, _from_rest(points, roomy)[0].duration, duration, stops)
+    return ShortSighted(seed, known, _from_rest(points, roomy)[0].duration, duration, stops)
 
 
 def fly_knowing(points: NDArray, known: int, limits: Limits) -> tuple[float, int]:
@@ -133,12 +141,10 @@ def _from_rest(points: NDArray, limits: Limits) -> tuple[Trajectory, tuple[float
     return planned.trajectory, tuple(np.cumsum(times).tolist())
 
 
-def _row(known: int, trials: list[_Trial]) -> dict[str, Any]:
-    return {
-        "known": known,
-        "paths": len(trials),
-        "lost_all": sum(trial.duration for trial in trials) / sum(trial.whole for trial in trials) - 1.0,
-        **quantile_values("lost", (trial.lost for trial in trials)),
-        "lost_max": max(trial.lost for trial in trials),
-        "stops": sum(trial.stops for trial in trials),
-    }
+def tables(settings: Settings, rows: list[ShortSighted]) -> Iterator[Table]:
+    """Yield a line for each number of known waypoints."""
+    title = f"Time lost by knowing only the next waypoints of {settings.waypoints}"
+    yield table("horizon", title, COLUMNS, rows, by=("known",))
+
+
+STUDY = Study(Settings, work, tables, "--known 3 --known 5 -o results/horizon.json")

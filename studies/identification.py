@@ -1,12 +1,13 @@
-"""Identify drawn vehicles from one flight each in the stepped lab, and fly on with what was found.
+"""Identify drawn vehicles from one flight along PATH each in the stepped lab, and fly NEXT with what was found.
 
-Mass, motor lag, drag, thrust and the poses' latency are drawn by seeds. Each vehicle flies flights/identify.yaml as if
-it were the one of safety.yaml; its record, read back from its file, is all that identification sees. Then every
-vehicle flies another path three times: as unknown as before, as identified, and as if all were known.
+Mass, motor lag, drag, thrust and the poses' latency are drawn by seeds. Each vehicle flies PATH as if it were the one
+of safety.yaml; its record, read back from its file, is all that identification sees. Then every vehicle flies NEXT four
+times: as unknown as before, as identified, as identified without having been weighed, and as if all were known.
 """
 
+import math
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,46 +21,38 @@ from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints.packets import decode
 from cfplan.identification.identify import identify
 from cfplan.identification.quantities import Identification
-from cfplan.preparation.plan_flight import FlightOptions
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.recording.header import header_under
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import Record
 from cfplan.recording.writer import RecordWriter
 from cfplan.safety.limits import Limits, within_reserve
-from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
+from cfplan.vehicle.airframe import Airframe
 from studies.fault_scenarios import Scenario
 from studies.faults import SteppedFlight, fly_stepped
-from studies.runner.result import Column, StudyResult, Table, detail_table
-from cfplan.vehicle.airframe import Airframe
+from studies.runner.limits import limits_for
+from studies.runner.options import argument, option
+from studies.runner.reductions import count, largest, median
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
 
 MASS, THRUST = 0.10, 0.08  # by which they are off at most, relative
 LAGS, DRAGS, LATENCIES = (0.06, 0.14), (0.5, 2.0), (0.005, 0.040)  # s, factor, s
 SCALE_STEP = 1e-4  # kg, of the scale that weighs the vehicle
 _FIRST_SEED = 1000
 
-ERROR_COLUMNS = (
-    Column("quantity", "quantity"),
-    Column("asked", "aim", meaning="for the median error"),
-    Column("median", "error, median"),
-    Column("worst", "worst"),
-    Column("bias", "mean", meaning="with its sign"),
-    Column("uncertainty", "stated", meaning="median of the standard uncertainties that `cfplan identify` states"),
-)
-NEXT_COLUMNS = (
-    Column("vehicle", "vehicle"),
-    Column("flights", "flights"),
-    Column("landed", "landed", of="flights", meaning="at the end of the plan"),
-    Column("median", "deviation, median", "cm", ".1f", meaning="of each flight's largest true distance from the plan"),
-    Column("worst", "worst", "cm", ".1f"),
-    Column("over_median", "over known, median", "cm", ".1f", meaning="against the same vehicle, known"),
-    Column("over_worst", "over known, worst", "cm", ".1f"),
-)
-_ASKED = {"thrust": "1 %", "thrust over mass": "–", "mass": "1 %", "motor lag": "8 ms", "drag": "15 %",
-          "axial drag": "–", "pose latency": "3 ms"}  # fmt: skip
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which paths are flown, and by how many vehicles."""
+
+    path_file: Path = argument()
+    next_file: Path = argument()
+    vehicles: int = option(30, "Drawn by seeds.", least=1)
+    seed: int = option(0, "Of the first vehicle.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,14 +66,38 @@ class DrawnVehicle:
 
 @dataclass(frozen=True, slots=True)
 class StudiedVehicle:
-    """What was found of it, and how it flew; NaN where it did not."""
+    """What was found of a vehicle, and how it flew; NaN where it did not."""
 
     seed: int
-    errors: dict[str, float]  # by the keys of _ASKED, in the units of the table
-    uncertainties: dict[str, float]
-    deviations: dict[str, float]  # m, of the next flight, by how the vehicle was known
     first_flight: str  # how it ended
     reason: str = ""  # why there is nothing
+    errors: dict[str, float] | None = None  # by the keys of _ASKED, in the units of the table
+    uncertainties: dict[str, float] | None = None
+    deviations: dict[str, float] | None = None  # m, of the next flight, by how the vehicle was known
+
+
+ERROR_COLUMNS = (
+    Column("quantity", "quantity"),
+    Column("asked", "aim", meaning="for the median error"),
+    Column("median", "error, median"),
+    Column("worst", "worst"),
+    Column("bias", "mean", meaning="with its sign"),
+    Column("uncertainty", "stated", meaning="median of the standard uncertainties that `cfplan identify` states"),
+)
+NEXT_COLUMNS = (
+    Column("vehicle", "vehicle"),
+    Column("flights", "flights", value=count()),
+    Column("landed", "landed", of="flights", meaning="at the end of the plan",
+           value=count(lambda flight: math.isfinite(flight.deviation))),
+    Column("median", "deviation, median", "cm", ".1f", meaning="of each flight's largest true distance from the plan",
+           value=median("deviation")),
+    Column("worst", "worst", "cm", ".1f", value=largest("deviation")),
+    Column("over_median", "over known, median", "cm", ".1f", meaning="against the same vehicle, known",
+           value=median("over_known")),
+    Column("over_worst", "over known, worst", "cm", ".1f", value=largest("over_known")),
+)  # fmt: skip
+_ASKED = {"thrust": "1 %", "thrust over mass": "–", "mass": "1 %", "motor lag": "8 ms", "drag": "15 %",
+          "axial drag": "–", "pose latency": "3 ms"}  # fmt: skip
 
 
 def draw_vehicle(seed: int, nominal: Airframe) -> DrawnVehicle:
@@ -117,47 +134,16 @@ def fly_drawn(drawn: DrawnVehicle, mission: Mission, folder: Path, seed: int) ->
     return read_record(folder), flown
 
 
-def identification(
-    path_file: Path,
-    next_file: Path,
-    find_safety_file: Callable[[Path], Path],
-    *,
-    vehicles: int = 30,
-    first_seed: int = 0,
-    speed_factor: float | None = None,
-    jobs: int = 1,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> StudyResult:
-    """Identify `vehicles` drawn ones along `path_file`, and fly `next_file` with what was found.
-
-    Raises what planning raises.
-    """
-    from joblib import Parallel, delayed
-
-    limits = load_limits(find_safety_file(path_file))
-    options = FlightOptions(speed_factor=speed_factor)
-    missions = prepare_mission(path_file, limits, options), prepare_mission(next_file, limits)
-    study = partial(_study, missions=missions, next_file=next_file)
-    seeds = range(first_seed, first_seed + vehicles)
-    studied: list[StudiedVehicle] = []
-    work = Parallel(n_jobs=jobs, return_as="generator")(delayed(study)(seed) for seed in seeds)
-    for done, vehicle in enumerate(work):
-        progress(done + 1, vehicles)
-        studied.append(vehicle)
-    settings = {
-        "path": path_file.stem, "next": next_file.stem, "vehicles": vehicles, "first_seed": first_seed,
-        "speed_factor": speed_factor, "mass": MASS, "thrust": THRUST, "lags": LAGS, "drags": DRAGS,
-        "latencies": LATENCIES,
-    }  # fmt: skip
-    rows = [
-        {"seed": v.seed, "first_flight": v.first_flight, "reason": v.reason, **v.errors}
-        | {f"next flight, {name}": value for name, value in v.deviations.items()}
-        for v in studied
-    ]
-    return StudyResult("identification", settings, _tables(studied), (detail_table("vehicles", rows),))
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case a vehicle: its seed. Raises what planning raises."""
+    limits = limits_for(settings.path_file)
+    missions = prepare_mission(settings.path_file, limits), prepare_mission(settings.next_file, limits)
+    cases = {str(seed): seed for seed in range(settings.seed, settings.seed + settings.vehicles)}
+    return Work(cases, partial(measure, missions=missions, next_file=settings.next_file), StudiedVehicle)
 
 
-def _study(seed: int, missions: tuple[Mission, Mission], next_file: Path) -> StudiedVehicle:
+def measure(seed: int, missions: tuple[Mission, Mission], next_file: Path) -> StudiedVehicle:
+    """Identify the vehicle of a seed, and fly on with what was found. Raises what planning raises."""
     mission, unknown = missions
     drawn = draw_vehicle(seed, mission.limits.airframe)
     weighed = round(drawn.airframe.mass / SCALE_STEP) * SCALE_STEP
@@ -166,7 +152,7 @@ def _study(seed: int, missions: tuple[Mission, Mission], next_file: Path) -> Stu
         try:
             found, unweighed = identify([record], mass=weighed), identify([record])
         except CfplanError as error:
-            return StudiedVehicle(seed, {}, {}, {}, flown.reason, str(error))
+            return StudiedVehicle(seed, flown.reason, str(error))
         errors, uncertainties = _errors(found, drawn, mission.limits.airframe)
         believed = {
             "unknown": mission.limits,
@@ -179,7 +165,7 @@ def _study(seed: int, missions: tuple[Mission, Mission], next_file: Path) -> Stu
             next_mission = unknown if limits is mission.limits else prepare_mission(next_file, limits)
             place = Path(folder) / name.replace(" ", "-")
             deviations[name] = _deviation(fly_drawn(drawn, next_mission, place, 3 * seed + 1)[1], next_mission)
-    return StudiedVehicle(seed, errors, uncertainties, deviations, flown.reason)
+    return StudiedVehicle(seed, flown.reason, "", errors, uncertainties, deviations)
 
 
 def _limits_of(limits: Limits, found: Identification) -> Limits:
@@ -225,20 +211,18 @@ def _deviation(flown: SteppedFlight, mission: Mission) -> float:
     return float(np.linalg.norm(truth.position[moving] - wanted, axis=1).max())
 
 
-def _tables(studied: Sequence[StudiedVehicle]) -> tuple[Table, ...]:
-    done = [vehicle for vehicle in studied if not vehicle.reason]
-    return (
-        Table(
-            "errors", f"Identified from one flight each, {len(done)} vehicles", ERROR_COLUMNS, tuple(_accuracy(done))
-        ),
-        Table("next-flight", "The next flight", NEXT_COLUMNS, tuple(_next_flights(done))),
-    )
+def tables(settings: Settings, rows: list[StudiedVehicle]) -> Iterator[Table]:
+    """Yield how well the vehicles were identified, and how they flew on."""
+    done = [vehicle for vehicle in rows if not vehicle.reason]
+    title = f"Identified from one flight each, {len(done)} of {len(rows)} vehicles"
+    yield table("errors", title, ERROR_COLUMNS, list(_accuracy(done)))
+    yield table("next-flight", "The next flight", NEXT_COLUMNS, list(_next_flights(done)), by=("vehicle",))
 
 
 def _accuracy(done: Sequence[StudiedVehicle]) -> Iterator[dict[str, Any]]:
     for name, asked in _ASKED.items() if done else ():
-        errors = np.array([vehicle.errors[name] for vehicle in done])
-        stated = [vehicle.uncertainties[name] for vehicle in done]
+        errors = np.array([vehicle.errors[name] for vehicle in done if vehicle.errors])
+        stated = [vehicle.uncertainties[name] for vehicle in done if vehicle.uncertainties]
         unit = "ms" if name in ("motor lag", "pose latency") else "%"
         figures = {
             "median": np.median(np.abs(errors)),
@@ -250,16 +234,19 @@ def _accuracy(done: Sequence[StudiedVehicle]) -> Iterator[dict[str, Any]]:
         yield {"quantity": name, "asked": asked, **shown}
 
 
-def _next_flights(done: Sequence[StudiedVehicle]) -> Iterator[dict[str, Any]]:
-    for name in done[0].deviations if done else ():
-        deviations = np.array([vehicle.deviations[name] for vehicle in done])
-        over = deviations - np.array([vehicle.deviations["known"] for vehicle in done])
-        yield {
-            "vehicle": name,
-            "flights": len(deviations),
-            "landed": int(np.isfinite(deviations).sum()),
-            "median": np.nanmedian(deviations),
-            "worst": np.nanmax(deviations),
-            "over_median": np.nanmedian(over),
-            "over_worst": np.nanmax(over),
-        }
+@dataclass(frozen=True, slots=True)
+class _NextFlight:
+    vehicle: str  # how it was known
+    deviation: float  # m; NaN where it did not land
+    over_known: float  # m, more than that of the same vehicle, known
+
+
+def _next_flights(done: Sequence[StudiedVehicle]) -> Iterator[_NextFlight]:
+    for vehicle in done:
+        for name, deviation in (vehicle.deviations or {}).items():
+            yield _NextFlight(name, deviation, deviation - (vehicle.deviations or {})["known"])
+
+
+STUDY = Study(
+    Settings, work, tables, "flights/identify.yaml flights/figure8.yaml --vehicles 5 -o results/identification.json"
+)

@@ -119,7 +119,6 @@ class Trial:
     solve_seconds: float = np.nan  # of its solver alone, as the solver says
     finish_seconds: float = np.nan  # to refine, repair and certify
     encode_seconds: float = np.nan  # to encode and certify the setpoints
-    steps: float = np.nan  # Newton steps of the planner
     worst_usage: float = np.nan  # of any limit on the dense grid, before repair
     planned_time: float = np.nan  # s of flight, before repair
     certified_time: float = np.nan  # s of flight
@@ -162,7 +161,6 @@ TIME_COLUMNS = (
     Column("paths", "", value=count()),
     Column("length", "length", "m", ".0f", meaning="mean", value=mean("length")),
     Column("nodes", "nodes", "", ".0f", value=mean("nodes")),
-    Column("steps", "Newton steps", "", ".1f", meaning="of the planner's search, mean", value=mean("steps")),
     *quantile_columns("plan_seconds", "plan", "ms", ".1f", shown=("median",), meaning="the planner's call"),
     *quantile_columns("seconds", "to certificate", "ms", ".1f", meaning="from the path to the certified trajectory"),
     *quantile_columns("to_setpoints", "to setpoints", "ms", ".1f", lambda row: row.seconds + row.encode_seconds,
@@ -308,10 +306,8 @@ def _planned(trial: Trial, case: Case) -> Trial:
     begun = time.process_time()
     task = PlanningTask(case.path, airframe, limits, case.nodes, case.yaw, case.yaw_angle)
     solution = find_planner(trial.planner)(task)
-    trial = replace(
-        trial, plan_seconds=time.process_time() - begun, steps=float(solution.stats.get("iterations", np.nan)),
-        solve_seconds=float(solution.stats.get("solve_seconds", np.nan)),
-    )  # fmt: skip
+    seconds, solving = time.process_time() - begun, float(solution.stats.get("solve_seconds", np.nan))
+    trial = replace(trial, plan_seconds=seconds, solve_seconds=solving)
     if solution.profile is None:
         return replace(trial, answer=Answer.REFUSED, reason=solution.reason or str(solution.status))
     finish = refine if trial.planner in REFINED else repair if trial.planner == EXPERT else slow

@@ -1,4 +1,4 @@
-"""Stops of several durations from full speed, straight on: what each asks of the vehicle, and what refuses it.
+"""Stop from full speed, straight on, within several times: what that asks of the vehicle, and what refuses it.
 
 The vehicle flies along the longest side of the room, and stops where it flies at a constant speed. From there every
 duration is tried that a request to stop tries, and shorter ones. Beside them stands the hardest braking of the fastest
@@ -6,16 +6,17 @@ plan along that side, which keeps every limit of plans.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import CfplanError
 from cfplan.flight.setpoints.encoding import LEAD, RATE, encode_trajectory
-from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
+from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import encode_stops, stop_motion
@@ -23,67 +24,98 @@ from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
 from cfplan.preparation.replan import STOPS, HeldFlight, hold, snapshots_at, stop_within
 from cfplan.safety.limits import Limits
-from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dry_run import fly_on
 from cfplan.simulation.link_loss import as_believed
-from studies.runner.result import Column, StudyResult, Table
+from studies.runner.limits import limits_for
+from studies.runner.options import option
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
 
 SHORTER = (0.36, 0.4, 0.42, 0.43, 0.44)  # s, besides those that a request tries
 LONGEST = 0.6  # s
+PLAN = "the fastest plan"
 _FROM_WALLS = 0.5  # m beyond the margin
 _FINE = 300  # intervals of a grid that brakes as late as it may
-_FULL = 0.99  # share of the highest speed from which on a plan brakes
+_FULL = 0.99  # of the highest speed: from there on a plan brakes
 _NEXT = np.array([1])  # row of a motion
 
-COLUMNS = (
-    Column("duration", "within", "s", ".2f"),
-    Column("distance", "way to rest", "m", ".2f", meaning="of the setpoints, from full speed"),
-    Column(
-        "flown", "as flown", "m", ".2f", meaning="the farthest that the vehicle comes from where they begin to brake"
-    ),
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which stops are tried."""
+
+    durations: tuple[float, ...] = option(
+        tuple(sorted({*SHORTER, *(each for each in STOPS if each <= LONGEST)})), "Of a stop, s.", least=0.1
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Braking:
+    """One way to come to rest from full speed."""
+
+    what: str  # a stop, or the plan
+    speed: float  # m/s, before
+    duration: float  # s
+    distance: float  # m, of the setpoints
+    flown: float  # m, the farthest that the vehicle comes from where they begin to brake; NaN where it is refused
+    acceleration: float  # m/s²
+    tilt: float  # °
+    turning: float  # rad/s²
+    refused: str = ""  # why
+
+
+_DURATION = Column("duration", "within", "s", ".2f")
+_DISTANCE = Column("distance", "way to rest", "m", ".2f", meaning="of the setpoints, from full speed")
+_FLOWN = Column("flown", "as flown", "m", ".2f",
+                meaning="the farthest that the vehicle comes from where they begin to brake")  # fmt: skip
+_HARDNESS = (
     Column("acceleration", "acceleration", "m/s²", ".1f"),
     Column("tilt", "tilt", "°", ".1f"),
     Column("turning", "angular acceleration", "rad/s²", ".0f", meaning="that the setpoints ask for"),
-    Column("refused", "refused, as"),
 )
-
-BRAKING_COLUMNS = (
-    Column("speed", "from", "m/s", ".2f"),
-    Column("distance", "way to rest", "m", ".2f"),
-    Column("flown", "as flown", "m", ".2f"),
-    Column("duration", "within", "s", ".2f"),
-    Column("acceleration", "acceleration", "m/s²", ".1f"),
-    Column("tilt", "tilt", "°", ".1f"),
-    Column("turning", "angular acceleration", "rad/s²", ".0f"),
-)
+COLUMNS = (_DURATION, _DISTANCE, _FLOWN, *_HARDNESS, Column("refused", "refused, as"))
+PLAN_COLUMNS = (Column("speed", "from", "m/s", ".2f"), _DISTANCE, _FLOWN, _DURATION, *_HARDNESS)
 
 
-def stops(
-    safety_file: Path,
-    *,
-    durations: Sequence[float] = (),
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> StudyResult:
-    """Stop within each of the durations, s, from full speed. Raises a CfplanError where no flight can be planned."""
-    limits = load_limits(safety_file)
-    tried = durations or sorted({*SHORTER, *(each for each in STOPS if each <= LONGEST)})
-    held = _straight_flight(limits)
-    number = _at_full_speed(held)
-    since = held.flown.since(number / RATE)
-    motion = encode_trajectory(since, gains=gains_under(limits), space=limits.space).motion
-    rows = []
-    for done, duration in enumerate(tried):
-        progress(done, len(tried))
-        rows.append(_row(held, number, motion, duration, limits))
-    speed, tilt = float(np.linalg.norm(motion.velocity[0])), np.degrees(limits.flight.stop_tilt)
-    title = f"Stops from {speed:.2f} m/s, straight on, at a tilt of {tilt:.0f}° at most"
-    braking = Table("braking", "How the fastest plan brakes, straight on", BRAKING_COLUMNS, (_braking(limits),))
-    settings = {"durations": list(tried)}
-    return StudyResult("stops", settings, (Table("stops", title, COLUMNS, tuple(rows)), braking))
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case a stop, and one for the fastest plan. Raises a CfplanError where no flight can be planned."""
+    limits = limits_for(Path())
+    cases: dict[str, float | None] = {PLAN: None} | {f"{each:g} s": each for each in settings.durations}
+    return Work(cases, partial(measure, held=_straight_flight(limits), limits=limits), Braking)
 
 
-def _braking(limits: Limits) -> dict[str, Any]:
-    """Return a row about the end of the fastest plan along that side, from where it has all but its highest speed.
+def measure(duration: float | None, held: HeldFlight, limits: Limits) -> Braking:
+    """Stop what is held within a duration, s, from full speed; None: brake as the fastest plan does."""
+    return _plan(limits) if duration is None else _stop(held, duration, limits)
+
+
+def _stop(held: HeldFlight, duration: float, limits: Limits) -> Braking:
+    number, gains, space = _at_full_speed(held), gains_under(limits), limits.space
+    motion = encode_trajectory(held.flown.since(number / RATE), gains=gains, space=space).motion
+    payloads = encode_stops(motion, RATE, duration, _NEXT, gains, space)
+    reached = certify_stops(payloads, motion, limits, RATE, _NEXT, gains, space).worst
+    made, _ = stop_motion(motion, _NEXT, RATE, duration)
+    refused, flown = "", math.nan
+    try:
+        stop = stop_within(held, number, duration, limits)
+        flown = _flown(stop.proposal.payloads, 1, held, number, limits)
+    except CfplanError as error:
+        refused = error.what
+    return Braking(
+        "a stop",
+        speed=float(np.linalg.norm(motion.velocity[0])),
+        duration=duration,
+        distance=_way(made.position),
+        flown=flown,
+        acceleration=reached["acceleration"],
+        tilt=float(np.degrees(reached["tilt"])),
+        turning=float(np.linalg.norm(np.diff(made.body_rate, axis=0), axis=1).max() * RATE),
+        refused=refused,
+    )
+
+
+def _plan(limits: Limits) -> Braking:
+    """Return the end of the fastest plan along that side, from where it has all but its highest speed.
 
     Its waypoints are a metre apart, so that its path leaves the speed free nearly until the end.
     """
@@ -98,15 +130,16 @@ def _braking(limits: Limits) -> dict[str, Any]:
     number = math.ceil((times[begin] - LEAD) * RATE)  # of the first setpoint from then on
     passed = float(speed[begin]) * (number / RATE + LEAD - float(times[begin]))  # m, until that setpoint is due
     lean = np.degrees(np.arccos(np.clip(state.thrust_axis[begin:, 2], -1.0, 1.0)))
-    return {
-        "speed": float(speed[begin]),
-        "distance": _way(state.position[begin:]),
-        "flown": passed + _flown(held.commitment.payloads[number:], 0, held, number, limits),
-        "duration": flown.duration - float(times[begin]),
-        "acceleration": float(np.linalg.norm(state.acceleration[begin:], axis=1).max()),
-        "tilt": float(lean.max()),
-        "turning": float(np.linalg.norm(state.angular_acceleration[begin:], axis=1).max()),
-    }
+    return Braking(
+        PLAN,
+        speed=float(speed[begin]),
+        duration=flown.duration - float(times[begin]),
+        distance=_way(state.position[begin:]),
+        flown=passed + _flown(held.commitment.payloads[number:], 0, held, number, limits),
+        acceleration=float(np.linalg.norm(state.acceleration[begin:], axis=1).max()),
+        tilt=float(lean.max()),
+        turning=float(np.linalg.norm(state.angular_acceleration[begin:], axis=1).max()),
+    )
 
 
 def _ends(limits: Limits) -> NDArray:
@@ -130,29 +163,7 @@ def _at_full_speed(held: HeldFlight) -> int:
     """Return the number of the setpoint where the vehicle is fastest and its speed changes least."""
     state = held.flown.at(np.arange(0.0, held.ends, 1.0 / RATE))
     speed, acceleration = np.linalg.norm(state.velocity, axis=1), np.linalg.norm(state.acceleration, axis=1)
-    return int(np.argmin(np.where(speed >= 0.99 * speed.max(), acceleration, np.inf)))
-
-
-def _row(held: HeldFlight, number: int, motion: FullStateSetpoints, duration: float, limits: Limits) -> dict[str, Any]:
-    gains, space = gains_under(limits), limits.space
-    payloads = encode_stops(motion, RATE, duration, _NEXT, gains, space)
-    reached = certify_stops(payloads, motion, limits, RATE, _NEXT, gains, space).worst
-    made, _ = stop_motion(motion, _NEXT, RATE, duration)
-    refused, flown = "", math.nan
-    try:
-        stop = stop_within(held, number, duration, limits)
-        flown = _flown(stop.proposal.payloads, 1, held, number, limits)
-    except CfplanError as error:
-        refused = error.what
-    return {
-        "duration": duration,
-        "distance": _way(made.position),
-        "flown": flown,
-        "acceleration": reached["acceleration"],
-        "tilt": float(np.degrees(reached["tilt"])),
-        "turning": float(np.linalg.norm(np.diff(made.body_rate, axis=0), axis=1).max() * RATE),
-        "refused": refused,
-    }
+    return int(np.argmin(np.where(speed >= _FULL * speed.max(), acceleration, np.inf)))
 
 
 def _flown(payloads: NDArray, brakes: int, held: HeldFlight, number: int, limits: Limits) -> float:
@@ -167,3 +178,15 @@ def _flown(payloads: NDArray, brakes: int, held: HeldFlight, number: int, limits
 
 def _way(places: NDArray) -> float:
     return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
+def tables(settings: Settings, rows: list[Braking]) -> Iterator[Table]:
+    """Yield the stops, and how the fastest plan brakes."""
+    stops = [row for row in rows if row.what != PLAN]
+    speed = f" from {stops[0].speed:.2f} m/s" if stops else ""
+    yield table("stops", f"Stops{speed}, straight on", COLUMNS, stops)
+    plans = [row for row in rows if row.what == PLAN]
+    yield table("braking", "How the fastest plan brakes, straight on", PLAN_COLUMNS, plans)
+
+
+STUDY = Study(Settings, work, tables, "-o results/stops.json")

@@ -20,7 +20,7 @@ FLOWN = "tests/cli/test_commands_of_the_pages.py::test_a_flight_lands_as_it_is_s
 STEERED = "tests/cli/test_commands_of_the_pages.py::test_waypoints_are_flown_as_it_is_shown"
 COMPLETED = "tests/cli/test_commands_of_the_pages.py::test_completion_is_set_up_as_it_is_shown"
 ROOM = "tests/cli/test_virtual_in_real_time.py::test_a_second_terminal_flies_one_of_two_vehicles_by_its_own_poses"
-MEASURED = "tests/cli/test_studies_of_the_pages.py::test_what_takes_long_ends_well_in_small"
+MEASURED = "tests/cli/test_long_commands.py::test_what_takes_long_ends_well_in_small"
 FROM_A_CLONE = "tests/test_packaging.py::test_make_fly_in_a_new_clone_lands_and_is_never_silent_for_ten_seconds"
 PICTURES = "tests/test_pictures.py::test_make_pictures_draws_every_picture_of_the_pages"
 BY_CI = ".ci/run"
@@ -30,7 +30,7 @@ RUN_BY = (
     (r"python -m cfplan fly …$", AS_SHOWN),
     (r"cfplan fly --waypoints", STEERED),
     (r"cfplan fly", FLOWN),
-    (r"cfplan (dataset|train|bench|robustness|study)", MEASURED),
+    (r"cfplan (dataset|train|bench|robustness)|python -m studies", MEASURED),
     (r"cfplan (init|plan|check|sim|export|replay|report|identify|doctor)\b", AS_SHOWN),
     (r"eval|_CFPLAN_COMPLETE", COMPLETED),
     (r"git clone|make fly$", FROM_A_CLONE),
@@ -49,7 +49,7 @@ class Shown(NamedTuple):
     @property
     def whole(self) -> bool:
         """Return whether it can be typed as it stands."""
-        named = re.fullmatch(r"cfplan (?:(?:study|dataset) )?[\w-]+", self.line)
+        named = re.fullmatch(r"cfplan (?:dataset )?[\w-]+|python -m studies( [\w-]+)?", self.line)
         return self.block or not (named or FORM.search(self.line) or self.line.removeprefix("cfplan ") in MENTIONED)
 
 
@@ -77,7 +77,7 @@ def _of_page(page: Path) -> Iterator[Shown]:
                 command = line.strip().removeprefix("$ ")
                 if command.startswith(BEGINNINGS):
                     yield Shown(name, _without_comment(command), True)
-    for span in re.findall(r"`(cfplan [^`\n]+)`", text):
+    for span in re.findall(r"`((?:cfplan|python -m studies) [^`\n]+)`", text):
         yield Shown(name, _without_comment(span), False)
 
 

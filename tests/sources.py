@@ -1,4 +1,4 @@
-"""cfplan's sources as syntax trees, each parsed once in a process; none is changed."""
+"""The sources of cfplan and of the studies as syntax trees, each parsed once in a process; none is changed."""
 
 import ast
 from functools import cache
@@ -6,6 +6,8 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "cfplan"
 FILES = sorted(PACKAGE.rglob("*.py"))
+STUDIES = PACKAGE.parent / "studies"
+STUDY_FILES = sorted(STUDIES.rglob("*.py"))
 
 
 @cache

@@ -40,14 +40,14 @@ def test_there_are_enough_ideas_each_once():
 
 @pytest.mark.parametrize(("idea", "name"), IDEAS, ids=[idea for idea, _ in IDEAS])
 def test_an_idea_is_found_in_its_file_first(idea, name):
-    own = rank(PACKAGE / name, idea)
-    assert own < 2, f"cfplan/{name} does not say {idea!r} in its docstring"
+    own = rank((REPOSITORY if name.startswith("studies/") else PACKAGE) / name, idea)
+    assert own < 2, f"{name} does not say {idea!r} in its docstring"
     louder = [file for file in PACKAGE.rglob("*.py") if file.stem != "__init__" and rank(file, idea) < own]
     assert not louder, f"{idea!r} is announced more prominently by {louder}"
 
 
 def test_every_file_and_folder_that_the_page_names_exists():
     named = set(re.findall(r"`((?:tests/)?[\w/]+(?:\.py|\.yaml|/))`", PAGE))
-    roots = (REPOSITORY, PACKAGE, *PACKAGE.iterdir(), *PACKAGE.glob("*/*"))
+    roots = (REPOSITORY, PACKAGE, *PACKAGE.iterdir(), *PACKAGE.glob("*/*"), *(REPOSITORY / "studies").glob("**"))
     missing = [name for name in named if not any((root / name).exists() for root in roots)]
     assert not missing

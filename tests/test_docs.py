@@ -1,13 +1,22 @@
-"""README and docs/ are true in what a machine can check: links lead somewhere, commands and their options exist."""
+"""README and docs/ are true in what a machine can check: links, commands with their options, numbers of the code."""
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 
 import click
 import pytest
 
+import cfplan as top_level
 from cfplan.cli import cfplan
+from cfplan.flight.telemetry import Phase
+from cfplan.learning import features
+from cfplan.planning import plan_file
+from cfplan.recording import topics
+from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.airframes import AIRFRAMES
+from cfplan.version import __version__
 
 REPOSITORY = Path(__file__).parent.parent
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
@@ -45,3 +54,41 @@ def test_commands_and_their_options_exist(line):
     assert command is not None
     known = {option for parameter in command.params for option in parameter.opts} | {"--help", "--version"}
     assert {word for word in words if re.match(r"-{1,2}[a-z]", word)} <= known
+
+
+def test_the_page_of_airframes_has_their_numbers():
+    page = (REPOSITORY / "docs" / "airframes.md").read_text()
+    rows = dict(re.findall(r"^\| `([\w.+-]+)` \| (\d.*) \|", page, re.MULTILINE))
+    assert rows.keys() == AIRFRAMES.keys()
+    for name, airframe in AIRFRAMES.items():
+        mass, ratio, lag = re.findall(r"[\d.]+", " ".join(rows[name].split(" | ")[:3]))
+        assert float(mass) == pytest.approx(1e3 * airframe.mass, abs=0.05)
+        assert float(ratio) == pytest.approx(4 * airframe.motor_thrust_max / (airframe.mass * GRAVITY), abs=0.005)
+        assert float(lag) == airframe.motor_time_constant
+
+
+def test_the_page_of_records_has_the_versions_and_topics_of_the_code():
+    page = (REPOSITORY / "docs" / "records.md").read_text()
+    versions = re.findall(r"^\| [^|]*`(?:format|features)`[^|]*\| (\d+) \|", page, re.MULTILINE)
+    assert versions == [topics.FORMAT, str(plan_file.FORMAT), str(features.VERSION)]
+    assert set(re.findall(r"`(/\w+)`", page)) - {"/public"} == {topic.name for topic in topics.TOPICS}
+
+
+def test_every_phase_of_the_pilot_is_in_its_diagram():
+    page = (REPOSITORY / "docs" / "architecture.md").read_text()
+    diagram = page[page.index("## The pilot") :].split("```")[1]
+    assert all(re.search(rf"\b{phase}\b", diagram) for phase in Phase)
+
+
+def test_the_version_is_the_same_wherever_it_is_written():
+    assert tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["version"] == __version__
+    assert f"\nversion: {__version__}\n" in (REPOSITORY / "CITATION.cff").read_text()
+    assert f"\n## {__version__}" in (REPOSITORY / "CHANGELOG.md").read_text()
+
+
+def test_the_page_of_the_programming_interface_has_every_name_of_cfplan():
+    page = (REPOSITORY / "docs" / "api.md").read_text()
+    for name in set(top_level.__all__) - {"__version__"}:
+        value = getattr(top_level, name)
+        assert value.__module__ == "cfplan.errors" or f"::: {value.__module__}.{value.__name__}\n" in page
+    assert "::: cfplan.errors\n" in page

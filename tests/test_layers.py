@@ -1,15 +1,18 @@
-"""Packages import those above them in the design's list, rooms of a package likewise, and each by its face alone."""
+"""Packages import those above them in the design's list, rooms of a package likewise, and each by its face alone.
+
+Studies import cfplan, and are imported by nothing but tests.
+"""
 
 import ast
 from functools import cache
 from pathlib import Path
 
 import pytest
-from sources import FILES, PACKAGE, nodes, tree
+from sources import FILES, PACKAGE, STUDIES, STUDY_FILES, nodes, tree
 
 LAYERS = [
     "files", "geometry", "vehicle", "safety", "planners", "learning", "planning", "flight", "simulation",
-    "preparation", "recording", "identification", "steering", "studies", "cli",
+    "preparation", "recording", "identification", "steering", "cli",
 ]  # fmt: skip
 # Modules and rooms of a package, in order: each may import those before it. Modules not named stand together.
 MODULES = "its other modules"
@@ -20,26 +23,33 @@ ROOMS = {
     "recording": ["plausible", "importers", MODULES, "rerun", "report", "mavlink"],
 }
 
+TESTS = {"tests", *(file.stem for file in Path(__file__).parent.glob("*.py"))}  # as tests import them
+
+
+@cache
+def names(file: Path) -> list[tuple[str, ...]]:
+    """What a file imports, anywhere in it: the parts of each name."""
+    found = []
+    for node in nodes(file):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: relative imports hide what is imported"
+            found += [f"{node.module}.{alias.name}" for alias in node.names]
+    return [tuple(name.split(".")) for name in found]
+
 
 @cache
 def imports(file: Path) -> list[tuple[str, ...]]:
-    """What a file imports of cfplan, anywhere in it: the parts of each module's name, without the first."""
+    """What a file imports of cfplan: the parts of each module's name, without the first."""
     found = []
-    for node in nodes(file):
-        names: list[str] = []
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{file}: relative imports hide what is imported"
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-        for name in names:
-            first, *parts = name.split(".")
-            if first == "cfplan":
-                while parts and not (
-                    PACKAGE.joinpath(*parts).is_dir() or PACKAGE.joinpath(*parts).with_suffix(".py").exists()
-                ):
-                    parts.pop()
-                found.append(tuple(parts))
+    for first, *parts in names(file):
+        if first == "cfplan":
+            while parts and not (
+                PACKAGE.joinpath(*parts).is_dir() or PACKAGE.joinpath(*parts).with_suffix(".py").exists()
+            ):
+                parts.pop()
+            found.append(tuple(parts))
     return found
 
 
@@ -81,14 +91,27 @@ def test_a_room_imports_only_those_above_it(package):
                 assert place(package, parts[1]) <= place(package, inside[0]), f"{file} reaches down to {parts[1]}"
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
+@pytest.mark.parametrize("file", FILES + STUDY_FILES, ids=lambda file: str(file.relative_to(PACKAGE.parent)))
 def test_a_file_imports_other_rooms_by_their_face(file):
-    own = file.relative_to(PACKAGE).parent.parts
+    own = file.relative_to(PACKAGE).parent.parts if file in FILES else ("studies",)
     for parts in imports(file):
         for depth in range(1, len(parts)):
             room, name = parts[:depth], parts[depth]
             if own[:depth] != room:
                 assert name in face(room), f"{file} imports {'.'.join(parts)}, which {'.'.join(room)} does not offer"
+
+
+def test_cfplan_imports_neither_studies_nor_tests():
+    for file in FILES:
+        assert not {name[0] for name in names(file)} & {"studies", *TESTS}, f"{file} needs a checkout"
+
+
+def test_studies_import_no_tests_and_their_runner_imports_no_study():
+    for file in STUDY_FILES:
+        assert not {name[0] for name in names(file)} & TESTS, f"{file} imports tests"
+    for file in (STUDIES / "runner").glob("*.py"):
+        studies = {name[:2] for name in names(file) if name[0] == "studies"}
+        assert studies <= {("studies", "STUDIES"), ("studies", "runner")}, f"{file} imports a study"
 
 
 def test_every_face_names_what_there_is():

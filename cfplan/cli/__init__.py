@@ -21,7 +21,6 @@ from cfplan.cli.replay import replay
 from cfplan.cli.report import report
 from cfplan.cli.robustness import robustness
 from cfplan.cli.sim import sim
-from studies.commands.study import study
 from cfplan.cli.train import train
 from cfplan.cli.virtual import virtual
 from cfplan.errors import CfplanError
@@ -76,7 +75,7 @@ def cfplan() -> None:
 
 COMMANDS = (
     init, plan, check, export, sim, robustness, fly, virtual, replay, report, identify, mocap, dataset, train, bench,
-    study, doctor,
+    doctor,
 )  # fmt: skip
 for command in COMMANDS:
     cfplan.add_command(command)

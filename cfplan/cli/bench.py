@@ -1,24 +1,78 @@
-"""`cfplan bench`: the planners compared on the same paths, in one run."""
+"""`cfplan bench`: the planners compared on one's own paths."""
+
+from pathlib import Path
+from typing import Any
 
 import click
 
-from studies.commands.measured import BOXES, NODES, SETS, YAW, Study, count, measured, seed
+from cfplan.cli import options
+from cfplan.cli.output import Steps, print_json, print_table
+from cfplan.errors import CfplanError
+from cfplan.numbers import shown
+from cfplan.preparation.compiled_calls import Stage
+
+TITLES = ["path", "planner", "flight", "against the fastest", "planning", "worst usage", "refused"]
 
 
-@measured(
-    "planning",
-    "cfplan bench --paths 20 --planner expert --planner toppquad",
-    count(100, "Random paths in each box with each set."),
-    click.option("--planner", "planners", multiple=True, help="May be given several times.  [default: all]"),
-    NODES,
-    seed(0),
-    BOXES,
-    SETS,
-    YAW,
-    short_help="Compare the planners on the same paths.",
+@click.command(
+    short_help="The planners compared on your paths.",
+    epilog="Example: cfplan bench flights/slalom.yaml --planner expert --planner toppquad",
 )
-def bench() -> Study:
-    """Compare the planners on the same paths, in one run, on one thread."""
-    from studies.bench import bench as run
+@click.argument("path_files", metavar="PATH...", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="Limits; else the nearest safety.yaml.")
+@click.option("--planner", "planners", multiple=True, help="Planner to compare; repeatable.  [default: all]")
+@options.as_json
+def bench(path_files: tuple[Path, ...], safety_file: Path | None, planners: tuple[str, ...], as_json: bool) -> None:
+    """Plan each PATH by each planner and compare their certified flights and planning times.
 
-    return run
+    Each planner plans a path twice, and the second time counts: the first one loads machine code.
+    """
+    steps = Steps(as_json=as_json)
+    limits = options.read_limits(safety_file, path_files[0], steps, compile_to=Stage.PLAN)
+    with steps.waiting("loading planners"):
+        from cfplan.geometry.path_file import load_path_file
+        from cfplan.planning.planners import PLANNERS, find_planner
+
+    for name in planners:
+        find_planner(name)
+    paths = [load_path_file(file) for file in path_files]
+    rows = []
+    for path in paths:
+        with steps.step(path.name) as results:
+            own = [_row(path, name, limits) for name in planners or PLANNERS]
+            fastest = min((row["duration"] for row in own if row["duration"]), default=None)
+            results.append("refused by all" if fastest is None else f"{fastest:.3f} s at best")
+        rows += [row | {"against_fastest": row["duration"] and row["duration"] / fastest - 1.0} for row in own]
+    if as_json:
+        print_json({"plans": rows})
+    else:
+        print_table("Certified flights by planner", TITLES, [_cells(row) for row in rows])
+
+
+def _row(path_file: Any, planner: str, limits: Any) -> dict[str, Any]:
+    """Return what became of one path by one planner; duration, s, is None where the path was refused."""
+    from cfplan.planning.plan import plan
+
+    row: dict[str, Any] = {"path": path_file.name, "planner": planner, "duration": None, "refused": ""}
+    try:
+        for _ in range(2):
+            made = plan(
+                path_file.path, limits.airframe, limits, planner=planner, yaw=path_file.yaw,
+                yaw_angle=path_file.yaw_angle, speed_factor=path_file.speed,
+            )  # fmt: skip
+    except CfplanError as error:
+        return row | {"seconds": None, "worst_usage": None, "refused": str(error)}
+    return row | {
+        "duration": made.trajectory.duration,
+        "seconds": made.seconds,
+        "worst_usage": made.certificate.worst.share,
+    }
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    if row["duration"] is None:
+        return [row["path"], row["planner"], "", "", "", "", row["refused"]]
+    return [
+        row["path"], row["planner"], f"{row['duration']:.3f} s", f"{shown(100 * row['against_fastest'], '+.2f')} %",
+        f"{1e3 * row['seconds']:.1f} ms", f"{shown(100 * row['worst_usage'], '.1f')} %", "",
+    ]  # fmt: skip

@@ -1,13 +1,23 @@
 """`cfplan robustness`: how a plan changes with its path."""
 
+import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table
+from cfplan.numbers import shown
 from cfplan.preparation.compiled_calls import Stage
+
+if TYPE_CHECKING:
+    from cfplan.preparation.path_robustness import PathRobustness, ScaleSummary
+
+COLUMNS = [
+    "perturbed by at most", "certified", "dry run passed", "time of flight: mean change", "largest",
+    "speed: largest change", "yaw: largest change", "dry run: deviation", "largest",
+]  # fmt: skip
 
 
 @click.command(short_help="How a plan changes with its path.", epilog="Example: cfplan robustness flights/slalom.yaml")
@@ -33,19 +43,38 @@ def robustness(
     with steps.waiting("loading planners and simulator"):
         from cfplan.geometry.path_file import load_path_file
         from cfplan.machine_code import compile_from_here
-        from studies.path_robustness import path_robustness
+        from cfplan.preparation.path_robustness import path_robustness
 
     compile_from_here()  # without, simulating takes minutes
     with steps.step("robustness") as results:
         chosen: dict[str, Any] = {"scales": scales} if scales else {}
         result = path_robustness(load_path_file(path_file), limits, **chosen, **given)
-        plans = result.table("plans").rows
-        fit = sum(not plan["reason"] for plan in plans)
-        results.append(f"{fit} of {len(plans)} plans are certified and pass the dry run")
+        fit = sum(not plan.reason for plan in result.plans)
+        results.append(f"{fit} of {len(result.plans)} plans are certified and pass the dry run")
     if as_json:
-        print_json(result.to_json())
+        print_json(result)
         return
-    for table in result.tables:
-        print_table(table.title, *table.cells())
-    for reason in dict.fromkeys(plan["reason"] for plan in plans if plan["reason"]):
+    print_table(_title(result), COLUMNS, [_cells(scale) for scale in result.scales])
+    for reason in dict.fromkeys(plan.reason for plan in result.plans if plan.reason):
         click.echo(f"refused: {reason}")
+
+
+def _title(result: "PathRobustness") -> str:
+    until_then = ", until interrupted" if result.interrupted else ""
+    return f"{result.path}, {result.length:.1f} m, {result.flight:.2f} s: the path perturbed{until_then}"
+
+
+def _cells(scale: "ScaleSummary") -> list[str]:
+    return [
+        f"{100 * scale.epsilon:g} cm",
+        f"{scale.certified}/{scale.plans}",
+        f"{scale.flown}/{scale.plans}",
+        *(_cell(100 * value, "+.2f", "%") for value in (scale.longer, scale.longer_most)),
+        _cell(scale.faster, ".2f", "m/s"),
+        _cell(scale.turned, ".3f", "rad"),
+        *(_cell(100 * value, ".1f", "cm") for value in (scale.deviation, scale.deviation_most)),
+    ]
+
+
+def _cell(value: float, spec: str, unit: str) -> str:
+    return f"{shown(value, spec)} {unit}" if math.isfinite(value) else "–"

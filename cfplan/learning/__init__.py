@@ -10,7 +10,6 @@ __all__ = [
     "learned",
     "model_files",
     "networks",
-    "paper",
     "training",
     "training_set",
     "workers",

@@ -9,6 +9,7 @@ __all__ = [
     "from_programs",
     "lead",
     "on_board_flight",
+    "path_robustness",
     "plan_flight",
     "planner_process",
     "planner_worker",

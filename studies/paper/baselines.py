@@ -1,17 +1,17 @@
-"""The paper's Table 3: planners of other kinds on the same waypoints, each flown by the geometric controller.
+"""Make the paper's Table 3: TOPPQuad, networks and the planner that ships beside planners of other kinds.
 
 TOPPQuad, the paper's networks, the planner that ships and convex TOPP time the min-snap path, and scaled min-snap flies
 it at one factor on its timing. MFBOTrajectory's kind searches for other times of the min-snap segments. A learned time
-allocation flies a path of its own through the corridor about it, as AllocNet does.
+allocation flies a path of its own through the corridor about it, as AllocNet does. All are flown by the geometric
+controller.
 """
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path as FilePath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,37 +20,22 @@ from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
-from cfplan.learning.paper.bayesian_times import Budget, require_library
-from cfplan.learning.paper.sequences import MAX_LENGTH
-from cfplan.learning.paper.time_allocation import TimeNetwork, allotted_times, time_label, train_times
-from cfplan.learning.paper.training import SequenceOptions
+from cfplan.learning.workers import pool
 from cfplan.planners.baselines.convex import plan_convex
-from cfplan.planners.baselines.corridors import (
-    ACCELERATION,
-    SPEED,
-    box_corners,
-    corridor_about,
-    min_jerk,
-    timed_path,
-)
 from cfplan.planners.baselines.min_snap import plan_min_snap
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import LOST, fly_geometric, thrust_violation
-from studies.runner.items import HERE, Progress, Running, work_table, work_through
-from studies.paper.architectures import training_steps
-from studies.paper.networks import (
-    DATA,
-    NETWORKS,
-    WAYPOINTS,
-    TrainedNetwork,
-    identities,
-    paper_data,
-    trained_networks,
-)
-from studies.paper.printed import BASELINES
+from cfplan.vehicle.trajectory import Trajectory
+from studies.paper.bayesian_times import Budget, require_library
+from studies.paper.corridors import ACCELERATION, SPEED, corridor_about, min_jerk, timed_path
+from studies.paper.printed import BASELINES, paper_column
 from studies.paper.segment_times import QUICK_BUDGET, bayesian_motion, timed_trajectory
+from studies.paper.sequences import MAX_LENGTH
+from studies.paper.time_allocation import TimeNetwork, allotted_times, time_label, train_times
+from studies.paper.trained import WAYPOINTS, NetworkSettings, TrainedNetwork, paper_data
+from studies.paper.training import SequenceOptions
 from studies.paper.trials import (
     EXPERT,
     FLOWN,
@@ -58,18 +43,19 @@ from studies.paper.trials import (
     SAMPLE,
     TOPPQUAD,
     Plan,
-    finite_mean,
     network_plan,
     profile_by,
     shipped_profile,
     trajectory_by,
 )
-from studies.runner.result import Column, StudyResult, Table, detail_table
-from cfplan.vehicle.trajectory import Trajectory
+from studies.runner.options import option
+from studies.runner.reductions import among, count, mean
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
 
 BOX = np.array([10.0, 10.0, 5.0])  # m, where waypoints are drawn
 NOISES = (0.0, 0.1)  # m, of the LSTMs of the table
-CORRIDORS, QUICK_CORRIDORS = 2000, 6  # that the time allocation learns from
+QUICK_CORRIDORS = 6  # that the time allocation learns from
 SHIPPED, ALLOCATION, CONVEX, MIN_SNAP = "the shipped planner", "AllocNet's kind", "convex TOPP", "scaled min-snap"
 BAYESIAN = "MFBOTrajectory's kind"
 DRAWN, DRAWN_PATHS, DRAWN_POINTS = (SHIPPED, BAYESIAN, ALLOCATION), 3, 121  # of the figure
@@ -88,6 +74,15 @@ Ask = Callable[[Course], Trajectory]  # raises CfplanError where there is none
 
 
 @dataclass(frozen=True, slots=True)
+class Settings(NetworkSettings):
+    """Which paths are planned, and what the time allocation learns from."""
+
+    paths: int = option(50, "Random paths.", least=1)
+    corridors: int = option(2000, "Corridors that the time allocation learns from.", least=2)
+    seed: int = option(60_000, "Seed of the first path.")
+
+
+@dataclass(frozen=True, slots=True)
 class BaselineTrial:
     """One path, planned and flown. NaN where there was nothing to measure."""
 
@@ -102,63 +97,55 @@ class BaselineTrial:
     thrust_most: float = np.nan  # N
     violation: float = np.nan  # N, planned beyond a motor's range, mean over time
     top_speed: float = np.nan  # m/s, planned
+    retraining: float | None = None  # s of the processor, once for a vehicle and its limits
+    points: list[list[float]] = field(default_factory=list)  # m, along the motion, where that is drawn
 
     @property
     def failed(self) -> bool:
         """Return whether there was no flight, or one that crashed or was LOST."""
         return not self.deviation < LOST
 
+    @property
+    def flown(self) -> bool:
+        """Return the contrary."""
+        return not self.failed
 
-def baselines(
-    *,
-    paths: int = 50,
-    corridors: int = CORRIDORS,
-    first_seed: int = 60_000,
-    data: FilePath = DATA,
-    networks: FilePath = NETWORKS,
-    epochs: int | None = None,
-    quick: bool = False,
-    running: Running = HERE,
-    progress: Progress = lambda done, total: None,
-) -> StudyResult:
-    """Plan and fly `paths` random paths by each planner; networks are trained if need be.
+    @property
+    def speed(self) -> float:
+        """Return the mean speed, m/s."""
+        return self.length / self.travel_time
 
-    The time allocation learns from `corridors` corridors about other paths.
 
-    Raises:
-        InputError: no path or corridor, no such dataset, or no scikit-learn.
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case a path; networks and the time allocation are trained if need be.
+
+    Raises InputError where scikit-learn is not installed; as `paper_data`.
     """
-    if paths < 1:
-        raise InputError("paths must be at least 1", where="paths", hint="give --paths 50, as in the paper")
     require_library()
-    wanted = [SequenceOptions(epsilon=epsilon) for epsilon in NOISES]
-    budget = QUICK_BUDGET if quick else Budget()
-    corridors = QUICK_CORRIDORS if quick else corridors
-    settings = {
-        "paths": paths, "first_seed": first_seed, "corridors": corridors, "motor_lag": PAPER_LAG, "quick": quick,
-    }  # fmt: skip
-    with paper_data(data, networks, 1, epochs=epochs, quick=quick) as material:
-        trained = trained_networks(material, wanted, progress)
-        labels = work_through(
-            "baselines, corridors", settings, _label, {str(k): 10 * first_seed + k for k in range(corridors)},
-            running.beside("corridors"), progress,
-        )  # fmt: skip
-        begun = time.process_time()
-        allocation = _time_network(10 * first_seed, labels.values)
-        training = labels.seconds + time.process_time() - begun
-        asked = Asked(tuple(trained), allocation, budget)
-        seeds = {str(seed): seed for seed in range(first_seed, first_seed + paths)}
-        known = settings | {"networks": identities(trained)}
-        work = work_through("baselines", known, partial(_flown_on, asked, first_seed), seeds, running, progress)
-    retraining = {each.name: each.training_seconds for each in trained} | {ALLOCATION: training}
-    trials = [BaselineTrial(**trial) for value in work.values for trial in value["trials"]]
-    drawn = [row for value in work.values for row in value["drawn"]]
-    table = baselines_table(trials, list(asked.planners()), retraining)
-    steps = training_steps(trained, len(material.learned_from.rows)) | {
-        "corridor": (corridors, training), "path": (len(work.values), work.seconds),
-    }  # fmt: skip
-    details = (detail_table("trials", trials), detail_table("drawn", drawn), work_table(steps))
-    return StudyResult("baselines", settings, (table,), details, work.interrupted)
+    data = paper_data(settings, run, [SequenceOptions(epsilon=epsilon) for epsilon in NOISES], paths=1)
+    first = 10 * settings.seed  # of the corridors' paths, which are none of those that are flown
+    corridors = range(first, first + (QUICK_CORRIDORS if settings.quick else settings.corridors))
+    labels, training = dict[int, NDArray | None](), 0.0
+    with pool(run.workers, run.scheduler) as measured:
+        for seed, label, seconds in measured(_label, corridors):
+            labels[seed], training = label, training + seconds
+            run.progress(len(labels), len(corridors))
+    begun = time.process_time()
+    own = [corridor_about(random_course(seed).path) for seed in corridors]
+    allocation = train_times(own, [labels[seed] for seed in corridors])
+    training += time.process_time() - begun
+    retraining = {each.name: each.training_seconds for each in data.networks} | {ALLOCATION: training}
+    asked = Asked(tuple(data.networks), allocation, QUICK_BUDGET if settings.quick else Budget())
+    seeds = {str(seed): seed for seed in range(settings.seed, settings.seed + settings.paths)}
+    drawn = range(settings.seed, settings.seed + DRAWN_PATHS)
+    return Work(seeds, partial(measure, asked, retraining, drawn), BaselineTrial, data.identity)
+
+
+def _label(seed: int) -> tuple[int, NDArray | None, float]:
+    """Return the seed of a path, the label of the corridor about it, and the seconds that it took the processor."""
+    begun = time.process_time()
+    label = time_label(corridor_about(random_course(seed).path))
+    return seed, label, time.process_time() - begun
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,17 +184,6 @@ def random_course(seed: int) -> Course:
         attempt += 1
 
 
-def _label(seed: int) -> list[float] | None:
-    """Return the label of the corridor about a path, which is none of those that are flown."""
-    label = time_label(corridor_about(random_course(seed).path))
-    return None if label is None else label.tolist()
-
-
-def _time_network(first: int, labels: Sequence[list[float] | None]) -> TimeNetwork:
-    corridors = [corridor_about(random_course(first + k).path) for k in range(len(labels))]
-    return train_times(corridors, [None if label is None else np.array(label) for label in labels])
-
-
 def _on_the_path(plan: Plan) -> Ask:
     timed = trajectory_by(plan)
     return lambda course: timed(course.path)
@@ -219,31 +195,31 @@ def _allotted(path: Path, network: TimeNetwork) -> Trajectory:
     return timed_trajectory(timed_path(min_jerk(corridor, times), times))
 
 
-Flown = tuple[BaselineTrial, Trajectory | None]
-
-
-def _flown_on(asked: Asked, first_seed: int, seed: int) -> dict[str, Any]:
-    """Plan and fly one path by each planner; of the first paths, keep what the figure shows."""
-    course, flown = random_course(seed), []
+def measure(asked: Asked, retraining: Mapping[str, float], drawn: Sequence[int], seed: int) -> list[BaselineTrial]:
+    """Plan and fly one path by each planner; of the paths that are `drawn`, by their seeds, keep the motion."""
+    course, trials = random_course(seed), []
     for name, ask in asked.planners().items():
         if name not in _WARM:
             quickly = replace(asked, budget=QUICK_BUDGET).planners()[name]
             with suppress(CfplanError):
                 quickly(course)  # loads and compiles
             _WARM.add(name)
-        flown.append(_flown(ask, course, BaselineTrial(name, seed)))
-    drawn = list(_drawn(flown, course)) if seed < first_seed + DRAWN_PATHS else []
-    return {"trials": [trial for trial, _ in flown], "drawn": drawn}
+        begun = BaselineTrial(name, seed, retraining=retraining.get(name))
+        trials.append(_flown(ask, course, begun, keep=name in DRAWN and seed in drawn))
+    return trials
 
 
-def _flown(ask: Ask, course: Course, trial: BaselineTrial) -> Flown:
+def _flown(ask: Ask, course: Course, trial: BaselineTrial, *, keep: bool) -> BaselineTrial:
     begun = time.process_time()
     try:
         trajectory = ask(course)
     except CfplanError as error:
-        return replace(trial, reason=str(error)), None
-    seconds = time.process_time() - begun
-    return _judged(trajectory, replace(trial, seconds=seconds)), trajectory
+        return replace(trial, reason=str(error))
+    trial = _judged(trajectory, replace(trial, seconds=time.process_time() - begun))
+    if keep and trial.flown:
+        path = trajectory.path
+        return replace(trial, points=np.round(path(np.linspace(0.0, path.end, DRAWN_POINTS)), 3).tolist())
+    return trial
 
 
 def _judged(trajectory: Trajectory, trial: BaselineTrial) -> BaselineTrial:
@@ -260,83 +236,43 @@ def _judged(trajectory: Trajectory, trial: BaselineTrial) -> BaselineTrial:
     )
 
 
-def _drawn(trials: Sequence[Flown], course: Course) -> Iterator[dict[str, Any]]:
-    """Yield what the figure shows of a path: the motions of DRAWN, and AllocNet's boxes by their corners."""
-    own = {trial.planner: trajectory for trial, trajectory in trials if not trial.failed}
-    if not own:
-        return
-    yield {"seed": course.seed, "what": "waypoints", "points": _millimetres(course.waypoints)}
-    for name in DRAWN:
-        trajectory = own.get(name)
-        if trajectory is not None:
-            path = trajectory.path
-            points = _millimetres(path(np.linspace(0.0, path.end, DRAWN_POINTS)))
-            yield {"seed": course.seed, "what": name, "points": points}
-    for corners in box_corners(corridor_about(course.path)):
-        yield {"seed": course.seed, "what": "box", "points": _millimetres(corners)}
+_paper = partial(paper_column, BASELINES, by=("planner",))
+COLUMNS = (
+    Column("planner", "planner"),
+    Column("paths", value=count()),
+    Column("deviation", "largest deviation", "m", ".3f", meaning="mean over flights that did not fail",
+           value=among("flown", mean("deviation"))),
+    _paper("deviation", unit="m", spec=".3f"),
+    Column("thrust_least", "least thrust", "N", ".2f", meaning="planned, of a motor; mean over paths",
+           value=mean("thrust_least")),
+    Column("thrust_most", "greatest", "N", ".2f", value=mean("thrust_most")),
+    _paper("thrusts", meaning="least and greatest, N"),
+    Column("violation", "thrust violation", "N", ".4f", meaning="planned beyond a motor's range, mean over time",
+           value=mean("violation")),
+    _paper("violation", unit="N", spec=".3f"),
+    Column("travel_time", "time", "s", ".2f", meaning="mean, as are length and speed", value=mean("travel_time")),
+    _paper("time", unit="s", spec=".2f"),
+    Column("length", "length", "m", ".1f", value=mean("length")),
+    _paper("length", unit="m", spec=".1f"),
+    Column("speed", "mean speed", "m/s", ".2f", value=mean("speed")),
+    _paper("speed", unit="m/s", spec=".2f"),
+    Column("failed", "failures", of="paths", meaning=f"no plan, a crash, or {LOST:g} m from its place",
+           value=count("failed")),
+    _paper("failed", unit="%", spec=".0f"),
+    Column("seconds", "compute", "ms", ".1f", meaning="mean of the processor's time, one thread",
+           value=mean("seconds")),
+    _paper("seconds", unit="ms", spec=".0f"),
+    Column("retraining", "training", "s", ".0f", meaning="of the processor, once for a vehicle and its limits"),
+)  # fmt: skip
 
 
-def _millimetres(points: NDArray) -> list[list[float]]:
-    return [[round(float(value), 3) for value in point] for point in points]
-
-
-def baselines_table(trials: Sequence[BaselineTrial], names: Sequence[str], retraining: Mapping[str, float]) -> Table:
-    """Return the paper's Table 3 with the paper's numbers beside."""
-    columns = (
-        Column("planner", "planner"),
-        Column("paths"),
-        Column("deviation", "largest deviation", "m", ".3f", meaning="mean over flights that did not fail"),
-        Column("paper_deviation", "paper", "m", ".3f"),
-        Column("thrust_least", "least thrust", "N", ".2f", meaning="planned, of a motor; mean over paths"),
-        Column("thrust_most", "greatest", "N", ".2f"),
-        Column("paper_thrusts", "paper", meaning="least and greatest, N"),
-        Column("violation", "thrust violation", "N", ".4f", meaning="planned beyond a motor's range, mean over time"),
-        Column("paper_violation", "paper", "N", ".3f"),
-        Column("travel_time", "time", "s", ".2f", meaning="mean, as are length and speed"),
-        Column("paper_time", "paper", "s", ".2f"),
-        Column("length", "length", "m", ".1f"),
-        Column("paper_length", "paper", "m", ".1f"),
-        Column("speed", "mean speed", "m/s", ".2f"),
-        Column("paper_speed", "paper", "m/s", ".2f"),
-        Column("failed", "failures", of="paths", meaning=f"no plan, a crash, or {LOST:g} m from its place"),
-        Column("paper_failed", "paper", "%", ".0f"),
-        Column("seconds", "compute", "ms", ".1f", meaning="mean of the processor's time, one thread"),
-        Column("paper_seconds", "paper", "ms", ".0f"),
-        Column("retraining", "training", "s", ".0f", meaning="of the processor, once for a vehicle and its limits"),
-    )  # fmt: skip
-    rows = [
-        _row([trial for trial in trials if trial.planner == name]) | {"retraining": retraining.get(name)}
-        for name in names
-        if any(trial.planner == name for trial in trials)
-    ]
+def tables(settings: Settings, rows: list[BaselineTrial]) -> Iterator[Table]:
+    """Yield the paper's Table 3 with the paper's numbers beside."""
     title = (
         f"Paths through {WAYPOINTS} random waypoints in {' × '.join(f'{side:g}' for side in BOX)} m, "
         f"{SPEED:g} m/s, motor lag {PAPER_LAG:g} s; {ALLOCATION}: {ACCELERATION:g} m/s²"
     )
-    return Table("baselines", title, columns, tuple(rows))
+    yield table("baselines", title, COLUMNS, rows, by=("planner",))
 
 
-def _row(own: Sequence[BaselineTrial]) -> dict[str, Any]:
-    printed = BASELINES.get(own[0].planner)
-    flown = [trial for trial in own if not trial.failed]
-    return {
-        "planner": own[0].planner,
-        "paths": len(own),
-        "deviation": finite_mean(trial.deviation for trial in flown),
-        "thrust_least": finite_mean(trial.thrust_least for trial in own),
-        "thrust_most": finite_mean(trial.thrust_most for trial in own),
-        "violation": finite_mean(trial.violation for trial in own),
-        "travel_time": finite_mean(trial.travel_time for trial in own),
-        "length": finite_mean(trial.length for trial in own),
-        "speed": finite_mean(trial.length / trial.travel_time for trial in own),
-        "failed": sum(trial.failed for trial in own),
-        "seconds": finite_mean(trial.seconds for trial in own),
-        "paper_deviation": printed.deviation if printed else None,
-        "paper_thrusts": f"{printed.thrust_least:g} / {printed.thrust_most:g}" if printed else None,
-        "paper_violation": printed.violation if printed else None,
-        "paper_time": printed.travel_time if printed else None,
-        "paper_length": printed.length if printed else None,
-        "paper_speed": printed.speed if printed else None,
-        "paper_failed": printed.failures if printed else None,
-        "paper_seconds": printed.seconds if printed else None,
-    }
+STUDY = Study(Settings, work, tables, "--epochs 5 -o results/baselines.json")

@@ -1,4 +1,4 @@
-"""The paper's figures, drawn from results/: paths of the baselines with AllocNet's boxes, yaw consistency, tracks."""
+"""The paper's figures, drawn from the rows of results: paths of the baselines with AllocNet's boxes, yaw, tracks."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
+from cfplan.geometry.path import Path as PathOfMotion
 from cfplan.planning.figure import save_figure
-from cfplan.simulation.geometric_flight import LOST
-from studies.paper.baselines import ALLOCATION, BAYESIAN, DRAWN, SHIPPED
-from studies.paper.hardware import CERTIFIED, LONG, RAW, TRACKED
+from cfplan.safety.limits_file import DEFAULTS, load_limits
+from studies.paper.baselines import ALLOCATION, BAYESIAN, DRAWN, SHIPPED, BaselineTrial, random_course
+from studies.paper.corridors import box_corners, corridor_about
+from studies.paper.hardware import CERTIFIED, LONG, RAW, TRACKED, HardwareFlight, hardware_paths, long_path
 from studies.paper.trials import TOPPQUAD
-from studies.paper.yaw_consistency import WAYS
-from studies.runner.result import StudyResult, read_result
+from studies.paper.yaw_consistency import WAYS, Pair
+from studies.runner.result import ITEMS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,19 +27,18 @@ COLOURS = MappingProxyType({SHIPPED: "#7b3fa0", BAYESIAN: "#c04a2b", ALLOCATION:
 DIFFERENCES = (("h", "largest Δh"), ("time", "Δtime, s"), ("yaw", "largest Δyaw, rad"))  # of the paper's histograms
 BINS = 20
 NETWORKS = MappingProxyType({"LSTM-0.001": "#7b3fa0", "LSTM-0.01": "#1f7a4d", "LSTM-0.1": "#c0282b"})  # as in the paper
-LONG_STYLES = MappingProxyType({
-    "": {"color": "black", "ls": "--", "zorder": 3}, TOPPQUAD: {"color": "#2b5fc0", "ls": "--", "zorder": 2},
-})  # fmt: skip
+TOPPQUAD_STYLE = MappingProxyType({"color": "#2b5fc0", "ls": "--", "zorder": 2})
 PANELS = 4  # of tracks, in a line
 EDGES = tuple((corner, corner | 1 << axis) for corner in range(8) for axis in range(3) if not corner & 1 << axis)
-Row = Mapping[str, Any]
+PATH_POINTS = 121  # of a path that was to be flown
 
 
 class Drawing(NamedTuple):
-    """One figure: the study whose result it is drawn from, and how."""
+    """One figure: the study from whose rows it is drawn, what a row is, and how they are drawn."""
 
     study: str
-    draw: Callable[[StudyResult], "Figure"]
+    row: type
+    draw: Callable[[Sequence[Any]], "Figure"]
 
 
 class Written(NamedTuple):
@@ -48,7 +49,9 @@ class Written(NamedTuple):
 
 
 def write_figures(results: Path, images: Path) -> list[Written]:
-    """Draw each of FIGURES from the results in one folder, into the other; those without a result are left out.
+    """Draw each of FIGURES from the rows beside the results in one folder, into the other.
+
+    Those without rows, which are not kept in the repository, are left out.
 
     Raises:
         InputError: no such folder, or a figure that cannot be written.
@@ -59,7 +62,7 @@ def write_figures(results: Path, images: Path) -> list[Written]:
     for name, drawing in FIGURES.items():
         file = images / f"{name}.png"
         try:
-            figure = drawing.draw(read_result(results / f"{drawing.study}.json"))
+            figure = drawing.draw(_read_rows(results, drawing.study, drawing.row))
         except InputError as error:
             written.append(Written(file, str(error)))
             continue
@@ -68,76 +71,89 @@ def write_figures(results: Path, images: Path) -> list[Written]:
     return written
 
 
-def draw_baselines(result: StudyResult) -> "Figure":
+def _read_rows(results: Path, study: str, row: type) -> list[Any]:
+    """Return the rows of a study's cases. Raises InputError, with the command that makes them, where there are none."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    file, hint = results / ITEMS / f"{study}.parquet", f"make it: python -m studies {study} -o {results / study}.json"
+    try:
+        return [row(**fields) for fields in pq.read_table(file).to_pylist()]
+    except OSError as error:
+        raise InputError(error.strerror or "no rows of its cases", where=str(file), hint=hint) from None
+    except (pa.ArrowInvalid, TypeError):
+        raise InputError("not the rows of this study as it is", where=str(file), hint=hint) from None
+
+
+def draw_baselines(rows: Sequence[BaselineTrial]) -> "Figure":
     """Draw the paths of a row of planners through the same waypoints, and the boxes that AllocNet's kind is given."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    rows = result.table("drawn").rows
-    seeds = list(dict.fromkeys(row["seed"] for row in rows))
+    seeds = list(dict.fromkeys(row.seed for row in rows if row.points))
     if not seeds:
-        raise InputError("no path was flown by any planner", where="drawn", hint="run cfplan study baselines anew")
+        raise InputError("no path was flown by any planner of the figure", where="baselines", hint="measure more paths")
     figure = Figure(figsize=(3.2 * len(DRAWN), 2.6 * len(seeds)), layout=ConstrainedLayoutEngine(rect=(0, 0, 0.97, 1)))
     for line, seed in enumerate(seeds):
-        own = [row for row in rows if row["seed"] == seed]
+        motions = {row.planner: np.array(row.points) for row in rows if row.seed == seed and row.points}
         for column, name in enumerate(DRAWN):
             axes = figure.add_subplot(len(seeds), len(DRAWN), line * len(DRAWN) + column + 1, projection="3d")
-            _draw_motion(axes, own, name)
+            _draw_motion(axes, name, motions, seed)
             if line == 0:
                 axes.set_title(name, fontsize=10)
     return figure
 
 
-def _draw_motion(axes: Any, rows: Sequence[Row], name: str) -> None:
+def _draw_motion(axes: Any, name: str, motions: Mapping[str, NDArray], seed: int) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    (waypoints,) = _points(rows, "waypoints")
-    boxes = _points(rows, "box") if name == ALLOCATION else []
+    course = random_course(seed)
+    waypoints, boxes = course.waypoints, box_corners(corridor_about(course.path))
+    everything = np.concatenate([waypoints, *motions.values(), *boxes])
     if name == ALLOCATION:
         waypoints = waypoints[[0, -1]]  # it keeps no other
-    for box in boxes:
-        for edge in EDGES:
-            axes.plot(*box[list(edge)].T, color="0.55", lw=0.7)
-    for points in _points(rows, name):
-        axes.plot(*points.T, color=COLOURS[name], lw=1.6)
+        for box in boxes:
+            for edge in EDGES:
+                axes.plot(*box[list(edge)].T, color="0.55", lw=0.7)
+    if name in motions:
+        axes.plot(*motions[name].T, color=COLOURS[name], lw=1.6)
     axes.plot(*waypoints.T, "o", color="black", ms=3.5)
     for axis, label in ((axes.xaxis, "x, m"), (axes.yaxis, "y, m"), (axes.zaxis, "z, m")):
         axis.set_label_text(label, fontsize=7)
         axis.labelpad = -6.0
         axis.set_major_locator(MaxNLocator(4, integer=True))
     axes.tick_params(labelsize=6, pad=-3.0)
-    everything = np.concatenate([row["points"] for row in rows])
     axes.set(
         **dict(zip(("xlim", "ylim", "zlim"), np.stack([everything.min(0), everything.max(0)], axis=1), strict=True))
     )
     axes.set_aspect("equal")
 
 
-def draw_yaw_consistency(result: StudyResult) -> "Figure":
+def draw_yaw_consistency(rows: Sequence[Pair]) -> "Figure":
     """Draw the histograms of the largest differences within pairs of paths, a row for each way to plan them."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    rows = [row for row in result.table("pairs").rows if not row["reason"]]
+    solved = [row for row in rows if row.solved]
     figure = Figure(figsize=(10.0, 2.3 * len(WAYS)), layout="constrained")
     grid = np.asarray(figure.subplots(len(WAYS), len(DIFFERENCES), sharex="col", sharey="col"))
     for column, (key, label) in enumerate(DIFFERENCES):
-        bins = np.linspace(0.0, max((row[key] for row in rows), default=1.0), BINS + 1)
+        bins = np.linspace(0.0, max((getattr(row, key) for row in solved), default=1.0), BINS + 1)
         for line, way in enumerate(WAYS):
             axes = grid[line, column]
-            axes.hist([row[key] for row in rows if row["planner"] == way], bins, color="#4a6fa5")
+            axes.hist([getattr(row, key) for row in solved if row.planner == way], bins, color="#4a6fa5")
             axes.grid(alpha=0.25)
             axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
             axes.set(xlabel=label if line == len(WAYS) - 1 else "", ylabel=f"{way}\npairs" if column == 0 else "")
     return figure
 
 
-def draw_tracks(result: StudyResult, network: str) -> "Figure":
+def draw_tracks(rows: Sequence[HardwareFlight], network: str) -> "Figure":
     """Draw the flights of a network and of TOPPQuad over their paths, from above: as planned, then certified."""
     from matplotlib.figure import Figure
 
-    rows = [row for row in result.table("tracks").rows if row["path"] != LONG]
-    paths = {row["path"]: np.array(row["points"]) / 1000.0 for row in rows if not row["planner"]}
+    rows = [row for row in rows if row.limits == TRACKED and row.path != LONG and row.planner in (TOPPQUAD, network)]
+    paths = hardware_paths(load_limits(DEFAULTS), len({row.path for row in rows}))
     lines = -(-len(paths) // PANELS)
     figure = Figure(figsize=(2.4 * PANELS, 2 * 2.5 * lines), layout="constrained")
     parts = np.atleast_1d(np.asarray(figure.subfigures(2, 1))).tolist()
@@ -145,14 +161,14 @@ def draw_tracks(result: StudyResult, network: str) -> "Figure":
         part.suptitle(f"{network}, {way}", fontsize=10)
         grid = np.atleast_1d(part.subplots(lines, PANELS)).ravel()
         for axes, (name, path) in zip(grid, paths.items(), strict=False):
-            axes.plot(path[:, 0], path[:, 1], "--", color="black", lw=0.9, zorder=3)
-            for row in rows:
-                if (row["path"], row["way"]) == (name, way) and row["planner"] in (TOPPQUAD, network):
-                    own = row["planner"] == network
-                    style = {"color": NETWORKS[network]} if own else {"color": "#2b5fc0", "ls": "--", "zorder": 2}
-                    track = np.array(row["points"]) / 1000.0
-                    axes.plot(track[:, 0], track[:, 1], lw=0.9, **style)
-            axes.set_title(f"path {name}{_failures(result, name, way, network)}", fontsize=8)
+            flights = [row for row in rows if (row.path, row.way) == (name, way)]
+            axes.plot(*_places(path)[:, :2].T, "--", color="black", lw=0.9, zorder=3)
+            for flight in flights:
+                style = {"color": NETWORKS[network]} if flight.planner == network else TOPPQUAD_STYLE
+                axes.plot(*_track(flight)[:, :2].T, lw=0.9, **style)
+            own = [flight for flight in flights if flight.planner == network]
+            failed = sum(flight.failed for flight in own)
+            axes.set_title(f"path {name}" + (f": {failed} of {len(own)} failed" if failed else ""), fontsize=8)
             axes.set_aspect("equal")
             axes.tick_params(labelsize=6)
         for axes in grid[len(paths) :]:
@@ -160,44 +176,45 @@ def draw_tracks(result: StudyResult, network: str) -> "Figure":
     return figure
 
 
-def _failures(result: StudyResult, path: str, way: str, network: str) -> str:
-    flown = [
-        row for row in result.table("flights").rows
-        if (row["limits"], row["path"], row["way"], row["planner"]) == (TRACKED, path, way, network)
-    ]  # fmt: skip
-    failed = sum(bool(row["reason"]) or row["deviation"] is None or row["deviation"] >= LOST for row in flown)
-    return f": {failed} of {len(flown)} failed" if failed else ""
-
-
-def draw_long(result: StudyResult) -> "Figure":
+def draw_long(rows: Sequence[HardwareFlight]) -> "Figure":
     """Draw the flights over the long path, certified, from above and from the side: the planner's that ships."""
     from matplotlib.figure import Figure
 
-    rows = [row for row in result.table("tracks").rows if row["path"] == LONG and row["way"] in ("", CERTIFIED)]
-    if not any(row["planner"] == SHIPPED for row in rows):
+    flights = [row for row in rows if (row.limits, row.path, row.way) == (TRACKED, LONG, CERTIFIED)]
+    if not any(flight.planner == SHIPPED for flight in flights):
         raise InputError(
-            "no flight of the planner that ships over the long path",
-            where="tracks",
-            hint="run cfplan study hardware anew",
+            "no flight of the planner that ships over the long path", where="hardware", hint="leave --quick out"
         )
     figure = Figure(figsize=(9.6, 5.4), layout="constrained")
+    path = _places(long_path(load_limits(DEFAULTS)))
     for axes, (first, second) in zip(figure.subplots(1, 2), ((0, 1), (1, 2)), strict=True):
-        for row in rows:
-            points = np.array(row["points"]) / 1000.0
-            style = LONG_STYLES.get(row["planner"], {"color": COLOURS[SHIPPED]})
+        axes.plot(path[:, first], path[:, second], "--", color="black", lw=0.9, zorder=3)
+        for flight in flights:
+            points, style = (
+                _track(flight),
+                TOPPQUAD_STYLE if flight.planner == TOPPQUAD else {"color": COLOURS[SHIPPED]},
+            )
             axes.plot(points[:, first], points[:, second], lw=0.9, **style)
         axes.set(xlabel=f"{'xyz'[first]}, m", ylabel=f"{'xyz'[second]}, m")
         axes.set_aspect("equal")
     return figure
 
 
-def _points(rows: Sequence[Row], what: str) -> list[NDArray]:
-    return [np.array(row["points"]) for row in rows if row["what"] == what]
+def _places(path: PathOfMotion) -> NDArray:
+    """Return where a path goes, (PATH_POINTS, 3) m."""
+    return path(np.linspace(0.0, path.end, PATH_POINTS))
+
+
+def _track(flight: HardwareFlight) -> NDArray:
+    """Return where a flight was, (N, 3) m."""
+    return np.reshape(flight.points, (-1, 3)) / 1000.0
 
 
 FIGURES: MappingProxyType[str, Drawing] = MappingProxyType({
-    "paper-baselines": Drawing("baselines", draw_baselines),
-    "paper-yaw": Drawing("yaw-consistency", draw_yaw_consistency),
-    **{f"paper-{name}": Drawing("hardware", partial(draw_tracks, network=name)) for name in NETWORKS},
-    "paper-long": Drawing("hardware", draw_long),
+    "paper-baselines": Drawing("baselines", BaselineTrial, draw_baselines),
+    "paper-yaw": Drawing("yaw-consistency", Pair, draw_yaw_consistency),
+    **{
+        f"paper-{name}": Drawing("hardware", HardwareFlight, partial(draw_tracks, network=name)) for name in NETWORKS
+    },
+    "paper-long": Drawing("hardware", HardwareFlight, draw_long),
 })  # fmt: skip

@@ -1,22 +1,23 @@
-"""The paper's hardware tables, on the virtual lab: TOPPQuad and learned plans, flown by the pilot with poses by Vicon.
+"""Make the paper's hardware tables on the virtual lab, without real time: TOPPQuad, networks and what ships.
 
 Eight paths in a motion capture room, the first a straight line, and a long one; several flights of each, which differ
 by the noise of sensors, cameras and radio. The paper states two sets of limits, so there are two. Plans are flown in
 two ways: as they are, which cfplan otherwise refuses, and certified, as cfplan flies them. Room, vehicle and all other
-limits are those that `cfplan init` writes. Of the first set the poses are kept, for the figures of the tracks.
+limits are those that `cfplan init` writes. Paths are labelled and networks trained where they are not there, for each
+set of limits in its own folder; what was stopped goes on. Of the first set the poses are kept, for the figures.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import count
+from itertools import count as numbers
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfplan.errors import CfplanError, ExitCode, InputError
+from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.pilot.mission import Mission, mission_of
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints.encoding import encode_trajectory
@@ -26,8 +27,8 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.geometry.yaw import YawMode
+from cfplan.learning.dataset import make_dataset
 from cfplan.learning.dataset_spec import GIVEN, DatasetSpec
-from cfplan.learning.paper.training import SequenceOptions
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import plan
@@ -43,26 +44,32 @@ from cfplan.safety.space import check_space
 from cfplan.simulation.geometric_flight import LOST
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.vehicle.trajectory import Trajectory
 from studies.fault_scenarios import FOR_GOOD, Scenario
 from studies.faults import fly_stepped
 from studies.giving_way import random_paths
-from studies.runner.items import HERE, Progress, Running, work_table, work_through
-from studies.paper.architectures import training_steps
-from studies.paper.networks import (
+from studies.paper.printed import HARDWARE, paper_column
+from studies.paper.sequences import read_sequences
+from studies.paper.trained import (
+    EPOCHS,
     NODES,
+    QUICK,
+    QUICK_EPOCHS,
+    QUICK_PATHS,
+    TRAINING_COLUMNS,
     WAYPOINTS,
     TrainedNetwork,
     identities,
-    labelled_data,
     trained_networks,
 )
-from studies.paper.printed import HARDWARE
-from studies.paper.trials import TOPPQUAD, Plan, finite_mean, network_plan, profile_of
-from studies.runner.result import Column, StudyResult, Table, detail_table
-from cfplan.vehicle.trajectory import Trajectory
+from studies.paper.training import SequenceOptions
+from studies.paper.trials import TOPPQUAD, Plan, network_plan, profile_of
+from studies.runner.options import option
+from studies.runner.reductions import among, count, largest, mean
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
 
 DATA = FilePath("datasets/paper-hardware")  # a folder for each set of limits, with its dataset and its networks
-LEARNED_FROM = 9000  # paths, as in the paper
 NOISES = (0.001, 0.01, 0.1)  # m, of the LSTMs that the paper flew
 SHIPPED = "the shipped planner"
 TOPPQUAD_FLIGHTS, LEARNED_FLIGHTS = 4, 5  # of each path
@@ -73,7 +80,18 @@ LONG_WAYPOINTS, LONG_WALL_DISTANCE = 16, 0.35  # of the long path, and m that th
 LIMITS = {"appendix": (5.0, 8.0), "text": (10.0, 10.0)}  # m/s² and rad/s, as the paper has them in the two places
 RAW, CERTIFIED = "as planned", "certified"
 TRACKED = next(iter(LIMITS))  # the limits whose flights are drawn
-TRACK_SPACING, TRACK_POINTS = 0.1, 121  # s between two kept poses; points of a path
+TRACK_SPACING = 0.1  # s between two kept poses
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Which paths are flown, and what the networks learn from."""
+
+    paths: int = option(8, "Paths in the room, the first a straight line; the long one is flown besides.", least=1)
+    learned_from: int = option(9000, "Paths that networks learn from, for each set of limits.", least=10)
+    data: FilePath = option(DATA, "Folder of paths and networks; others are made.")
+    epochs: int | None = option(None, EPOCHS, least=1)
+    quick: bool = option(False, QUICK)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,22 +107,18 @@ class HardwareFlight:
     travel_time: float = np.nan  # s, planned
     deviation: float = np.nan  # m, largest by the poses, from where the setpoint is at that time
     settled: float = np.nan  # s after the end of the motion; inf where it did not settle
+    points: list[list[int]] = field(default_factory=list)  # mm, where it was along the path, where that is drawn
+    training: Mapping[str, Any] | None = None  # of the network that planned
 
     @property
     def failed(self) -> bool:
         """Return whether there was no flight to the end of the path, or it was LOST."""
         return bool(self.reason) or not self.deviation < LOST
 
-
-@dataclass(frozen=True, slots=True)
-class Track:
-    """Where a vehicle was along a path, by the poses; or, without a planner, the path itself."""
-
-    path: str
-    points: list[list[int]]  # mm
-    way: str = ""
-    planner: str = ""
-    trial: int = 0
+    @property
+    def flown(self) -> bool:
+        """Return the contrary."""
+        return not self.failed
 
 
 class _Poses:
@@ -119,7 +133,7 @@ class _Poses:
             case PhaseEntered(phase=phase):
                 self._flying = phase is Phase.STREAM
             case PoseReceived(time=time, position=position) if self._flying and time >= self._next:
-                self.points.append(_millimetres(position))
+                self.points.append([round(1000.0 * float(value)) for value in position])
                 self._next = time + TRACK_SPACING
 
 
@@ -136,58 +150,39 @@ class FlownPlanner:
     certified: Certified
     flights: int = LEARNED_FLIGHTS  # of each path
     any_length: bool = False  # whether it plans paths longer than the paper's
+    training: Mapping[str, Any] | None = None  # of a network
 
 
-def hardware(
-    *,
-    paths: int = 8,
-    learned_from: int = LEARNED_FROM,
-    data: FilePath = DATA,
-    epochs: int | None = None,
-    quick: bool = False,
-    running: Running = HERE,
-    progress: Progress = lambda done, total: None,
-) -> StudyResult:
-    """Fly `paths` paths and the long one by each planner; paths are labelled and networks trained if need be.
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case a plan, which is flown several times; paths are labelled and networks trained if need be.
 
-    Under `data` each set of limits has a folder, in which labelling and training that were stopped go on.
-
-    Raises:
-        InputError: fewer than one path, or other data or networks in the folder.
+    Raises InputError where the folder holds other data or networks.
     """
-    if paths < 1:
-        raise InputError("paths must be at least 1", where="paths", hint="give --paths 8, as in the paper")
     usual = load_limits(DEFAULTS)
-    names = list(LIMITS)[:1] if quick else list(LIMITS)
-    flown_paths = hardware_paths(usual, paths) | ({} if quick else {LONG: long_path(usual)})
-    wanted = [SequenceOptions(epsilon=epsilon) for epsilon in (NOISES[:1] if quick else NOISES)]
-    networks: dict[str, list[TrainedNetwork]] = {}
-    training: list[dict[str, Any]] = []
-    steps: dict[str, tuple[int, float]] = {}
-    for name in names:
-        spec = hardware_spec(paper_limits(usual, name), learned_from)
-        with labelled_data(data / name, spec, progress, running=running, epochs=epochs, quick=quick) as material:
-            networks[name] = trained_networks(material, wanted, progress)
-            steps |= training_steps(networks[name], len(material.learned_from.rows), f"{name} ")
-            training += [
-                {"limits": name, "network": each.name, "learned_from": len(material.learned_from.rows),
-                 "epochs": each.options.epochs, "seconds": each.training_seconds} for each in networks[name]
-            ]  # fmt: skip
-    planners = {name: flown_planners({each.name: network_plan(each) for each in own}) for name, own in networks.items()}
-    settings = {"paths": paths, "learned_from": learned_from, "radio_loss": LOSS, "quick": quick}
-    work = work_through(
-        "hardware", settings | {"networks": {name: identities(own) for name, own in networks.items()}},
-        partial(_flights, planners, flown_paths, 1 if quick else None), _flown_together(planners, flown_paths), running,
-        progress,
-    )  # fmt: skip
-    flown = [(HardwareFlight(**flight), points) for value in work.values for flight, points in value]
-    flights = [flight for flight, _ in flown]
-    tables = (*hardware_tables(flights), Table("training", "Networks", TRAINING_COLUMNS, tuple(training)))
-    details = (
-        detail_table("flights", flights), detail_table("tracks", _tracks(flown_paths, flown)),
-        work_table(steps | {"plan": (len(work.values), work.seconds)}),
-    )  # fmt: skip
-    return StudyResult("hardware", settings, tables, details, work.interrupted)
+    paths = hardware_paths(usual, settings.paths) | ({} if settings.quick else {LONG: long_path(usual)})
+    networks = {name: _networks(settings, run, name) for name in list(LIMITS)[: 1 if settings.quick else None]}
+    planners = {name: flown_planners(own) for name, own in networks.items()}
+    identity = {name: identities(own) for name, own in networks.items()}
+    most = 1 if settings.quick else None
+    return Work(plans_of(planners, paths), partial(measure, planners, paths, most), HardwareFlight, identity)
+
+
+def _networks(settings: Settings, run: Run, name: str) -> list[TrainedNetwork]:
+    """Return the networks for one set of limits."""
+    spec = hardware_spec(paper_limits(load_limits(DEFAULTS), name), settings.learned_from)
+    folder, noises, epochs = settings.data / name, NOISES[: 1 if settings.quick else None], settings.epochs
+    if settings.quick:
+        spec, folder, epochs = replace(spec, count=QUICK_PATHS // 2), run.scratch, QUICK_EPOCHS
+    done = 0
+
+    def show(rows: int) -> None:
+        nonlocal done
+        done += rows
+        run.progress(done, spec.rows)
+
+    make_dataset(folder / "data", spec, workers=run.workers, scheduler=run.scheduler, on_rows=show)
+    known, wanted = read_sequences(folder / "data").learned_from(0), [SequenceOptions(epsilon=each) for each in noises]
+    return trained_networks(known, folder, wanted, run, epochs)
 
 
 def paper_limits(usual: Limits, name: str) -> Limits:
@@ -229,7 +224,7 @@ def long_path(limits: Limits) -> Path:
     """Return a path several times as long that stays within the room."""
     distance = limits.space.margin + LONG_WALL_DISTANCE
     box = np.array([limits.space.low, limits.space.high]) + np.array([[distance], [-distance]])
-    for seed in count():
+    for seed in numbers():
         path = min_snap(random_waypoints(seed, box, (LONG_WAYPOINTS, LONG_WAYPOINTS)))
         with suppress(CfplanError):  # between its waypoints it leaves the space, or has a cusp
             path.check()
@@ -238,11 +233,12 @@ def long_path(limits: Limits) -> Path:
     raise AssertionError
 
 
-def flown_planners(networks: Mapping[str, Plan]) -> list[FlownPlanner]:
+def flown_planners(networks: Iterable[TrainedNetwork]) -> list[FlownPlanner]:
     """Return TOPPQuad, the networks and the planner that ships."""
+    plans = [(network_plan(each), each) for each in networks]
     return [
         FlownPlanner(TOPPQUAD, _toppquad, _policy("toppquad"), TOPPQUAD_FLIGHTS, any_length=True),
-        *(FlownPlanner(name, _raw(network), _repaired(name, network)) for name, network in networks.items()),
+        *(FlownPlanner(own.name, _raw(plan), _repaired(own.name, plan), training=own.training) for plan, own in plans),
         FlownPlanner(SHIPPED, None, _policy(AUTO), any_length=True),
     ]
 
@@ -280,8 +276,8 @@ def _task(path: Path, limits: Limits) -> PlanningTask:
     return PlanningTask(path, limits.airframe, limits.plan, max(NODES, default_nodes(path)), YawMode.FREE)
 
 
-class FlownGroup(NamedTuple):
-    """Flights of one plan."""
+class FlownPlan(NamedTuple):
+    """One plan, flown several times."""
 
     limits: str
     way: str
@@ -289,30 +285,33 @@ class FlownGroup(NamedTuple):
     path: str
 
 
-def _flown_together(planners: Mapping[str, Sequence[FlownPlanner]], paths: Iterable[str]) -> dict[str, FlownGroup]:
-    groups = [
-        FlownGroup(name, way, place, path)
+def plans_of(planners: Mapping[str, Sequence[FlownPlanner]], paths: Iterable[str]) -> dict[str, FlownPlan]:
+    """Return what is planned, by the names of the cases."""
+    plans = [
+        FlownPlan(name, way, place, path)
         for name, own in planners.items()
         for way in (RAW, CERTIFIED)
         for place, planner in enumerate(own)
         for path in paths
         if (way == CERTIFIED or planner.raw) and (path != LONG or planner.any_length)
     ]
-    return {" ".join(map(str, group)): group for group in groups}
+    return {" ".join(map(str, each)): each for each in plans}
 
 
-def _flights(
-    planners: Mapping[str, Sequence[FlownPlanner]], paths: Mapping[str, Path], most: int | None, group: FlownGroup
-) -> list[tuple[HardwareFlight, list[list[int]]]]:
-    """Plan once, and fly that as often as the paper; return with each flight where it was, mm."""
-    name, way, place, path = group
+def measure(
+    planners: Mapping[str, Sequence[FlownPlanner]], paths: Mapping[str, Path], most: int | None, asked: FlownPlan
+) -> list[HardwareFlight]:
+    """Plan once, and fly that as often as the paper, or `most` times."""
+    name, way, place, path = asked
     planner, limits = planners[name][place], paper_limits(load_limits(DEFAULTS), name)
     flights = planner.flights if most is None else min(most, planner.flights)
-    begun = [HardwareFlight(name, way, planner.name, path, trial) for trial in range(flights)]
+    begun = [
+        HardwareFlight(name, way, planner.name, path, trial, training=planner.training) for trial in range(flights)
+    ]
     try:
         mission, duration = _mission(way, planner, paths[path], limits)
     except CfplanError as error:
-        return [(replace(flight, reason=str(error)), []) for flight in begun]
+        return [replace(flight, reason=str(error)) for flight in begun]
     seed = 10 * list(paths).index(path)
     return [_flown(replace(flight, travel_time=duration), mission, seed + flight.trial) for flight in begun]
 
@@ -332,85 +331,59 @@ def _mission(way: str, planner: FlownPlanner, path: Path, limits: Limits) -> tup
     return mission_of(encoded, patient), trajectory.duration
 
 
-def _flown(flight: HardwareFlight, mission: Mission, seed: int) -> tuple[HardwareFlight, list[list[int]]]:
-    """Return what became of it, and where it was, mm."""
+def _flown(flight: HardwareFlight, mission: Mission, seed: int) -> HardwareFlight:
+    """Return what became of it."""
     lossy = (RadioFault(RadioFaultKind.LOSS, 0.0, FOR_GOOD, LOSS),)
     vehicle = VehicleSettings(auto_arming=False, seed=seed)
     scenario, poses = Scenario("", Rung.NONE, lossy, from_start=True, vehicle=vehicle), _Poses()
     flown = fly_stepped(scenario, mission, seed=seed, listen=poses.hear)
     outcome = flown.outcome
+    if _is_drawn(flight):
+        flight = replace(flight, points=poses.points)
     if outcome is None or outcome.exit_code is not ExitCode.OK:
-        return replace(flight, reason=flown.reason), poses.points
-    return replace(flight, deviation=outcome.deviation.max, settled=outcome.settled_after), poses.points
+        return replace(flight, reason=flown.reason)
+    return replace(flight, deviation=outcome.deviation.max, settled=outcome.settled_after)
 
 
-def _tracks(paths: Mapping[str, Path], flown: Sequence[tuple[HardwareFlight, list[list[int]]]]) -> Iterator[Track]:
-    """Yield what the paper draws: each path, and the flights of TOPPQuad and of the networks, under TRACKED.
-
-    On the long path the planner that ships is in their place.
-    """
-    for name, path in paths.items():
-        yield Track(name, [_millimetres(point) for point in path(np.linspace(0.0, path.end, TRACK_POINTS))])
-    for flight, points in flown:
-        if flight.limits == TRACKED and points and (flight.planner != SHIPPED or flight.path == LONG):
-            yield Track(flight.path, points, flight.way, flight.planner, flight.trial)
-
-
-def _millimetres(point: Iterable[float]) -> list[int]:
-    return [round(1000.0 * float(value)) for value in point]
+def _is_drawn(flight: HardwareFlight) -> bool:
+    """Return whether the paper draws it: flights of TOPPQuad and of networks; of what ships, that of the long path."""
+    return flight.limits == TRACKED and (flight.planner != SHIPPED or flight.path == LONG)
 
 
 COLUMNS = (
     Column("limits", "limits"),
     Column("way", "plans"),
     Column("planner", "planner"),
-    Column("flights"),
-    Column("deviation", "largest deviation: mean", "m", ".3f", meaning="over flights that did not fail, by the poses"),
-    Column("deviation_most", "of all", "m", ".3f"),
-    Column("paper_deviation", "paper", "m", ".3f"),
-    Column("travel_time", "travel time", "s", ".2f", meaning="planned, mean over those flights"),
-    Column("settled", "settling", "s", ".2f", meaning="after that, until it stays near the end"),
-    Column("paper_time", "paper", "s", ".2f", meaning="with settling, along other paths"),
-    Column("failed", "failures", of="flights", meaning=f"no plan, ended by the pilot, or {LOST:g} m from its place"),
-)
-TRAINING_COLUMNS = (
-    Column("limits", "limits"), Column("network", "network"), Column("learned_from", "paths learned from"),
-    Column("epochs", "epochs"), Column("seconds", "training", "s", ".0f", meaning="of the processor, one thread"),
+    Column("flights", value=count()),
+    Column("deviation", "largest deviation: mean", "m", ".3f", meaning="over flights that did not fail, by the poses",
+           value=among("flown", mean("deviation"))),
+    Column("deviation_most", "of all", "m", ".3f", value=among("flown", largest("deviation"))),
+    paper_column(HARDWARE, "deviation", ("planner",), "m", ".3f"),
+    Column("travel_time", "travel time", "s", ".2f", meaning="planned, mean over those flights",
+           value=among("flown", mean("travel_time"))),
+    Column("settled", "settling", "s", ".2f", meaning="after that, until it stays near the end",
+           value=among("flown", mean("settled"))),
+    paper_column(HARDWARE, "time", ("planner",), "s", ".2f", "with settling, along other paths"),
+    Column("failed", "failures", of="flights", meaning=f"no plan, ended by the pilot, or {LOST:g} m from its place",
+           value=count("failed")),
 )  # fmt: skip
 
 
-def hardware_tables(flights: Sequence[HardwareFlight]) -> tuple[Table, ...]:
-    """Return the paper's table, and the same of the straight line and of the long path alone."""
-    usual = {flight.path for flight in flights} - {LONG}
+def tables(settings: Settings, rows: list[HardwareFlight]) -> Iterator[Table]:
+    """Yield the paper's table, the same of the straight line and of the long path alone, and the trainings."""
+    number = len({row.path for row in rows} - {LONG})
     pairs = ", ".join(f"{name} {first:g} m/s² and {second:g} rad/s" for name, (first, second) in LIMITS.items())
-    groups = (
-        ("hardware", f"{len(usual)} paths in the room, 2 m/s; limits: {pairs}", usual),
-        ("line", "The straight line among them, alone", {LINE}),
-        ("long", "The long path", {LONG}),
-    )
-    return tuple(
-        Table(name, title, COLUMNS, tuple(_rows([flight for flight in flights if flight.path in paths], name)))
-        for name, title, paths in groups
-    )
+    title = f"{number} paths in the room, 2 m/s; limits: {pairs}"
+    by = ("limits", "way", "planner")
+    yield table("hardware", title, COLUMNS, [row for row in rows if row.path != LONG], by=by)
+    alone = [column for column in COLUMNS if not column.key.startswith("paper_")]
+    for name, path, title in (("line", LINE, "The straight line among them, alone"), ("long", LONG, "The long path")):
+        yield table(name, title, alone, [row for row in rows if row.path == path], by=by)
+    trained = (Column("limits", "limits"), Column("network", "network", value=lambda rows: rows[0].planner))
+    yield table(
+        "training", "Networks", (*trained, *TRAINING_COLUMNS), [row for row in rows if row.training],
+        by=("limits", "planner"),
+    )  # fmt: skip
 
 
-def _rows(flights: Sequence[HardwareFlight], table: str) -> Iterator[dict[str, Any]]:
-    groups: dict[tuple[str, str, str], list[HardwareFlight]] = {}
-    for flight in flights:
-        groups.setdefault((flight.limits, flight.way, flight.planner), []).append(flight)
-    for (limits, way, planner), own in groups.items():
-        flown = [flight for flight in own if not flight.failed]
-        printed = HARDWARE.get(planner) if table == "hardware" else None
-        yield {
-            "limits": limits,
-            "way": way,
-            "planner": planner,
-            "flights": len(own),
-            "deviation": finite_mean(flight.deviation for flight in flown),
-            "deviation_most": max((flight.deviation for flight in flown), default=np.nan),
-            "travel_time": finite_mean(flight.travel_time for flight in flown),
-            "settled": finite_mean(flight.settled for flight in flown),
-            "failed": len(own) - len(flown),
-            "paper_deviation": printed.deviation if printed else None,
-            "paper_time": printed.travel_time if printed else None,
-        }
+STUDY = Study(Settings, work, tables, "--epochs 5 -o results/hardware.json")

@@ -1,167 +1,203 @@
-"""The networks of the paper's studies: read where they are trained, else trained first, resumed if need be."""
+"""The networks of the paper's Table 1 in torch: LSTM and Transformer encoder-decoders, an encoder, a per-step MLP.
 
-import hashlib
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+Each maps the derivatives of a path at N nodes, (B, N, I), to h and cos ψ there, (B, N, 2); means and scales are stored
+with the weights. Inside, h is its logarithm: at rest ends h is ten times and more what it is elsewhere, and would
+outweigh it. That, the sizes, and what the MLP sees are not in the paper: see `SIZES` and `REACH`.
+
+Where `answers` are given, the answer before is the true one (teacher forcing), else the network's.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from enum import StrEnum
+from itertools import pairwise
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from cfplan.errors import InputError
-from cfplan.geometry.path import Path as PathOfMotion
-from cfplan.geometry.yaw import YawMode
-from cfplan.learning.checkpoints import Epoch
-from cfplan.learning.dataset import make_dataset
-from cfplan.learning.dataset_spec import DatasetSpec
-from cfplan.learning.paper.networks import SequenceNetwork
-from cfplan.learning.paper.sequences import Sequences, read_sequences
-from cfplan.learning.paper.training import SequenceOptions, load_network, train_network
-from cfplan.safety.limit_sets import BOXES, PAPER
-from studies.runner.items import HERE, Progress, Running
-from studies.paper.printed import TEST, TRAIN
+import torch
+from torch import Tensor, nn
 
-DATA, NETWORKS = Path("datasets/paper"), Path("datasets/paper-networks")
-TESTED = 100  # first rows of the dataset, from which nothing is learned
-WAYPOINTS = 4
-NODES = 99  # intervals: 100 points
-DATA_COMMAND = (
-    "cfplan dataset make datasets/paper --count 10100 --seed 1 --limits paper --box 10x10x10 --waypoints 4-4 "
-    "--nodes 99 --yaw free"
-)
-QUICK_PATHS, QUICK_EPOCHS = 40, 2
+OUTPUTS = 2  # h and cos ψ
+REACH = 8  # nodes on either side of its own that the MLP sees, and answers before its own that it is fed
 
 
-@dataclass(frozen=True, slots=True)
-class PaperData:
-    """The paths of the paper's studies, and where their networks are kept."""
+class Kind(StrEnum):
+    """The architectures of Table 1."""
 
-    parts: dict[str, Sequences]  # TRAIN: of those learned from the first ones; TEST
-    learned_from: Sequences
-    folder: Path
-    epochs: int | None = None  # None: as many as the options say
-
-
-@dataclass(frozen=True, slots=True)
-class TrainedNetwork:
-    """A network ready to be asked."""
-
-    name: str
-    options: SequenceOptions
-    network: SequenceNetwork
-    training_seconds: float  # of the processor
+    LSTM = "LSTM"
+    TRANSFORMER = "Transformer"
+    ENCODER = "ETransformer"
+    MLP = "MLP"
 
 
-@contextmanager
-def paper_data(
-    data: Path, networks: Path, paths: int, *, epochs: int | None = None, quick: bool = False
-) -> Iterator[PaperData]:
-    """Yield `paths` paths for training and for testing each; `quick`: a few of its own, in a folder that goes away.
+class Size(NamedTuple):
+    """Width and number of layers, of each of encoder and decoder."""
 
-    Raises InputError where there is no such dataset, or too small a one; says which command makes it.
-    """
-    if quick:
-        with tempfile.TemporaryDirectory() as folder:
-            made = Path(folder) / "data"
-            make_dataset(made, quick_spec())
-            yield _parts(read_sequences(made), Path(folder), min(paths, 4), QUICK_PATHS // 2, QUICK_EPOCHS)
-        return
-    if not data.is_dir():
-        raise InputError("no such dataset", where=str(data), hint=f"make it: {DATA_COMMAND}")
-    yield _parts(read_sequences(data), networks, paths, TESTED, epochs)
+    width: int
+    layers: int
 
 
-@contextmanager
-def labelled_data(
-    folder: Path, spec: DatasetSpec, progress: Progress, *, running: Running = HERE, epochs: int | None = None,
-    quick: bool = False,
-) -> Iterator[PaperData]:  # fmt: skip
-    """Yield the dataset of `spec` to learn from, labelled first where it is not there; networks are kept beside it.
-
-    `quick`: a few paths, in a folder that goes away. Raises InputError where the folder holds another dataset.
-    """
-    if quick:
-        with tempfile.TemporaryDirectory() as passing:
-            few = replace(spec, count=QUICK_PATHS // 2)
-            with labelled_data(Path(passing), few, progress, running=running, epochs=QUICK_EPOCHS) as material:
-                yield material
-        return
-    done = 0
-
-    def show(rows: int) -> None:
-        nonlocal done
-        done += rows
-        progress(done, spec.rows)
-
-    data = folder / "data"
-    make_dataset(data, spec, workers=running.workers, scheduler=running.scheduler, on_rows=show)
-    yield PaperData({}, read_sequences(data).learned_from(0), folder, epochs)
+SIZES = MappingProxyType({
+    Kind.LSTM: Size(96, 1), Kind.TRANSFORMER: Size(64, 2), Kind.ENCODER: Size(64, 3), Kind.MLP: Size(192, 3),
+})  # fmt: skip
+HEADS = 4
+MOST_LOG = 10.0  # of h: farther out are no answers but accidents
 
 
-class PaperItem(NamedTuple):
-    """One path of the dataset, with which a study works."""
+class SequenceNetwork(nn.Module, ABC):
+    """What the networks have in common: the normalisation of what they see and say."""
 
-    part: str
-    row: int
-    path: PathOfMotion
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.mean, self.scale = nn.Buffer(torch.zeros(inputs)), nn.Buffer(torch.ones(inputs))
+        self.middle, self.spread = nn.Buffer(torch.zeros(OUTPUTS)), nn.Buffer(torch.ones(OUTPUTS))
+
+    def set_units(self, inputs: Tensor, answers: Tensor) -> None:
+        """Take means and scales from data, (R, N, I) and (R, N, 2)."""
+        self.mean.copy_(inputs.mean((0, 1)))
+        self.scale.copy_(inputs.std((0, 1)).clamp_min(1e-6))
+        logs = _with_logarithm(answers)
+        self.middle.copy_(logs.mean((0, 1)))
+        self.spread.copy_(logs.std((0, 1)).clamp_min(1e-6))
+
+    def forward(self, inputs: Tensor, answers: Tensor | None = None) -> Tensor:
+        """Map (B, N, I) to (B, N, 2); with `answers`, (B, N, 2), by teacher forcing."""
+        seen = (inputs - self.mean) / self.scale
+        fed = None if answers is None else self.scaled(answers)
+        found = self.middle + self.spread * self.answer(seen, fed)
+        return torch.stack([found[..., 0].clamp(-MOST_LOG, MOST_LOG).exp(), found[..., 1]], -1)
+
+    def scaled(self, answers: Tensor) -> Tensor:
+        """Return answers as the network has them, in which errors are measured."""
+        return (_with_logarithm(answers) - self.middle) / self.spread
+
+    @abstractmethod
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """Map what is scaled to what is scaled."""
 
 
-def paper_items(data: PaperData) -> dict[str, PaperItem]:
-    """Return the paths for training and for testing, by a name."""
-    return {
-        f"{part} {row}": PaperItem(part, int(row), path)
-        for part, sequences in data.parts.items()
-        for row, path in zip(sequences.rows, sequences.paths, strict=True)
-    }
+class LstmEncoderDecoder(SequenceNetwork):
+    """The paper's choice: attention between decoder and encoder has no parameters, answers are fed back."""
+
+    def __init__(self, inputs: int, size: Size) -> None:
+        super().__init__(inputs)
+        self.encoder = nn.LSTM(inputs, size.width, size.layers, batch_first=True)
+        self.decoder = nn.LSTM(OUTPUTS + inputs, size.width, size.layers, batch_first=True)
+        self.head = nn.Linear(2 * size.width, OUTPUTS)
+
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """See SequenceNetwork."""
+        memory, state = self.encoder(seen)
+        first = seen.new_zeros(len(seen), 1, OUTPUTS)
+        if fed is not None:
+            decoded, _ = self.decoder(torch.cat([torch.cat([first, fed[:, :-1]], 1), seen], 2), state)
+            return self._head(memory, decoded)
+        answers = [first]
+        for n in range(seen.shape[1]):
+            decoded, state = self.decoder(torch.cat([answers[-1], seen[:, n : n + 1]], 2), state)
+            answers.append(self._head(memory, decoded))
+        return torch.cat(answers[1:], 1)
+
+    def _head(self, memory: Tensor, decoded: Tensor) -> Tensor:
+        weights = torch.softmax(decoded @ memory.transpose(1, 2) / memory.shape[2] ** 0.5, 2)
+        answers: Tensor = self.head(torch.cat([decoded, weights @ memory], 2))
+        return answers
 
 
-def quick_spec() -> DatasetSpec:
-    """Return a dataset of the paper's kind that is made in a second."""
-    return DatasetSpec(
-        count=QUICK_PATHS, seed=1, limits=PAPER.name, families=(), boxes=(BOXES["10x10x10"],),
-        waypoints=(WAYPOINTS, WAYPOINTS), nodes=NODES, yaw=YawMode.FREE,
-    )  # fmt: skip
+class TransformerEncoderDecoder(SequenceNetwork):
+    """Self-attention over the path, a decoder with a causal mask and cross-attention, fed its answers."""
+
+    def __init__(self, inputs: int, size: Size) -> None:
+        super().__init__(inputs)
+        self.enter, self.enter_answers = nn.Linear(inputs, size.width), nn.Linear(OUTPUTS, size.width)
+        options: dict[str, Any] = {"dropout": 0.0, "batch_first": True, "norm_first": True}
+        encoding = nn.TransformerEncoderLayer(size.width, HEADS, 4 * size.width, **options)
+        decoding = nn.TransformerDecoderLayer(size.width, HEADS, 4 * size.width, **options)
+        norms = nn.LayerNorm(size.width), nn.LayerNorm(size.width)
+        self.encoder = nn.TransformerEncoder(encoding, size.layers, norms[0], enable_nested_tensor=False)
+        self.decoder = nn.TransformerDecoder(decoding, size.layers, norms[1])
+        self.head = nn.Linear(size.width, OUTPUTS)
+
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """See SequenceNetwork."""
+        memory = self.encoder(placed(self.enter(seen)))
+        first = seen.new_zeros(len(seen), 1, OUTPUTS)
+        if fed is not None:
+            return self._decode(torch.cat([first, fed[:, :-1]], 1), memory)
+        answers = first
+        for _ in range(seen.shape[1]):
+            answers = torch.cat([answers, self._decode(answers, memory)[:, -1:]], 1)
+        return answers[:, 1:]
+
+    def _decode(self, before: Tensor, memory: Tensor) -> Tensor:
+        mask = nn.Transformer.generate_square_subsequent_mask(before.shape[1], device=before.device)
+        entered = placed(self.enter_answers(before))
+        answers: Tensor = self.head(self.decoder(entered, memory, tgt_mask=mask, tgt_is_causal=True))
+        return answers
 
 
-def _parts(read: Sequences, folder: Path, paths: int, tested: int, epochs: int | None) -> PaperData:
-    known, unseen = read.learned_from(tested), read.tested(tested)
-    if not 1 <= paths <= min(len(known.rows), len(unseen.rows)):
-        raise InputError(
-            f"{paths} paths of {len(unseen.rows)} for testing and {len(known.rows)} for training",
-            where="paths",
-            hint=f"give fewer, at least 1, or make more: {DATA_COMMAND}",
+class EncoderTransformer(SequenceNetwork):
+    """Self-attention over the path and a head at each node: nothing is fed back."""
+
+    def __init__(self, inputs: int, size: Size) -> None:
+        super().__init__(inputs)
+        self.enter = nn.Linear(inputs, size.width)
+        layer = nn.TransformerEncoderLayer(
+            size.width, HEADS, 4 * size.width, dropout=0.0, batch_first=True, norm_first=True
         )
-    parts = {TRAIN: known.part(slice(0, paths)), TEST: unseen.part(slice(0, paths))}
-    return PaperData(parts, known, folder, epochs)
+        norm = nn.LayerNorm(size.width)
+        self.encoder = nn.TransformerEncoder(layer, size.layers, norm, enable_nested_tensor=False)
+        self.head = nn.Linear(size.width, OUTPUTS)
+
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """See SequenceNetwork."""
+        answers: Tensor = self.head(self.encoder(placed(self.enter(seen))))
+        return answers
 
 
-def trained_networks(data: PaperData, wanted: Sequence[SequenceOptions], progress: Progress) -> list[TrainedNetwork]:
-    """Return the networks, those not trained yet after training; `progress` is told of their epochs."""
-    options = [replace(each, epochs=data.epochs) if data.epochs else each for each in wanted]
-    total, done = sum(each.epochs for each in options), 0
-    found = []
-    for each in options:
+class StepMlp(SequenceNetwork):
+    """One node after the other: from the path within REACH nodes and the last REACH answers."""
 
-        def show(epoch: Epoch, before: int = done) -> None:
-            progress(before + epoch.epoch, total)
+    def __init__(self, inputs: int, size: Size) -> None:
+        super().__init__(inputs)
+        widths = [(2 * REACH + 1) * (inputs + 1) + REACH * OUTPUTS] + [size.width] * size.layers
+        layers = [part for i, o in pairwise(widths) for part in (nn.Linear(i, o), nn.ReLU())]
+        self.layers = nn.Sequential(*layers, nn.Linear(size.width, OUTPUTS))
 
-        folder = data.folder / each.name
-        loaded = load_network(folder, data.learned_from, each)
-        if loaded is None:
-            train_network(data.learned_from, folder, each, on_epoch=show)
-            loaded = load_network(folder, data.learned_from, each)
-        assert loaded is not None
-        done += each.epochs
-        progress(done, total)
-        found.append(TrainedNetwork(each.name, each, *loaded))
-    return found
-
-
-def identities(trained: Sequence[TrainedNetwork]) -> dict[str, Any]:
-    """Return what tells networks of the same names from others: their options, and a digest of their weights."""
-    return {each.name: {**asdict(each.options), "weights": _digest(each.network)} for each in trained}
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """See SequenceNetwork."""
+        there = torch.cat([seen, torch.ones_like(seen[..., :1])], 2)  # zeros where the path has ended
+        around = nn.functional.pad(there, (0, 0, REACH, REACH)).unfold(1, 2 * REACH + 1, 1).flatten(2)
+        before = seen.new_zeros(len(seen), REACH, OUTPUTS)
+        if fed is not None:
+            last = torch.cat([before, fed[:, :-1]], 1).unfold(1, REACH, 1).flatten(2)
+            answers: Tensor = self.layers(torch.cat([around, last], 2))
+            return answers
+        for n in range(seen.shape[1]):
+            known = torch.cat([around[:, n], before[:, -REACH:].transpose(1, 2).flatten(1)], 1)
+            before = torch.cat([before, self.layers(known)[:, None]], 1)
+        return before[:, REACH:]
 
 
-def _digest(network: SequenceNetwork) -> str:
-    weights = b"".join(tensor.numpy().tobytes() for tensor in network.state_dict().values())
-    return hashlib.sha256(weights).hexdigest()
+_NETWORKS: dict[Kind, Callable[[int, Size], SequenceNetwork]] = {
+    Kind.LSTM: LstmEncoderDecoder, Kind.TRANSFORMER: TransformerEncoderDecoder, Kind.ENCODER: EncoderTransformer,
+    Kind.MLP: StepMlp,
+}  # fmt: skip
+
+
+def build_network(kind: Kind, inputs: int, size: Size | None = None) -> SequenceNetwork:
+    """Return a network with random weights, by torch's seed."""
+    return _NETWORKS[kind](inputs, size or SIZES[kind])
+
+
+def _with_logarithm(answers: Tensor) -> Tensor:
+    return torch.stack([answers[..., 0].clamp_min(math.exp(-MOST_LOG)).log(), answers[..., 1]], -1)
+
+
+def placed(values: Tensor) -> Tensor:
+    """Add to (B, N, W) the sines and cosines by which attention knows a node's place."""
+    count, width = values.shape[1:]
+    rates = torch.exp(torch.arange(0, width, 2) * (-math.log(1e4) / width))
+    angles = torch.arange(count)[:, None] * rates
+    return values + torch.stack([angles.sin(), angles.cos()], 2).flatten(1).to(values)

@@ -1,11 +1,26 @@
 """What the paper prints, number by number: K. Mao et al., "Sequence Modeling for Time-Optimal Quadrotor Trajectory
 Optimization with Sampling-based Robustness Analysis" (2025).
 
-SI units; shares as fractions. Where the paper prints one number for train and test, it stands under both.
+SI units; fractions are at most 1. Where the paper prints one number for train and test, it stands under both.
 """
 
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from studies.runner.result import Column
+
+
+def paper_column(
+    rows: Mapping[Any, Any], number: str, by: tuple[str, ...], unit: str = "", spec: str = "", meaning: str = ""
+) -> Column:
+    """Return the column of one of the paper's numbers, which a group has by its fields `by`, or has not."""
+
+    def printed(group: Sequence[Any]) -> Any:
+        key = tuple(getattr(group[0], field) for field in by)
+        return getattr(rows.get(key if len(key) > 1 else key[0]), number, None)
+
+    return Column(f"paper_{number}", "paper", unit, spec, meaning=meaning, value=printed)
 
 
 class PrintedRow(NamedTuple):
@@ -14,7 +29,7 @@ class PrintedRow(NamedTuple):
     deviation: float  # m, "max dev"
     violation: float  # N, "thrust violation"
     slower: float | None  # "TD ratio"; None for TOPPQuad, of which the travel time is printed
-    failures: float  # share
+    failed: float  # fraction
     seconds: float | None = None  # "compute time"
 
 
@@ -56,7 +71,7 @@ class PrintedRobustness(NamedTuple):
     deviation: float  # m
     slower: float  # "TD ratio", against TOPPQuad
     variation: float  # "output variation"
-    in_brt: float  # share
+    in_brt: float  # fraction
 
 
 # Table 2, "Robustness analysis for the LSTM Encoder-Decoder model", by its columns: model, scale of perturbation, m.
@@ -77,7 +92,7 @@ class PrintedHardware(NamedTuple):
     """A planner's numbers in the hardware tables."""
 
     deviation: float  # m, "max deviation"
-    travel_time: float  # s, with settling
+    time: float  # s, with settling
 
 
 # The hardware table, and that of the appendix, "Noised Model Hardware Experiments", where the first two stand again.
@@ -96,11 +111,16 @@ class PrintedBaseline(NamedTuple):
     thrust_least: float  # N
     thrust_most: float  # N
     violation: float  # N
-    travel_time: float  # s
+    time: float  # s
     length: float  # m
     speed: float  # m/s, average
-    failures: float  # share
+    failed: float  # fraction
     seconds: float  # "compute time"
+
+    @property
+    def thrusts(self) -> str:
+        """Return least and greatest thrust, N."""
+        return f"{self.thrust_least:g} / {self.thrust_most:g}"
 
 
 # Table 3, the comparison with baselines, by its columns. What the paper calls AllocNet and MFBOTrajectory are these

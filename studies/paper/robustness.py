@@ -1,4 +1,4 @@
-"""The paper's Table 2: networks trained on clean and on perturbed paths, asked about perturbed ones.
+"""Make the paper's Table 2: networks and the planner that ships, asked about perturbed paths.
 
 For each path and each of its perturbations by at most ε: the plan is flown by the geometric controller with the paper's
 motor lag. Beside the networks, as they are: the planner that ships, certified, in each mode of yaw, the expert and
@@ -6,44 +6,31 @@ TOPPQuad. One network is not in the paper: it learns from perturbed paths with l
 keeps the clean path's.
 """
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path as FilePath
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.errors import CfplanError, InputError
+from cfplan.errors import CfplanError
 from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import perturbed
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.dataset_spec import Relabel
-from cfplan.learning.paper.recovery import recover_profile
-from cfplan.learning.paper.sequences import path_inputs
-from cfplan.learning.paper.training import SequenceOptions, answer
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import Planner
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import fly_geometric, nearest_states
-from studies.runner.items import HERE, Progress, Running, work_table, work_through
-from studies.paper.architectures import settings_of, training_steps, training_table
-from studies.paper.networks import (
-    DATA,
-    NETWORKS,
-    PaperItem,
-    TrainedNetwork,
-    identities,
-    paper_data,
-    paper_items,
-    trained_networks,
-)
+from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.printed import TEST
+from studies.paper.recovery import recover_profile
 from studies.paper.robustness_tables import (
+    HELD_YAW,
     SCALES,
     SHIPPED,
     SHIPPED_FIXED,
@@ -53,19 +40,23 @@ from studies.paper.robustness_tables import (
     robustness_table,
     variation_table,
 )
+from studies.paper.sequences import path_inputs
+from studies.paper.trained import NODES, NetworkSettings, PaperPath, TrainedNetwork, paper_data
+from studies.paper.training import SequenceOptions, answer
 from studies.paper.trials import (
     EXPERT,
     FLOWN,
-    NODES,
     TOPPQUAD,
     Plan,
+    ordered,
     profile_by,
     shipped_profile,
+    training_table,
     trajectory_by,
 )
-from studies.runner.result import StudyResult, detail_table
-from cfplan.vehicle.profile import SpeedProfile
-from cfplan.vehicle.trajectory import Trajectory
+from studies.runner.options import option
+from studies.runner.result import Table
+from studies.runner.study import Run, Study, Work
 
 MODELS = MappingProxyType(
     {
@@ -77,7 +68,6 @@ MODELS = MappingProxyType(
     }
 )
 REFERENCES: Mapping[str, Planner] = MappingProxyType({"toppquad": plan_toppquad, "expert": plan_expert})
-COMPARING, ASKING = "perturbed path, compared", "perturbed path, "  # steps of the work; behind the second, a model
 
 
 class Answered(NamedTuple):
@@ -117,73 +107,19 @@ PLANNERS: Mapping[str, tuple[str, Ask]] = MappingProxyType(  # besides the netwo
 USUAL = (*MODELS, *(name for name in PLANNERS if name != "toppquad"))  # that takes 18 s a path, all others 10
 
 
-def robustness(
-    *,
-    paths: int = 100,
-    draws: int = 10,
-    models: Sequence[str] = USUAL,
-    reference: str = "toppquad",
-    reference_draws: int | None = None,
-    data: FilePath = DATA,
-    networks: FilePath = NETWORKS,
-    epochs: int | None = None,
-    quick: bool = False,
-    running: Running = HERE,
-    progress: Progress = lambda done, total: None,
-) -> StudyResult:
-    """Perturb `paths` paths for testing, `draws` times each; networks are trained if need be.
+@dataclass(frozen=True, slots=True)
+class Settings(NetworkSettings):
+    """Which models are asked, about which paths."""
 
-    `reference` says whose travel times are compared with, toppquad or expert; `reference_draws`, of how many draws,
-    of all where it is None.
-
-    Raises:
-        InputError: an unknown model, no such dataset, or fewer paths in it.
-    """
-    for name in models:
-        if name not in (*MODELS, *PLANNERS):
-            known = ", ".join((*MODELS, *PLANNERS))
-            raise InputError(f"unknown model {name!r}", where="models", hint=f"known: {known}")
-    if draws < 1:
-        raise InputError("draws must be at least 1", where="draws", hint="give --draws 10, as is usual")
-    wanted = [MODELS[name] for name in models if name in MODELS]
-    planners = tuple(name for name in models if name in PLANNERS)
-    with paper_data(data, networks, paths, epochs=epochs, quick=quick) as material:
-        trained = trained_networks(material, wanted, progress)
-        settings = settings_of(material, quick) | {
-            "draws": draws, "models": list(models), "reference": reference,
-            "reference_draws": draws if reference_draws is None else reference_draws,
-        }  # fmt: skip
-        unseen = replace(material, parts={TEST: material.parts[TEST]})
-        asked = Questions(tuple(trained), planners, draws, reference, settings["reference_draws"])
-        work = work_through(
-            "robustness", settings | {"networks": identities(trained)}, partial(_trials_of, asked),
-            paper_items(unseen), running, progress,
-        )  # fmt: skip
-    trials = [RobustnessTrial(**trial) for value in work.values for trial in value["trials"]]
-    tables = (
-        robustness_table(trials, list(asked.models()), reference),
-        variation_table(trials, list(asked.models())),
-        *([training_table(trained, material)] if trained else []),
+    draws: int = option(10, "Perturbations of each path, each ε.", least=1)
+    models: tuple[str, ...] = option(USUAL, "Network or planner.", choices=(*MODELS, *PLANNERS))
+    reference: str = option(
+        "toppquad", "Reference planner for travel times, on the path and on the perturbed one.",
+        choices=tuple(REFERENCES),
+    )  # fmt: skip
+    reference_draws: int | None = option(
+        None, "Draws that the reference plans too, which takes the most time.  [default: all]", least=1
     )
-    compared = sum(value["compared"] for value in work.values)
-    steps = training_steps(trained, settings["learned_from"]) | {
-        COMPARING: (compared, sum(value["comparing_seconds"] for value in work.values))
-    }
-    for name in asked.models():
-        own = [trial.seconds for trial in trials if trial.model == name]
-        steps[f"{ASKING}{name}"] = (len(own), sum(own))
-    details = (detail_table("trials", trials), work_table(steps))
-    return StudyResult("robustness", settings, tables, details, work.interrupted)
-
-
-def step_names() -> list[str]:
-    """Return the names of the steps of a usual run, as its result counts them."""
-    return [COMPARING, *(f"{ASKING}{PLANNERS[name][0] if name in PLANNERS else name}" for name in USUAL)]
-
-
-def perturbed_paths(paths: int, draws: int) -> int:
-    """Return how many paths are asked about: each as it is, and its draws of each other scale."""
-    return paths * (1 + draws * (len(SCALES) - 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,28 +137,40 @@ class Questions:
         return {each.name: _network(each) for each in self.networks} | dict(PLANNERS[name] for name in self.planners)
 
 
-def _trials_of(questions: Questions, item: PaperItem) -> dict[str, Any]:
+def work(settings: Settings, run: Run) -> Work:
+    """Return a case a path for testing; networks are trained if need be. Raises what `paper_data` raises."""
+    data = paper_data(settings, run, [MODELS[name] for name in settings.models if name in MODELS])
+    planners = tuple(name for name in settings.models if name in PLANNERS)
+    compared = settings.draws if settings.reference_draws is None else settings.reference_draws
+    asked = Questions(tuple(data.networks), planners, settings.draws, settings.reference, compared)
+    return Work(data.part(TEST), partial(measure, asked), RobustnessTrial, data.identity)
+
+
+def measure(questions: Questions, item: PaperPath) -> list[RobustnessTrial]:
     """Ask each model about the path and about each of its perturbations."""
     _, row, path = item
     asked, reference = questions.models(), REFERENCES[questions.reference]
+    training = {each.name: each.training for each in questions.networks}
     clean = {name: _answered(ask, path) for name, ask in asked.items()}
-    trials, times, comparing = [], [], 0.0
+    clean_time, trials = _time(reference, path), list[RobustnessTrial]()
     for epsilon in SCALES:
         for draw in range(questions.draws if epsilon else 1):
             seed = np.random.SeedSequence(row, spawn_key=(SCALES.index(epsilon), draw))
             moved = perturbed(path, epsilon, seed) if epsilon else path
             own_time = against = np.nan
             if draw < questions.reference_draws:
-                begun = time.process_time()
-                times.append(_time(reference, moved))
-                comparing += time.process_time() - begun
-                own_time, against = times[-1], times[0]
-            for name, ask in asked.items():
-                begun = time.process_time()
-                trial = RobustnessTrial(name, epsilon, row, draw, own_time=own_time, clean_time=against)
-                trial = _flown(trial, moved, _answered(ask, moved), clean[name])
-                trials.append(replace(trial, seconds=time.process_time() - begun))
-    return {"trials": trials, "compared": len(times), "comparing_seconds": comparing}
+                own_time, against = _time(reference, moved) if epsilon else clean_time, clean_time
+            own = [
+                _flown(
+                    RobustnessTrial(name, epsilon, row, draw, own_time=own_time, clean_time=against,
+                                    training=training.get(name)),
+                    moved, _answered(ask, moved), clean[name],
+                )
+                for name, ask in asked.items()
+            ]  # fmt: skip
+            free = next((trial.travel_time for trial in own if trial.model == SHIPPED), np.nan)
+            trials += [replace(trial, free_time=free) if trial.model in HELD_YAW else trial for trial in own]
+    return trials
 
 
 def _flown(begun: RobustnessTrial, path: Path, found: Answered | str, clean: Answered | str) -> RobustnessTrial:
@@ -265,3 +213,14 @@ def _time(planner: Planner, path: Path) -> float:
         return trajectory_by(profile_by(planner))(path).duration
     except CfplanError:
         return float("nan")
+
+
+def tables(settings: Settings, rows: list[RobustnessTrial]) -> Iterator[Table]:
+    """Yield the paper's table, how answers vary, and the trainings."""
+    trials = ordered(rows, "model")
+    yield robustness_table(trials, settings.reference)
+    yield variation_table(trials)
+    yield training_table(trials, "model")
+
+
+STUDY = Study(Settings, work, tables, "--epochs 5 --reference-draws 1 -o results/robustness.json")

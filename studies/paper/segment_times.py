@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
-from cfplan.learning.paper.bayesian_times import Budget, optimise_times
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import fly_geometric
-from studies.paper.trials import FLOWN, NODES
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
+from studies.paper.bayesian_times import Budget, optimise_times
+from studies.paper.trials import FLOWN, NODES
 
 FOLLOWED = 0.1  # m that a motion may be off in closed loop
 SAMPLE = 0.01  # s between the moments at which flatness is asked

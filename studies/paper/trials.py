@@ -5,10 +5,11 @@ planned and as asked by the controller, speed above the limit, travel time, and 
 """
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,20 +17,21 @@ from cfplan.errors import CfplanError
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.learned import plan_learned
-from cfplan.learning.paper.recovery import recover_profile
-from cfplan.learning.paper.sequences import path_inputs
-from cfplan.learning.paper.training import answer
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import Planner, PlanningTask
 from cfplan.planning.repair import refine, repair
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import LOST, fly_geometric, thrust_violation
-from studies.paper.networks import NODES, TrainedNetwork
-from studies.paper.printed import PrintedRow
-from studies.runner.result import Column
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
+from studies.paper.printed import PrintedRow, paper_column
+from studies.paper.recovery import recover_profile
+from studies.paper.sequences import path_inputs
+from studies.paper.trained import NODES, PARAMETERS, TRAINING_COLUMNS, PaperPath, TrainedNetwork
+from studies.paper.training import answer
+from studies.runner.reductions import among, count, mean
+from studies.runner.result import Column, Table, table
 
 PAPER_LAG = 0.005  # s, time constant of the motors in RotorPy of the paper's day
 FLOWN = replace(PAPER.airframe, motor_time_constant=PAPER_LAG)
@@ -38,6 +40,7 @@ SAMPLE = 0.002  # s between the moments at which planned thrust and speed are lo
 _WARM: set[str] = set()  # planners that this process has asked before
 Plan = Callable[[Path], SpeedProfile]  # raises CfplanError where there is none
 Ask = Callable[[Path], Trajectory]  # likewise
+Row = TypeVar("Row")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +58,33 @@ class PaperTrial:
     violation: float = np.nan  # N, planned
     asked_violation: float = np.nan  # N, by the controller
     top_speed: float = np.nan  # m/s, planned
+    reference_time: float = np.nan  # s, of TOPPQuad's plan
+    training: Mapping[str, Any] | None = None  # of the network that planned
 
     @property
     def failed(self) -> bool:
         """Return whether there was no flight, or one that crashed or was LOST."""
         return not self.deviation < LOST
+
+    @property
+    def flown(self) -> bool:
+        """Return the contrary."""
+        return not self.failed
+
+    @property
+    def counted_deviation(self) -> float:
+        """Return the deviation, m, in which a failure counts as LOST."""
+        return LOST if self.failed else self.deviation
+
+    @property
+    def slower(self) -> float:
+        """Return by which fraction the plan takes longer than the reference's."""
+        return self.travel_time / self.reference_time - 1.0
+
+    @property
+    def above(self) -> float:
+        """Return by which fraction the planned speed exceeds its limit; NaN without a plan."""
+        return max(self.top_speed / PAPER.limits.speed - 1.0, 0.0) if not self.reason else np.nan
 
 
 def planners(networks: Iterable[TrainedNetwork]) -> dict[str, Plan]:
@@ -111,35 +136,38 @@ def network_plan(trained: TrainedNetwork) -> Plan:
     return plan
 
 
-def path_trials(plans: Mapping[str, Plan], part: str, row: int, path: Path) -> list[PaperTrial]:
-    """Return what each planner planned, flown as it is and flown after repair."""
+def path_trials(
+    plans: Mapping[str, Plan], networks: Mapping[str, TrainedNetwork], asked: PaperPath
+) -> list[PaperTrial]:
+    """Return what each planner planned, flown as it is and flown after repair; TOPPQuad is one of them."""
     trials: list[PaperTrial] = []
     for name, plan in plans.items():
         if name not in _WARM:
             with suppress(CfplanError):
-                plan(path)  # loads and compiles
+                plan(asked.path)  # loads and compiles
             _WARM.add(name)
-        trials += _both(plan, path, {"planner": name, "part": part, "row": row})
-    return trials
+        training = networks[name].training if name in networks else None
+        trials += _both(plan, asked.path, PaperTrial(name, asked.part, asked.row, repaired=False, training=training))
+    reference = next(trial.travel_time for trial in trials if trial.planner == TOPPQUAD)
+    return [replace(trial, reference_time=reference) for trial in trials]
 
 
-def _both(plan: Plan, path: Path, known: dict[str, Any]) -> tuple[PaperTrial, PaperTrial]:
-    begun = time.process_time()
+def _both(plan: Plan, path: Path, begun: PaperTrial) -> tuple[PaperTrial, PaperTrial]:
+    started = time.process_time()
     try:
         profile = plan(path)
     except CfplanError as error:
-        return PaperTrial(**known, repaired=False, reason=str(error)), PaperTrial(
-            **known, repaired=True, reason=str(error)
-        )
-    seconds = time.process_time() - begun
-    raw = _flown(Trajectory(path, profile, PAPER.airframe), PaperTrial(**known, repaired=False, seconds=seconds))
+        failed = replace(begun, reason=str(error))
+        return failed, replace(failed, repaired=True)
+    seconds = time.process_time() - started
+    raw = _flown(Trajectory(path, profile, PAPER.airframe), replace(begun, seconds=seconds))
     try:
-        begun = time.process_time()
+        started = time.process_time()
         found = repair(paper_task(path), profile)
-        seconds += time.process_time() - begun
+        seconds += time.process_time() - started
     except CfplanError as error:
-        return raw, PaperTrial(**known, repaired=True, reason=str(error))
-    return raw, _flown(found.trajectory, PaperTrial(**known, repaired=True, seconds=seconds))
+        return raw, replace(begun, repaired=True, reason=str(error))
+    return raw, _flown(found.trajectory, replace(begun, repaired=True, seconds=seconds))
 
 
 def _flown(trajectory: Trajectory, trial: PaperTrial) -> PaperTrial:
@@ -155,61 +183,56 @@ def _flown(trajectory: Trajectory, trial: PaperTrial) -> PaperTrial:
     )
 
 
-def planner_columns(what: str) -> tuple[Column, ...]:
+def planner_tables(
+    name: str, what: str, printed: Mapping[tuple[str, str], PrintedRow], trials: Sequence[PaperTrial]
+) -> Iterator[Table]:
+    """Yield the paper's table, of plans as they are, with the paper's numbers beside; the same after repair."""
+    columns = planner_columns(what, printed)
+    bare = [column for column in columns if not column.key.startswith("paper_")]
+    terms = f"{PAPER.limits.speed:g} m/s, motor lag {PAPER_LAG:g} s"
+    raw, repaired = ([trial for trial in ordered(trials) if trial.repaired is way] for way in (False, True))
+    yield table(name, f"The paper's table, as planned, {terms}", columns, raw, by=("planner", "part"))
+    yield table(f"{name}-repaired", f"After cfplan's repair, {terms}", bare, repaired, by=("planner", "part"))
+
+
+def ordered(rows: Sequence[Row], by: str = "planner") -> list[Row]:
+    """Return the rows planner by planner, in the order in which these first occur."""
+    places = {name: place for place, name in enumerate(dict.fromkeys(getattr(row, by) for row in rows))}
+    return sorted(rows, key=lambda row: places[getattr(row, by)])
+
+
+def training_table(rows: Sequence[Any], by: str = "planner") -> Table:
+    """Return the size and the training of each network, of rows that say by which network they are."""
+    columns = (Column("network", "network", value=lambda rows: rows[0].training["network"]), PARAMETERS)
+    of_networks = [row for row in rows if row.training]
+    return table("training", "Networks and their training", (*columns, *TRAINING_COLUMNS), of_networks, by=(by,))
+
+
+def planner_columns(what: str, printed: Mapping[tuple[str, str], PrintedRow]) -> tuple[Column, ...]:
     """Return the columns of the paper's tables of planners, each with the paper's beside it."""
+    paper = partial(paper_column, printed, by=("planner", "part"))
     return (
         Column("planner", what),
         Column("part", "paths"),
-        Column("paths", "", meaning="number of them"),
-        Column("deviation", "largest deviation", "m", ".3f", meaning=f"mean; a failure counts as {LOST:g} m"),
-        Column("deviation_flown", "without failures", "m", ".3f", meaning="the same, of flights that did not fail"),
-        Column("paper_deviation", "paper", "m", ".3f", meaning="the paper does not say which of the two"),
-        Column(
-            "violation", "thrust violation", "N", ".4f", meaning="planned thrust beyond a motor's range, mean over time"
-        ),
-        Column("asked_violation", "asked", "N", ".4f", meaning="the same, of what the controller asks"),
-        Column("paper_violation", "paper", "N", ".3f"),
-        Column("above", "speed above 5 m/s", "%", ".2f", meaning="the most on a path, mean"),
-        Column("slower", "time over TOPPQuad", "%", "+.2f", meaning="mean over paths"),
-        Column("slower_flown", "without failures", "%", "+.2f"),
-        Column("paper_slower", "paper", "%", "+.2f"),
-        Column("failed", "failures", of="paths", meaning=f"no plan, a crash, or {LOST:g} m from its place"),
-        Column("paper_failed", "paper", "%", ".0f"),
-        Column("seconds", "compute", "ms", ".1f", meaning="mean of the processor's time, one thread"),
-        Column("paper_seconds", "paper", "ms", ".0f"),
-    )
-
-
-def planner_row(
-    trials: Sequence[PaperTrial], reference: Sequence[PaperTrial], printed: PrintedRow | None
-) -> dict[str, Any]:
-    """Return a row of `planner_columns`; `reference` are TOPPQuad's trials of the same paths, in the same order."""
-    flown = [trial for trial in trials if not trial.failed]
-    against = {trial.row: trial.travel_time for trial in reference}
-    return {
-        "planner": trials[0].planner,
-        "part": trials[0].part,
-        "paths": len(trials),
-        "deviation": finite_mean(LOST if trial.failed else trial.deviation for trial in trials),
-        "deviation_flown": finite_mean(trial.deviation for trial in flown),
-        "violation": finite_mean(trial.violation for trial in trials),
-        "asked_violation": finite_mean(trial.asked_violation for trial in trials),
-        "above": finite_mean(
-            max(trial.top_speed / PAPER.limits.speed - 1.0, 0.0) for trial in trials if not trial.reason
-        ),
-        "slower": finite_mean(trial.travel_time / against[trial.row] - 1.0 for trial in trials),
-        "slower_flown": finite_mean(trial.travel_time / against[trial.row] - 1.0 for trial in flown),
-        "failed": sum(trial.failed for trial in trials),
-        "seconds": finite_mean(trial.seconds for trial in trials),
-        "paper_deviation": printed.deviation if printed else None,
-        "paper_violation": printed.violation if printed else None,
-        "paper_slower": printed.slower if printed else None,
-        "paper_failed": printed.failures if printed else None,
-        "paper_seconds": printed.seconds if printed else None,
-    }
-
-
-def finite_mean(values: Iterable[float]) -> float:
-    """Return the mean of what is finite; NaN where nothing is."""
-    finite = [value for value in values if np.isfinite(value)]
-    return float(np.mean(finite)) if finite else float("nan")
+        Column("paths", "", meaning="number of them", value=count()),
+        Column("deviation", "largest deviation", "m", ".3f", meaning=f"mean; a failure counts as {LOST:g} m",
+               value=mean("counted_deviation")),
+        Column("deviation_flown", "without failures", "m", ".3f", meaning="the same, of flights that did not fail",
+               value=among("flown", mean("deviation"))),
+        paper("deviation", unit="m", spec=".3f", meaning="the paper does not say which of the two"),
+        Column("violation", "thrust violation", "N", ".4f",
+               meaning="planned thrust beyond a motor's range, mean over time", value=mean("violation")),
+        Column("asked_violation", "asked", "N", ".4f", meaning="the same, of what the controller asks",
+               value=mean("asked_violation")),
+        paper("violation", unit="N", spec=".3f"),
+        Column("above", "speed above 5 m/s", "%", ".2f", meaning="the most on a path, mean", value=mean("above")),
+        Column("slower", "time over TOPPQuad", "%", "+.2f", meaning="mean over paths", value=mean("slower")),
+        Column("slower_flown", "without failures", "%", "+.2f", value=among("flown", mean("slower"))),
+        paper("slower", unit="%", spec="+.2f"),
+        Column("failed", "failures", of="paths", meaning=f"no plan, a crash, or {LOST:g} m from its place",
+               value=count("failed")),
+        paper("failed", unit="%", spec=".0f"),
+        Column("seconds", "compute", "ms", ".1f", meaning="mean of the processor's time, one thread",
+               value=mean("seconds")),
+        paper("seconds", unit="ms", spec=".0f"),
+    )  # fmt: skip

@@ -89,6 +89,13 @@ class _Done(NamedTuple):
     seconds: float  # of the processor
 
 
+def write_result(result: StudyResult, file: Path) -> None:
+    """Write a result; its finished cases are kept only where it was interrupted."""
+    result.write(file)
+    if not result.interrupted:
+        unfinished_file(file).unlink(missing_ok=True)
+
+
 def unfinished_file(result: Path) -> Path:
     """Return the file of the finished cases of a result that is not complete yet."""
     return result.with_name(result.name + UNFINISHED)

@@ -13,7 +13,7 @@ import click
 
 from cfplan.errors import CfplanError, InputError
 from studies import STUDIES
-from studies.runner.cases import Effort, run_study, unfinished_file
+from studies.runner.cases import Effort, run_study, write_result
 from studies.runner.options import parameters, settings_of
 from studies.runner.result import StudyResult, Table
 from studies.runner.study import Progress, Study
@@ -52,9 +52,7 @@ def study_command(name: str, module: str) -> click.Command:
             effort = Effort(workers, scheduler, minutes or float("inf"), output, _note, bar)
             result = run_study(name, module, study, settings, effort)
         if output is not None:
-            result.write(output)
-            if not result.interrupted:
-                unfinished_file(output).unlink(missing_ok=True)
+            write_result(result, output)
         print_result(result)
 
     callback: Callable[..., Any] = run
@@ -64,9 +62,13 @@ def study_command(name: str, module: str) -> click.Command:
     return click.command(name, help=found.__doc__, epilog=example)(callback)
 
 
+_WORKERS = click.option(
+    "--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine."
+)
+_SCHEDULER = click.option("--scheduler", metavar="ADDRESS", help="Dask cluster that works instead: tcp://host:port.")
 _EFFORT = (
-    click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine."),
-    click.option("--scheduler", metavar="ADDRESS", help="Dask cluster that works instead: tcp://host:port."),
+    _WORKERS,
+    _SCHEDULER,
     click.option("--minutes", type=click.FloatRange(0, min_open=True), help="Time after which no case is begun."),
     click.option("-o", "--output", type=click.Path(path_type=Path), help="JSON file for the result."),
 )
@@ -93,6 +95,38 @@ def pages(folder: Path, fresh: bool) -> None:
             f"README shows figures of {', '.join(old)}, measured with other sources", where="README.md",
             hint="measure them anew; each result names its command",
         )  # fmt: skip
+
+
+@studies.command(epilog="Example: python -m studies paper results --workers 2")
+@click.argument("folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path("results"))
+@click.option("--quick", is_flag=True, help="A few paths and epochs on data of their own: does all of it run?")
+@_WORKERS
+@_SCHEDULER
+def paper(folder: Path, quick: bool, workers: int, scheduler: str | None) -> None:
+    """Make the results of all of the paper's tables in DIR, one study after the other.
+
+    What is there already, of the same sources and settings, is kept, so that a run that was stopped goes on.
+    """
+    from studies.paper.all_tables import paper_results
+
+    with progress_bars() as bar:
+        effort = Effort(workers, scheduler, say=_note, progress=bar)
+        made = list(paper_results(folder, quick=quick, effort=effort))
+    for each in made:
+        print_result(each.result)
+    for each in made:
+        click.echo(f"{each.file}: {each.result.seconds:.0f} s of the processor{', kept' if each.kept else ''}")
+
+
+@studies.command(epilog="Example: python -m studies figures results docs/images")
+@click.argument("results", metavar="[RESULTS]", type=click.Path(path_type=Path), default=Path("results"))
+@click.argument("images", metavar="[IMAGES]", type=click.Path(path_type=Path), default=Path("docs/images"))
+def figures(results: Path, images: Path) -> None:
+    """Draw the paper's figures as .png in IMAGES from the results in RESULTS, where the rows of their cases are."""
+    from studies.paper.figures import write_figures
+
+    for file, reason in write_figures(results, images):
+        click.echo(f"{file}: left out: {reason}" if reason else file)
 
 
 def print_result(result: StudyResult) -> None:

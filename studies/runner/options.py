@@ -42,6 +42,7 @@ def _parameter(each: Field, hint: Any) -> Callable[[Callable[..., Any]], Callabl
         return click.argument(each.name, metavar=f"{name}..." if several else name, type=_type(kind, each),
                               nargs=-1 if several else 1, required=True)  # fmt: skip
     default = None if each.default is MISSING else each.default
+    default = default.value if isinstance(default, StrEnum) else default
     text, spelled = each.metadata[_HELP], "--" + _singular(each.name, several).replace("_", "-")
     if kind is bool:
         return click.option(spelled, each.name, is_flag=True, help=text)

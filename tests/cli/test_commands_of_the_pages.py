@@ -26,7 +26,6 @@ from scipy.spatial.transform import Rotation
 from stepped_flight import fly_stepped
 
 from cfplan.cli import cfplan as command_line
-from studies.commands.study import study
 from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.prepare_flight import prepare_flight
 from cfplan.recording.header import header_of_plan
@@ -270,10 +269,8 @@ def test_the_commands_of_the_first_hour_and_after_a_flight_are_among_them():
     assert len(pages.lines_for(FLOWN)) > 10
 
 
-@pytest.mark.parametrize(
-    "words", [[name] for name in sorted(command_line.commands)] + [["study", name] for name in sorted(study.commands)]
-)
-def test_every_command_and_study_explains_itself(cfplan, words):
+@pytest.mark.parametrize("words", [[name] for name in sorted(command_line.commands)])
+def test_every_command_explains_itself(cfplan, words):
     ended = cfplan(*words, "--help")
     assert ended.code == 0
     assert ended.out.startswith(f"Usage: cfplan {' '.join(words)} ")

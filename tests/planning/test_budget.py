@@ -23,8 +23,7 @@ from cfplan.planning.planners import PLANNERS
 from cfplan.planning.repair import repair
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
-from studies.drawn_paths import path_of_length
-from studies.drawn_paths import random_path
+from studies.drawn_paths import path_of_length, random_path
 
 HARDWARE = LIMIT_SETS["hardware"]
 

@@ -10,8 +10,8 @@ from cfplan.planners.task import PlanningTask
 from cfplan.planning.lowering import lower_locally
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
-from studies.drawn_paths import random_path
 from cfplan.vehicle.trajectory import Trajectory
+from studies.drawn_paths import random_path
 
 HARDWARE = LIMIT_SETS["hardware"]
 LINE = min_snap([[0, 0, 1], [6, 0, 1]])

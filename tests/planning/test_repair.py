@@ -16,8 +16,8 @@ from cfplan.planning import repair as repairing
 from cfplan.planning.repair import repair
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
-from studies.drawn_paths import random_path
 from cfplan.vehicle.trajectory import Trajectory
+from studies.drawn_paths import random_path
 
 HARDWARE = LIMIT_SETS["hardware"]
 SHARP_TURNS = [

@@ -26,9 +26,9 @@ from cfplan.simulation.link_loss import (
     link_loss_within_stops,
     simulate_link_loss,
 )
+from cfplan.vehicle.airframe import GRAVITY
 from studies.fault_scenarios import SCENARIOS
 from studies.faults import fly_stepped
-from cfplan.vehicle.airframe import GRAVITY
 
 REPOSITORY = Path(__file__).parents[2]
 KILLED = next(row for row in SCENARIOS if row.name == "pilot killed")

@@ -1,6 +1,8 @@
 """The examples fly as they stand, on the virtual vehicle and the stepped clock."""
 
+import ast
 import importlib.util
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -87,3 +89,25 @@ def test_a_plan_is_made_saved_and_rehearsed(tmp_path):
 def test_every_example_is_tested():
     here = Path(__file__).read_text()
     assert all(f'example("{file.stem}")' in here for file in EXAMPLES.glob("*.py"))
+
+
+def test_examples_use_nothing_of_cfplan_but_what_its_top_level_offers():
+    notebook = json.loads((EXAMPLES / "notebook.ipynb").read_text())
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    for source in ["\n".join(cells), *[file.read_text() for file in EXAMPLES.glob("*.py")]]:
+        nodes = list(ast.walk(ast.parse(source)))
+        imported = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+        imported |= {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
+        assert "cfplan" in imported
+        assert not [name for name in imported if name.startswith("cfplan.")]
+        used = {
+            node.attr
+            for node in nodes
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "cfplan"
+        }
+        assert used
+        assert used <= set(cfplan.__all__)
+
+
+def test_every_name_of_the_top_level_is_there():
+    assert all(getattr(cfplan, name) is not None for name in cfplan.__all__)

@@ -1,17 +1,15 @@
 """The study of the horizon: with all waypoints known nothing is lost, with few of them little."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from studies.horizon import fly_knowing, horizon
+from studies.horizon import STUDY, Settings, fly_knowing
+from studies.runner.cases import run_study
 
-SAFETY = Path(__file__).parents[2] / "safety.yaml"
 CORNERS = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -0.5, 1.0]])
 
 
@@ -27,8 +25,7 @@ def test_with_all_waypoints_known_nothing_is_lost(limits):
     assert knowing_two < 0.9 * at_each
 
 
-def test_its_result_survives_json():
-    result = horizon(SAFETY, paths=1, waypoints=5, known=(2, 3))
-    document = json.loads(json.dumps(result.to_json(), allow_nan=False))
-    assert [row[0] for row in document["tables"][0]["rows"]] == [2, 3]
-    assert result.table("horizon").rows[0]["paths"] == 1
+def test_each_number_of_known_waypoints_is_a_line():
+    settings = Settings(paths=1, waypoints=5, known=(2, 3))
+    rows = run_study("horizon", "studies.horizon", STUDY, settings).table("horizon").rows
+    assert [(row["known"], row["paths"]) for row in rows] == [(2, 1), (3, 1)]

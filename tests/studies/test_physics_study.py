@@ -1,6 +1,5 @@
 """The study of other simulators' bodies: the same controller and bytes, and bodies that agree to a centimetre."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,8 +20,9 @@ from cfplan.simulation.dynamics.body import (
     step_body,
 )
 from cfplan.simulation.other_bodies import fly_on, identified_body, rotorpy_body
-from studies import physics
 from cfplan.vehicle.airframes import AIRFRAMES
+from studies.physics import BODIES, PAPER_LAG, REALISTIC_LAG, STUDY, OtherBody, Settings, measure
+from studies.runner.cases import run_study
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"
 AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
@@ -38,7 +38,7 @@ def path_file(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def result(path_file):
-    return physics.physics([path_file], lambda _: SAFETY)
+    return run_study("physics", "studies.physics", STUDY, Settings((path_file,)))
 
 
 def own_step(state, asked, seconds):
@@ -59,21 +59,20 @@ def test_with_the_dry_runs_body_it_is_the_dry_runs_flight(path_file):
 
 
 def test_rotorpy_and_the_dry_run_are_a_centimetre_apart_at_most(result):
-    flights = [flight for flight in result.table("flights").rows if flight["body"].startswith("RotorPy")]
-    assert [flight["motor_lag"] for flight in flights] == [physics.REALISTIC_LAG, physics.PAPER_LAG]
+    flights = [flight for flight in result.rows if flight.body.startswith("RotorPy")]
+    assert [flight.motor_lag for flight in flights] == [REALISTIC_LAG, PAPER_LAG]
     for flight in flights:
-        assert 0.0 < flight["apart"] < 0.01
-        assert flight["apart_rms"] <= flight["apart"]
-        assert abs(flight["deviation"] - flight["own_deviation"]) <= flight["apart"]
+        assert 0.0 < flight.apart < 0.01
+        assert flight.apart_rms <= flight.apart
+        assert abs(flight.deviation - flight.own_deviation) <= flight.apart
 
 
-def test_a_body_that_is_heavier_than_believed_is_told_apart(path_file, monkeypatch):
-    def heavy(airframe, lag):
-        return rotorpy_body(replace(airframe, mass=1.2 * airframe.mass), lag)
+def test_a_body_that_is_heavier_than_believed_is_told_apart(path_file):
+    def heavy(airframe):
+        return rotorpy_body(replace(airframe, mass=1.2 * airframe.mass), REALISTIC_LAG)
 
-    monkeypatch.setattr(physics, "rotorpy_body", heavy)
-    found = physics.physics([path_file], lambda _: SAFETY).table("flights").rows
-    assert all(flight["apart"] > 0.02 for flight in found if flight["body"].startswith("RotorPy"))
+    (flight,) = measure(path_file, [OtherBody("heavy", heavy, REALISTIC_LAG)])
+    assert flight.apart > 0.02
 
 
 def test_the_identified_model_moves_as_the_airframe_does():
@@ -94,17 +93,25 @@ def test_an_airframe_that_drone_models_does_not_know_is_said():
         identified_body(AIRFRAMES["crazyflie-2.0"])
 
 
-def test_packages_that_are_not_there_are_named(path_file, monkeypatch):
-    def not_there(*_):
-        raise InputError("RotorPy is not installed")
+def not_there(_):
+    raise InputError("RotorPy is not installed")
 
-    monkeypatch.setattr(physics, "rotorpy_body", not_there)
-    monkeypatch.setattr(physics, "identified_body", not_there)
+
+def test_packages_that_are_not_there_are_named(path_file):
     with pytest.raises(InputError, match="RotorPy is not installed") as raised:
-        physics.physics([path_file], lambda _: SAFETY)
+        measure(path_file, [OtherBody("RotorPy", not_there)])
     assert "pip install" in raised.value.hint
 
 
-def test_the_result_is_one_row_a_path_and_survives_json(result):
-    (table,) = json.loads(json.dumps(result.to_json(), allow_nan=False))["tables"]
-    assert [row[0] for row in table["rows"]] == ["short"]
+def test_a_body_that_is_not_there_is_left_out_and_the_others_fly(path_file):
+    rows = measure(path_file, [OtherBody("absent", not_there), OtherBody("RotorPy", BODIES[1].make, REALISTIC_LAG)])
+    bodies, left_out = STUDY.tables(Settings((path_file,)), rows)
+    (flown,), (absent,) = bodies.rows, left_out.rows
+    assert [column.title for column in bodies.columns[2:]] == ["RotorPy", f"cfplan, {REALISTIC_LAG:g} s", "apart"]
+    assert flown["apart_0"] == rows[1].apart
+    assert (absent["body"], absent["reason"]) == ("absent", "RotorPy is not installed")
+
+
+def test_the_result_is_one_row_a_path(result):
+    (table,) = result.tables
+    assert [row["path"] for row in table.rows] == ["short"]

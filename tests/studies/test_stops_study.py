@@ -1,16 +1,19 @@
 """The study of stops: straight on from full speed, those that a request does not try lean too far."""
 
-from pathlib import Path
+import pytest
 
-from studies.stops import stops
+from studies.runner.cases import run_study
+from studies.stops import STUDY, Settings
 
-ROOT = Path(__file__).parents[2]
+
+@pytest.fixture(scope="module")
+def result():
+    return run_study("stops", "studies.stops", STUDY, Settings(durations=(0.43, 0.54)))
 
 
-def test_the_stop_that_is_flown_takes_hardly_more_way_than_the_fastest_plan_to_brake():
+def test_the_stop_that_is_flown_takes_hardly_more_way_than_the_fastest_plan_to_brake(result):
     """Though it is certified from any moment on, without a search; 10 % is what it may take more."""
-    result = stops(ROOT / "safety.yaml", durations=(0.54,))
-    [stop], [braking] = result.table("stops").rows, result.table("braking").rows
+    [_, stop], [braking] = result.table("stops").rows, result.table("braking").rows
     assert braking["acceleration"] <= 5.0
     assert braking["turning"] <= 35.0
     for way in ("distance", "flown"):
@@ -18,9 +21,8 @@ def test_the_stop_that_is_flown_takes_hardly_more_way_than_the_fastest_plan_to_b
     assert stop["distance"] < stop["flown"] < stop["distance"] + 0.02  # motors lag, and the vehicle overshoots
 
 
-def test_shorter_stops_from_full_speed_lean_too_far():
-    rows = stops(ROOT / "safety.yaml", durations=(0.43, 0.54)).table("stops").rows
-    short, flown = rows
+def test_shorter_stops_from_full_speed_lean_too_far(result):
+    short, flown = result.table("stops").rows
     assert not flown["refused"]
     assert flown["tilt"] < 35.0
     assert abs(flown["distance"] - 0.54) < 0.01  # as many metres as seconds at 2 m/s

@@ -1,3 +1,3 @@
-"""Baselines: the paper's TOPPQuad, convex TOPP with its lower bound, scaled min-snap, corridors."""
+"""Baselines: the paper's TOPPQuad, convex TOPP with its lower bound, scaled min-snap."""
 
-__all__ = ["convex", "corridors", "min_snap", "toppquad", "toppquad_nlp"]
+__all__ = ["convex", "min_snap", "toppquad", "toppquad_nlp"]

@@ -27,9 +27,9 @@ from cfplan.planners.baselines.convex import plan_convex
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.repair import repair
 from cfplan.safety.limit_sets import BOXES, LIMIT_SETS
-from studies.drawn_paths import random_path
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import rotations_of
+from studies.drawn_paths import random_path
 
 GRAVITATION = np.array([0.0, 0.0, GRAVITY])
 

@@ -18,10 +18,10 @@ from cfplan.planning.planners import default_nodes
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
 from cfplan.safety.limits import PlanLimits
-from studies.drawn_paths import path_of_length
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
+from studies.drawn_paths import path_of_length
 
 HARDWARE, SIMULATION = LIMIT_SETS["hardware"], LIMIT_SETS["simulation"]
 CORNERED = np.array([[0.5, 0.5, 1.0], [3.5, 1.0, 1.5], [3.0, 4.0, 0.8], [1.0, 6.0, 1.2]])

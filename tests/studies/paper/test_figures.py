@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.planners.baselines.corridors import BOXES, box_corners, corridor_about
-from studies.paper.baselines import ALLOCATION, DRAWN, random_course
+from studies.paper.baselines import ALLOCATION, DRAWN, BaselineTrial, random_course
+from studies.paper.corridors import BOXES
 from studies.paper.figures import (
     EDGES,
     NETWORKS,
@@ -15,73 +15,54 @@ from studies.paper.figures import (
     draw_yaw_consistency,
     write_figures,
 )
-from studies.paper.hardware import CERTIFIED, LONG, RAW, SHIPPED, TRACKED
+from studies.paper.hardware import CERTIFIED, LONG, RAW, SHIPPED, TRACKED, HardwareFlight
 from studies.paper.trials import TOPPQUAD
-from studies.paper.yaw_consistency import WAYS, yaw_consistency
-from studies.runner.result import StudyResult, detail_table
+from studies.paper.yaw_consistency import WAYS, Pair
+from studies.runner.result import StudyResult
 
 SEEDS = (60_000, 60_001)
+BASELINES = [
+    BaselineTrial(name, seed, points=random_course(seed).path([0.0, 5.0, 9.0]).tolist() if name in DRAWN else [])
+    for seed in SEEDS for name in (*DRAWN, "expert")
+]  # fmt: skip
+PAIRS = [Pair(way, 50_000, "", 8.0, 1.0, 0.1, 0.2, 0.3) for way in WAYS]
 
 
-@pytest.fixture
-def baselines():
-    rows = []
-    for seed in SEEDS:
-        course = random_course(seed)
-        rows.append({"seed": seed, "what": "waypoints", "points": course.waypoints.tolist()})
-        rows += [{"seed": seed, "what": name, "points": course.path([0.0, 5.0, 9.0]).tolist()} for name in DRAWN]
-        boxes = box_corners(corridor_about(course.path))
-        rows += [{"seed": seed, "what": "box", "points": box.tolist()} for box in boxes]
-    return StudyResult("baselines", {}, (), (detail_table("drawn", rows),))
+def flights():
+    """Flights over two paths and the long one; of LSTM-0.01 over the second, a crash and a loss as planned."""
+    over = {RAW: [[0, 0, 0], [900, 880, 0]], CERTIFIED: [[0, 0, 500], [900, 890, 500]]}
+    made = [
+        HardwareFlight(TRACKED, way, planner, path, trial, deviation=0.1, points=over[way])
+        for path in ("1", "2", LONG) for way in (RAW, CERTIFIED) for planner in (TOPPQUAD, *NETWORKS)
+        for trial in range(2)
+    ]  # fmt: skip
+    made.append(HardwareFlight(TRACKED, RAW, "LSTM-0.01", "2", 2, reason="crash"))
+    made.append(HardwareFlight(TRACKED, RAW, "LSTM-0.01", "2", 3, deviation=1.2, points=over[RAW]))
+    return [*made, HardwareFlight(TRACKED, CERTIFIED, SHIPPED, LONG, 0, deviation=0.1, points=over[CERTIFIED])]
 
 
-@pytest.fixture(scope="module")
-def pairs():
-    return yaw_consistency(pairs=1)
-
-
-@pytest.fixture(scope="module")
-def hardware():
-    rows = []
-    for path in ("1", "2", LONG):
-        rows.append({"path": path, "planner": "", "way": "", "points": [[0, 0, 0], [900, 900, 0]]})
-        rows += [
-            {"path": path, "planner": planner, "way": way, "points": [[0, 0, 0], [900, 880, 0]]}
-            for way in (RAW, CERTIFIED) for planner in (TOPPQUAD, *NETWORKS) for _ in range(2)
-        ]  # fmt: skip
-        rows += [{"path": path, "planner": SHIPPED, "way": CERTIFIED, "points": [[0, 0, 500], [900, 890, 500]]}] * (
-            path == LONG
-        )
-    flights = [
-        {"limits": TRACKED, "way": RAW, "planner": "LSTM-0.01", "path": "2", "reason": reason, "deviation": deviation}
-        for reason, deviation in (("crash", None), ("", 0.1), ("", 1.2))
-    ]
-    return StudyResult("hardware", {}, (), (detail_table("tracks", rows), detail_table("flights", flights)))
-
-
-def test_tracks_of_one_network_and_toppquad_stand_over_each_path_as_planned_and_certified(hardware):
-    panels = [panel for panel in draw_tracks(hardware, "LSTM-0.01").axes if panel.get_visible()]
-    assert [panel.get_title() for panel in panels] == ["path 1", "path 2: 2 of 3 failed", "path 1", "path 2"]
-    for panel in panels:
+def test_tracks_of_one_network_and_toppquad_stand_over_each_path_as_planned_and_certified():
+    panels = [panel for panel in draw_tracks(flights(), "LSTM-0.01").axes if panel.get_visible()]
+    assert [panel.get_title() for panel in panels] == ["path 1", "path 2: 2 of 4 failed", "path 1", "path 2"]
+    for panel, count in zip(panels, (2, 4, 2, 2), strict=True):
         colours = [line.get_color() for line in panel.lines]
-        assert len(colours) == 5
-        assert colours.count(NETWORKS["LSTM-0.01"]) == 2
-        np.testing.assert_allclose(panel.lines[0].get_xdata(), [0.0, 0.9])
+        assert len(colours) == 1 + 2 + count
+        assert colours.count(NETWORKS["LSTM-0.01"]) == count
+        np.testing.assert_allclose(panel.lines[1].get_xdata(), [0.0, 0.9])
 
 
-def test_the_long_path_is_drawn_from_above_and_from_the_side_with_all_that_was_flown_certified(hardware):
-    above, side = draw_long(hardware).axes
+def test_the_long_path_is_drawn_from_above_and_from_the_side_with_all_that_was_flown_certified():
+    above, side = draw_long(flights()).axes
     assert len(above.lines) == len(side.lines) == 1 + 2 * (1 + len(NETWORKS)) + 1
     assert (above.get_xlabel(), side.get_ylabel()) == ("x, m", "z, m")
     np.testing.assert_allclose(above.lines[-1].get_ydata(), [0.0, 0.89])
     np.testing.assert_allclose(side.lines[-1].get_ydata(), [0.5, 0.5])
-    without = StudyResult("hardware", {}, (), (detail_table("tracks", hardware.table("tracks").rows[:1]),))
     with pytest.raises(InputError, match="long path"):
-        draw_long(without)
+        draw_long(flights()[:1])
 
 
-def test_each_planner_has_a_panel_for_each_path_and_allocnets_has_its_boxes(baselines):
-    panels = draw_baselines(baselines).axes
+def test_each_planner_has_a_panel_for_each_path_and_allocnets_has_its_boxes():
+    panels = draw_baselines(BASELINES).axes
     assert [panel.get_title() for panel in panels[: len(DRAWN)]] == list(DRAWN)
     assert len(panels) == len(SEEDS) * len(DRAWN)
     for number, panel in enumerate(panels):
@@ -94,25 +75,24 @@ def test_a_box_has_twelve_edges_of_one_axis_each():
     assert all(bin(first ^ second).count("1") == 1 for first, second in EDGES)
 
 
-def test_every_way_to_plan_has_its_histograms_of_as_many_pairs(pairs):
-    panels = draw_yaw_consistency(pairs).axes
+def test_every_way_to_plan_has_its_histograms_of_as_many_pairs():
+    panels = draw_yaw_consistency([*PAIRS, Pair(next(iter(WAYS)), 50_001, "no solution")]).axes
     assert len(panels) == 3 * len(WAYS)
     for panel in panels:
         assert sum(bar.get_height() for bar in panel.patches) == 1
 
 
-def test_figures_are_written_and_those_without_a_result_are_left_out_with_the_reason(
-    tmp_path, baselines, pairs, hardware
-):
-    baselines.write(tmp_path / "baselines.json")
-    StudyResult("hardware", {}, ()).write(tmp_path / "hardware.json")  # of a version that kept no tracks
+def test_figures_are_written_and_those_without_rows_name_the_command_that_makes_them(tmp_path):
+    def write(study, rows):
+        StudyResult(study, {}, (), rows).write(tmp_path / f"{study}.json")
+
+    write("baselines", BASELINES)
     written = {file.name: reason for file, reason in write_figures(tmp_path, tmp_path)}
     assert not written["paper-baselines.png"]
-    assert "No such file" in written["paper-yaw.png"]
-    assert "no table 'tracks'" in written["paper-LSTM-0.1.png"]
+    assert f"python -m studies yaw-consistency -o {tmp_path}/yaw-consistency.json" in written["paper-yaw.png"]
     assert not (tmp_path / "paper-yaw.png").exists()
-    pairs.write(tmp_path / "yaw-consistency.json")
-    hardware.write(tmp_path / "hardware.json")
+    write("yaw-consistency", PAIRS)
+    write("hardware", flights())
     written = dict(write_figures(tmp_path, tmp_path))
     assert not any(written.values())
     assert {file.stem for file in written} == {

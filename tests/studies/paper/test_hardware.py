@@ -1,34 +1,37 @@
 """The paper's hardware tables on the virtual lab: what is flown, under which limits, and who crashes."""
 
-import cloudpickle
 import numpy as np
 import pytest
 
-from cfplan.errors import CfplanError, InputError
+from cfplan.errors import CfplanError
 from cfplan.safety.limits_file import DEFAULTS, load_limits
 from cfplan.safety.space import check_space
-from studies.paper import hardware as study
 from studies.paper.hardware import (
     CERTIFIED,
     LIMITS,
     LONG,
     RAW,
     SHIPPED,
+    STUDY,
+    FlownPlanner,
     HardwareFlight,
-    hardware,
+    Settings,
     hardware_paths,
-    hardware_tables,
     long_path,
+    measure,
     paper_limits,
+    plans_of,
+    tables,
 )
 from studies.paper.trials import TOPPQUAD
+from studies.runner.cases import run_study
 
 USUAL = load_limits(DEFAULTS)
 
 
 @pytest.fixture(scope="module")
 def quick():
-    return hardware(paths=1, quick=True)
+    return run_study("hardware", "studies.paper.hardware", STUDY, Settings(paths=1, quick=True))
 
 
 def test_every_planner_flies_certified_and_all_but_the_one_that_ships_as_planned(quick):
@@ -37,29 +40,24 @@ def test_every_planner_flies_certified_and_all_but_the_one_that_ships_as_planned
         (RAW, TOPPQUAD), (RAW, "LSTM-0.001"), (CERTIFIED, TOPPQUAD), (CERTIFIED, "LSTM-0.001"), (CERTIFIED, SHIPPED),
     ]  # fmt: skip
     assert [row["paper_deviation"] for row in rows] == [0.347, 0.355, 0.347, 0.355, None]
-    assert quick.settings["quick"]
-    assert len(quick.table("training").rows) == 1
+    assert [(row["limits"], row["network"]) for row in quick.table("training").rows] == [("appendix", "LSTM-0.001")]
 
 
 def test_what_is_certified_lands_near_its_place(quick):
-    flights = [flight for flight in quick.table("flights").rows if flight["way"] == CERTIFIED]
-    assert all(not flight["reason"] for flight in flights)
-    assert max(flight["deviation"] for flight in flights) < 0.06
-    assert max(flight["settled"] for flight in flights) < 1.0
-    times = {flight["planner"]: flight["travel_time"] for flight in flights}
+    flights = [flight for flight in quick.rows if flight.way == CERTIFIED]
+    assert all(not flight.reason for flight in flights)
+    assert max(flight.deviation for flight in flights) < 0.06
+    assert max(flight.settled for flight in flights) < 1.0
+    times = {flight.planner: flight.travel_time for flight in flights}
     assert times["LSTM-0.001"] == pytest.approx(times[SHIPPED], rel=0.01)  # repair leads to the same optimum
 
 
 def test_tracks_are_kept_of_all_but_what_ships_and_go_along_the_path(quick):
-    tracks = quick.table("tracks").rows
-    (path,) = (np.array(track["points"]) for track in tracks if not track["planner"])
-    flown = [track for track in tracks if track["planner"]]
-    assert {(track["way"], track["planner"]) for track in flown} == {
-        (way, planner) for way in (RAW, CERTIFIED) for planner in (TOPPQUAD, "LSTM-0.001")
-    }
-    (certified,) = (track for track in flown if (track["way"], track["planner"]) == (CERTIFIED, TOPPQUAD))
-    points = np.array(certified["points"])
-    away = np.linalg.norm(points[:, None] - path, axis=2)
+    tracks = {(flight.way, flight.planner): np.array(flight.points) for flight in quick.rows if flight.points}
+    assert set(tracks) == {(way, planner) for way in (RAW, CERTIFIED) for planner in (TOPPQUAD, "LSTM-0.001")}
+    path = hardware_paths(USUAL, 1)["1"]
+    places = 1000.0 * path(np.linspace(0.0, path.end, 121))
+    away = np.linalg.norm(tracks[CERTIFIED, TOPPQUAD][:, None] - places, axis=2)
     assert away.min(axis=1).max() < 60  # mm
     assert away.min(axis=0).max() < 250  # all of the path: 2 m/s, ten poses a second
 
@@ -72,7 +70,7 @@ def test_failures_are_counted_and_left_out_of_the_means():
         flight(1, deviation=0.2, travel_time=5.0, settled=0.1), flight(2, deviation=1.4, travel_time=7.0, settled=9.0),
         flight(3, reason="no plan"), flight(4, deviation=0.4, travel_time=6.0, settled=0.3),
     ]  # fmt: skip
-    table, line, long = hardware_tables(flights)
+    table, line, long, _ = tables(Settings(), flights)
     (row,) = table.rows
     assert (row["flights"], row["failed"]) == (4, 2)
     assert (row["deviation"], row["deviation_most"]) == (pytest.approx(0.3), 0.4)
@@ -80,6 +78,7 @@ def test_failures_are_counted_and_left_out_of_the_means():
     assert row["paper_time"] == 8.288
     assert [each["flights"] for each in line.rows] == [1]  # the first path alone
     assert not long.rows
+    assert all("paper_time" not in row for row in line.rows)  # the paper's are of all paths
 
 
 @pytest.mark.parametrize("name", LIMITS)
@@ -104,28 +103,13 @@ def test_the_paths_stay_in_the_room_and_the_first_is_straight():
     assert long_path(USUAL).length > 2.0 * longest
 
 
-def test_a_planner_without_a_plan_fails_every_flight_of_that_path(monkeypatch):
+def test_a_planner_without_a_plan_fails_every_flight_of_that_path():
     def none(*_):
         raise CfplanError("no plan", hint="none")
 
-    planner = study.FlownPlanner("none", none, none, 3)
+    planners = {"text": [FlownPlanner("none", none, none, 3)]}
     paths = {LONG: long_path(USUAL), **hardware_paths(USUAL, 1)}
-    planners = {"text": [planner]}
-    groups = study._flown_together(planners, paths).values()
-    flown = [each for group in groups for each in study._flights(planners, paths, None, group)]
-    assert [(flight.path, flight.way, flight.failed) for flight, _ in flown] == 3 * [("1", RAW, True)] + 3 * [
+    flown = [flight for plan in plans_of(planners, paths).values() for flight in measure(planners, paths, None, plan)]
+    assert [(flight.path, flight.way, flight.failed) for flight in flown] == 3 * [("1", RAW, True)] + 3 * [
         ("1", CERTIFIED, True)
     ]
-
-
-def test_what_is_flown_can_be_sent_to_other_processes():
-    networks = {"LSTM": lambda path: None}
-    planners = {"text": study.flown_planners(networks)}
-    sent = cloudpickle.loads(cloudpickle.dumps((planners, hardware_paths(USUAL, 2))))
-    assert [planner.name for planner in sent[0]["text"]] == [TOPPQUAD, "LSTM", SHIPPED]
-    assert sent[1]["2"].length == hardware_paths(USUAL, 2)["2"].length
-
-
-def test_no_path_is_refused():
-    with pytest.raises(InputError, match="at least 1"):
-        hardware(paths=0)

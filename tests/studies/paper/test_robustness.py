@@ -1,26 +1,18 @@
-"""Perturbed paths: the paper's Table 2, and the command for a path of one's own."""
-
-import json
-from pathlib import Path
+"""Perturbed paths: the paper's Table 2."""
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from cfplan.cli import cfplan
-from cfplan.errors import InputError
-from cfplan.geometry.path_file import load_path_file
-from cfplan.safety.limits_file import load_limits
-from studies.paper.robustness import robustness
+from studies.paper.robustness import STUDY, Settings
 from studies.paper.robustness_tables import SCALES, SHIPPED, SHIPPED_FIXED
-from studies.path_robustness import path_robustness
-
-REPOSITORY = Path(__file__).parents[3]
+from studies.runner.cases import run_study
 
 
 @pytest.fixture(scope="module")
 def quick():
-    return robustness(paths=1, draws=2, models=["LSTM", "shipped", "shipped-fixed"], reference="expert", quick=True)
+    models = ("LSTM", "shipped", "shipped-fixed")
+    settings = Settings(paths=1, draws=2, models=models, reference="expert", quick=True)
+    return run_study("robustness", "studies.paper.robustness", STUDY, settings)
 
 
 def test_the_quick_run_asks_each_model_about_each_scale(quick):
@@ -33,14 +25,14 @@ def test_the_quick_run_asks_each_model_about_each_scale(quick):
 
 
 def test_what_is_certified_is_followed_and_changes_with_its_path(quick):
-    trials = [trial for trial in quick.table("trials").rows if trial["model"] == SHIPPED]
-    assert all(not trial["reason"] for trial in trials)
-    assert max(trial["deviation"] for trial in trials) < 0.1
+    trials = [trial for trial in quick.rows if trial.model == SHIPPED]
+    assert all(not trial.reason for trial in trials)
+    assert max(trial.deviation for trial in trials) < 0.1
     for trial in trials:  # a wider tolerance is met no less often
-        assert list(trial["reached"]) == sorted(trial["reached"])
-        assert trial["reached"][-1] > 0.9
-        assert trial["travel_time"] == pytest.approx(trial["own_time"], rel=0.02)
-    changes = [np.mean([t["h_variation"] for t in trials if t["epsilon"] == scale]) for scale in SCALES]
+        assert list(trial.reached) == sorted(trial.reached)
+        assert trial.reached[-1] > 0.9
+        assert trial.travel_time == pytest.approx(trial.own_time, rel=0.02)
+    changes = [np.mean([t.h_variation for t in trials if t.epsilon == scale]) for scale in SCALES]
     assert changes[0] == 0.0
     assert changes[1] < changes[2] < changes[3]
 
@@ -48,46 +40,16 @@ def test_what_is_certified_is_followed_and_changes_with_its_path(quick):
 def test_how_answers_vary_is_told_of_each_scale_and_yaw_that_is_held_does_not(quick):
     rows = {(row["model"], row["epsilon"]): row for row in quick.table("variation").rows}
     assert len(rows) == 3 * len(SCALES[1:])
-    trials = quick.table("trials").rows
+    trials = quick.rows
     for (model, epsilon), row in rows.items():
-        own = [t["cosine_variation"] for t in trials if (t["model"], t["epsilon"]) == (model, epsilon)]
+        own = [t.cosine_variation for t in trials if (t.model, t.epsilon) == (model, epsilon)]
         assert row["cosine_variation"] == pytest.approx(np.mean(own))
         assert row["cosine_most"] == pytest.approx(max(own))  # of the one path
         assert (row["cosine_variation"] == 0.0) == (model == SHIPPED_FIXED)
         assert 0.0 < row["h_relative"] < 2.0
-    time = {t["draw"]: t["travel_time"] for t in trials if (t["model"], t["epsilon"]) == (SHIPPED, 0.1)}
-    held = {t["draw"]: t["travel_time"] for t in trials if (t["model"], t["epsilon"]) == (SHIPPED_FIXED, 0.1)}
+    time = {t.draw: t.travel_time for t in trials if (t.model, t.epsilon) == (SHIPPED, 0.1)}
+    held = {t.draw: t.travel_time for t in trials if (t.model, t.epsilon) == (SHIPPED_FIXED, 0.1)}
     cost = np.mean([held[draw] / time[draw] - 1.0 for draw in time])
     assert rows[SHIPPED_FIXED, 0.1]["slower_free"] == pytest.approx(cost)
     assert cost > -1e-4  # what is free may be held too
-    assert rows[SHIPPED, 0.1]["slower_free"] is None
-
-
-def test_unknown_models_and_no_draws_are_refused():
-    with pytest.raises(InputError, match="unknown model") as error:
-        robustness(models=["GRU"])
-    assert "LSTM-0.01" in error.value.hint
-    with pytest.raises(InputError, match="draws"):
-        robustness(draws=0)
-
-
-def test_a_path_of_ones_own_hardly_changes_its_flight_where_it_hardly_changes():
-    path_file = load_path_file(REPOSITORY / "flights" / "line.yaml")
-    found = path_robustness(path_file, load_limits(REPOSITORY / "safety.yaml"), scales=(1e-4, 0.02), draws=2)
-    little, more = found.table("robustness").rows
-    assert little["certified"] == little["flown"] == little["plans"] == 2
-    assert abs(little["longer_most"]) < 0.01
-    assert little["faster"] < more["faster"]
-    again = path_robustness(path_file, load_limits(REPOSITORY / "safety.yaml"), scales=(1e-4,), draws=1)
-    assert again.table("plans").rows[0] == found.table("plans").rows[0]
-
-
-def test_the_command_says_what_is_refused(tmp_path):
-    done = CliRunner().invoke(
-        cfplan,
-        ["robustness", str(REPOSITORY / "flights" / "line.yaml"), "--epsilon", "3", "--draws", "1", "--json"],
-    )
-    assert done.exit_code == 0, done.output
-    (plans,) = json.loads(done.output)["details"]
-    reason = plans["rows"][0][[column["key"] for column in plans["columns"]].index("reason")]
-    assert "space" in reason  # moved by metres it leaves the room
+    assert np.isnan(rows[SHIPPED, 0.1]["slower_free"])

@@ -7,9 +7,8 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STILL_AIR, TIME_STEP, pack_body, step_body
 from cfplan.simulation.geometric_flight import fly_geometric, positions_by_both
-from studies.paper.simulators import HARDWARE, PLANNED, BodyFlight, bodies_table
+from studies.paper.simulators import HARDWARE, PLANNED, BodyFlight, Settings, bodies_for, tables
 from studies.paper.trials import FLOWN, PAPER_LAG, TOPPQUAD, profile_by, trajectory_by
-from studies.physics import bodies_for
 
 LAGS = [f"RotorPy, {lag:g} s" for lag in (0.072, 0.005)]
 
@@ -34,8 +33,8 @@ def test_with_cfplans_own_body_it_is_the_flight_of_the_tables(trajectory):
 
 def test_rotorpy_with_the_papers_motor_lag_follows_as_cfplan_does(trajectory):
     pytest.importorskip("rotorpy")
-    (body,) = (each for each in bodies_for(FLOWN, []) if each.airframe.motor_time_constant == PAPER_LAG)
-    wanted, theirs, own = positions_by_both(body.step, trajectory, body.airframe)
+    (body,) = (each for each in bodies_for(FLOWN) if each.motor_lag == PAPER_LAG)
+    wanted, theirs, own = positions_by_both(body.make(FLOWN), trajectory, body.beside(FLOWN))
     assert np.linalg.norm(theirs - own, axis=1).max() < 0.03
     assert np.linalg.norm(theirs - wanted, axis=1).max() < 0.05
 
@@ -48,10 +47,11 @@ def test_the_lost_count_as_a_metre_and_are_left_out_of_how_far_bodies_are_apart(
         flight("1", deviation=0.2, own_deviation=0.1, apart=0.15),
         flight("2", deviation=9.0, own_deviation=0.3, apart=9.1),
         flight("3", deviation=float("nan"), own_deviation=float("nan"), apart=float("nan")),
-        flight("4", body="", reason="no plan"),
+        flight("4", reason="no plan"),
         BodyFlight(HARDWARE, TOPPQUAD, "1", LAGS[0], "", 0.02, 0.01, 0.015),
     ]
-    planned, hardware = bodies_table(flights).rows
+    (table,) = tables(Settings(), flights)
+    planned, hardware = table.rows
     assert (planned["paths"], planned["failed"], planned["own_failed"]) == (4, 3, 2)
     assert planned["deviation"] == pytest.approx((0.2 + 3.0) / 4)
     assert planned["own_deviation"] == pytest.approx((0.1 + 0.3 + 2.0) / 4)

@@ -1,0 +1,180 @@
+"""The paths and networks of the paper's studies: read where they are there, else labelled and trained first.
+
+Training that was stopped goes on from its last epoch.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cfplan.errors import InputError
+from cfplan.geometry.path import Path as PathOfMotion
+from cfplan.geometry.yaw import YawMode
+from cfplan.learning.checkpoints import Epoch
+from cfplan.learning.dataset import make_dataset
+from cfplan.learning.dataset_spec import DatasetSpec
+from cfplan.safety.limit_sets import BOXES, PAPER
+from studies.paper.networks import SequenceNetwork
+from studies.paper.printed import TEST, TRAIN
+from studies.paper.sequences import Sequences, read_sequences
+from studies.paper.training import SequenceOptions, load_network, train_network
+from studies.runner.options import option
+from studies.runner.result import Column
+from studies.runner.study import Run
+
+DATA, NETWORKS = Path("datasets/paper"), Path("datasets/paper-networks")
+TESTED = 100  # first rows of the dataset, from which nothing is learned
+WAYPOINTS = 4
+NODES = 99  # intervals: 100 points
+DATA_COMMAND = (
+    "cfplan dataset make datasets/paper --count 10100 --seed 1 --limits paper --box 10x10x10 --waypoints 4-4 "
+    "--nodes 99 --yaw free"
+)
+QUICK_PATHS, QUICK_TESTED, QUICK_MOST, QUICK_EPOCHS = 40, 20, 4, 2
+QUICK = "A few paths and epochs on data of its own: does it run?"
+EPOCHS = f"Epochs of each training.  [default: {SequenceOptions().epochs}]"
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkSettings:
+    """Which paths are planned, and where the networks are that plan them."""
+
+    paths: int = option(100, "Paths for training and for testing each.", least=1)
+    data: Path = option(DATA, "Dataset; its first 100 paths are for testing.")
+    networks: Path = option(NETWORKS, "Folder of the networks; those not there are trained.")
+    epochs: int | None = option(None, EPOCHS, least=1)
+    quick: bool = option(False, QUICK)
+
+
+@dataclass(frozen=True, slots=True)
+class TrainedNetwork:
+    """A network ready to be asked."""
+
+    name: str
+    options: SequenceOptions
+    network: SequenceNetwork
+    learned_from: int  # paths
+    training_seconds: float  # of the processor
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """Return what tables of training show; each row of the network has it."""
+        return {
+            "network": self.name,
+            "parameters": sum(tensor.numel() for tensor in self.network.parameters()),
+            "learned_from": self.learned_from,
+            "epochs": self.options.epochs,
+            "seconds": self.training_seconds,
+        }
+
+
+def _of_training(key: str, title: str, unit: str = "", spec: str = "", meaning: str = "") -> Column:
+    return Column(key, title, unit, spec, meaning=meaning, value=lambda rows: rows[0].training[key])
+
+
+TRAINING_COLUMNS = (
+    _of_training("learned_from", "paths learned from"),
+    _of_training("epochs", "epochs"),
+    _of_training("seconds", "training", "s", ".0f", meaning="of the processor, one thread"),
+)
+PARAMETERS = _of_training("parameters", "parameters")
+
+
+class PaperPath(NamedTuple):
+    """One path of the dataset."""
+
+    part: str  # TRAIN or TEST
+    row: int  # of the dataset
+    path: PathOfMotion
+
+
+@dataclass(frozen=True, slots=True)
+class PaperData:
+    """The paths of a study, and the networks that it asks."""
+
+    paths: dict[str, PaperPath]  # by the names of their cases: first TRAIN, then TEST
+    networks: list[TrainedNetwork]
+    identity: dict[str, Any]  # of dataset and networks
+
+    def part(self, name: str) -> dict[str, PaperPath]:
+        """Return the paths of one part."""
+        return {case: each for case, each in self.paths.items() if each.part == name}
+
+
+def paper_data(
+    settings: NetworkSettings, run: Run, wanted: Sequence[SequenceOptions], paths: int | None = None
+) -> PaperData:
+    """Return the paths of a study, by default as many as its settings say, and the networks that it wants.
+
+    Raises InputError where there is no such dataset, or too small a one; names the command that makes it.
+    """
+    count = settings.paths if paths is None else paths
+    data, folder, tested, epochs = settings.data, settings.networks, TESTED, settings.epochs
+    if settings.quick:
+        data, folder, tested, epochs = run.scratch / "data", run.scratch, QUICK_TESTED, QUICK_EPOCHS
+        count = min(count, QUICK_MOST)
+        make_dataset(data, quick_spec())
+    if not data.is_dir():
+        raise InputError("no such dataset", where=str(data), hint=f"make it: {DATA_COMMAND}")
+    read = read_sequences(data)
+    known, unseen = read.learned_from(tested), read.tested(tested)
+    if count > min(len(known.rows), len(unseen.rows)):
+        raise InputError(
+            f"{count} paths of {len(unseen.rows)} for testing and {len(known.rows)} for training",
+            where="paths",
+            hint=f"give fewer, or make more: {DATA_COMMAND}",
+        )
+    networks = trained_networks(known, folder, wanted, run, epochs)
+    found = {
+        f"{part} {row}": PaperPath(part, int(row), path)
+        for part, sequences in ((TRAIN, known), (TEST, unseen))
+        for row, path in zip(sequences.rows[:count], sequences.paths[:count], strict=True)
+    }
+    return PaperData(found, networks, {"data": asdict(read.spec), "networks": identities(networks)})
+
+
+def quick_spec() -> DatasetSpec:
+    """Return a dataset of the paper's kind that is made in a second."""
+    return DatasetSpec(
+        count=QUICK_PATHS, seed=1, limits=PAPER.name, families=(), boxes=(BOXES["10x10x10"],),
+        waypoints=(WAYPOINTS, WAYPOINTS), nodes=NODES, yaw=YawMode.FREE,
+    )  # fmt: skip
+
+
+def trained_networks(
+    sequences: Sequences, folder: Path, wanted: Sequence[SequenceOptions], run: Run, epochs: int | None = None
+) -> list[TrainedNetwork]:
+    """Return the networks of a folder, those not there yet after training; `epochs`: in place of the options'.
+
+    Raises InputError where the folder holds others.
+    """
+    options = [replace(each, epochs=epochs or each.epochs) for each in wanted]
+    total, done = sum(each.epochs for each in options), 0
+    found = []
+    for each in options:
+
+        def show(epoch: Epoch, before: int = done) -> None:
+            run.progress(before + epoch.epoch, total)
+
+        loaded = load_network(folder / each.name, sequences, each)
+        if loaded is None:
+            train_network(sequences, folder / each.name, each, on_epoch=show)
+            loaded = load_network(folder / each.name, sequences, each)
+        assert loaded is not None
+        done += each.epochs
+        run.progress(done, total)
+        network, seconds = loaded
+        found.append(TrainedNetwork(each.name, each, network, len(sequences.rows), seconds))
+    return found
+
+
+def identities(trained: Sequence[TrainedNetwork]) -> dict[str, Any]:
+    """Return what tells networks of the same names from others: their options, and a digest of their weights."""
+    return {each.name: {**asdict(each.options), "weights": _digest(each.network)} for each in trained}
+
+
+def _digest(network: SequenceNetwork) -> str:
+    weights = b"".join(tensor.numpy().tobytes() for tensor in network.state_dict().values())
+    return hashlib.sha256(weights).hexdigest()
