@@ -4,7 +4,7 @@ Measures how far the vehicle is off its plan, by the poses and by the simulated 
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -181,7 +181,7 @@ def tables(settings: Settings, rows: list[JudgedFlight]) -> Iterator[Table]:
         yield table("not-landed", "Not landed", FAILURE_COLUMNS, failed)
 
 
-def _settled(rows: list[JudgedFlight]) -> float | str:
+def _settled(rows: Sequence[JudgedFlight]) -> float | str:
     times = [row.settled_after for row in rows if row.landed]
     return "not" if any(map(math.isinf, times)) else max(times, default=math.nan)
 

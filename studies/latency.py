@@ -1,16 +1,17 @@
-"""Measure how soon the motion changes after a request in flight, with pilot, planner and lab as processes.
+"""Steer the virtual vehicle in real time: how soon requests change the motion, and how many a second may.
 
-First the vehicle hovers, for the lateness of its stream alone. Then requests come one at a time, each of them for a
-tour of `HORIZON` m through random waypoints instead of what is ahead. Then they come much faster than they can be
-planned, and the latest wins.
+Pilot, planner and lab are processes. First the vehicle hovers, for the lateness of its stream alone. Then requests come
+one at a time, each for a tour of 10 m through random waypoints instead of what is ahead. Then they come much faster
+than they can be planned, and the latest wins.
 """
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,32 +25,45 @@ from cfplan.preparation.air_planner import PathAnswer, PathVerdict, Wish
 from cfplan.preparation.replan import HeldFlight
 from cfplan.preparation.steps import ignore_steps
 from cfplan.safety.limits import Limits
-from cfplan.safety.limits_file import load_limits
 from cfplan.steering.flight_in_progress import Listeners
 from cfplan.steering.real_time_steering import RealTimeSteering
 from cfplan.steering.steered_vehicle import SteeredVehicle
-from studies.runner.result import Column, StudyResult, Table, detail_table
+from studies.real_time import patient
+from studies.runner.limits import limits_for
+from studies.runner.options import option
+from studies.runner.reductions import count, largest, mean, median, quantile
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
 
 HORIZON = 10.0  # m, at least, of straight lines through the waypoints of a request
 _WALL_DISTANCE = 0.5  # m beyond the margin, that those keep
 _PAUSE = (0.2, 0.6)  # s between an answer and the next request, where they come one at a time
-_ANSWERS_WITHIN = 5.0  # s, of the last requests
 _HEIGHT = 0.8  # m
 
+_MEDIAN = Column("median", "median", "ms", ".0f", value=median("seconds"))
+_P90 = Column("p90", "p90", "ms", ".0f", value=quantile("seconds", 0.9))
+_MAX = Column("max", "max", "ms", ".0f", value=largest("seconds"))
 LATENCY_COLUMNS = (
     Column("what", "from the request to"),
-    Column("count", "requests", meaning="that were accepted"),
-    Column("median", "median", "ms", ".0f"),
-    Column("p90", "p90", "ms", ".0f"),
-    Column("p99", "p99", "ms", ".0f"),
-    Column("max", "max", "ms", ".0f"),
+    Column("count", "requests", meaning="that were accepted", value=count()),
+    _MEDIAN,
+    _P90,
+    Column("p99", "p99", "ms", ".0f", value=quantile("seconds", 0.99)),
+    _MAX,
+)
+BUDGET_COLUMNS = (
+    Column("what", "part of the time until the first changed setpoint"),
+    _MEDIAN,
+    Column("mean", "mean", "ms", ".0f", value=mean("seconds")),
+    _P90,
+    _MAX,
 )
 RATE_COLUMNS = (
     Column("what", "what"),
     Column("seconds", "for", "s", ".0f"),
     Column("asked", "requests"),
     Column("accepted", "accepted"),
-    Column("rate", "accepted", "/s", ".1f"),
+    Column("rate", "accepted", "/s", ".1f", value=lambda rows: rows[0].accepted / rows[0].seconds),
     Column("refused", "refused"),
     Column("late", "late"),
     Column("superseded", "superseded"),
@@ -61,43 +75,52 @@ RATE_COLUMNS = (
 )
 
 
-BUDGET_COLUMNS = (
-    Column("what", "part of the time until the first changed setpoint"),
-    Column("median", "median", "ms", ".0f"),
-    Column("mean", "mean", "ms", ".0f"),
-    Column("p90", "p90", "ms", ".0f"),
-    Column("max", "max", "ms", ".0f"),
-)
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How many requests are made, and how fast."""
+
+    requests: int = option(100, "Requests one at a time.", least=1)
+    seconds: float = option(60.0, "Time of all other requests, s; as long it hovers before.", least=1)
+    rate: float = option(100.0, "Those requests a second.", least=0.1)
+    seed: int = option(0, "Seed of the waypoints.", least=0)
 
 
 @dataclass(frozen=True, slots=True)
-class Replan:
-    """One request that was accepted."""
+class Stretch:
+    """A part of the flight."""
 
-    asked: float  # s on the flight's clock
-    first_changed: float  # s from then until the first setpoint was sent that is another than before
-    motion: float  # s from then to the joint
-    answer: float  # s from then to the answer, as the planner counts
-    # What `first_changed` consists of, s, in order:
-    to_planner: float = 0.0  # until the planner's process has the request
-    waiting: float = 0.0  # until it begins to plan; with its proposals that came late
-    planning: float = 0.0  # the plan, whole
-    checking: float = 0.0  # bytes, stops, link loss, gaps and dry run of its first part
-    verifying: float = 0.0  # the way to the pilot, which looks every 10 ms, verifies and answers
-    spare: float = 0.0  # until the splice, which lies as far ahead as most plans need
+    what: str
+    seconds: float
+    asked: int  # requests
+    accepted: int
+    refused: int
+    late: int
+    superseded: int
+    p50: float  # s by which setpoints were sent late, as p99, p999 and max_late
+    p99: float
+    p999: float
+    max_late: float
+    load: float  # of the computer, the mean of the minute before its end
+    replans: Sequence[Mapping[str, float]] = ()  # s, by DELAYS and PARTS, of each accepted request; one at a time alone
 
 
-_PARTS = (
-    ("to the planner's process", "to_planner"),
-    ("what it does before", "waiting"),
-    ("plan", "planning"),
-    ("checks", "checking"),
-    ("verified by the pilot", "verifying"),
-    ("left until the splice", "spare"),
+DELAYS = (  # from the request
+    "first changed setpoint",  # is sent
+    "change of the motion",  # at the joint
+    "answer",  # as the planner counts
 )
+PARTS = (  # of the time until the first changed setpoint, in order
+    "to the planner's process",  # until it has the request
+    "what it does before",  # until it begins to plan; with its proposals that came late
+    "plan",
+    "checks",  # bytes, stops, link loss, gaps and dry run of its first part
+    "verified by the pilot",  # which looks every 10 ms, verifies and answers
+    "left until the splice",  # which lies as far ahead as most plans need
+)
+ONE_BY_ONE = "one request at a time"
 
 
-class _HeardSteering(RealTimeSteering):
+class HeardSteering(RealTimeSteering):
     """A flight by processes whose setpoints and commitments are kept."""
 
     def __init__(self, limits: Limits):
@@ -121,24 +144,21 @@ class _HeardSteering(RealTimeSteering):
         super().start(mission, held, Listeners(hear, hear_answer))
 
 
-def latency(
-    safety_file: Path,
-    *,
-    requests: int = 100,
-    seconds: float = 60.0,
-    rate: float = 100.0,
-    first_seed: int = 0,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> StudyResult:
-    """Ask for so many changes one at a time, then `rate` a second for so many s; hover before for as many s.
+def work(settings: Settings, run: Run) -> Work:
+    """Return one case: the flight, under the limits of this folder."""
+    return Work({"flight": settings}, partial(measure, limits=limits_for(Path())), Stretch)
 
-    Raises a CfplanError where the vehicle does not take off or its flight ends early.
+
+def measure(settings: Settings, limits: Limits) -> list[Stretch]:
+    """Fly, and return the stretches: hovering, one request at a time, and many.
+
+    Raises:
+        CfplanError: the vehicle did not take off, or its flight ended early.
+        InputError: none of the requests that came one at a time was accepted.
     """
-    limits = _patient(load_limits(safety_file))
-    chance = np.random.default_rng(first_seed)
-    flight = _HeardSteering(limits)
-    asked: dict[int, float] = {}
-    rows: list[dict[str, Any]] = []
+    limits = patient(limits)
+    chance = np.random.default_rng(settings.seed)
+    flight, asked = HeardSteering(limits), dict[int, float]()
 
     def ask(vehicle: SteeredVehicle) -> int:
         tour = list(_tour(chance, vehicle.target, limits))
@@ -149,55 +169,40 @@ def latency(
 
     with SteeredVehicle(flight, limits, uri="sim://0") as vehicle:
         vehicle.take_off(_HEIGHT)
-        begun = vehicle.time
-        vehicle.sleep(seconds)
-        rows.append(_stretch("hovering, no requests", flight, begun, vehicle.time, {}))
-        for done in range(requests):
+        begun = _mark(vehicle)
+        vehicle.sleep(settings.seconds)
+        hovered = _mark(vehicle)
+        for _ in range(settings.requests):
             vehicle.answer_to(ask(vehicle))
             vehicle.sleep(float(chance.uniform(*_PAUSE)))
-            progress(done, 2 * requests)
-        one_by_one = dict(asked)
-        begun = vehicle.time
-        while (now := vehicle.time) < begun + seconds:
+        one_by_one, answered = dict(asked), _mark(vehicle)
+        while (now := vehicle.time) < answered.time + settings.seconds:
             ask(vehicle)
-            vehicle.sleep(max(now + 1.0 / rate - vehicle.time, 0.0))
-            progress(requests + int(requests * (now - begun) / seconds), 2 * requests)
-        ended = vehicle.time
+            vehicle.sleep(max(now + 1.0 / settings.rate - vehicle.time, 0.0))
+        ended = _mark(vehicle)
         vehicle.answer_to(max(asked))
-        many = {number: time for number, time in asked.items() if number not in one_by_one}
-        rows.append(_stretch(f"{rate:g} requests a second", flight, begun, ended, many))
         vehicle.land()
-    replans = _replans(flight, one_by_one)
-    settings = {"requests": requests, "seconds": seconds, "rate": rate, "seed": first_seed, "horizon": HORIZON}
-    many_table = Table("rate", "Requests much faster than plans", RATE_COLUMNS, tuple(rows))
-    tables = (latency_table(replans), budget_table(replans), many_table)
-    return StudyResult("latency", settings, tables, (detail_table("replans", replans),))
+    many = asked.keys() - one_by_one.keys()
+    return [  # once all messages have come
+        _stretch("hovering, no requests", flight, (), begun, hovered),
+        replace(_stretch(ONE_BY_ONE, flight, one_by_one, hovered, answered), replans=find_replans(flight, one_by_one)),
+        _stretch(f"{settings.rate:g} requests a second", flight, many, answered, ended),
+    ]
 
 
-def latency_table(replans: Sequence[Replan]) -> Table:
-    """Return a row for each kind of delay. Raises InputError where nothing was accepted."""
-    if not replans:
-        raise InputError("no request was accepted", hint="is the computer too busy? see `python -m studies lateness`")
-    kinds = (
-        ("first changed setpoint", [each.first_changed for each in replans]),
-        ("change of the motion", [each.motion for each in replans]),
-        ("answer", [each.answer for each in replans]),
-    )
-    rows = []
-    for what, values in kinds:
-        median, p90, p99, most = np.percentile(values, [50, 90, 99, 100]).tolist()
-        rows.append({"what": what, "count": len(values), "median": median, "p90": p90, "p99": p99, "max": most})
-    return Table("latency", "Requests one at a time", LATENCY_COLUMNS, tuple(rows))
+def tables(settings: Settings, rows: list[Stretch]) -> Iterator[Table]:
+    """Yield each kind of delay, the parts of the time until the first changed setpoint, and what became of many."""
+    replans = [replan for row in rows for replan in row.replans]
+    delays, parts = ([_Duration(what, each[what]) for what in names for each in replans] for names in (DELAYS, PARTS))
+    yield table("latency", "Requests one at a time", LATENCY_COLUMNS, delays, by=("what",))
+    yield table("budget", "What that time consists of", BUDGET_COLUMNS, parts, by=("what",))
+    others = [row for row in rows if row.what != ONE_BY_ONE]
+    yield table("rate", "Requests much faster than plans", RATE_COLUMNS, others)
 
 
-def budget_table(replans: Sequence[Replan]) -> Table:
-    """Return a row for each part of the time until the first changed setpoint."""
-    rows = []
-    for what, name in _PARTS:
-        values = np.array([getattr(each, name) for each in replans])
-        rows.append({"what": what, "median": np.median(values), "mean": values.mean(),
-                     "p90": np.quantile(values, 0.9), "max": values.max()})  # fmt: skip
-    return Table("budget", "What that time consists of", BUDGET_COLUMNS, tuple(rows))
+class _Duration(NamedTuple):
+    what: str
+    seconds: float
 
 
 def first_change(sequence: NDArray, splice: int, payloads: NDArray) -> int | None:
@@ -210,10 +215,11 @@ def first_change(sequence: NDArray, splice: int, payloads: NDArray) -> int | Non
     return splice + int(changed[0]) if len(changed) else None
 
 
-def _replans(flight: _HeardSteering, asked: dict[int, float]) -> list[Replan]:
-    """Return what became of the requests that were accepted, by the bytes that the pilot was bound to.
+def find_replans(flight: HeardSteering, asked: Mapping[int, float]) -> list[dict[str, float]]:
+    """Return DELAYS and PARTS of each request that was accepted, s, by the bytes that the pilot was bound to.
 
-    Where the vehicle is to stop first, the first setpoint of that is the one that changes.
+    Where the vehicle is to stop first, the first setpoint of that is the one that changes. Raises InputError where none
+    was accepted.
     """
     accepted = [each for each in flight.heard if each.verdict is PathVerdict.ACCEPTED and each.number in asked]
     answers = {each.stop or each.checksum: each for each in accepted if each.splice >= 0}
@@ -225,17 +231,20 @@ def _replans(flight: _HeardSteering, asked: dict[int, float]) -> list[Replan]:
             if number in flight.sent:
                 sent = flight.sent[number]
                 joint = sent.due if answer.stop else sent.due + answer.joint - number / RATE
-                parts = _parts(answer, begun, sent.time)
-                found.append(Replan(begun, sent.time - begun, joint - begun, answer.seconds, *parts))
+                delays = dict(zip(DELAYS, (sent.time - begun, joint - begun, answer.seconds), strict=True))
+                found.append(delays | dict(zip(PARTS, _parts(answer, begun, sent.time), strict=True)))
         if len(sequence) < each.splice:
             waits = np.repeat(sequence[-1:], each.splice - len(sequence), axis=0)
             sequence = np.concatenate([sequence, waits])
         sequence = np.concatenate([sequence[: each.splice], payloads])
+    if not found:
+        hint = "is the computer too busy? see `python -m studies lateness`"
+        raise InputError("no request was accepted", hint=hint)
     return found
 
 
 def _parts(answer: PathAnswer, asked: float, changed: float) -> tuple[float, ...]:
-    """Return the parts of the time from when it was asked until the first changed setpoint was sent, s, as _PARTS."""
+    """Return PARTS of the time from the request until the first changed setpoint was sent, s."""
     times = answer.times
     assert times is not None
     return (
@@ -244,26 +253,34 @@ def _parts(answer: PathAnswer, asked: float, changed: float) -> tuple[float, ...
     )  # fmt: skip
 
 
-def _stretch(what: str, flight: _HeardSteering, begin: float, end: float, asked: dict[int, float]) -> dict[str, Any]:
-    """Return a row about the requests that were asked for, and the setpoints sent meanwhile."""
+class _Mark(NamedTuple):
+    time: float  # s
+    load: float  # of the computer, the mean of the minute before
+
+
+def _mark(vehicle: SteeredVehicle) -> _Mark:
+    return _Mark(vehicle.time, os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan"))
+
+
+def _stretch(what: str, flight: HeardSteering, asked: Collection[int], begin: _Mark, end: _Mark) -> Stretch:
+    """Return what became of the requests of these numbers, and how late setpoints were sent meanwhile."""
     became = Counter(each.verdict for each in flight.heard if each.number in asked)
-    late = [each.time - each.due for each in list(flight.sent.values()) if begin <= each.due <= end]
+    late = [each.time - each.due for each in flight.sent.values() if begin.time <= each.due <= end.time]
     p50, p99, p999, most = np.percentile(late, [50, 99, 99.9, 100]).tolist()
-    return {
-        "what": what,
-        "seconds": end - begin,
-        "asked": len(asked),
-        "accepted": became[PathVerdict.ACCEPTED],
-        "rate": became[PathVerdict.ACCEPTED] / (end - begin),
-        "refused": became[PathVerdict.REFUSED],
-        "late": became[PathVerdict.LATE],
-        "superseded": became[PathVerdict.SUPERSEDED],
-        "p50": p50,
-        "p99": p99,
-        "p999": p999,
-        "max_late": most,
-        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan"),
-    }
+    return Stretch(
+        what=what,
+        seconds=end.time - begin.time,
+        asked=len(asked),
+        accepted=became[PathVerdict.ACCEPTED],
+        refused=became[PathVerdict.REFUSED],
+        late=became[PathVerdict.LATE],
+        superseded=became[PathVerdict.SUPERSEDED],
+        p50=p50,
+        p99=p99,
+        p999=p999,
+        max_late=most,
+        load=end.load,
+    )
 
 
 def _tour(chance: np.random.Generator, begin: Triple, limits: Limits) -> Iterator[Triple]:
@@ -280,7 +297,4 @@ def _tour(chance: np.random.Generator, begin: Triple, limits: Limits) -> Iterato
         yield x, y, z
 
 
-def _patient(limits: Limits) -> Limits:
-    """Return limits under which no flight is refused or ended by lateness, and no hover by its endurance."""
-    pose = replace(limits.pose, age_warning=0.15, age_brake=0.5, age_land=1.5)
-    return replace(limits, pose=pose, lateness=1.0)
+STUDY = Study(Settings, work, tables, "--requests 400 -o results/latency.json", one_at_a_time=True)

@@ -1,13 +1,12 @@
 """The study of latency: which setpoint is the first that another plan changes, and what the tables say of it."""
 
-import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cfplan.errors import InputError
-from studies.latency import Replan, budget_table, first_change, latency_table
-from studies.runner.result import StudyResult
+from studies.latency import DELAYS, ONE_BY_ONE, PARTS, STUDY, Settings, Stretch, find_replans, first_change
 
 
 def rows(*values):
@@ -29,25 +28,33 @@ def test_the_first_changed_setpoint_is_the_first_with_other_bytes(splice, payloa
     assert first_change(rows(0, 1, 2, 3, 4), splice, payloads) == number
 
 
-def test_its_table_has_a_row_for_each_delay_and_survives_json():
-    replans = [Replan(0.0, 0.05 + 0.001 * k, 0.2 + 0.001 * k, 0.04) for k in range(101)]
-    result = StudyResult("latency", {}, (latency_table(replans),))
-    document = json.loads(json.dumps(result.to_json(), allow_nan=False))
-    assert [row[0] for row in document["tables"][0]["rows"]] == [
-        "first changed setpoint", "change of the motion", "answer",
-    ]  # fmt: skip
-    first = result.table("latency").rows[0]
+def replan(*times):
+    return dict.fromkeys(PARTS, 0.0) | dict(zip((*DELAYS, *PARTS), times, strict=False))
+
+
+def tables(replans):
+    stretch = Stretch(ONE_BY_ONE, 60.0, 120, len(replans), 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 1.0, replans)
+    hovering = Stretch("hovering, no requests", 60.0, 0, 0, 0, 0, 0, 1e-4, 2e-4, 3e-4, 4e-4, 1.0)
+    return {each.name: each.rows for each in STUDY.tables(Settings(), [hovering, stretch])}
+
+
+def test_its_table_has_a_row_for_each_delay():
+    found = tables([replan(0.05 + 0.001 * k, 0.2 + 0.001 * k, 0.04) for k in range(101)])
+    first = found["latency"][0]
+    assert [row["what"] for row in found["latency"]] == ["first changed setpoint", "change of the motion", "answer"]
     assert (first["count"], first["median"], first["p99"]) == (101, pytest.approx(0.1), pytest.approx(0.149))
+    assert [(row["what"], row["rate"]) for row in found["rate"]] == [("hovering, no requests", 0.0)]
 
 
 def test_where_nothing_was_accepted_that_is_said():
+    flight = SimpleNamespace(heard=[], committed=[], sent={})
     with pytest.raises(InputError, match="no request was accepted"):
-        latency_table([])
+        find_replans(flight, {})
 
 
 def test_the_parts_of_the_time_are_told_apart():
-    replans = [Replan(0.0, 0.1, 0.2, 0.08, 0.001, 0.0, 0.02, 0.04, 0.01 * k, 0.02) for k in range(11)]
-    rows = {row["what"]: row for row in budget_table(replans).rows}
+    replans = [replan(0.1, 0.2, 0.08, 0.001, 0.0, 0.02, 0.04, 0.01 * k, 0.02) for k in range(11)]
+    rows = {row["what"]: row for row in tables(replans)["budget"]}
     assert rows["plan"]["median"] == pytest.approx(0.02)
     assert (rows["verified by the pilot"]["median"], rows["verified by the pilot"]["max"]) == pytest.approx((0.05, 0.1))
     assert sum(row["mean"] for row in rows.values()) == pytest.approx(0.131)
