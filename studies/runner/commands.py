@@ -26,6 +26,12 @@ class _Studies(click.Group):
         """Return the names of all studies, then of what makes pages of them."""
         return [*sorted(STUDIES), *sorted({*COMMANDS, *self.commands})]
 
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the studies, each with the first sentence of its help."""
+        found = ((name, self.get_command(ctx, name)) for name in self.list_commands(ctx))
+        with formatter.section("Studies"):
+            formatter.write_dl([(name, each.get_short_help_str(300)) for name, each in found if each is not None])
+
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         """Return the command of that name. Raises InputError where there is none."""
         if name in self.commands:
@@ -79,7 +85,7 @@ _EFFORT = (
 
 @click.group(cls=_Studies, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 def studies() -> None:
-    """Measure cfplan: each study makes one result with its tables. Nobody who only flies needs them."""
+    """Measure cfplan: each study makes one result with its tables. Flying needs none of them."""
 
 
 @studies.command()
