@@ -8,7 +8,7 @@ times: as unknown as before, as identified, as identified without having been we
 import math
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -71,9 +71,9 @@ class StudiedVehicle:
     seed: int
     first_flight: str  # how it ended
     reason: str = ""  # why there is nothing
-    errors: dict[str, float] | None = None  # by the keys of _ASKED, in the units of the table
-    uncertainties: dict[str, float] | None = None
-    deviations: dict[str, float] | None = None  # m, of the next flight, by how the vehicle was known
+    errors: dict[str, float] = field(default_factory=dict)  # by the keys of _ASKED, in the units of the table
+    uncertainties: dict[str, float] = field(default_factory=dict)  # likewise
+    deviations: dict[str, float] = field(default_factory=dict)  # m, of the next flight, by how the vehicle was known
 
 
 ERROR_COLUMNS = (
@@ -221,8 +221,8 @@ def tables(settings: Settings, rows: list[StudiedVehicle]) -> Iterator[Table]:
 
 def _accuracy(done: Sequence[StudiedVehicle]) -> Iterator[dict[str, Any]]:
     for name, asked in _ASKED.items() if done else ():
-        errors = np.array([vehicle.errors[name] for vehicle in done if vehicle.errors])
-        stated = [vehicle.uncertainties[name] for vehicle in done if vehicle.uncertainties]
+        errors = np.array([vehicle.errors[name] for vehicle in done])
+        stated = [vehicle.uncertainties[name] for vehicle in done]
         unit = "ms" if name in ("motor lag", "pose latency") else "%"
         figures = {
             "median": np.median(np.abs(errors)),
@@ -243,8 +243,8 @@ class _NextFlight:
 
 def _next_flights(done: Sequence[StudiedVehicle]) -> Iterator[_NextFlight]:
     for vehicle in done:
-        for name, deviation in (vehicle.deviations or {}).items():
-            yield _NextFlight(name, deviation, deviation - (vehicle.deviations or {})["known"])
+        for name, deviation in vehicle.deviations.items():
+            yield _NextFlight(name, deviation, deviation - vehicle.deviations["known"])
 
 
 STUDY = Study(
