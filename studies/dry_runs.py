@@ -42,7 +42,7 @@ COLUMNS = (
 
 def work(settings: Settings, run: Run) -> Work:
     """Return a case a path."""
-    return Work({file.stem: file for file in settings.path_files}, measure)
+    return Work({str(file): file for file in settings.path_files}, measure)
 
 
 def measure(path_file: Path) -> dict[str, Any]:

@@ -5,11 +5,12 @@ sources it is, each further line holds one case. A run of the same study goes on
 settings is stale: it is set aside under a name that says so, and nothing of it is used.
 """
 
+import hashlib
 import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -61,7 +62,7 @@ def _measured(name: str, module: str, settings: Any, work: Work, effort: Effort)
     """Return the rows in the order of the cases, whether there was an interrupt, and the processor's seconds."""
     file = None if effort.output is None else unfinished_file(effort.output)
     header = {
-        "study": name, "settings": plain(asdict(settings)), "identity": plain(work.identity),
+        "study": name, "settings": plain(asdict(settings)), "files": _digests(settings), "identity": plain(work.identity),
         "commit": provenance(module).commit, "sources": provenance(module).sources,
     }  # fmt: skip
     kept = {} if file is None else _resume(file, header, effort.say)
@@ -81,6 +82,14 @@ def _measured(name: str, module: str, settings: Any, work: Work, effort: Effort)
     found = [done[case] for case in work.cases if case in done]
     rows = [work.row(**row) for each in found for row in each.rows]
     return rows, interrupted, sum(each.seconds for each in found)
+
+
+def _digests(settings: Any) -> dict[str, str]:
+    """Return the digests of the files that settings name."""
+    values = (getattr(settings, each.name) for each in fields(settings))
+    named = [path for value in values for path in (value if isinstance(value, tuple) else (value,))]
+    files = (path for path in named if isinstance(path, Path) and path.is_file())
+    return {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 
 
 class _Done(NamedTuple):

@@ -113,7 +113,7 @@ def test_a_case_that_a_kill_cut_off_as_it_was_written_is_measured_again(log, tmp
     assert made(log) == [0, 1, 2, 3, 3]
 
 
-@pytest.mark.parametrize("key", ["sources", "settings", "study", "identity", None])
+@pytest.mark.parametrize("key", ["sources", "settings", "study", "identity", "files", None])
 def test_what_other_sources_or_settings_made_is_set_aside_and_never_mixed_in(log, tmp_path, key):
     told = []
     effort = Effort(output=tmp_path / "r.json", say=told.append)
