@@ -62,7 +62,8 @@ def _measured(name: str, module: str, settings: Any, work: Work, effort: Effort)
     """Return the rows in the order of the cases, whether there was an interrupt, and the processor's seconds."""
     file = None if effort.output is None else unfinished_file(effort.output)
     header = {
-        "study": name, "settings": plain(asdict(settings)), "files": _digests(settings), "identity": plain(work.identity),
+        "study": name, "settings": plain(asdict(settings)), "files": _digests(settings),
+        "identity": plain(work.identity),
         "commit": provenance(module).commit, "sources": provenance(module).sources,
     }  # fmt: skip
     kept = {} if file is None else _resume(file, header, effort.say)
