@@ -49,7 +49,7 @@ class Settings:
 
     path_files: tuple[FilePath, ...] = argument()
     random: int = option(200, "Random paths besides.", least=0)
-    seed: int = option(0, "Of the first random path.")
+    seed: int = option(0, "Of the first random path.", least=0)
 
 
 @dataclass(frozen=True, slots=True)

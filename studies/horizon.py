@@ -35,7 +35,7 @@ class Settings:
     """Which paths are planned."""
 
     paths: int = option(100, "Random paths.", least=1)
-    seed: int = option(0, "Of the first path.")
+    seed: int = option(0, "Of the first path.", least=0)
     waypoints: int = option(20, "Of each path.", least=3)
     known: tuple[int, ...] = option((3,), "Waypoints ahead that are known.", least=1)
 

@@ -52,7 +52,7 @@ class Settings:
     path_file: Path = argument()
     next_file: Path = argument()
     vehicles: int = option(30, "Drawn by seeds.", least=1)
-    seed: int = option(0, "Of the first vehicle.")
+    seed: int = option(0, "Of the first vehicle.", least=0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from setuptools import find_namespace_packages
 
 from cfplan.errors import InputError
 from cfplan.files.shipped import example, shipped_folder
@@ -27,6 +28,11 @@ def test_a_wheel_takes_every_model_example_and_layout_along():
     wanted |= set((REPOSITORY / "layouts").iterdir())
     wanted |= {file for file in (REPOSITORY / "models").glob("*/*") if file.suffix in (".safetensors", ".json")}
     assert wanted == found
+
+
+def test_a_wheel_has_no_studies_and_no_tests():
+    found = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]["find"]
+    assert {name.partition(".")[0] for name in find_namespace_packages(str(REPOSITORY), **found)} == {"cfplan"}
 
 
 def test_examples_are_found_by_name_and_listed_where_there_is_none():

@@ -25,7 +25,6 @@ from cfplan.numbers import coordinates
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-_REFRESH = 0.1  # s
 _NOTES = 4.0  # s between lines within a phase, where there is no bar
 KEYS = "space lands · Esc cuts the motors · Ctrl-C lands, twice cuts"
 SIGNALS_ALONE = "Ctrl-C lands, twice cuts the motors"  # where standard input is no terminal
@@ -39,9 +38,8 @@ class FlightProgress:
         from rich.progress import BarColumn, Progress, TextColumn
         from rich.text import Text
 
-        self._quiet = steps.as_json
         self._keys = KEYS if sys.stdin.isatty() else SIGNALS_ALONE
-        console = Console(stderr=True, quiet=self._quiet)
+        console = Console(stderr=True, quiet=steps.as_json)
         keys = Text(f"  {self._keys}", style="bold")
 
         class BarWithKeys(Progress):
@@ -54,18 +52,16 @@ class FlightProgress:
             BarColumn(),
             TextColumn("{task.fields[numbers]}"),
             console=console,
-            disable=self._quiet or not console.is_terminal,
+            disable=steps.as_json or not console.is_terminal,
             transient=True,
         )
         self._duration = duration
         self._task = self._bar.add_task("", total=None, numbers="")
-        self._console = console
         self._setpoint: SetpointSent | None = None
         self._first_index_time: float | None = None  # s, while the path is streamed
         self._pose: PoseReceived | None = None
         self._battery: float | None = None  # V
         self.heard_vehicle = False
-        self._shown = -math.inf  # s
         self._phase, self._noted = "", math.inf  # the phase, and when a line last said how far it is, s
         self._entered = math.inf  # s
         self._clock, self._began = clock, clock.now()
@@ -81,7 +77,7 @@ class FlightProgress:
             self._bar.stop()
 
     def show(self, message: Telemetry) -> None:
-        """Take a message; draw at most ten times a second. A terminal that has closed is no reason to land."""
+        """Take a message, and show it. A terminal that has closed is no reason to land."""
         with contextlib.suppress(OSError):
             self._show(message)
 
@@ -98,10 +94,7 @@ class FlightProgress:
         elif isinstance(message, VehicleStatus):
             self._battery = message.battery_voltage
             self.heard_vehicle = True
-        now = self._clock.now()
-        if now - self._shown > _REFRESH:
-            self._shown = now
-            self._draw(now)
+        self._draw(self._clock.now())
 
     def _enter(self, message: PhaseEntered) -> None:
         elapsed = message.time - self._began

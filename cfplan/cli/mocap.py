@@ -1,7 +1,6 @@
 """`cfplan mocap`: what motion capture sees."""
 
 import math
-import sys
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -30,14 +29,16 @@ Examples:
 @options.as_json
 def mocap(uri: str, seconds: float, as_json: bool) -> int:
     """Show the bodies that a motion capture system at URI sees, and how steadily its frames come."""
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
     from cfplan.flight.mocap.survey import survey
     from cfplan.flight.mocap.uri import parse_uri
 
     where = parse_uri(uri, subject_needed=False)
-    live = not as_json and sys.stdout.isatty()
-    found = survey(where, seconds, _show_live if live else lambda _: None)
-    if live:
-        click.echo("\r\033[K", nl=False)
+    with Live(console=Console(quiet=as_json), transient=True) as screen:  # on a terminal alone
+        found = survey(where, seconds, lambda so_far: screen.update(Text(_line(so_far))))
     if as_json:
         print_json({"uri": str(where), **asdict(found), "remarks": _remarks(found)})
     else:
@@ -45,9 +46,9 @@ def mocap(uri: str, seconds: float, as_json: bool) -> int:
     return 0
 
 
-def _show_live(found: "Survey") -> None:
+def _line(found: "Survey") -> str:
     bodies = "  ".join(f"{printable(body.name)} {_place(body.position)}" for body in found.bodies)
-    click.echo(f"\r\033[K{found.rate:.0f} Hz  {bodies}"[:200], nl=False)
+    return f"{found.rate:.0f} Hz  {bodies}"
 
 
 def _print(uri: str, found: "Survey") -> None:

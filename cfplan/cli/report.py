@@ -30,7 +30,6 @@ def report(records: tuple[Path, ...], output: Path | None, force: bool, as_json:
 
     With --json the numbers are printed, and a page is written only where -o names one.
     """
-    from cfplan.recording.report.page import write_page
     from cfplan.recording.report.report import flight_to_dict, read_flight
 
     steps = Steps(as_json=as_json)
@@ -44,6 +43,8 @@ def report(records: tuple[Path, ...], output: Path | None, force: bool, as_json:
     if file is None and not as_json:
         file = flights[0].record.folder / "report.html" if len(flights) == 1 else Path("report.html")
     if file is not None:
+        from cfplan.recording.report.page import write_page
+
         with steps.step("page") as said:
             write_page(flights, file, overwrite=force)
             said.append(f"{file} ({file.stat().st_size / 1e6:.1f} MB)")

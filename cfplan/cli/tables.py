@@ -9,11 +9,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-_GAP = 2  # characters between two columns
 _LEAST_TEXT = 12  # characters, to which a column of text is wrapped at most
 _LONGEST_NUMBER = 24  # characters, with its unit; what is longer is a sentence that begins with a number
-_TIE = "\N{NO-BREAK SPACE}"  # keeps a number and its unit on one line while the table is laid out
 _NUMBER = re.compile(r"[-+–(≤≥<>]?\s*\d.*|[-–]?")
+_UNBOUNDED = 100_000  # characters, of a console on which any table fits
 
 Rows = Sequence[Sequence[str]]
 
@@ -22,66 +21,52 @@ def print_fitting(console: Console, title: str, columns: Sequence[str], rows: Ro
     """Print a table no wider than the console; where even wrapping cannot do that, with a column for each row."""
     with console.capture() as drawn:
         console.print(Text(title, "italic"))
-        for heads, cells in _fitting(list(columns), [list(row) for row in rows], console.width):
-            console.print(_table(heads, cells))
-    console.file.writelines(f"{line.rstrip()}\n" for line in drawn.get().replace(_TIE, " ").splitlines())
+        for table in _fitting(console, columns, rows):
+            console.print(table)
+    console.file.writelines(f"{line.rstrip()}\n" for line in drawn.get().splitlines())
 
 
-def _fitting(columns: list[str], rows: list[list[str]], width: int) -> Iterator[tuple[list[str], list[list[str]]]]:
+def _fitting(console: Console, columns: Sequence[str], rows: Rows) -> Iterator[Table]:
     """Yield the table itself if it fits, else parts of it turned over, each with as many of the rows as fit."""
-    if not rows or len(columns) < 3 or _least_width(columns, rows) <= width:
-        yield columns, rows
+    table = _table(columns, rows)
+    if not rows or len(columns) < 3 or _fits(console, table):
+        yield table
         return
-    begin = 0
-    while begin < len(rows):
-        end = len(rows)
-        while end > begin + 1 and _least_width(*_turned(columns, rows[begin:end])) > width:
-            end -= 1
-        yield _turned(columns, rows[begin:end])
-        begin = end
+    while rows:
+        count = 1
+        while count < len(rows) and _fits(console, _turned(columns, rows[: count + 1])):
+            count += 1
+        yield _turned(columns, rows[:count])
+        rows = rows[count:]
 
 
-def _turned(columns: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+def _fits(console: Console, table: Table) -> bool:
+    return console.measure(table, options=console.options.update_width(_UNBOUNDED)).minimum <= console.width
+
+
+def _turned(columns: Sequence[str], rows: Rows) -> Table:
     """Return the table with a column for each row, under the row's first cell."""
-    heads = [columns[0], *(row[0] for row in rows)]
-    return heads, [[name, *(row[index] for row in rows)] for index, name in enumerate(columns) if index > 0]
-
-
-def _least_width(columns: list[str], rows: list[list[str]]) -> int:
-    """Return how narrow the table may be drawn, in characters."""
-    return sum(_least_widths(columns, rows)) + _GAP * (len(columns) - 1)
-
-
-def _least_widths(columns: Sequence[str], rows: Rows) -> list[int]:
-    """Return how narrow each column may be: its longest number or word, and a little more of text."""
-    least = []
-    for index, head in enumerate(columns):
-        cells = [row[index] for row in rows]
-        width = max(map(_longest_word, (head, *cells)))
-        if index > 0 and _is_numeric(cells):
-            least.append(max(width, _longest(cells)))
-        else:
-            least.append(max(width, min(_LEAST_TEXT, _longest((head, *cells)))))
-    return least
-
-
-def _longest(texts: Sequence[str]) -> int:
-    return max((cell_len(text) for text in texts), default=0)
-
-
-def _longest_word(text: str) -> int:
-    return _longest(text.split())
-
-
-def _is_numeric(cells: Sequence[str]) -> bool:
-    return all(_NUMBER.fullmatch(cell) and len(cell) <= _LONGEST_NUMBER for cell in cells)
+    (corner, *heads), *lines = zip(columns, *rows, strict=True)
+    return _table([corner, *heads], lines)
 
 
 def _table(columns: Sequence[str], rows: Rows) -> Table:
     table = Table(header_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
-    for index, (column, least) in enumerate(zip(columns, _least_widths(columns, rows), strict=True)):
-        numeric = index > 0 and _is_numeric([row[index] for row in rows])
-        table.add_column(column, justify="right" if numeric else "left", min_width=least)
+    for index, column in enumerate(columns):
+        cells = [row[index] for row in rows]
+        numeric = index > 0 and all(_NUMBER.fullmatch(cell) and len(cell) <= _LONGEST_NUMBER for cell in cells)
+        least = _least_width(column, cells, numeric=numeric)
+        table.add_column(Text(column), justify="right" if numeric else "left", min_width=least)
     for row in rows:
-        table.add_row(*(Text(cell.replace(" ", _TIE) if _is_numeric([cell]) else cell) for cell in row))
+        table.add_row(*map(Text, row))
     return table
+
+
+def _least_width(column: str, cells: Sequence[str], *, numeric: bool) -> int:
+    """Return how narrow a column may be: its longest number or word, and a little more of text."""
+    words = _longest(" ".join((column, *cells)).split())
+    return max(words, _longest(cells) if numeric else min(_LEAST_TEXT, _longest((column, *cells))))
+
+
+def _longest(texts: Sequence[str]) -> int:
+    return max(map(cell_len, texts), default=0)

@@ -11,7 +11,6 @@ has the same bounds). Where the path rests, only its fourth derivative bounds th
 """
 
 import math
-from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -76,9 +75,6 @@ class ScaledLimits(NamedTuple):
     def smoothing(self) -> float:
         """Return the time over which answers are smoothed, in units of time."""
         return SMOOTHING / math.sqrt(float(self.bounds[3]))
-
-
-View = Callable[[Airframe, PlanLimits], ScaledLimits]  # what a network sees of vehicle and limits
 
 
 @lru_cache(maxsize=16)

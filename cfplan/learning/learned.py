@@ -22,7 +22,6 @@ from cfplan.learning.features import (
     LEAST_SHARE,
     REFERENCE,
     ScaledLimits,
-    View,
     fill_inputs,
     node_features,
     rests,
@@ -76,11 +75,10 @@ class _Windows(NamedTuple):
     rests: tuple[bool, bool]  # whether the path rests at its start and end, where no state is given
 
 
-def plan_learned(task: PlanningTask, *, model: Model | None = None, view: View = scaled_limits) -> Solution:
+def plan_learned(task: PlanningTask, *, model: Model | None = None) -> Solution:
     """Plan by the network over the task's intervals, or over one window's where those are more.
 
-    On a finer grid than the network needs it is asked on a coarser one, and its answer laid over the grid. `view` is
-    what the network was trained to see of limits and vehicle.
+    On a finer grid than the network needs it is asked on a coarser one, and its answer laid over the grid.
 
     Raises:
         InputError: fewer than ten nodes, or than the path needs, or no model.
@@ -98,7 +96,7 @@ def plan_learned(task: PlanningTask, *, model: Model | None = None, view: View =
     task.check_nodes()
     if task.refusal:
         return task.refusal
-    coefficients, yaw = propose(task, model, view)
+    coefficients, yaw = propose(task, model)
     if not _sound(coefficients, yaw.yaw):
         return Solution(Status.NOT_CONVERGED, None, f"the network {model.name} answered what is not a number")
     stats: dict[str, float | int | str] = {
@@ -123,7 +121,7 @@ def _sound(coefficients: NDArray, yaw: NDArray) -> bool:
     return sound
 
 
-def propose(task: PlanningTask, model: Model, view: View = scaled_limits) -> tuple[NDArray, YawSpline]:
+def propose(task: PlanningTask, model: Model) -> tuple[NDArray, YawSpline]:
     """Return the (N+3,) coefficients of h that a model proposes, not finite where it fails, and yaw."""
     path, nodes, start, end = task.path, task.nodes, task.start, task.end
     asked = _asked(path, nodes, model.window)
@@ -131,7 +129,7 @@ def propose(task: PlanningTask, model: Model, view: View = scaled_limits) -> tup
         None if task.yaw is YawMode.FREE else YawSpline.along(path, count, task.yaw, task.yaw_angle, start, end)
         for count in dict.fromkeys((asked, nodes))
     ]
-    known = view(task.airframe, task.limits)
+    known = scaled_limits(task.airframe, task.limits)
     question = Question(path, known, asked, start, end, tracks[0], task.yaw_angle)
     ((coefficients, turned),) = predict([question], model.network, model.window)
     yaw = tracks[-1]

@@ -24,7 +24,6 @@ from cfplan.learning.features import (
     OUTPUTS,
     REFERENCE,
     ScaledLimits,
-    View,
     coefficient_logs,
     fill_inputs,
     fill_node_features,
@@ -99,8 +98,8 @@ class TrainingSet:
         return Labels(*_joined(paths, self.scaled), *self.labels[3:])
 
 
-def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH, view: View = scaled_limits) -> TrainingSet:
-    """Read the rows of a dataset that can be learned from. `view` is what a network is to see of limits and vehicle.
+def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> TrainingSet:
+    """Read the rows of a dataset that can be learned from.
 
     Raises:
         InputError: no dataset, a damaged one, or no row that was solved and certified.
@@ -122,20 +121,20 @@ def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH, view:
     paths = _paths(usable, folder)
     h = np.stack([_column(usable, name, spec.nodes, folder) for name in ("h", "dh", "ddh", "dddh")], axis=1)
     yaw = np.stack([_column(usable, name, spec.nodes, folder) for name in ("yaw", "dyaw", "ddyaw")], axis=1)
-    known, chooses = _scaled(usable, folder, view), usable["yaw_mode"].to_numpy() == YawMode.FREE.value
+    known, chooses = _scaled(usable, folder), usable["yaw_mode"].to_numpy() == YawMode.FREE.value
     h *= np.array([each.time**2 for each in known])[:, None, None]
     bounds, numbers = np.stack([each.bounds for each in known]), np.stack([each.numbers for each in known])
     labels = Labels(*_joined(paths, known), length, h, yaw, chooses, bounds, numbers)
     return TrainingSet(spec, usable["row"].to_numpy(), paths, known, labels, travel_time)
 
 
-def _scaled(rows: pa.Table, folder: FilePath, view: View) -> tuple[ScaledLimits, ...]:
+def _scaled(rows: pa.Table, folder: FilePath) -> tuple[ScaledLimits, ...]:
     found = []
     columns = (rows[name].to_pylist() for name in ("row", "airframe", "limits"))
     for row, airframe, limits in zip(*columns, strict=True):
         try:
             vehicle = Airframe(**airframe | {name: tuple(airframe[name]) for name in ("inertia", "drag")})
-            known = view(vehicle, PlanLimits(**limits))
+            known = scaled_limits(vehicle, PlanLimits(**limits))
         except (ValueError, TypeError, ArithmeticError) as error:
             raise _damaged(f"limits or vehicle of row {row}: {error}", folder) from None
         if not (np.isfinite(known.numbers).all() and np.isfinite(known.bounds).all() and (known.bounds > 0.0).all()):

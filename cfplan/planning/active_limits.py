@@ -45,12 +45,12 @@ class ActiveLimits:
         ]
 
 
-def on_white(colour: Colour) -> Colour:
-    """Return the colour for white paper, darkened where it is too light."""
+def on_white(colour: Colour) -> str:
+    """Return the colour for white paper as #rrggbb, darkened where it is too light."""
     red, green, blue = colour
     luminance = (0.2126 * red + 0.7152 * green + 0.0722 * blue) / 255
     factor = min(1.0, LIGHTEST / luminance) if luminance > 0 else 1.0
-    return round(factor * red), round(factor * green), round(factor * blue)
+    return f"#{round(factor * red):02x}{round(factor * green):02x}{round(factor * blue):02x}"
 
 
 def active_limits(plan: Plan) -> ActiveLimits:

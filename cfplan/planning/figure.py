@@ -6,21 +6,13 @@ White ground, labelled axes in metres of one scale, and for each limit the colou
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.files.whole import check_new_file, write_whole
-from cfplan.planning.active_limits import (
-    FREE,
-    FREE_COLOUR,
-    LIMIT_COLOURS,
-    ActiveLimits,
-    Colour,
-    active_limits,
-    on_white,
-)
+from cfplan.planning.active_limits import FREE, FREE_COLOUR, LIMIT_COLOURS, ActiveLimits, active_limits, on_white
 from cfplan.planning.plan_result import Plan
 
 if TYPE_CHECKING:
@@ -30,7 +22,7 @@ if TYPE_CHECKING:
 SUFFIXES = (".png", ".pdf", ".svg")
 SHOWN = 0.5  # share that a limit comes to somewhere, from which on it gets a curve
 INSET = 0.06  # m at least, half of the side of what is magnified
-FLOWN: Colour = (20, 20, 20)
+FLOWN = "#141414"  # what was flown
 AXES = ("x", "y", "z")
 
 
@@ -65,22 +57,26 @@ def draw_plan(plan: Plan, name: str, flown: Flown | None = None) -> "Figure":
     above.set_title("from above", loc="left", fontsize=9)
     aside.set_title("from the side", loc="left", fontsize=9)
     rows: Sequence[Axes] = curves.subplots(2 if flown is None else 3, 1, sharex=True).tolist()
-    _draw_speed(rows[0], plan, active, flown)
+    draw_speed(rows[0], plan, active)
     _draw_shares(rows[1], active)
     if flown is not None:
-        rows[2].plot(flown.time, 100.0 * flown.deviation, color=_hex(FLOWN), lw=1.0)
+        rows[2].plot(flown.time, 100.0 * flown.deviation, color=FLOWN, lw=1.0)
         rows[2].set(ylabel="deviation, cm", ylim=(0.0, None))
     rows[-1].set_xlabel("time from the start of the path, s")
     for axes in (above, aside, *rows):
         axes.grid(alpha=0.25)
-    said = f"{plan.path.length:.1f} m in {plan.trajectory.duration:.2f} s, {plan.airframe.name}"
-    figure.suptitle(f"{name}: {said}", fontsize=11)
+    figure.suptitle(caption(plan, name), fontsize=11, parse_math=False)
     handles, labels = above.get_legend_handles_labels()
     names = _shown(active) + ([FREE] if FREE in active.name else [])
-    handles += [Line2D([], [], color=_colour(name), lw=2.6) for name in names]
+    handles += [Line2D([], [], color=limit_colour(name), lw=2.6) for name in names]
     labels += ["no limit" if name == FREE else name for name in names]
     views.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return figure
+
+
+def caption(plan: Plan, name: str) -> str:
+    """Return the line above a plan: its name, length, travel time and vehicle."""
+    return f"{name}: {plan.path.length:.1f} m in {plan.trajectory.duration:.2f} s, {plan.airframe.name}"
 
 
 def save_figure(figure: "Figure", file: Path, *, overwrite: bool = False) -> None:
@@ -106,21 +102,21 @@ def _draw_view(axes: "Axes", plan: Plan, active: ActiveLimits, flown: Flown | No
     if across == 1:  # with x up the page, y grows to the left
         axes.invert_xaxis()
     axes.set(xlabel=f"{AXES[across]}, m", ylabel=f"{AXES[up]}, m")
-    _draw_path(axes, active, across, up)
+    draw_path(axes, active, across, up)
     begin, end = active.position[0], active.position[-1]
     axes.plot(begin[across], begin[up], "o", color="black", mfc="white", ms=6, label="start")
     axes.plot(end[across], end[up], "s", color="black", ms=5, label="end")
     if flown is None:
         return
-    axes.plot(flown.position[:, across], flown.position[:, up], color=_hex(FLOWN), lw=0.8, label="flown")
+    axes.plot(flown.position[:, across], flown.position[:, up], color=FLOWN, lw=0.8, label="flown")
     if up != 2:  # the largest deviation, magnified, from above
         _magnify(axes, active, flown, across, up)
 
 
-def _draw_path(axes: "Axes", active: ActiveLimits, across: int, up: int) -> None:
-    """Draw the path in the colours of the limits that hold it back."""
+def draw_path(axes: "Axes", active: ActiveLimits, *along: int) -> None:
+    """Draw the path in the colours of the limits that hold it back, along two or all of the room's axes."""
     for name, rows in active.stretches():
-        axes.plot(active.position[rows, across], active.position[rows, up], color=_colour(name), lw=2.6)
+        axes.plot(*active.position[rows][:, along].T, color=limit_colour(name), lw=2.6)
 
 
 def _magnify(axes: "Axes", active: ActiveLimits, flown: Flown, across: int, up: int) -> None:
@@ -133,10 +129,10 @@ def _magnify(axes: "Axes", active: ActiveLimits, flown: Flown, across: int, up: 
     corners = [np.array([x, y]) for y in (0.67, 0.02) for x in (0.02, 0.71)]
     free = min(corners, key=lambda corner: int(np.all((shown > corner) & (shown < corner + size), axis=1).sum()))
     inset = axes.inset_axes((*free, *size), xticks=[], yticks=[])
-    _draw_path(inset, active, across, up)
-    inset.plot(flown.position[:, across], flown.position[:, up], color=_hex(FLOWN), lw=0.8)
+    draw_path(inset, active, across, up)
+    inset.plot(flown.position[:, across], flown.position[:, up], color=FLOWN, lw=0.8)
     wanted = [float(np.interp(flown.time[worst], active.time, active.position[:, axis])) for axis in (across, up)]
-    inset.plot(*zip(wanted, centre.tolist(), strict=True), color=_hex(FLOWN), lw=1.2)
+    inset.plot(*zip(wanted, centre.tolist(), strict=True), color=FLOWN, lw=1.2)
     inset.plot(*wanted, "o", color="black", mfc="white", ms=4)
     inset.plot(*centre.tolist(), "o", color="black", ms=4)
     inset.set(xlim=centre[0] + np.array([-half, half]), ylim=centre[1] + np.array([-half, half]), aspect="equal")
@@ -147,16 +143,17 @@ def _magnify(axes: "Axes", active: ActiveLimits, flown: Flown, across: int, up: 
     axes.indicate_inset_zoom(inset, edgecolor="0.3")
 
 
-def _draw_speed(axes: "Axes", plan: Plan, active: ActiveLimits, flown: Flown | None) -> None:
+def draw_speed(axes: "Axes", plan: Plan, active: ActiveLimits) -> None:
+    """Draw the plan's speed over time, and its limit."""
     speed = np.linalg.norm(plan.trajectory.at(active.time).velocity, axis=1)
-    axes.plot(active.time, speed, color=_colour("speed"), lw=1.4)
+    axes.plot(active.time, speed, color=limit_colour("speed"), lw=1.4)
     axes.axhline(plan.limits.plan.speed, color="0.35", lw=0.8, ls="--")
     axes.set(ylabel="speed, m/s", ylim=(0.0, None))
 
 
 def _draw_shares(axes: "Axes", active: ActiveLimits) -> None:
     for name in _shown(active):
-        axes.plot(active.time, 100.0 * active.shares[name], color=_colour(name), lw=1.0)
+        axes.plot(active.time, 100.0 * active.shares[name], color=limit_colour(name), lw=1.0)
     axes.axhline(100.0, color="0.35", lw=0.8, ls="--")
     axes.set(ylabel="share of the limit, %", ylim=(0.0, 108.0))
 
@@ -165,9 +162,6 @@ def _shown(active: ActiveLimits) -> list[str]:
     return [name for name, share in active.shares.items() if share.max() >= SHOWN]
 
 
-def _colour(name: str) -> Any:
-    return _hex(FREE_COLOUR if name == FREE else LIMIT_COLOURS[name])
-
-
-def _hex(colour: Colour) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*on_white(colour))
+def limit_colour(name: str) -> str:
+    """Return the colour of a limit on white paper."""
+    return on_white(FREE_COLOUR if name == FREE else LIMIT_COLOURS[name])

@@ -1,47 +1,62 @@
 """A recorded flight as a GIF: the room in perspective, the path in the colours of its limits, the vehicle, its speed.
 
-Drawn by Pillow alone, so it needs neither screen nor graphics driver. Each frame is drawn at twice its size and shrunk;
-all have one palette, and a file holds what changes from frame to frame.
+What stays is drawn once, and over it in each frame what moves. All frames have one palette, and a file holds what
+changes from frame to frame.
 """
 
-from dataclasses import dataclass
 from io import BytesIO
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
+import matplotlib as mpl
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+from PIL import Image
 
 from cfplan.files.whole import check_new_file, write_whole
-from cfplan.planning.active_limits import FREE, FREE_COLOUR, LIMIT_COLOURS, Colour, active_limits, on_white
+from cfplan.planning.active_limits import FREE, active_limits
+from cfplan.planning.figure import FLOWN, caption, draw_path, draw_speed, limit_colour
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
 from cfplan.recording.record import PLAN_FILE, Record
 from cfplan.recording.summary import reference_span
 from cfplan.safety.space import Space
-from cfplan.vehicle.rotations import axes_of
-
-if TYPE_CHECKING:
-    from PIL import Image, ImageDraw
+from cfplan.vehicle.rotations import matrix_of
 
 SUFFIX = ".gif"
 WIDTH, HEIGHT = 720, 440  # pixels of a frame
 RATE = 10  # frames a second, of the flight's own time
-_FINE = 2  # times the size at which frames are drawn
-_VIEW, _CURVE = (16, 34, 704, 336), (60, 352, 704, 414)  # pixels: left, top, right, bottom
+_DPI = 100  # pixels an inch
+_VIEW, _CURVE = (0.08, 0.33, 0.84, 0.51), (0.07, 0.1, 0.91, 0.13)  # of a frame: left, bottom, width, height
 _BEFORE, _AFTER = 0.5, 1.0  # s shown before the path and after it
 _TAIL = 2.0  # s of the track that are thick
-_ARM = 0.16  # m, four times as long as a Crazyflie's: in a room of 8 m it would be a dot
-_ROTOR = 0.09  # m
 _COLOURS = 128  # of the palette
-_SWING, _RISE = np.radians(-32.0), np.radians(26.0)  # of the camera, from across the room
-_AWAY = 2.6  # times the room's longest side
-_WHITE, _GREY, _PALE, _DARK = (255, 255, 255), (150, 150, 150), (226, 228, 230), (30, 30, 30)
-_FRONT, _FLOWN = (213, 60, 40), (20, 20, 20)
+_STYLE: dict[Any, Any] = {
+    "axes.spines.right": False, "axes.spines.top": False, "axes.labelpad": 6, "font.size": 8, "grid.color": "0.85",
+    "grid.linewidth": 0.6,
+    **{f"axes3d.{axis}axis.panecolor": "white" for axis in "xyz"},
+}  # fmt: skip
+_SWING, _RISE = -32.0, 26.0  # degrees, of the camera, from across the shorter side of a room
+_FOCAL_LENGTH = 0.42  # of matplotlib's camera, which then stands 2.2 diagonals of the room away
+_FRONT, _PALE = "#d53c28", "0.8"
+_ARM, _ROTOR = 0.16, 0.09  # m; an arm is four times as long as a Crazyflie's: in a room of 8 m it would be a dot
+_TIPS = _ARM / np.sqrt(2.0) * np.array([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])  # (4, 3) m, on the body
+_TURN = np.append(np.linspace(0.0, 2.0 * np.pi, 17), np.nan)  # NaN, for a line that breaks
+_ROTORS = _TIPS[:, None] + _ROTOR * np.stack([np.cos(_TURN), np.sin(_TURN), 0.0 * _TURN], axis=1)  # (4, 18, 3) m
+_VEHICLE = (  # lines on the body in m, their colours and widths
+    (_TIPS[[0, 3]], FLOWN, 1.6),
+    (_TIPS[[1, 2]], FLOWN, 1.6),
+    (np.concatenate(_ROTORS[2:]), FLOWN, 1.2),
+    (np.concatenate(_ROTORS[:2]), _FRONT, 1.2),
+)
 
 
-def animate_flight(record: Record) -> "list[Image.Image]":
+def animate_flight(record: Record) -> list[Image.Image]:
     """Return the frames of a flight along its plan, RATE a second.
 
     Raises:
@@ -59,10 +74,8 @@ def check_animation_file(file: Path, *, overwrite: bool) -> None:
     check_new_file(file, SUFFIX, overwrite=overwrite)
 
 
-def save_animation(frames: "list[Image.Image]", file: Path, *, overwrite: bool = False) -> None:
+def save_animation(frames: list[Image.Image], file: Path, *, overwrite: bool = False) -> None:
     """Write frames as a GIF that repeats, whole or not at all. Raises InputError where it cannot be written."""
-    from PIL import Image
-
     check_animation_file(file, overwrite=overwrite)
     palette = frames[len(frames) // 2].quantize(_COLOURS, Image.Quantize.MAXCOVERAGE)
     few = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
@@ -71,158 +84,81 @@ def save_animation(frames: "list[Image.Image]", file: Path, *, overwrite: bool =
     write_whole(file, content.getvalue())
 
 
-@dataclass(frozen=True, slots=True)
-class _Camera:
-    """A perspective view of a room that fills a rectangle of the frame."""
-
-    eye: NDArray  # (3,) m
-    axes: NDArray  # (3, 3): right, up and ahead
-    scale: float  # pixels at a distance of 1
-    centre: NDArray  # (2,) pixels
-
-    @staticmethod
-    def of(space: Space) -> "_Camera":
-        """Return the view across the shorter side of a room, from above."""
-        low, high = np.array(space.low), np.array(space.high)
-        side = 0.0 if (high - low)[0] <= (high - low)[1] else -np.pi / 2
-        swing = side + _SWING
-        away = np.array([np.cos(swing) * np.cos(_RISE), np.sin(swing) * np.cos(_RISE), np.sin(_RISE)])
-        eye = (low + high) / 2 + _AWAY * float((high - low).max()) * away
-        right = np.array([-np.sin(swing), np.cos(swing), 0.0])
-        axes = np.stack([right, np.cross(away, right), -away])
-        view = _Camera(eye, axes, 1.0, np.zeros(2))
-        corners = view.pixels(np.array(list(product(*zip(low, high, strict=True)))))
-        least, most = corners.min(axis=0), corners.max(axis=0)
-        room = np.array([_VIEW[2] - _VIEW[0], _VIEW[3] - _VIEW[1]])
-        scale = float((room / (most - least)).min())
-        middle = np.array([(_VIEW[0] + _VIEW[2]) / 2, (_VIEW[1] + _VIEW[3]) / 2])
-        return _Camera(eye, axes, scale, middle - scale * (least + most) / 2)
-
-    def pixels(self, points: NDArray) -> NDArray:
-        """Return where points, (N, 3) m, are in the frame, (N, 2)."""
-        right, up, ahead = self.axes @ (points - self.eye).T
-        return self.scale * np.stack([right / ahead, -up / ahead], axis=1) + self.centre
-
-
 class _Scene:
     """What stays the same from frame to frame, drawn once, and what moves."""
 
+    @mpl.rc_context(_STYLE)
     def __init__(self, record: Record, plan: Plan, begin: float):
-        self._record, self._plan, self._begin = record, plan, begin
-        self._camera = _Camera.of(plan.limits.space)
-        self._active = active_limits(plan)
+        self._record, self._begin, self._floor = record, begin, plan.limits.space.low[2]
         self._speed = np.linalg.norm(record.estimates.velocity, axis=1)
-        self._span = -_BEFORE, plan.trajectory.duration + _AFTER
-        self._most = 1.1 * plan.limits.plan.speed
-        self._still = self._draw_still()
+        figure = Figure(figsize=(WIDTH / _DPI, HEIGHT / _DPI), dpi=_DPI)
+        self._canvas = FigureCanvasAgg(figure)
+        room, curve = _draw_still(figure, plan, record.header.name)
+        moving: dict[str, Any] = {"animated": True}  # left out where the canvas is drawn
+        self._track, self._tail, self._plumb, *self._vehicle = (
+            room.plot([], [], [], color=colour, lw=width, **moving)[0]
+            for colour, width in ((FLOWN, 0.6), (FLOWN, 1.2), ("0.6", 0.7), *((c, w) for _, c, w in _VEHICLE))
+        )
+        (self._flown,) = curve.plot([], [], color=FLOWN, lw=0.8, **moving)
+        (self._now,) = curve.plot([], [], "o", color=_FRONT, ms=4, **moving)
+        self._clock = figure.text(0.98, 0.94, "", size=10, ha="right", **moving)
+        self._canvas.draw()
+        self._still = self._canvas.copy_from_bbox(figure.bbox)
 
-    def frame(self, moment: float) -> "Image.Image":
+    def frame(self, moment: float) -> Image.Image:
         """Return the frame of a moment, s on the record's clock."""
-        from PIL import Image, ImageDraw
-
-        image = self._still.copy()
-        draw = ImageDraw.Draw(image)
-        poses = self._record.poses
+        poses, estimates = self._record.poses, self._record.estimates
         now = int(np.searchsorted(poses.time, moment, side="right")) - 1
         early, tail = np.searchsorted(poses.time, [self._begin - _BEFORE, moment - _TAIL])
-        self._line(draw, poses.position[early : now + 1 : 2], _FLOWN, 1)
-        self._line(draw, poses.position[max(tail, early) : now + 1], _FLOWN, 2)
-        self._draw_vehicle(draw, poses.position[now], poses.quaternion[now])
-        self._draw_speed(draw, moment)
-        return image.resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS)
-
-    def _draw_still(self) -> "Image.Image":
-        from PIL import Image, ImageDraw
-
-        image = Image.new("RGB", (_FINE * WIDTH, _FINE * HEIGHT), _WHITE)
-        draw, space = ImageDraw.Draw(image), self._plan.limits.space
-        low, high = np.array(space.low), np.array(space.high)
-        for axis in (0, 1):
-            for at in np.arange(np.ceil(low[axis]), high[axis] + 1e-9):
-                ends = np.array([low, high])
-                ends[:, 2], ends[:, axis] = low[2], at
-                self._line(draw, ends, _PALE, 1)
-        corners = np.array(list(product(*zip(low, high, strict=True))))
-        for a, b in product(range(8), range(8)):
-            if a < b and int(np.count_nonzero(corners[a] != corners[b])) == 1:
-                self._line(draw, corners[[a, b]], _GREY, 1)
-        floor = self._active.position.copy()
-        floor[:, 2] = low[2]
-        self._line(draw, floor[::4], (205, 205, 205), 2)
-        for name, rows in self._active.stretches():
-            self._line(draw, self._active.position[rows], _colour(name), 4)
-        self._draw_words(draw)
-        self._draw_curve(draw)
-        return image
-
-    def _draw_words(self, draw: "ImageDraw.ImageDraw") -> None:
-        plan = self._plan
-        said = f"{plan.path.length:.1f} m in {plan.trajectory.duration:.2f} s, {plan.airframe.name}"
-        self._text(draw, (16, 10), f"{self._record.header.name}: {said}", 15)
-        place = 16
-        for name in [*dict.fromkeys(str(name) for name in self._active.name if name != FREE)]:
-            self._text(draw, (place + 22, HEIGHT - 18), name, 11, _GREY)
-            draw.line([_FINE * place, _FINE * (HEIGHT - 11), _FINE * (place + 16), _FINE * (HEIGHT - 11)],
-                      fill=_colour(name), width=4 * _FINE)  # fmt: skip
-            place += 34 + 7 * len(name)
-
-    def _draw_curve(self, draw: "ImageDraw.ImageDraw") -> None:
-        """Draw the plan's speed over time, and its limit."""
-        left, _, right, bottom = _CURVE
-        limit = self._height_of(self._plan.limits.plan.speed)
-        self._text(draw, (16, limit - 7), f"{self._plan.limits.plan.speed:g} m/s", 11, _GREY)
-        for place in range(left, right, 12):
-            draw.line([_FINE * place, _FINE * limit, _FINE * (place + 6), _FINE * limit], fill=_GREY, width=_FINE)
-        draw.line([_FINE * left, _FINE * bottom, _FINE * right, _FINE * bottom], fill=_GREY, width=_FINE)
-        speed = np.linalg.norm(self._plan.trajectory.at(self._active.time).velocity, axis=1)
-        self._curve(draw, self._active.time, speed, (190, 190, 190), 3)
-
-    def _draw_speed(self, draw: "ImageDraw.ImageDraw", moment: float) -> None:
-        estimates, now = self._record.estimates, moment - self._begin
-        flown = (estimates.time >= self._begin + self._span[0]) & (estimates.time <= moment)
-        if flown.any():
-            self._curve(draw, estimates.time[flown] - self._begin, self._speed[flown], _FLOWN, 1)
-            x, y = self._across(now), self._height_of(float(self._speed[flown][-1]))
-            draw.ellipse([_FINE * (x - 3), _FINE * (y - 3), _FINE * (x + 3), _FINE * (y + 3)], fill=_FRONT)
-            self._text(draw, (WIDTH - 128, 10), f"{max(now, 0.0):4.1f} s  {self._speed[flown][-1]:.1f} m/s", 15)
-
-    def _draw_vehicle(self, draw: "ImageDraw.ImageDraw", position: NDArray, quaternion: NDArray) -> None:
-        """Draw arms and rotors, red in front, and a line down to the floor."""
-        below = position.copy()
-        below[2] = self._plan.limits.space.low[2]
-        self._line(draw, np.array([position, below]), _GREY, 1)
-        x, y, _ = (np.array(axis) for axis in axes_of(*quaternion))
-        turn = np.linspace(0.0, 2 * np.pi, 17)
-        circle = _ROTOR * (np.outer(np.cos(turn), x) + np.outer(np.sin(turn), y))
-        for along, aside in product((1, -1), (1, -1)):
-            tip = position + _ARM * (along * x + aside * y) / np.sqrt(2.0)
-            self._line(draw, np.array([position, tip]), _FLOWN, 3)
-            self._line(draw, tip + circle, _FRONT if along > 0 else _FLOWN, 2)
-
-    def _curve(self, draw: "ImageDraw.ImageDraw", time: NDArray, speed: NDArray, colour: Colour, width: int) -> None:
-        points = [(_FINE * self._across(t), _FINE * self._height_of(v)) for t, v in zip(time, speed, strict=True)]
-        draw.line(points, fill=colour, width=width * _FINE)
-
-    def _across(self, time: float) -> float:
-        begin, end = self._span
-        return float(_CURVE[0] + (_CURVE[2] - _CURVE[0]) * np.clip((time - begin) / (end - begin), 0.0, 1.0))
-
-    def _height_of(self, speed: float) -> float:
-        return float(_CURVE[3] - (_CURVE[3] - _CURVE[1]) * np.clip(speed / self._most, 0.0, 1.0))
-
-    def _line(self, draw: "ImageDraw.ImageDraw", points: NDArray, colour: Colour, width: int) -> None:
-        if len(points) > 1:
-            pixels = _FINE * self._camera.pixels(points)
-            draw.line([(x, y) for x, y in pixels.tolist()], fill=colour, width=width * _FINE, joint="curve")
-
-    def _text(
-        self, draw: "ImageDraw.ImageDraw", place: tuple[float, float], text: str, size: int, colour: Colour = _DARK
-    ) -> None:
-        from PIL import ImageFont
-
-        font = ImageFont.load_default(_FINE * size)
-        draw.text((_FINE * place[0], _FINE * place[1]), text, fill=colour, font=font)
+        self._track.set_data_3d(*poses.position[early : now + 1 : 2].T)
+        self._tail.set_data_3d(*poses.position[max(tail, early) : now + 1].T)
+        x, y, z = poses.position[now]
+        self._plumb.set_data_3d([x, x], [y, y], [z, self._floor])
+        for line, (points, _, _) in zip(self._vehicle, _VEHICLE, strict=True):
+            line.set_data_3d(*(poses.position[now] + points @ matrix_of(poses.quaternion[now]).T).T)
+        flown = (estimates.time >= self._begin - _BEFORE) & (estimates.time <= moment)
+        time, speed = estimates.time[flown] - self._begin, self._speed[flown]
+        self._flown.set_data(time, speed)
+        self._now.set_data(time[-1:], speed[-1:])
+        self._clock.set_text(f"{max(moment - self._begin, 0.0):4.1f} s  {speed[-1]:.1f} m/s" if len(speed) else "")
+        self._canvas.restore_region(self._still)
+        for artist in (self._track, self._tail, self._plumb, *self._vehicle, self._flown, self._now, self._clock):
+            artist.draw(self._canvas.get_renderer())
+        return Image.fromarray(np.array(self._canvas.buffer_rgba())).convert("RGB")
 
 
-def _colour(name: str) -> Colour:
-    return on_white(FREE_COLOUR if name == FREE else LIMIT_COLOURS[name])
+def _draw_still(figure: Figure, plan: Plan, name: str) -> tuple[Any, Axes]:
+    """Draw what does not move; return the axes of the room and of the speed."""
+    active = active_limits(plan)
+    figure.text(0.02, 0.94, caption(plan, name), size=10, parse_math=False)
+    limits = dict.fromkeys(str(name) for name in active.name if name != FREE)
+    handles = [Line2D([], [], color=limit_colour(limit), lw=2.6, label=limit) for limit in limits]
+    figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.01, 0.94), ncols=5, fontsize=7, frameon=False)
+    room = _draw_room(figure, plan.limits.space)
+    room.plot(*active.position[:, :2].T, plan.limits.space.low[2], color=_PALE, lw=1.4)
+    draw_path(room, active, 0, 1, 2)
+    curve = figure.add_axes(_CURVE, xlim=(-_BEFORE, plan.trajectory.duration + _AFTER))
+    draw_speed(curve, plan, active)
+    curve.set(xlabel="time, s", ylim=(0.0, 1.1 * plan.limits.plan.speed))
+    return room, curve
+
+
+def _draw_room(figure: Figure, space: Space) -> Any:
+    """Return three-dimensional axes that show the room, in one scale, as large as it goes into the view."""
+    low, high = np.array(space.low), np.array(space.high)
+    room: Any = figure.add_axes((0.0, 0.0, HEIGHT / WIDTH, 1.0), projection="3d")
+    room.set_proj_type("persp", _FOCAL_LENGTH)
+    room.view_init(_RISE, _SWING - (0.0 if (high - low)[0] <= (high - low)[1] else 90.0))
+    room.set(xlabel="x, m", ylabel="y, m", zlabel="z, m")
+    room.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    room.set_box_aspect(high - low)
+    for axis in (room.xaxis, room.yaxis, room.zaxis):
+        axis.set_major_locator(MaxNLocator(9, integer=True))
+    corners = [(*corner, 1.0) for corner in product(*zip(low, high, strict=True))]
+    x, y, _, away = room.get_proj() @ np.transpose(corners)
+    drawn = (room.transData - figure.transFigure).transform(np.stack([x / away, y / away], axis=1))
+    least, most = drawn.min(axis=0), drawn.max(axis=0)
+    scale = float(np.min(_VIEW[2:] / (most - least)))
+    left, bottom = np.array(_VIEW[:2]) + 0.5 * np.array(_VIEW[2:]) - 0.5 * scale * (least + most)
+    room.set_position((left, bottom, scale * HEIGHT / WIDTH, scale))
+    return room

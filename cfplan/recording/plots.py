@@ -1,6 +1,7 @@
 """The plots of a flight: lines over time, and their limits."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,14 +133,14 @@ def finite_limits(plot: Plot) -> tuple[float, ...]:
     return tuple(limit for limit in plot.limits if math.isfinite(limit))
 
 
-def near_limits(plot: Plot) -> tuple[float, ...]:
-    """Return the limits beside which what was measured can still be seen: at most FAR_LIMIT of its span beyond it."""
-    values = np.concatenate([line.values[np.isfinite(line.values)] for line in plot.lines] or [np.empty(0)])
-    if len(values) == 0:
-        return plot.limits
-    low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
+def near_limits(limits: Sequence[float], values: Sequence[NDArray]) -> tuple[float, ...]:
+    """Return the limits beside which the values can still be seen: at most FAR_LIMIT of their span beyond them."""
+    known = np.concatenate([np.empty(0), *(array[np.isfinite(array)] for array in values)])
+    if len(known) == 0:
+        return tuple(limits)
+    low, high = min(float(known.min()), 0.0), max(float(known.max()), 0.0)
     reach = FAR_LIMIT * (high - low)
-    return tuple(limit for limit in plot.limits if low - reach <= limit <= high + reach)
+    return tuple(limit for limit in limits if low - reach <= limit <= high + reach)
 
 
 def _flown(name: str, time: NDArray, values: NDArray, label: str = "flown") -> Line:

@@ -26,7 +26,7 @@ from cfplan.planners.baselines.min_snap import plan_min_snap
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.safety.limit_sets import PAPER
-from cfplan.simulation.geometric_flight import LOST, fly_geometric, thrust_violation
+from cfplan.simulation.geometric_flight import fly_geometric, thrust_violation
 from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.bayesian_times import Budget, require_library
 from studies.paper.corridors import ACCELERATION, SPEED, corridor_about, min_jerk, timed_path
@@ -38,15 +38,18 @@ from studies.paper.trained import WAYPOINTS, NetworkSettings, TrainedNetwork, pa
 from studies.paper.training import SequenceOptions
 from studies.paper.trials import (
     EXPERT,
+    FAILED,
     FLOWN,
     PAPER_LAG,
     SAMPLE,
     TOPPQUAD,
     Plan,
+    flown,
     network_plan,
     profile_by,
     shipped_profile,
     trajectory_by,
+    warm_up,
 )
 from studies.runner.options import option
 from studies.runner.reductions import among, count, mean
@@ -69,7 +72,6 @@ class Course(NamedTuple):
     seed: int
 
 
-_WARM: set[str] = set()  # planners that this process has asked before
 Ask = Callable[[Course], Trajectory]  # raises CfplanError where there is none
 
 
@@ -101,16 +103,6 @@ class BaselineTrial:
     points: list[list[float]] = field(default_factory=list)  # m, along the motion, where that is drawn
 
     @property
-    def failed(self) -> bool:
-        """Return whether there was no flight, or one that crashed or was LOST."""
-        return not self.deviation < LOST
-
-    @property
-    def flown(self) -> bool:
-        """Return the contrary."""
-        return not self.failed
-
-    @property
     def speed(self) -> float:
         """Return the mean speed, m/s."""
         return self.length / self.travel_time
@@ -135,10 +127,10 @@ def work(settings: Settings, run: Run) -> Work:
     allocation = train_times(own, [labels[seed] for seed in corridors])
     training += time.process_time() - begun
     retraining = {each.name: each.training_seconds for each in data.networks} | {ALLOCATION: training}
-    asked = Asked(tuple(data.networks), allocation, QUICK_BUDGET if settings.quick else Budget())
+    asked, budget = partial(planners, data.networks, allocation), QUICK_BUDGET if settings.quick else Budget()
     seeds = {str(seed): seed for seed in range(settings.seed, settings.seed + settings.paths)}
     drawn = range(settings.seed, settings.seed + DRAWN_PATHS)
-    return Work(seeds, partial(measure, asked, retraining, drawn), BaselineTrial, data.identity)
+    return Work(seeds, partial(measure, asked, budget, retraining, drawn), BaselineTrial, data.identity)
 
 
 def _label(seed: int) -> tuple[int, NDArray | None, float]:
@@ -148,26 +140,18 @@ def _label(seed: int) -> tuple[int, NDArray | None, float]:
     return seed, label, time.process_time() - begun
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What the planners of the table are made of."""
-
-    networks: tuple[TrainedNetwork, ...]
-    allocation: TimeNetwork
-    budget: Budget
-
-    def planners(self) -> dict[str, Ask]:
-        """Return the planners by name, in the order of the table."""
-        on_the_path = {
-            TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert),
-            **{each.name: network_plan(each) for each in self.networks}, SHIPPED: shipped_profile,
-        }  # fmt: skip
-        return {name: _on_the_path(plan) for name, plan in on_the_path.items()} | {
-            ALLOCATION: lambda course: _allotted(course.path, self.allocation),
-            BAYESIAN: lambda course: bayesian_motion(course.waypoints, budget=self.budget, seed=course.seed),
-            CONVEX: _on_the_path(profile_by(plan_convex)),
-            MIN_SNAP: _on_the_path(profile_by(plan_min_snap)),
-        }
+def planners(networks: Sequence[TrainedNetwork], allocation: TimeNetwork, budget: Budget) -> dict[str, Ask]:
+    """Return the planners by name, in the order of the table."""
+    on_the_path = {
+        TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert),
+        **{each.name: network_plan(each) for each in networks}, SHIPPED: shipped_profile,
+    }  # fmt: skip
+    return {name: _on_the_path(plan) for name, plan in on_the_path.items()} | {
+        ALLOCATION: lambda course: _allotted(course.path, allocation),
+        BAYESIAN: lambda course: bayesian_motion(course.waypoints, budget=budget, seed=course.seed),
+        CONVEX: _on_the_path(profile_by(plan_convex)),
+        MIN_SNAP: _on_the_path(profile_by(plan_min_snap)),
+    }
 
 
 def random_course(seed: int) -> Course:
@@ -195,15 +179,14 @@ def _allotted(path: Path, network: TimeNetwork) -> Trajectory:
     return timed_trajectory(timed_path(min_jerk(corridor, times), times))
 
 
-def measure(asked: Asked, retraining: Mapping[str, float], drawn: Sequence[int], seed: int) -> list[BaselineTrial]:
+def measure(
+    asked: Callable[[Budget], dict[str, Ask]], budget: Budget, retraining: Mapping[str, float], drawn: Sequence[int],
+    seed: int,
+) -> list[BaselineTrial]:  # fmt: skip
     """Plan and fly one path by each planner; of the paths that are `drawn`, by their seeds, keep the motion."""
-    course, trials = random_course(seed), []
-    for name, ask in asked.planners().items():
-        if name not in _WARM:
-            quickly = replace(asked, budget=QUICK_BUDGET).planners()[name]
-            with suppress(CfplanError):
-                quickly(course)  # loads and compiles
-            _WARM.add(name)
+    course, trials, quick = random_course(seed), [], asked(QUICK_BUDGET)
+    for name, ask in asked(budget).items():
+        warm_up(name, partial(quick[name], course))
         begun = BaselineTrial(name, seed, retraining=retraining.get(name))
         trials.append(_flown(ask, course, begun, keep=name in DRAWN and seed in drawn))
     return trials
@@ -216,7 +199,7 @@ def _flown(ask: Ask, course: Course, trial: BaselineTrial, *, keep: bool) -> Bas
     except CfplanError as error:
         return replace(trial, reason=str(error))
     trial = _judged(trajectory, replace(trial, seconds=time.process_time() - begun))
-    if keep and trial.flown:
+    if keep and flown(trial):
         path = trajectory.path
         return replace(trial, points=np.round(path(np.linspace(0.0, path.end, DRAWN_POINTS)), 3).tolist())
     return trial
@@ -241,7 +224,7 @@ COLUMNS = (
     Column("planner", "planner"),
     Column("paths", value=count()),
     Column("deviation", "largest deviation", "m", ".3f", meaning="mean over flights that did not fail",
-           value=among("flown", mean("deviation"))),
+           value=among(flown, mean("deviation"))),
     _paper("deviation", unit="m", spec=".3f"),
     Column("thrust_least", "least thrust", "N", ".2f", meaning="planned, of a motor; mean over paths",
            value=mean("thrust_least")),
@@ -256,8 +239,7 @@ COLUMNS = (
     _paper("length", unit="m", spec=".1f"),
     Column("speed", "mean speed", "m/s", ".2f", value=mean("speed")),
     _paper("speed", unit="m/s", spec=".2f"),
-    Column("failed", "failures", of="paths", meaning=f"no plan, a crash, or {LOST:g} m from its place",
-           value=count("failed")),
+    FAILED,
     _paper("failed", unit="%", spec=".0f"),
     Column("seconds", "compute", "ms", ".1f", meaning="mean of the processor's time, one thread",
            value=mean("seconds")),

@@ -16,7 +16,7 @@ from cfplan.safety.limits_file import DEFAULTS, load_limits
 from studies.paper.baselines import ALLOCATION, BAYESIAN, DRAWN, SHIPPED, BaselineTrial, random_course
 from studies.paper.corridors import box_corners, corridor_about
 from studies.paper.hardware import CERTIFIED, LONG, RAW, TRACKED, HardwareFlight, hardware_paths, long_path
-from studies.paper.trials import TOPPQUAD
+from studies.paper.trials import TOPPQUAD, failed
 from studies.paper.yaw_consistency import WAYS, Pair
 from studies.runner.result import ITEMS
 
@@ -167,8 +167,8 @@ def draw_tracks(rows: Sequence[HardwareFlight], network: str) -> "Figure":
                 style = {"color": NETWORKS[network]} if flight.planner == network else TOPPQUAD_STYLE
                 axes.plot(*_track(flight)[:, :2].T, lw=0.9, **style)
             own = [flight for flight in flights if flight.planner == network]
-            failed = sum(flight.failed for flight in own)
-            axes.set_title(f"path {name}" + (f": {failed} of {len(own)} failed" if failed else ""), fontsize=8)
+            lost = sum(map(failed, own))
+            axes.set_title(f"path {name}" + (f": {lost} of {len(own)} failed" if lost else ""), fontsize=8)
             axes.set_aspect("equal")
             axes.tick_params(labelsize=6)
         for axes in grid[len(paths) :]:

@@ -7,7 +7,7 @@ limits are those that `cfplan init` writes. Paths are labelled and networks trai
 set of limits in its own folder; what was stopped goes on. Of the first set the poses are kept, for the figures.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,7 +20,7 @@ import numpy as np
 from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.pilot.mission import Mission, mission_of
 from cfplan.flight.pilot.outcome import Rung
-from cfplan.flight.setpoints.encoding import encode_trajectory
+from cfplan.flight.setpoints.encoding import EncodedFlight, encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived, Telemetry
 from cfplan.geometry.min_snap import min_snap
@@ -32,7 +32,7 @@ from cfplan.learning.dataset_spec import GIVEN, DatasetSpec
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import plan
-from cfplan.planning.plan_result import Plan as CertifiedPlan
+from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO, default_nodes
 from cfplan.planning.repair import repair
 from cfplan.preparation.plan_flight import PlannedFlight, give_way
@@ -63,7 +63,7 @@ from studies.paper.trained import (
     trained_networks,
 )
 from studies.paper.training import SequenceOptions
-from studies.paper.trials import TOPPQUAD, Plan, network_plan, profile_of
+from studies.paper.trials import TOPPQUAD, failed, flown, network_plan, profile_of
 from studies.runner.options import option
 from studies.runner.reductions import among, count, largest, mean
 from studies.runner.result import Column, Table, table
@@ -110,16 +110,6 @@ class HardwareFlight:
     points: list[list[int]] = field(default_factory=list)  # mm, where it was along the path, where that is drawn
     training: Mapping[str, Any] | None = None  # of the network that planned
 
-    @property
-    def failed(self) -> bool:
-        """Return whether there was no flight to the end of the path, or it was LOST."""
-        return bool(self.reason) or not self.deviation < LOST
-
-    @property
-    def flown(self) -> bool:
-        """Return the contrary."""
-        return not self.failed
-
 
 class _Poses:
     """Keeps some poses of those that arrive while the path is flown."""
@@ -137,22 +127,6 @@ class _Poses:
                 self._next = time + TRACK_SPACING
 
 
-Raw = Callable[[Path, Limits], Trajectory]  # raises CfplanError where there is none
-Certified = Callable[[Path, Limits], CertifiedPlan]  # likewise
-
-
-@dataclass(frozen=True, slots=True)
-class FlownPlanner:
-    """A planner, and what of it is flown."""
-
-    name: str
-    raw: Raw | None  # None: it is only flown certified
-    certified: Certified
-    flights: int = LEARNED_FLIGHTS  # of each path
-    any_length: bool = False  # whether it plans paths longer than the paper's
-    training: Mapping[str, Any] | None = None  # of a network
-
-
 def work(settings: Settings, run: Run) -> Work:
     """Return a case a plan, which is flown several times; paths are labelled and networks trained if need be.
 
@@ -161,13 +135,12 @@ def work(settings: Settings, run: Run) -> Work:
     usual = load_limits(DEFAULTS)
     paths = hardware_paths(usual, settings.paths) | ({} if settings.quick else {LONG: long_path(usual)})
     networks = {name: _networks(settings, run, name) for name in list(LIMITS)[: 1 if settings.quick else None]}
-    planners = {name: flown_planners(own) for name, own in networks.items()}
-    identity = {name: identities(own) for name, own in networks.items()}
-    most = 1 if settings.quick else None
-    return Work(plans_of(planners, paths), partial(measure, planners, paths, most), HardwareFlight, identity)
+    identity = {name: identities(own.values()) for name, own in networks.items()}
+    most = 1 if settings.quick else LEARNED_FLIGHTS
+    return Work(plans_of(networks, paths), partial(measure, networks, paths, most), HardwareFlight, identity)
 
 
-def _networks(settings: Settings, run: Run, name: str) -> list[TrainedNetwork]:
+def _networks(settings: Settings, run: Run, name: str) -> dict[str, TrainedNetwork]:
     """Return the networks for one set of limits."""
     spec = hardware_spec(paper_limits(load_limits(DEFAULTS), name), settings.learned_from)
     folder, noises, epochs = settings.data / name, NOISES[: 1 if settings.quick else None], settings.epochs
@@ -182,7 +155,7 @@ def _networks(settings: Settings, run: Run, name: str) -> list[TrainedNetwork]:
 
     make_dataset(folder / "data", spec, workers=run.workers, scheduler=run.scheduler, on_rows=show)
     known, wanted = read_sequences(folder / "data").learned_from(0), [SequenceOptions(epsilon=each) for each in noises]
-    return trained_networks(known, folder, wanted, run, epochs)
+    return {each.name: each for each in trained_networks(known, folder, wanted, run, epochs)}
 
 
 def paper_limits(usual: Limits, name: str) -> Limits:
@@ -233,102 +206,69 @@ def long_path(limits: Limits) -> Path:
     raise AssertionError
 
 
-def flown_planners(networks: Iterable[TrainedNetwork]) -> list[FlownPlanner]:
-    """Return TOPPQuad, the networks and the planner that ships."""
-    plans = [(network_plan(each), each) for each in networks]
-    return [
-        FlownPlanner(TOPPQUAD, _toppquad, _policy("toppquad"), TOPPQUAD_FLIGHTS, any_length=True),
-        *(FlownPlanner(own.name, _raw(plan), _repaired(own.name, plan), training=own.training) for plan, own in plans),
-        FlownPlanner(SHIPPED, None, _policy(AUTO), any_length=True),
-    ]
-
-
-def _toppquad(path: Path, limits: Limits) -> Trajectory:
-    return Trajectory(path, profile_of(plan_toppquad, _task(path, limits)), limits.airframe)
-
-
-def _raw(network: Plan) -> Raw:
-    return lambda path, limits: Trajectory(path, network(path), limits.airframe)
-
-
-def _policy(planner: str) -> Certified:
-    def certified(path: Path, limits: Limits) -> CertifiedPlan:
-        found = plan(path, limits.airframe, limits, planner=planner, yaw=YawMode.FREE)
-        if planner not in (AUTO, found.planner):
-            raise CfplanError("; ".join(found.notes), hint="plan by another planner")
-        return give_way(found)[0]
-
-    return certified
-
-
-def _repaired(name: str, network: Plan) -> Certified:
-    def certified(path: Path, limits: Limits) -> CertifiedPlan:
-        found = repair(_task(path, limits), network(path), limits.space)
-        return give_way(CertifiedPlan(
-            path, limits.airframe, limits, found.trajectory, found.certificate, name, NODES, found.speed_factor,
-            speed_factor=1.0, seconds=0.0, notes=(),
-        ))[0]  # fmt: skip
-
-    return certified
-
-
-def _task(path: Path, limits: Limits) -> PlanningTask:
-    return PlanningTask(path, limits.airframe, limits.plan, max(NODES, default_nodes(path)), YawMode.FREE)
-
-
 class FlownPlan(NamedTuple):
     """One plan, flown several times."""
 
     limits: str
     way: str
-    planner: int  # its place among those of the limits
+    planner: str
     path: str
 
 
-def plans_of(planners: Mapping[str, Sequence[FlownPlanner]], paths: Iterable[str]) -> dict[str, FlownPlan]:
-    """Return what is planned, by the names of the cases."""
+Networks = Mapping[str, Mapping[str, TrainedNetwork]]  # by the names of limits and their own
+
+
+def plans_of(networks: Networks, paths: Iterable[str]) -> dict[str, FlownPlan]:
+    """Return what is planned, by the names of the cases: networks plan no long path, and what ships none as it is."""
     plans = [
-        FlownPlan(name, way, place, path)
-        for name, own in planners.items()
+        FlownPlan(limits, way, planner, path)
+        for limits, own in networks.items()
         for way in (RAW, CERTIFIED)
-        for place, planner in enumerate(own)
+        for planner in (TOPPQUAD, *own, SHIPPED)
         for path in paths
-        if (way == CERTIFIED or planner.raw) and (path != LONG or planner.any_length)
+        if (way == CERTIFIED or planner != SHIPPED) and (path != LONG or planner not in own)
     ]
-    return {" ".join(map(str, each)): each for each in plans}
+    return {" ".join(each): each for each in plans}
 
 
-def measure(
-    planners: Mapping[str, Sequence[FlownPlanner]], paths: Mapping[str, Path], most: int | None, asked: FlownPlan
-) -> list[HardwareFlight]:
-    """Plan once, and fly that as often as the paper, or `most` times."""
-    name, way, place, path = asked
-    planner, limits = planners[name][place], paper_limits(load_limits(DEFAULTS), name)
-    flights = planner.flights if most is None else min(most, planner.flights)
-    begun = [
-        HardwareFlight(name, way, planner.name, path, trial, training=planner.training) for trial in range(flights)
-    ]
+def measure(networks: Networks, paths: Mapping[str, Path], most: int, asked: FlownPlan) -> list[HardwareFlight]:
+    """Plan once, and fly that as often as the paper, at most `most` times."""
+    network, limits = networks[asked.limits].get(asked.planner), paper_limits(load_limits(DEFAULTS), asked.limits)
+    flights = min(most, TOPPQUAD_FLIGHTS if asked.planner == TOPPQUAD else LEARNED_FLIGHTS)
+    training = network.training if network else None
+    begun = [HardwareFlight(*asked, trial, training=training) for trial in range(flights)]
     try:
-        mission, duration = _mission(way, planner, paths[path], limits)
+        encoded, trajectory = encoded_plan(asked.way, asked.planner, network, paths[asked.path], limits)
     except CfplanError as error:
         return [replace(flight, reason=str(error)) for flight in begun]
-    seed = 10 * list(paths).index(path)
-    return [_flown(replace(flight, travel_time=duration), mission, seed + flight.trial) for flight in begun]
+    if asked.way == RAW:  # the paper's flights have no other end than a crash: here the pilot ends those that are LOST
+        limits = replace(limits, flight=replace(limits.flight, deviation=Ladder(LOST, 1.5 * LOST, 2.0 * LOST)))
+    mission, seed = mission_of(encoded, limits), 10 * list(paths).index(asked.path)
+    return [_flown(replace(flight, travel_time=trajectory.duration), mission, seed + flight.trial) for flight in begun]
 
 
-def _mission(way: str, planner: FlownPlanner, path: Path, limits: Limits) -> tuple[Mission, float]:
-    """Return what is flown, and how long its motion lasts, s."""
-    if way == CERTIFIED:
-        certified = planner.certified(path, limits)
-        return mission_of(encode_flight(PlannedFlight(planner.name, certified, limits)), limits), (
-            certified.trajectory.duration
-        )
-    assert planner.raw
-    trajectory = planner.raw(path, limits)
-    # The paper's flights have no other end than a crash: here the pilot ends those that are LOST.
-    patient = replace(limits, flight=replace(limits.flight, deviation=Ladder(LOST, 1.5 * LOST, 2.0 * LOST)))
-    encoded = encode_trajectory(trajectory, gains=gains_under(limits), space=limits.space)
-    return mission_of(encoded, patient), trajectory.duration
+def encoded_plan(
+    way: str, planner: str, network: TrainedNetwork | None, path: Path, limits: Limits
+) -> tuple[EncodedFlight, Trajectory]:
+    """Return what is flown of a plan by TOPPQuad, a network or the planner that ships. Raises CfplanError."""
+    task = PlanningTask(path, limits.airframe, limits.plan, max(NODES, default_nodes(path)), YawMode.FREE)
+    if way == RAW:
+        profile = network_plan(network)(path) if network else profile_of(plan_toppquad, task)
+        trajectory = Trajectory(path, profile, limits.airframe)
+        return encode_trajectory(trajectory, gains=gains_under(limits), space=limits.space), trajectory
+    if network:
+        found = repair(task, network_plan(network)(path), limits.space)
+        planned = Plan(
+            path, limits.airframe, limits, found.trajectory, found.certificate, planner, NODES, found.speed_factor,
+            speed_factor=1.0, seconds=0.0, notes=(),
+        )  # fmt: skip
+    else:
+        wanted = "toppquad" if planner == TOPPQUAD else AUTO
+        planned = plan(path, limits.airframe, limits, planner=wanted, yaw=YawMode.FREE)
+        if wanted not in (AUTO, planned.planner):
+            raise CfplanError("; ".join(planned.notes), hint="plan by another planner")
+    certified = give_way(planned)[0]
+    return encode_flight(PlannedFlight(planner, certified, limits)), certified.trajectory
 
 
 def _flown(flight: HardwareFlight, mission: Mission, seed: int) -> HardwareFlight:
@@ -336,12 +276,12 @@ def _flown(flight: HardwareFlight, mission: Mission, seed: int) -> HardwareFligh
     lossy = (RadioFault(RadioFaultKind.LOSS, 0.0, FOR_GOOD, LOSS),)
     vehicle = VehicleSettings(auto_arming=False, seed=seed)
     scenario, poses = Scenario("", Rung.NONE, lossy, from_start=True, vehicle=vehicle), _Poses()
-    flown = fly_stepped(scenario, mission, seed=seed, listen=poses.hear)
-    outcome = flown.outcome
+    found = fly_stepped(scenario, mission, seed=seed, listen=poses.hear)
+    outcome = found.outcome
     if _is_drawn(flight):
         flight = replace(flight, points=poses.points)
     if outcome is None or outcome.exit_code is not ExitCode.OK:
-        return replace(flight, reason=flown.reason)
+        return replace(flight, reason=found.reason)
     return replace(flight, deviation=outcome.deviation.max, settled=outcome.settled_after)
 
 
@@ -356,16 +296,16 @@ COLUMNS = (
     Column("planner", "planner"),
     Column("flights", value=count()),
     Column("deviation", "largest deviation: mean", "m", ".3f", meaning="over flights that did not fail, by the poses",
-           value=among("flown", mean("deviation"))),
-    Column("deviation_most", "of all", "m", ".3f", value=among("flown", largest("deviation"))),
+           value=among(flown, mean("deviation"))),
+    Column("deviation_most", "of all", "m", ".3f", value=among(flown, largest("deviation"))),
     paper_column(HARDWARE, "deviation", ("planner",), "m", ".3f"),
     Column("travel_time", "travel time", "s", ".2f", meaning="planned, mean over those flights",
-           value=among("flown", mean("travel_time"))),
+           value=among(flown, mean("travel_time"))),
     Column("settled", "settling", "s", ".2f", meaning="after that, until it stays near the end",
-           value=among("flown", mean("settled"))),
+           value=among(flown, mean("settled"))),
     paper_column(HARDWARE, "time", ("planner",), "s", ".2f", "with settling, along other paths"),
     Column("failed", "failures", of="flights", meaning=f"no plan, ended by the pilot, or {LOST:g} m from its place",
-           value=count("failed")),
+           value=count(failed)),
 )  # fmt: skip
 
 

@@ -122,43 +122,28 @@ class Settings(NetworkSettings):
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Questions:
-    """What is asked about each path."""
-
-    networks: tuple[TrainedNetwork, ...]
-    planners: tuple[str, ...]  # of PLANNERS
-    draws: int
-    reference: str
-    reference_draws: int
-
-    def models(self) -> dict[str, Ask]:
-        """Return those that are asked, by name."""
-        return {each.name: _network(each) for each in self.networks} | dict(PLANNERS[name] for name in self.planners)
-
-
 def work(settings: Settings, run: Run) -> Work:
     """Return a case a path for testing; networks are trained if need be. Raises what `paper_data` raises."""
     data = paper_data(settings, run, [MODELS[name] for name in settings.models if name in MODELS])
-    planners = tuple(name for name in settings.models if name in PLANNERS)
-    compared = settings.draws if settings.reference_draws is None else settings.reference_draws
-    asked = Questions(tuple(data.networks), planners, settings.draws, settings.reference, compared)
-    return Work(data.part(TEST), partial(measure, asked), RobustnessTrial, data.identity)
+    return Work(data.part(TEST), partial(measure, settings, data.networks), RobustnessTrial, data.identity)
 
 
-def measure(questions: Questions, item: PaperPath) -> list[RobustnessTrial]:
+def measure(settings: Settings, networks: list[TrainedNetwork], item: PaperPath) -> list[RobustnessTrial]:
     """Ask each model about the path and about each of its perturbations."""
     _, row, path = item
-    asked, reference = questions.models(), REFERENCES[questions.reference]
-    training = {each.name: each.training for each in questions.networks}
+    asked = {each.name: _network(each) for each in networks}
+    asked |= dict(PLANNERS[name] for name in settings.models if name in PLANNERS)
+    training = {each.name: each.training for each in networks}
+    reference = REFERENCES[settings.reference]
+    compared = settings.draws if settings.reference_draws is None else settings.reference_draws
     clean = {name: _answered(ask, path) for name, ask in asked.items()}
     clean_time, trials = _time(reference, path), list[RobustnessTrial]()
     for epsilon in SCALES:
-        for draw in range(questions.draws if epsilon else 1):
+        for draw in range(settings.draws if epsilon else 1):
             seed = np.random.SeedSequence(row, spawn_key=(SCALES.index(epsilon), draw))
             moved = perturbed(path, epsilon, seed) if epsilon else path
             own_time = against = np.nan
-            if draw < questions.reference_draws:
+            if draw < compared:
                 own_time, against = _time(reference, moved) if epsilon else clean_time, clean_time
             own = [
                 _flown(

@@ -1,17 +1,16 @@
 """The tables of the study of perturbed paths (robustness.py beside it): the paper's Table 2, and how answers vary."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from cfplan.safety.limit_sets import PAPER
-from cfplan.simulation.geometric_flight import LOST
 from studies.paper.printed import ROBUSTNESS, paper_column
-from studies.paper.trials import PAPER_LAG
-from studies.runner.reductions import among, count, finite, mean, median, quantile
+from studies.paper.trials import DEVIATION, DEVIATION_FLOWN, FAILED, PAPER_LAG
+from studies.runner.reductions import count, finite, mean, median, quantile
 from studies.runner.result import Column, Table, table
 
 SCALES = (0.0, 0.001, 0.01, 0.1)  # m
@@ -42,21 +41,6 @@ class RobustnessTrial:
     """Fraction of planned states that are reached in the time before them, by tolerance."""
     training: Mapping[str, Any] | None = None  # of the network that planned
 
-    @property
-    def failed(self) -> bool:
-        """Return whether there was no flight, or one that crashed or was LOST."""
-        return not self.deviation < LOST
-
-    @property
-    def flown(self) -> bool:
-        """Return the contrary."""
-        return not self.failed
-
-    @property
-    def counted_deviation(self) -> float:
-        """Return the deviation, m, in which a failure counts as LOST."""
-        return LOST if self.failed else self.deviation
-
 
 def _reached(number: int, title: str, meaning: str = "") -> Column:
     value = mean(lambda trial: trial.reached[number])
@@ -77,12 +61,10 @@ def robustness_table(trials: Sequence[RobustnessTrial], reference: str) -> Table
         Column("model", "model"),
         Column("epsilon", "ε", "m", "g"),
         Column("trials", value=count()),
-        Column("deviation", "largest deviation", "m", ".3f", meaning=f"mean; a failure counts as {LOST:g} m",
-               value=mean("counted_deviation")),
-        Column("deviation_flown", "without failures", "m", ".3f", value=among("flown", mean("deviation"))),
+        DEVIATION,
+        DEVIATION_FLOWN,
         _paper("deviation", unit="m", spec=".3f"),
-        Column("failed", "failures", of="trials", meaning=f"no plan, a crash, or {LOST:g} m from its place",
-               value=count("failed")),
+        replace(FAILED, of="trials"),
         Column("slower", f"time over {reference}, same path", "%", "+.2f", value=_over("own_time")),
         Column("slower_clean", "clean path", "%", "+.2f", value=_over("clean_time")),
         _paper("slower", unit="%", spec="+.2f", meaning="it does not say on which of the two"),

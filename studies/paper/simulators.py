@@ -15,17 +15,11 @@ from numpy.typing import NDArray
 
 from cfplan.errors import CfplanError, InputError
 from cfplan.flight.setpoints.encoding import EncodedFlight, encode_trajectory
-from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.path import Path
-from cfplan.geometry.yaw import YawMode
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
-from cfplan.planners.task import PlanningTask
-from cfplan.planning.plan import plan
 from cfplan.planning.repair import refine, repair
-from cfplan.preparation.plan_flight import PlannedFlight, give_way
-from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limit_sets import PAPER
 from cfplan.safety.limits_file import DEFAULTS, load_limits
 from cfplan.simulation.geometric_flight import LOST, positions_by_both
@@ -33,11 +27,22 @@ from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.architectures import SHIPPED_LIMITS, amid, lost_alone, shipped_task
-from studies.paper.hardware import TRACKED, hardware_paths, paper_limits
+from studies.paper.hardware import CERTIFIED, RAW, TRACKED, encoded_plan, hardware_paths, paper_limits
 from studies.paper.printed import TEST
-from studies.paper.trained import NODES, NetworkSettings, TrainedNetwork, paper_data
+from studies.paper.trained import NetworkSettings, TrainedNetwork, paper_data
 from studies.paper.training import SequenceOptions
-from studies.paper.trials import EXPERT, TOPPQUAD, network_plan, paper_task, profile_by, profile_of, shipped_profile
+from studies.paper.trials import (
+    DEVIATION,
+    EXPERT,
+    FAILED,
+    TOPPQUAD,
+    flown,
+    network_plan,
+    paper_task,
+    profile_by,
+    profile_of,
+    shipped_profile,
+)
 from studies.physics import BODIES, OtherBody, compared
 from studies.runner.options import option
 from studies.runner.reductions import among, count, largest, mean
@@ -60,20 +65,13 @@ class Settings(NetworkSettings):
     paths: int = option(8, "Paths of each kind of table.", least=1)
 
 
-class Flown(NamedTuple):
-    """One path of a table, flown by one of its planners."""
+class Asked(NamedTuple):
+    """One path of a table, and one of its planners."""
 
     table: str
     planner: str
     name: str
     path: Path
-
-
-class Sent(NamedTuple):
-    """What is flown of a path, as bytes."""
-
-    encoded: EncodedFlight
-    trajectory: Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,19 +88,14 @@ class BodyFlight:
     apart: float = np.nan  # m, largest distance of the two at the same time
 
     @property
-    def failed(self) -> bool:
-        """Return whether there was no flight, or it was LOST."""
-        return not self.deviation < LOST
-
-    @property
     def own_failed(self) -> bool:
-        """Return whether cfplan says so."""
+        """Return whether it was LOST by cfplan's body, or there was none."""
         return not self.own_deviation < LOST
 
     @property
     def both_flown(self) -> bool:
-        """Return whether both say that it was not lost."""
-        return not (self.failed or self.own_failed)
+        """Return whether it was LOST by neither."""
+        return flown(self) and not self.own_failed
 
 
 COLUMNS = (
@@ -110,12 +103,10 @@ COLUMNS = (
     Column("planner", "planner"),
     Column("body", "body"),
     Column("paths", value=count()),
-    Column("deviation", "largest deviation", "m", ".3f", meaning=f"mean; a failure counts as {LOST:g} m",
-           value=mean(lambda flight: LOST if flight.failed else flight.deviation)),
+    DEVIATION,
     Column("own_deviation", "cfplan's body", "m", ".3f", meaning="the same, with the same motor lag",
            value=mean(lambda flight: LOST if flight.own_failed else flight.own_deviation)),
-    Column("failed", "failures", of="paths", meaning=f"no plan, a crash, or {LOST:g} m from its place",
-           value=count("failed")),
+    FAILED,
     Column("own_failed", "cfplan's", of="paths", value=count("own_failed")),
     Column("apart", "apart", "m", ".3f", meaning="the two at the same time, at most; mean where none failed",
            value=among("both_flown", mean("apart"))),
@@ -135,22 +126,22 @@ def work(settings: Settings, run: Run) -> Work:
     tested = {str(each.row): each.path for each in data.part(TEST).values()}
     room = hardware_paths(usual, len(tested))
     cases = {
-        f"{kind}, {planner}, {name}": Flown(kind, planner, name, path)
+        f"{kind}, {planner}, {name}": Asked(kind, planner, name, path)
         for kind, planner in ROWS
         for name, path in (room if kind == HARDWARE else tested).items()
     }
     return Work(cases, partial(measure, data.networks[0]), BodyFlight, data.identity)
 
 
-def measure(network: TrainedNetwork, flown: Flown) -> list[BodyFlight]:
+def measure(network: TrainedNetwork, asked: Asked) -> list[BodyFlight]:
     """Plan a path, and fly it by each body."""
-    bodies = bodies_for(_airframe(flown.table))
-    begun = [BodyFlight(flown.table, flown.planner, flown.name, body.name) for body in bodies]
+    bodies = bodies_for(_airframe(asked.table))
+    begun = [BodyFlight(asked.table, asked.planner, asked.name, body.name) for body in bodies]
     try:
-        if flown.table == PLANNED:
-            fly = partial(_by_geometric_controller, _planned(network, flown.planner, flown.path))
+        if asked.table == PLANNED:
+            fly = partial(_by_geometric_controller, _planned(network, asked.planner, asked.path))
         else:
-            fly = partial(_by_bytes, _SENT[flown.table](flown.planner, flown.path))
+            fly = partial(_by_bytes, *_sent(asked))
         return [fly(flight, body) for flight, body in zip(begun, bodies, strict=True)]
     except CfplanError as error:
         return [replace(flight, reason=str(error)) for flight in begun]
@@ -186,38 +177,29 @@ def _largest(errors: NDArray) -> float:
     return float(np.linalg.norm(errors, axis=1).max())
 
 
-def _by_bytes(sent: Sent, begun: BodyFlight, body: OtherBody) -> BodyFlight:
-    flown = compared(begun.path, body, sent.encoded, sent.trajectory, sent.trajectory.airframe, lost_alone())
-    return replace(begun, deviation=flown.deviation, own_deviation=flown.own_deviation, apart=flown.apart)
+def _by_bytes(encoded: EncodedFlight, trajectory: Trajectory, begun: BodyFlight, body: OtherBody) -> BodyFlight:
+    found = compared(begun.path, body, encoded, trajectory, trajectory.airframe, lost_alone())
+    return replace(begun, deviation=found.deviation, own_deviation=found.own_deviation, apart=found.apart)
 
 
 def _planned(network: TrainedNetwork, planner: str, path: Path) -> Trajectory:
-    asked = network_plan(network)
+    plan = network_plan(network)
     profiles: dict[str, Callable[[Path], SpeedProfile]] = {
-        TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert), NETWORK: asked,
-        CERTIFIED_NETWORK: lambda path: repair(paper_task(path), asked(path)).trajectory.profile,
+        TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert), NETWORK: plan,
+        CERTIFIED_NETWORK: lambda path: repair(paper_task(path), plan(path)).trajectory.profile,
         SHIPPED_PLANNER: shipped_profile,
     }  # fmt: skip
     return Trajectory(path, profiles[planner](path), PAPER.airframe)
 
 
-def _shipped(_: str, path: Path) -> Sent:
-    task = shipped_task(amid(path))
+def _sent(asked: Asked) -> tuple[EncodedFlight, Trajectory]:
+    """Return what is flown of a path, as bytes."""
+    if asked.table == HARDWARE:
+        way, limits = RAW if asked.planner == TOPPQUAD else CERTIFIED, paper_limits(load_limits(DEFAULTS), TRACKED)
+        return encoded_plan(way, asked.planner, None, asked.path, limits)
+    task = shipped_task(amid(asked.path))
     trajectory = refine(task, profile_of(plan_learned, task)).trajectory
-    return Sent(encode_trajectory(trajectory), trajectory)
-
-
-def _hardware(planner: str, path: Path) -> Sent:
-    limits = paper_limits(load_limits(DEFAULTS), TRACKED)
-    if planner == TOPPQUAD:
-        task = PlanningTask(path, limits.airframe, limits.plan, NODES, YawMode.FREE)
-        trajectory = Trajectory(path, profile_of(plan_toppquad, task), limits.airframe)
-        return Sent(encode_trajectory(trajectory, gains=gains_under(limits), space=limits.space), trajectory)
-    found = give_way(plan(path, limits.airframe, limits, yaw=YawMode.FREE))[0]
-    return Sent(encode_flight(PlannedFlight(planner, found, limits)), found.trajectory)
-
-
-_SENT = {SHIPPED: _shipped, HARDWARE: _hardware}
+    return encode_trajectory(trajectory), trajectory
 
 
 def tables(settings: Settings, rows: list[BodyFlight]) -> Iterator[Table]:

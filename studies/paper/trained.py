@@ -4,7 +4,7 @@ Training that was stopped goes on from its last epoch.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -170,7 +170,7 @@ def trained_networks(
     return found
 
 
-def identities(trained: Sequence[TrainedNetwork]) -> dict[str, Any]:
+def identities(trained: Iterable[TrainedNetwork]) -> dict[str, Any]:
     """Return what tells networks of the same names from others: their options, and a digest of their weights."""
     return {each.name: {**asdict(each.options), "weights": _digest(each.network)} for each in trained}
 

@@ -62,21 +62,6 @@ class PaperTrial:
     training: Mapping[str, Any] | None = None  # of the network that planned
 
     @property
-    def failed(self) -> bool:
-        """Return whether there was no flight, or one that crashed or was LOST."""
-        return not self.deviation < LOST
-
-    @property
-    def flown(self) -> bool:
-        """Return the contrary."""
-        return not self.failed
-
-    @property
-    def counted_deviation(self) -> float:
-        """Return the deviation, m, in which a failure counts as LOST."""
-        return LOST if self.failed else self.deviation
-
-    @property
     def slower(self) -> float:
         """Return by which fraction the plan takes longer than the reference's."""
         return self.travel_time / self.reference_time - 1.0
@@ -142,14 +127,19 @@ def path_trials(
     """Return what each planner planned, flown as it is and flown after repair; TOPPQuad is one of them."""
     trials: list[PaperTrial] = []
     for name, plan in plans.items():
-        if name not in _WARM:
-            with suppress(CfplanError):
-                plan(asked.path)  # loads and compiles
-            _WARM.add(name)
+        warm_up(name, partial(plan, asked.path))
         training = networks[name].training if name in networks else None
         trials += _both(plan, asked.path, PaperTrial(name, asked.part, asked.row, repaired=False, training=training))
     reference = next(trial.travel_time for trial in trials if trial.planner == TOPPQUAD)
     return [replace(trial, reference_time=reference) for trial in trials]
+
+
+def warm_up(name: str, ask: Callable[[], object]) -> None:
+    """Ask a planner once in this process, so that it is loaded and compiled before it is timed."""
+    if name not in _WARM:
+        with suppress(CfplanError):
+            ask()
+        _WARM.add(name)
 
 
 def _both(plan: Plan, path: Path, begun: PaperTrial) -> tuple[PaperTrial, PaperTrial]:
@@ -181,6 +171,25 @@ def _flown(trajectory: Trajectory, trial: PaperTrial) -> PaperTrial:
         asked_violation=flight.asked_violation,
         top_speed=float(np.linalg.norm(state.velocity, axis=1).max()),
     )
+
+
+def failed(flight: Any) -> bool:
+    """Return whether there was no flight, or one that crashed or was LOST."""
+    return not flight.deviation < LOST
+
+
+def flown(flight: Any) -> bool:
+    """Return the contrary."""
+    return not failed(flight)
+
+
+FAILED = Column("failed", "failures", of="paths", meaning=f"no plan, a crash, or {LOST:g} m from its place",
+                value=count(failed))  # fmt: skip
+DEVIATION = Column("deviation", "largest deviation", "m", ".3f", meaning=f"mean; a failure counts as {LOST:g} m",
+                   value=mean(lambda flight: LOST if failed(flight) else flight.deviation))  # fmt: skip
+DEVIATION_FLOWN = Column("deviation_flown", "without failures", "m", ".3f",
+                         meaning="the same, of flights that did not fail",
+                         value=among(flown, mean("deviation")))  # fmt: skip
 
 
 def planner_tables(
@@ -215,10 +224,8 @@ def planner_columns(what: str, printed: Mapping[tuple[str, str], PrintedRow]) ->
         Column("planner", what),
         Column("part", "paths"),
         Column("paths", "", meaning="number of them", value=count()),
-        Column("deviation", "largest deviation", "m", ".3f", meaning=f"mean; a failure counts as {LOST:g} m",
-               value=mean("counted_deviation")),
-        Column("deviation_flown", "without failures", "m", ".3f", meaning="the same, of flights that did not fail",
-               value=among("flown", mean("deviation"))),
+        DEVIATION,
+        DEVIATION_FLOWN,
         paper("deviation", unit="m", spec=".3f", meaning="the paper does not say which of the two"),
         Column("violation", "thrust violation", "N", ".4f",
                meaning="planned thrust beyond a motor's range, mean over time", value=mean("violation")),
@@ -227,10 +234,9 @@ def planner_columns(what: str, printed: Mapping[tuple[str, str], PrintedRow]) ->
         paper("violation", unit="N", spec=".3f"),
         Column("above", "speed above 5 m/s", "%", ".2f", meaning="the most on a path, mean", value=mean("above")),
         Column("slower", "time over TOPPQuad", "%", "+.2f", meaning="mean over paths", value=mean("slower")),
-        Column("slower_flown", "without failures", "%", "+.2f", value=among("flown", mean("slower"))),
+        Column("slower_flown", "without failures", "%", "+.2f", value=among(flown, mean("slower"))),
         paper("slower", unit="%", spec="+.2f"),
-        Column("failed", "failures", of="paths", meaning=f"no plan, a crash, or {LOST:g} m from its place",
-               value=count("failed")),
+        FAILED,
         paper("failed", unit="%", spec=".0f"),
         Column("seconds", "compute", "ms", ".1f", meaning="mean of the processor's time, one thread",
                value=mean("seconds")),

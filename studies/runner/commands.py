@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from cfplan.errors import CfplanError, InputError
-from studies import STUDIES
+from studies import COMMANDS, STUDIES
 from studies.runner.cases import Effort, run_study, write_result
 from studies.runner.options import parameters, settings_of
 from studies.runner.result import StudyResult, Table
@@ -24,12 +24,21 @@ class _Studies(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all studies, then of what makes pages of them."""
-        return [*sorted(STUDIES), *sorted(self.commands)]
+        return [*sorted(STUDIES), *sorted({*COMMANDS, *self.commands})]
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the studies, each with the first sentence of its help."""
+        found = ((name, self.get_command(ctx, name)) for name in self.list_commands(ctx))
+        with formatter.section("Studies"):
+            formatter.write_dl([(name, each.get_short_help_str(300)) for name, each in found if each is not None])
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         """Return the command of that name. Raises InputError where there is none."""
         if name in self.commands:
             return self.commands[name]
+        if name in COMMANDS:
+            found: click.Command = getattr(importlib.import_module(COMMANDS[name]), name)
+            return found
         if name not in STUDIES:
             near = get_close_matches(name, self.list_commands(ctx), n=1)
             meant = f"did you mean {near[0]}? " if near else ""
@@ -49,7 +58,7 @@ def study_command(name: str, module: str) -> click.Command:
             raise InputError("no such folder", where=str(output.parent), hint="make it first")
         settings = settings_of(study.settings, given)
         with progress_bars() as bar:
-            effort = Effort(workers, scheduler, minutes or float("inf"), output, _note, bar)
+            effort = Effort(workers, scheduler, minutes or float("inf"), output, note, bar)
             result = run_study(name, module, study, settings, effort)
         if output is not None:
             write_result(result, output)
@@ -62,13 +71,13 @@ def study_command(name: str, module: str) -> click.Command:
     return click.command(name, help=found.__doc__, epilog=example)(callback)
 
 
-_WORKERS = click.option(
+WORKERS = click.option(
     "--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine."
 )
-_SCHEDULER = click.option("--scheduler", metavar="ADDRESS", help="Dask cluster that works instead: tcp://host:port.")
+SCHEDULER = click.option("--scheduler", metavar="ADDRESS", help="Dask cluster that works instead: tcp://host:port.")
 _EFFORT = (
-    _WORKERS,
-    _SCHEDULER,
+    WORKERS,
+    SCHEDULER,
     click.option("--minutes", type=click.FloatRange(0, min_open=True), help="Time after which no case is begun."),
     click.option("-o", "--output", type=click.Path(path_type=Path), help="JSON file for the result."),
 )
@@ -76,7 +85,7 @@ _EFFORT = (
 
 @click.group(cls=_Studies, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 def studies() -> None:
-    """Measure cfplan: each study makes one result with its tables. Nobody who only flies needs them."""
+    """Measure cfplan: each study makes one result with its tables. Flying needs none of them."""
 
 
 @studies.command()
@@ -95,38 +104,6 @@ def pages(folder: Path, fresh: bool) -> None:
             f"README shows figures of {', '.join(old)}, measured with other sources", where="README.md",
             hint="measure them anew; each result names its command",
         )  # fmt: skip
-
-
-@studies.command(epilog="Example: python -m studies paper results --workers 2")
-@click.argument("folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path("results"))
-@click.option("--quick", is_flag=True, help="A few paths and epochs on data of their own: does all of it run?")
-@_WORKERS
-@_SCHEDULER
-def paper(folder: Path, quick: bool, workers: int, scheduler: str | None) -> None:
-    """Make the results of all of the paper's tables in DIR, one study after the other.
-
-    What is there already, of the same sources and settings, is kept, so that a run that was stopped goes on.
-    """
-    from studies.paper.all_tables import paper_results
-
-    with progress_bars() as bar:
-        effort = Effort(workers, scheduler, say=_note, progress=bar)
-        made = list(paper_results(folder, quick=quick, effort=effort))
-    for each in made:
-        print_result(each.result)
-    for each in made:
-        click.echo(f"{each.file}: {each.result.seconds:.0f} s of the processor{', kept' if each.kept else ''}")
-
-
-@studies.command(epilog="Example: python -m studies figures results docs/images")
-@click.argument("results", metavar="[RESULTS]", type=click.Path(path_type=Path), default=Path("results"))
-@click.argument("images", metavar="[IMAGES]", type=click.Path(path_type=Path), default=Path("docs/images"))
-def figures(results: Path, images: Path) -> None:
-    """Draw the paper's figures as .png in IMAGES from the results in RESULTS, where the rows of their cases are."""
-    from studies.paper.figures import write_figures
-
-    for file, reason in write_figures(results, images):
-        click.echo(f"{file}: left out: {reason}" if reason else file)
 
 
 def print_result(result: StudyResult) -> None:
@@ -169,7 +146,8 @@ def progress_bars() -> Iterator[Callable[[str], Progress]]:
         yield begin
 
 
-def _note(text: str) -> None:
+def note(text: str) -> None:
+    """Print a line on stderr."""
     click.echo(text, err=True)
 
 

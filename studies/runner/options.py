@@ -68,9 +68,9 @@ def _type(kind: type, each: Field) -> click.ParamType:
     if issubclass(kind, StrEnum):
         return click.Choice([each.value for each in kind])
     if kind is int:
-        return click.IntRange(min=None if least is None else int(least))
+        return click.INT if least is None else click.IntRange(int(least))
     if kind is float:
-        return click.FloatRange(min=least)
+        return click.FLOAT if least is None else click.FloatRange(least)
     return click.STRING
 
 

@@ -151,6 +151,7 @@ WIDE = [["learned, refined", *(f"{number:.1f} ms" for number in range(15))], ["c
             [[f"{name}, refined", "801.1 ms", "2407.7 ms", "124.0×"] for name in ("learned", "expert", "convex")] * 3,
         ),
         (["limit", "worst", "allowed"], [["angular acceleration", "34.93 rad/s²", "35.00"]]),
+        (["", "flown [1]", "of [red]two"], [["a [b]", "1.0 m", "–"]]),
         (["", "value"], [["streamed", "655, each as committed, until a pose was too old, after 6.55 s"]]),
     ],
 )

@@ -123,8 +123,8 @@ def _spoil_sd(_: None, chance: Random, folder: Path) -> None:
 # .tlog
 
 
-def _tlog(folder: Path) -> bytes:
-    return logs.sound(folder, "tlog")
+def _tlog(_: Path) -> bytes:
+    return logs.SOUND["tlog"]
 
 
 def _spoil_tlog(sound: bytes, chance: Random, folder: Path) -> None:
@@ -155,11 +155,9 @@ def _absurd_packets(chance: Random, v1: bool, i: int) -> list[Any]:
 
 def _bag(_: Path) -> list[tuple[str, list[bytes]]]:
     """Return each kind of message as a bag holds it."""
-    types, found = logs.store(), []
-    for kind, (_, message_at) in logs.MESSAGES.items():
-        raws = [bytes(types.serialize_cdr(message_at(types.types, i), kind)) for i in range(logs.COUNT)]
-        found.append((kind, raws))
-    return found
+    return [
+        (kind, [logs.cdr(*message_at(i)) for i in range(logs.COUNT)]) for kind, (_, message_at) in logs.MESSAGES.items()
+    ]
 
 
 def _spoil_bag(sound: list[tuple[str, list[bytes]]], chance: Random, folder: Path) -> None:

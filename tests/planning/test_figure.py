@@ -21,7 +21,7 @@ def made(limits):
 def figure(made):
     time = np.linspace(0.0, made.trajectory.duration, 200)
     off = 0.05 * np.sin(np.pi * np.linspace(0.0, 1.0, 200))
-    return draw_plan(made, "bent", Flown(time, made.trajectory.at(time).position + off[:, None] * [1.0, 0, 0], off))
+    return draw_plan(made, r"$\bent$", Flown(time, made.trajectory.at(time).position + off[:, None] * [1.0, 0, 0], off))
 
 
 def test_the_room_is_drawn_in_one_scale_and_not_mirrored(figure, limits):

@@ -11,7 +11,6 @@ from cfplan.cli.output import print_json
 from cfplan.errors import InputError
 from cfplan.flight.telemetry import Event as Message
 from cfplan.flight.telemetry import Level, PoseReceived, SetpointSent
-from cfplan.recording.importers import usd_log
 from cfplan.recording.importers.formats import read_log
 from cfplan.recording.overlay import Trial, trial_of_record
 from cfplan.recording.plausible import check_times
@@ -125,15 +124,6 @@ def test_a_cell_that_only_one_reader_takes_for_a_number_is_no_traceback(tmp_path
     file.write_text(file.read_text().rstrip("\n") + ending)
     with contextlib.suppress(InputError):
         read_log(file)
-
-
-def test_a_microsd_log_that_ends_behind_its_head_is_named(tmp_path):
-    file = tmp_path / "log"
-    file.write_bytes(b"\xbc\x02\x00\x01\x00\xff\xfffixedFrequency\0\x03\x00" + b"".join(
-        f"stateEstimate.{axis}(f)\0".encode() for axis in "xyz"
-    ))  # fmt: skip
-    with pytest.raises(InputError, match="before its first record"):
-        usd_log.read(file)
 
 
 def test_what_is_drawn_is_bounded(tmp_path):

@@ -5,7 +5,7 @@ A warm start: from a near-feasible profile the search of the expert's problem ta
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -21,7 +21,6 @@ from cfplan.planners.expert.problem import FLOOR, Ends, Problem, Segment, build_
 from cfplan.planners.expert.search import (
     COLD_START,
     Attempt,
-    Start,
     refining_again,
     refining_restarts,
     refining_starts,
@@ -62,15 +61,11 @@ def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = LO
     return last
 
 
-def refinements(
-    task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = LONG_WINDOW,
-    restarts: Callable[..., Sequence[Start]] = refining_restarts,
-) -> Iterator[Solution]:  # fmt: skip
+def refinements(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = LONG_WINDOW) -> Iterator[Solution]:
     """Yield the refined profile, after each round in which limits exceeded between points are lowered.
 
     The first mostly passes the certificate. A path longer than `window` is planned window by window; its profile comes
     once, after all rounds. A failure comes alone. At the task's deadline what is not refined yet stays as given.
-    `restarts` gives the searches of those rounds, for a path that is not.
     """
     began = time.perf_counter()
     path, limits, nodes = task.path, task.limits, len(profile.s) - 1
@@ -94,7 +89,7 @@ def refinements(
     if isinstance(found, str):
         yield _solution(whole, found, began, task.deadline)
         return
-    starts = restarts(found.interval, capped=task.speed_caps is not None)
+    starts = refining_restarts(found.interval, capped=task.speed_caps is not None)
     for held in tighten(found.attempt, found.problem, whole, starts, task.deadline):
         yield solution_of(whole, Joined(held.coefficients, (), held.iterations, held.rounds), began)
 

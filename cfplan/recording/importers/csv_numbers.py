@@ -1,5 +1,6 @@
 """Read columns of numbers from the text of a file."""
 
+import io
 import re
 from collections.abc import Sequence
 
@@ -19,23 +20,24 @@ _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)", re.IGN
 def read_numbers(
     data: bytes, begin: int, end: int, columns: Sequence[int], width: int, where: str, *, delimiter: str = ",",
     point: str = ".",
-) -> tuple[NDArray, bool]:  # fmt: skip
-    """Return (rows, columns), NaN for empty cells, and whether the last line was cut off, which is then left out.
+) -> tuple[dict[int | str, NDArray], bool]:  # fmt: skip
+    """Return each of `columns`, NaN for empty cells, and whether the last line was cut off, which is then left out.
 
     Lines from byte `begin` to `end` have `width` cells each; `point` is that of the decimals.
 
     Raises InputError with the file's line where one has another number of cells, or a cell of `columns` is no number.
     """
     if begin == end:
-        return np.empty((0, len(columns))), False
-    names = [str(index) for index in range(width)]
-    kept = [names[column] for column in columns]
+        return {column: np.empty(0) for column in columns}, False
+    kept = [str(column) for column in columns]
     try:
         table = csv.read_csv(
             pa.BufferReader(memoryview(data)[begin:end]),
-            read_options=csv.ReadOptions(column_names=names, block_size=max(_BLOCK, _LONGEST_CELL * width)),
-            parse_options=csv.ParseOptions(delimiter=delimiter),
-            convert_options=csv.ConvertOptions(
+            csv.ReadOptions(
+                column_names=[str(index) for index in range(width)], block_size=max(_BLOCK, _LONGEST_CELL * width)
+            ),
+            csv.ParseOptions(delimiter=delimiter),
+            csv.ConvertOptions(
                 include_columns=kept,
                 column_types=dict.fromkeys(kept, pa.float64()),
                 null_values=_NO_NUMBER,
@@ -45,16 +47,14 @@ def read_numbers(
     except pa.ArrowInvalid:
         last = max(data.rfind(b"\n", begin, end) + 1, begin)
         if last < end == len(data):  # the file ends within a line
-            rows, _ = read_numbers(data, begin, last, columns, width, where, delimiter=delimiter, point=point)
-            return rows, True
+            return read_numbers(data, begin, last, columns, width, where, delimiter=delimiter, point=point)[0], True
         raise _mistake(data, begin, end, columns, width, where, delimiter, point) from None
-    return np.stack([column.to_numpy() for column in table.columns], axis=1), False
+    return {column: values.to_numpy() for column, values in zip(columns, table.columns, strict=True)}, False
 
 
-def place(data: bytes, offset: int, where: str) -> str:
-    """Return `file:line` of a byte."""
-    line = data.count(b"\n", 0, offset) + 1
-    return f"{where}:{line}"
+def line_at(data: bytes, offset: int) -> int:
+    """Return the number of the line, from 1, that holds a byte."""
+    return data.count(b"\n", 0, offset) + 1
 
 
 def _mistake(
@@ -62,28 +62,20 @@ def _mistake(
 ) -> InputError:
     """Find the first line, and the cell in it, that is not a row of numbers."""
     with_point = str.maketrans({point: ".", ".": point})
-    start = begin
-    while start < end:
-        after = data.find(b"\n", start, end) + 1 or end
-        line = data[start:after].decode("utf-8", errors="replace").strip("\r\n")
-        cells = line.split(delimiter)
-        if line and len(cells) != width:
-            return InputError(
-                f"{len(cells)} cells, {width} in the lines before it",
-                where=place(data, start, where),
-                hint="export it again, or remove the line",
-            )
-        for column in columns if line else ():
-            text = cells[column].strip().strip('"')
-            if text not in _NO_NUMBER and not _NUMBER.fullmatch(text.translate(with_point)):
-                return InputError(
-                    f"{text[:30]!r} in column {column + 1} is not a number",
-                    where=place(data, start, where),
-                    hint="export it again, or leave the cell empty: not seen",
-                )
-        start = after
+    for number, line in enumerate(io.BytesIO(data[begin:end]), line_at(data, begin)):
+        text = line.decode("utf-8", errors="replace").strip("\r\n")
+        cells = text.split(delimiter)
+        if text and len(cells) != width:
+            message, hint = f"{len(cells)} cells, {width} in the lines before it", "export it again, or remove the line"
+            return InputError(message, where=f"{where}:{number}", hint=hint)
+        for column in columns if text else ():
+            cell = cells[column].strip().strip('"')
+            if cell not in _NO_NUMBER and not _NUMBER.fullmatch(cell.translate(with_point)):
+                message = f"{cell[:30]!r} in column {column + 1} is not a number"
+                hint = "export it again, or leave the cell empty: not seen"
+                return InputError(message, where=f"{where}:{number}", hint=hint)
     return InputError(
         "the numbers behind this line cannot be read",
-        where=place(data, begin, where),
+        where=f"{where}:{line_at(data, begin)}",
         hint="export the log again, with plain decimal numbers and without quotes",
     )

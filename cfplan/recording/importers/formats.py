@@ -11,7 +11,7 @@ from cfplan.recording.plausible import check_places, check_times
 
 _HEAD = 4096  # bytes by which a format is recognised
 
-# Each has its name FORMAT, recognises(file, first bytes; none where it is a folder) and read(file).
+# Each has its name FORMAT, HEAD that matches the first bytes of a file, read(file), and EXTRA if it needs one.
 IMPORTERS = (usd_log, ros_bag, tlog, named_csv, vicon_csv)
 
 
@@ -25,6 +25,9 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
     importer = find_importer(file)
     try:
         log: MocapLog = vicon_csv.read(file, rotations) if importer is vicon_csv else importer.read(file)
+    except ImportError as error:
+        message = f"a {importer.FORMAT} needs the package {str(error.name).partition('.')[0]}"
+        raise InputError(message, where=str(file), hint=f"pip install 'cfplan[{importer.EXTRA}]'") from error
     except OSError as error:
         message = f"cannot be read ({error.strerror or error})"
         raise InputError(message, where=str(file), hint="check its permissions, or copy it again") from error
@@ -39,9 +42,11 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
 
 def find_importer(file: Path) -> ModuleType:
     """Return the importer that recognises the file. Raises InputError if absent, empty, or of no known format."""
+    if (file / "metadata.yaml").is_file():
+        return ros_bag
     head = b"" if file.is_dir() else _first_bytes(file)
     for importer in IMPORTERS:
-        if importer.recognises(file, head):
+        if importer.HEAD.match(head):
             return importer
     if head.startswith(b"RRF"):
         hint = "open it with `rerun FILE`; `rerun rrd merge FILE -o NEW` repairs one that is cut off"

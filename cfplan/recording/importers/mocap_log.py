@@ -1,13 +1,28 @@
-"""The poses of each subject in a log of motion capture or of a vehicle, and what all importers assemble them with."""
+"""The poses of each subject in a log of motion capture or of a vehicle, and how columns of a table become one.
 
-from collections.abc import Callable, Sequence
+A format declares in a table which of its columns holds which channel, in which unit; `subject` does the rest.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
+
+Table = Mapping[Any, NDArray]  # columns, (N,) each, by a format's own keys; times, in s, are "t"
+Columns = Mapping[str, tuple[Any, float]]  # channel: the key of its column, and the factor to SI units
+
+PLACE = ("x", "y", "z")
+QUATERNION = ("qx", "qy", "qz", "qw")
+YAW_PITCH_ROLL = ("yaw", "pitch", "roll")  # about z, then the turned y, then the turned x
+ROTATION_VECTOR = ("rx", "ry", "rz")
+EULER_XYZ = ("ex", "ey", "ez")  # about x, then the turned y, then the turned z
+POSE: Columns = {channel: (channel, 1.0) for channel in (*PLACE, *QUATERNION)}  # of tables that use our own names
 
 _LISTED = 12  # names that an error lists at most
 _LENGTH_TOLERANCE = 0.05  # of a quaternion whose length must be 1
@@ -52,38 +67,65 @@ class MocapLog:
         return tuple(by_name[name] for name in names) if names else self.subjects
 
 
-def growing(time: NDArray, rows: str, notes: list[str]) -> NDArray:
-    """Return (N,) whether a time is later than all before it; a note counts the others of these `rows`."""
+def in_order(table: Table, rows: str, notes: list[str]) -> Table:
+    """Return the rows whose time is later than all before it; a note counts the others of these `rows`."""
+    time = table["t"]
     latest = np.maximum.accumulate(np.where(np.isfinite(time), time, -np.inf))
     keep = np.isfinite(time) & (time > np.r_[-np.inf, latest[:-1]])
-    if not keep.all():
-        notes.append(f"{np.sum(~keep)} {rows} left out, as their times do not grow")
-    return keep
+    if keep.all():
+        return table
+    notes.append(f"{np.sum(~keep)} {rows} left out, as their times do not grow")
+    return {key: column[keep] for key, column in table.items()}
 
 
-def unknown_rotations(count: int) -> NDArray:
-    """Return (N, 4) quaternions of NaN."""
-    return np.full((count, 4), np.nan)
+def subject(name: str, table: Table, columns: Columns = POSE, *, where: str = "") -> LoggedSubject:
+    """Return the poses that the columns hold; those of an attitude may be absent.
+
+    Raises InputError, if `where` names the file, at the first quaternion whose length is neither 1 nor 0.
+    """
+    channels = {c: np.asarray(table[key], dtype=float) * unit for c, (key, unit) in columns.items() if key in table}
+    if where and set(channels) >= set(QUATERNION):
+        _check_lengths(_stack(channels, QUATERNION), table["t"], name, where)
+    return LoggedSubject(name, table["t"], _stack(channels, PLACE), attitude(channels))
+
+
+def attitude(channels: Table) -> NDArray:
+    """Return (N, 4) quaternions of the channels of an attitude, NaN where they state none."""
+    for names, quaternion in _ATTITUDES.items():
+        if channels.keys() >= set(names):
+            return quaternion(_stack(channels, names))
+    return np.full((len(next(iter(channels.values()))), 4), np.nan)
 
 
 def quaternions(values: NDArray, rotation: Callable[[NDArray], Rotation]) -> NDArray:
     """Return (N, 4) of the rotation that each row states, NaN where one of its values is not finite."""
-    quaternion = unknown_rotations(len(values))
+    quaternion = np.full((len(values), 4), np.nan)
     known = np.isfinite(values).all(axis=1)
     if known.any():
         quaternion[known] = rotation(values[known]).as_quat()
     return quaternion
 
 
-def unit_quaternions(quaternion: NDArray) -> NDArray:
+def _unit_quaternions(quaternion: NDArray) -> NDArray:
     """Return them (N, 4) with length 1; NaN where that is 0 or not finite, as in logs where nothing was seen."""
     with np.errstate(all="ignore"):
         length = np.linalg.norm(quaternion, axis=1, keepdims=True)
         return quaternion / np.where((length > 0) & (length < np.inf), length, np.nan)
 
 
-def check_lengths(quaternion: NDArray, time: NDArray, name: str, *, where: str) -> None:
-    """Raise InputError at the first quaternion, of (N, 4), whose length is neither 1 nor 0: it is something else."""
+_ATTITUDES: dict[tuple[str, ...], Callable[[NDArray], NDArray]] = {  # the first whose channels are there is taken
+    QUATERNION: _unit_quaternions,
+    YAW_PITCH_ROLL: partial(quaternions, rotation=partial(Rotation.from_euler, "ZYX")),
+    ROTATION_VECTOR: partial(quaternions, rotation=Rotation.from_rotvec),
+    EULER_XYZ: partial(quaternions, rotation=partial(Rotation.from_euler, "XYZ")),
+}
+
+
+def _stack(channels: Table, names: tuple[str, ...]) -> NDArray:
+    return np.stack([channels[name] for name in names], axis=1)
+
+
+def _check_lengths(quaternion: NDArray, time: NDArray, name: str, where: str) -> None:
     with np.errstate(all="ignore"):
         length = np.linalg.norm(quaternion, axis=1)
     wrong = np.flatnonzero((np.abs(length - 1) > _LENGTH_TOLERANCE) & (length > 0))

@@ -3,28 +3,17 @@
 crazyswarm2 writes `timestamp,x,y,z,qw,qx,qy,qz`, and `cfplan export --to samples` `t`, places, velocities and more.
 """
 
+import re
 from pathlib import Path
 
 from cfplan.errors import InputError
 from cfplan.recording.importers.csv_numbers import read_numbers
-from cfplan.recording.importers.mocap_log import (
-    LoggedSubject,
-    MocapLog,
-    check_lengths,
-    growing,
-    unit_quaternions,
-    unknown_rotations,
-)  # fmt: skip
+from cfplan.recording.importers.mocap_log import PLACE, QUATERNION, MocapLog, in_order, subject
 
 FORMAT = "CSV of t, x, y, z"
 TIMES = ("t", "time", "timestamp")  # what the column of times may be called
-PLACE, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
-
-
-def recognises(file: Path, head: bytes) -> bool:
-    """Return whether the first line names the columns."""
-    names = _names(head)
-    return bool(set(TIMES) & set(names)) and bool({"x", "qw"} & set(names))
+_COLUMN = r"(?=(?:[^\n]*,)?[ \t\"]*(?:%s)[ \t\"]*(?:[,\r\n]|\Z))"  # in the first line
+HEAD = re.compile((r"(?:\xef\xbb\xbf)?" + _COLUMN % "|".join(TIMES) + _COLUMN % "x|qw").encode())
 
 
 def read(file: Path) -> MocapLog:
@@ -32,24 +21,17 @@ def read(file: Path) -> MocapLog:
     data = file.read_bytes()
     begin = data.find(b"\n") + 1 or len(data)
     names = _names(data[:begin])
-    turned = bool(set(QUATERNION) & set(names))
-    wanted = (next(name for name in TIMES if name in names), *PLACE, *(QUATERNION if turned else ()))
-    missing = [name for name in wanted if name not in names]
-    if missing:
-        raise InputError(
-            f"there is no column {', '.join(missing)}",
-            where=f"{file}:1",
-            hint="the first line names the columns t, x, y, z, and where attitudes are known qx, qy, qz and qw",
-        )
-    columns = [names.index(name) for name in wanted]
-    values, cut = read_numbers(data, begin, len(data), columns, len(names), str(file))
+    channels = PLACE + (QUATERNION if set(QUATERNION) & set(names) else ())
+    if missing := [name for name in channels if name not in names]:
+        hint = "the first line names the columns t, x, y, z, and where attitudes are known qx, qy, qz and qw"
+        raise InputError(f"there is no column {', '.join(missing)}", where=f"{file}:1", hint=hint)
+    time = names.index(next(name for name in TIMES if name in names))
+    columns = {channel: (names.index(channel), 1.0) for channel in channels}
+    wanted = [time, *(column for column, _ in columns.values())]
+    table, cut = read_numbers(data, begin, len(data), wanted, len(names), str(file))
     notes = ["the last line is cut off and left out"] if cut else []
-    values = values[growing(values[:, 0], "rows", notes)]
-    time, position, quaternion = values[:, 0], values[:, 1:4], values[:, 4:]
-    if turned:
-        check_lengths(quaternion, time, file.stem, where=str(file))
-    quaternion = unit_quaternions(quaternion) if turned else unknown_rotations(len(time))
-    return MocapLog(FORMAT, (LoggedSubject(file.stem, time, position, quaternion),), tuple(notes), truncated=cut)
+    ordered = in_order({**table, "t": table[time]}, "rows", notes)
+    return MocapLog(FORMAT, (subject(file.stem, ordered, columns, where=str(file)),), tuple(notes), truncated=cut)
 
 
 def _names(head: bytes) -> list[str]:

@@ -7,6 +7,8 @@ east and y north (LOCAL_NED), or x forward (LOCAL_FRD).
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -14,55 +16,52 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from cfplan.errors import InputError
 from cfplan.recording.importers.mocap_log import (
+    PLACE,
+    QUATERNION,
+    YAW_PITCH_ROLL,
     LoggedSubject,
     MocapLog,
-    growing,
+    Table,
+    attitude,
+    in_order,
     quaternions,
-    unit_quaternions,
-    unknown_rotations,
+    subject,
 )  # fmt: skip
 
-FORMAT = "MAVLink .tlog"
-V1, V2 = 0xFE, 0xFD  # first bytes of a packet
-_MAGIC = re.compile(rb"[\xfd\xfe]")
+FORMAT, EXTRA = "MAVLink .tlog", "mavlink"
+_TIME = rb"\0[\x03-\x0e].{6}"  # between 1996 and 2103
+HEAD = re.compile(_TIME + rb"(?:[\xfd\xfe]|\Z)", re.DOTALL)  # the packet after it may be cut off
+_PACKET = re.compile(  # length, flags and kind of version 2; length and kind of version 1
+    _TIME + rb"(?:\xfd(?P<size>.)(?P<flags>.).{4}(?P<kind>...)|\xfe(?P<size_1>.)...(?P<kind_1>.))", re.DOTALL
+)
 _STAMP = 8  # bytes before each packet
 _SIGNED = 0x01  # of a v2 packet's incompatibility flags: 13 bytes of signature follow
-_LARGEST = 300  # bytes of a packet
-_FIRST, _LAST = 946_684_800_000_000, 4_102_444_800_000_000  # µs: 2000 and 2100, between which a log was made
 _LOCAL_FRD = 20
 _LOCAL_POSITION, _ATTITUDE, _ATTITUDE_QUATERNION, _ODOMETRY, _SETPOINT = 32, 30, 31, 331, 85
-_COLUMNS: dict[int, Callable[[Any], list[float]]] = {  # message: its place, its frame, its attitude
-    _LOCAL_POSITION: lambda m: [m.x, m.y, m.z],
-    _ATTITUDE: lambda m: [m.yaw, m.pitch, m.roll],
-    _ATTITUDE_QUATERNION: lambda m: [m.q2, m.q3, m.q4, m.q1],
-    _ODOMETRY: lambda m: [m.x, m.y, m.z, m.frame_id, *m.q[1:], m.q[0]],
-    _SETPOINT: lambda m: [m.x, m.y, m.z, m.coordinate_frame],
+_MESSAGES: dict[int, tuple[tuple[str, ...], Callable[[Any], Any]]] = {  # message: channels, and their fields
+    _LOCAL_POSITION: (PLACE, attrgetter("x", "y", "z")),
+    _ATTITUDE: (YAW_PITCH_ROLL, attrgetter("yaw", "pitch", "roll")),
+    _ATTITUDE_QUATERNION: (QUATERNION, attrgetter("q2", "q3", "q4", "q1")),
+    _ODOMETRY: ((*PLACE, "frame", *QUATERNION), lambda m: (m.x, m.y, m.z, m.frame_id, *m.q[1:], m.q[0])),
+    _SETPOINT: ((*PLACE, "frame"), attrgetter("x", "y", "z", "coordinate_frame")),
 }
+_SUBJECTS = {_ODOMETRY: " odometry", _LOCAL_POSITION: "", _SETPOINT: " setpoint"}  # message: what follows the name
 _NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])  # its own inverse; x and y change places, z turns over
 _FRD = Rotation.from_matrix([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
 _LONGEST_GAP = 0.5  # s between attitudes; over longer ones none is made up
 
 
-def recognises(file: Path, head: bytes) -> bool:
-    """Return whether a plausible time stands before a packet's first byte."""
-    return len(head) > 8 and head[8] in (V1, V2) and _FIRST < int.from_bytes(head[:8], "big") < _LAST
-
-
 def read(file: Path) -> MocapLog:
     """Read the positions that each vehicle reported and the setpoints it followed; other bytes are skipped.
 
-    Raises InputError where the extra is not installed.
+    Raises ImportError without the extra.
     """
-    try:
-        from pymavlink.dialects.v20 import common
-    except ImportError as error:
-        hint = "pip install 'cfplan[mavlink]'"
-        raise InputError(".tlog files need the package pymavlink", where=str(file), hint=hint) from error
+    from pymavlink.dialects.v20 import common
+
     notes: list[str] = []
     packets, truncated = _packets(file.read_bytes(), notes)
-    rows: dict[tuple[int, int], list[list[float]]] = defaultdict(list)
+    rows: dict[tuple[int, int], list[tuple[float, ...]]] = defaultdict(list)
     decoder = common.MAVLink(None)
     broken = 0
     for time, packet in packets:
@@ -72,87 +71,65 @@ def read(file: Path) -> MocapLog:
             broken += 1
             continue
         kind = message.get_msgId()
-        rows[message.get_srcSystem(), kind].append([time, *_COLUMNS[kind](message)])
+        rows[message.get_srcSystem(), kind].append((time, *_MESSAGES[kind][1](message)))
     if broken:
         notes.append(f"{broken} packets left out, as their checksums are wrong")
     if truncated:
         notes.append("the last packet is cut off and left out")
-    start = min((table[0][0] for table in rows.values()), default=0.0)
-    systems: dict[int, dict[int, NDArray]] = defaultdict(dict)
+    start = min((listed[0][0] for listed in rows.values()), default=0.0)
+    systems: dict[int, dict[int, Table]] = defaultdict(dict)
     for (system, kind), listed in sorted(rows.items()):
-        table = np.array(listed)
-        table = table[growing(table[:, 0], f"messages {kind} of vehicle {system}", notes)]
-        table[:, 0] -= start
-        systems[system][kind] = table
-    subjects = [subject for system, tables in systems.items() for subject in _subjects(f"vehicle {system}", tables)]
+        time, *columns = np.array(listed).T
+        table = {"t": time - start, **dict(zip(_MESSAGES[kind][0], columns, strict=True))}
+        systems[system][kind] = in_order(table, f"messages {kind} of vehicle {system}", notes)
+    subjects = [found for system, tables in systems.items() for found in _subjects(f"vehicle {system}", tables)]
     return MocapLog(FORMAT, tuple(subjects), tuple(notes), truncated)
 
 
 def _packets(data: bytes, notes: list[str]) -> tuple[list[tuple[float, bytes]], bool]:
     """Return (time in s, bytes) of each packet of a kind that is read, and whether the last packet is cut off."""
-    packets, skipped, place, cut = [], 0, 0, False
-    while place < len(data) and not cut:
-        size, kind = _size_and_kind(data[place : place + _STAMP + 10])
-        after = place + _STAMP + size
-        if size == 0:
-            found = _MAGIC.search(data, place + _STAMP + 1)
-            after = found.start() - _STAMP if found else len(data)
-            skipped += after - place
-        elif after > len(data):
-            cut = True
-        elif kind in _COLUMNS:
-            time = int.from_bytes(data[place : place + _STAMP], "big") * 1e-6
-            packets.append((time, data[place + _STAMP : after]))
-        place = after
+    packets, skipped, place = [], 0, 0
+    while head := _PACKET.search(data, place):
+        skipped += head.start() - place
+        size = 12 + head["size"][0] + 13 * (head["flags"][0] & _SIGNED) if head["size"] else 8 + head["size_1"][0]
+        place = head.start() + _STAMP + size
+        kind = int.from_bytes(head["kind"] or head["kind_1"], "little")
+        if kind in _MESSAGES and place <= len(data):
+            time = int.from_bytes(head[0][:_STAMP], "big") * 1e-6
+            packets.append((time, data[head.start() + _STAMP : place]))
+    cut = place > len(data) or HEAD.match(data, place) is not None
+    skipped += 0 if cut else len(data) - place
     if skipped:
         notes.append(f"{skipped} bytes skipped that are no packet")
     return packets, cut
 
 
-def _size_and_kind(begin: bytes) -> tuple[int, int]:
-    """Return length and kind of the packet behind a time; length 0 where there is none."""
-    head = begin[_STAMP:]
-    if not _FIRST < int.from_bytes(begin[:_STAMP], "big") < _LAST:
-        return 0, 0
-    if len(head) == 10 and head[0] == V2:
-        return 12 + head[1] + (13 if head[2] & _SIGNED else 0), int.from_bytes(head[7:10], "little")
-    if len(head) >= 6 and head[0] == V1:
-        return 8 + head[1], head[5]
-    if not head or head[0] in (V1, V2):
-        return _LARGEST, -1  # cut off within its head
-    return 0, 0
+def _subjects(name: str, tables: dict[int, Table]) -> Iterator[LoggedSubject]:
+    """Yield what one vehicle's messages say, in our axes."""
+    for kind, suffix in _SUBJECTS.items():
+        if kind not in tables:
+            continue
+        found = subject(name + suffix, tables[kind])
+        world = _FRD if tables[kind].get("frame", (0,))[-1] == _LOCAL_FRD else _NED
+        reported = _attitude_at(found.time, tables) if kind == _LOCAL_POSITION else found.quaternion
+        turned = quaternions(reported, partial(_turned, world))
+        with np.errstate(invalid="ignore"):  # a vehicle may report NaN or infinity
+            yield LoggedSubject(found.name, found.time, found.position @ world.as_matrix().T, turned)
 
 
-def _subjects(name: str, tables: dict[int, NDArray]) -> Iterator[LoggedSubject]:
-    if (odometry := tables.get(_ODOMETRY)) is not None:
-        yield _subject(f"{name} odometry", odometry, _frame(odometry), unit_quaternions(odometry[:, 5:]))
-    if (local := tables.get(_LOCAL_POSITION)) is not None:
-        yield _subject(name, local, _NED, _attitude_at(local[:, 0], tables))
-    if (setpoint := tables.get(_SETPOINT)) is not None:
-        yield _subject(f"{name} setpoint", setpoint, _frame(setpoint), unknown_rotations(len(setpoint)))
+def _turned(world: Rotation, reported: NDArray) -> Rotation:
+    return world * Rotation.from_quat(reported) * _FRD
 
 
-def _frame(table: NDArray) -> Rotation:
-    return _FRD if len(table) and table[-1, 4] == _LOCAL_FRD else _NED
-
-
-def _subject(name: str, table: NDArray, world: Rotation, quaternion: NDArray) -> LoggedSubject:
-    turned = quaternions(quaternion, lambda known: world * Rotation.from_quat(known) * _FRD)
-    with np.errstate(invalid="ignore"):  # a vehicle may report NaN or infinity
-        return LoggedSubject(name, table[:, 0], table[:, 1:4] @ world.as_matrix().T, turned)
-
-
-def _attitude_at(time: NDArray, tables: dict[int, NDArray]) -> NDArray:
+def _attitude_at(time: NDArray, tables: dict[int, Table]) -> NDArray:
     """Return (N, 4) the attitude at each time, NaN where none was reported nearby."""
-    found = unknown_rotations(len(time))
-    if (table := tables.get(_ATTITUDE_QUATERNION)) is not None:
-        turn = unit_quaternions(table[:, 1:])
-    elif (table := tables.get(_ATTITUDE)) is not None:
-        turn = quaternions(table[:, 1:], lambda angles: Rotation.from_euler("ZYX", angles))
-    else:
+    found = np.full((len(time), 4), np.nan)
+    table = tables.get(_ATTITUDE_QUATERNION, tables.get(_ATTITUDE))
+    if table is None:
         return found
+    turn = attitude(table)
     known = np.isfinite(turn).all(axis=1)
-    stamps, turn = table[known, 0], turn[known]
+    stamps, turn = table["t"][known], turn[known]
     if len(stamps) < 2:
         return found
     after = np.clip(np.searchsorted(stamps, time), 1, len(stamps) - 1)

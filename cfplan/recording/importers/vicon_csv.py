@@ -1,40 +1,27 @@
 """Read Vicon Tracker's and Nexus's CSV: sections of frames at a fixed rate, a subject every few columns."""
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
-from cfplan.recording.importers.csv_numbers import place, read_numbers
-from cfplan.recording.importers.mocap_log import (
-    LoggedSubject,
-    MocapLog,
-    check_lengths,
-    growing,
-    quaternions,
-    unit_quaternions,
-    unknown_rotations,
-)  # fmt: skip
+from cfplan.recording.importers.csv_numbers import line_at, read_numbers
+from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, Table, in_order, subject
 from cfplan.recording.importers.vicon_header import Group, Rotations, Section, read_head
 
 FORMAT = "Vicon CSV"
 LARGEST_ROOM = 100.0  # m from the origin; beyond it the unit is wrong
 _MARK = b"\xef\xbb\xbf"  # of the byte order, as some programs write it first
-_BEGIN = re.compile(rb"[\s,;\"]*[A-Za-z][\w ]*\"?[,;\t ]*\r?\n\"?[\d.,]+\"?[,;\t ]*\r?\n")
-_FRAME = re.compile(rb"(?m)^\"?frame\"?[,;\t]\"?sub ?frame", re.IGNORECASE)
-_LEADING = re.compile(rb"[\s,;]*")
+HEAD = re.compile(  # a section's name and its rate, or in some line the columns Frame and Sub Frame
+    rb"(?:\xef\xbb\xbf)?(?:[\s,;\"]*[A-Za-z][\w ]*\"?[,;\t ]*\r?\n\"?[\d.,]+\"?[,;\t ]*\r?\n"
+    rb"|(?s:.*\n|)(?i:\"?frame\"?[,;\t]\"?sub ?frame))"
+)
 _BLANK = re.compile(rb"\n[ \t,;\r]+(?=\n|\Z)")
+_LEADING = re.compile(rb"[\s,;]*")
 _SECTION = re.compile(rb"\n\n+(?=[^\n\d\"-])")  # what begins with a number goes on with the frames before
-_HEAD = re.compile(rb"(?:[^\n]*\n?){5}")
-
-
-def recognises(file: Path, head: bytes) -> bool:
-    """Return whether two lines are a section's name and rate, or there are columns Frame and Sub Frame."""
-    head = head.removeprefix(_MARK)
-    return bool(head) and (_BEGIN.match(head) is not None or _FRAME.search(head) is not None)
+_FIVE_LINES = re.compile(rb"(?:[^\n]*\n?){5}")
 
 
 def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
@@ -45,42 +32,38 @@ def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
     Raises InputError where a head, a unit or a number is wrong; a last line that is cut off only ends the log.
     """
     data = _BLANK.sub(b"\n", file.read_bytes().removeprefix(_MARK))
-    first = _LEADING.match(data).end()  # type: ignore[union-attr]  # it always matches
-    begins = [first, *(match.end() for match in _SECTION.finditer(data, first))]
     subjects: dict[str, LoggedSubject] = {}
-    sections: list[Section] = []
     notes: list[str] = []
+    rates: dict[str, None] = {}
+    assumed: list[str] = []
     origin, truncated = None, False
-    for begin, end in zip(begins, [*begins[1:], len(data)], strict=True):
-        frames = _HEAD.match(data, begin, end).end()  # type: ignore[union-attr]  # it always matches
-        lines = data[begin:frames].decode("utf-8", errors="replace").removesuffix("\n").split("\n")
-        section = read_head(lines, where=place(data, begin, str(file)), rotations=rotations)
-        sections.append(section)
+    first = _LEADING.match(data).end()  # type: ignore[union-attr]  # it always matches
+    for begin, end in pairwise([first, *(match.end() for match in _SECTION.finditer(data, first)), len(data)]):
+        head: re.Match[bytes] = _FIVE_LINES.match(data, begin, end)  # type: ignore[assignment]  # it always matches
+        lines = head[0].decode("utf-8", errors="replace").removesuffix("\n").split("\n")
+        section = read_head(lines, where=f"{file}:{line_at(data, begin)}", rotations=rotations)
         notes += [f"left out, as it holds no pose: {name}" for name in section.left_out]
-        if not section.groups or frames == end:
+        assumed += [group.name for group in section.groups if group.assumed]
+        if section.groups:
+            rates[f"{section.rate:g}"] = None
+        if not section.groups or head.end() == end:
             continue
-        columns = [
-            *section.frame_columns,
-            *(c for g in section.groups for c in (*g.rotation_columns, *g.position_columns)),
-        ]
-        values, cut = _frames(data, frames, end, columns, section, file)
+        table, cut = _frames(data, head.end(), end, section, str(file))
         truncated = truncated or cut
+        frame, *sub_frame = (table[column] for column in section.frame_columns)
         if origin is None:
-            origin = next(iter(values[np.isfinite(values[:, 0]), 0]), None)
-        time = _times(values[:, : len(section.frame_columns)], origin or 0.0, section.rate)
-        keep = growing(time, f"frames of section {section.name}", notes)
-        time, values = time[keep], values[keep]
+            origin = next(iter(frame[np.isfinite(frame)]), None)
+        part = np.nan_to_num(sub_frame[0]) if sub_frame else np.zeros(len(frame))
+        with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers do not grow, or make times that none has
+            time = ((frame - (origin or 0.0)) * (1 + part.max(initial=0.0)) + part) / section.rate
+        table = in_order({**table, "t": time}, f"frames of section {section.name}", notes)
         for group in section.groups:
             if group.name in subjects:
                 notes.append(f"{group.name} stands in the file twice; the first is used")
-                continue
-            turn, there = group.rotation_columns, group.position_columns
-            rotation, position = (values[:, [columns.index(c) for c in part]] for part in (turn, there))
-            subjects[group.name] = _subject(group, time, rotation, position, file)
-    rates = dict.fromkeys(f"{section.rate:g}" for section in sections if section.groups)
+            else:
+                subjects[group.name] = _subject(group, table, str(file))
     if len(rates) > 1:
         notes.append(f"sections of {' and '.join(rates)} Hz, each with its own times")
-    assumed = [group.name for section in sections for group in section.groups if group.assumed]
     if assumed:
         notes.append(f"the header does not say what the angles of {', '.join(assumed)} are: taken as helical")
     if truncated:
@@ -88,44 +71,28 @@ def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
     return MocapLog(FORMAT, tuple(subjects.values()), tuple(dict.fromkeys(notes)), truncated)
 
 
-def _frames(
-    data: bytes, begin: int, end: int, columns: list[int], section: Section, file: Path
-) -> tuple[NDArray, bool]:
-    """Return (frames, columns) of a section, and whether its last line was cut off."""
+def _frames(data: bytes, begin: int, end: int, section: Section, where: str) -> tuple[Table, bool]:
+    """Return the columns of a section, and whether its last line was cut off."""
+    poses = sorted(column for group in section.groups for column, _ in group.columns.values())
+    columns = [*section.frame_columns, *poses]
     first_line = data[begin : data.find(b"\n", begin, end) + 1 or end]
     width = max(first_line.count(section.delimiter.encode()), *columns) + 1
     commas = section.delimiter == ";" and data.count(b",", begin, end) > data.count(b".", begin, end)
     point = "," if commas else "."
-    return read_numbers(data, begin, end, columns, width, str(file), delimiter=section.delimiter, point=point)
+    return read_numbers(data, begin, end, columns, width, where, delimiter=section.delimiter, point=point)
 
 
-def _times(frames: NDArray, origin: float, rate: float) -> NDArray:
-    """Return (N,) s of frame numbers, or of frames and sub-frames, as columns."""
-    sub_frame = np.nan_to_num(frames[:, 1]) if frames.shape[1] > 1 else np.zeros(len(frames))
-    with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers do not grow, or make times that none has
-        return ((frames[:, 0] - origin) * (1 + sub_frame.max(initial=0.0)) + sub_frame) / rate
-
-
-def _subject(group: Group, time: NDArray, rotation: NDArray, position: NDArray, file: Path) -> LoggedSubject:
+def _subject(group: Group, table: Table, where: str) -> LoggedSubject:
     """Return one subject's poses; a row of zeros alone is an occlusion, as some exports write it."""
-    unseen = np.isnan(position).any(axis=1) | (np.c_[rotation, position] == 0).all(axis=1)
-    position = np.where(unseen[:, None], np.nan, position * group.position_scale)
-    reach = np.max(np.abs(position[~unseen]), initial=0.0)
+    values = np.stack([table[column] for column, _ in group.columns.values()])  # the place first
+    values[:, np.isnan(values[:3]).any(axis=0) | (values == 0).all(axis=0)] = np.nan
+    seen = dict(zip((column for column, _ in group.columns.values()), values, strict=True))
+    found = subject(group.name, {"t": table["t"], **seen}, group.columns, where=where)
+    reach = np.nanmax(np.abs(found.position), initial=0.0)
     if reach > LARGEST_ROOM:
         raise InputError(
             f"{group.name!r} is {reach:.0f} m from the origin",
-            where=str(file),
+            where=where,
             hint="the unit over its columns is wrong; export it again",
         )
-    rotation = np.where(unseen[:, None], np.nan, rotation * group.rotation_scale)
-    if group.rotations is Rotations.NONE:
-        quaternion = unknown_rotations(len(time))
-    elif group.rotations is Rotations.QUATERNION:
-        check_lengths(rotation, time, group.name, where=str(file))
-        quaternion = unit_quaternions(rotation)
-    elif group.rotations is Rotations.EULER:
-        # capital letters: each about the axes as the rotations before have turned them
-        quaternion = quaternions(rotation, lambda angles: Rotation.from_euler("XYZ", angles))
-    else:
-        quaternion = quaternions(rotation, Rotation.from_rotvec)
-    return LoggedSubject(group.name, time, position, quaternion)
+    return found

@@ -12,9 +12,11 @@ import math
 import re
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 
 from cfplan.errors import InputError
 from cfplan.files.text import is_number
+from cfplan.recording.importers.mocap_log import EULER_XYZ, PLACE, QUATERNION, ROTATION_VECTOR
 
 
 class Rotations(StrEnum):
@@ -26,14 +28,16 @@ class Rotations(StrEnum):
     NONE = "none"  # a marker
 
 
-COLUMNS = {  # rotation and place of a subject
-    Rotations.QUATERNION: (("RX", "RY", "RZ", "RW"), ("TX", "TY", "TZ")),
-    Rotations.HELICAL: (("RX", "RY", "RZ"), ("TX", "TY", "TZ")),
-    Rotations.EULER: (("RX", "RY", "RZ"), ("TX", "TY", "TZ")),
-    Rotations.NONE: ((), ("X", "Y", "Z")),
-}
 LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 ANGLES = {"rad": 1.0, "deg": math.pi / 180}
+_TRANSLATION = (PLACE, ("TX", "TY", "TZ"), LENGTHS)
+COLUMNS: dict[Rotations, tuple[tuple[tuple[str, ...], tuple[str, ...], dict[str, float]], ...]] = {
+    # kind: channels, their columns and units; the place first
+    Rotations.QUATERNION: (_TRANSLATION, (QUATERNION, ("RX", "RY", "RZ", "RW"), {})),
+    Rotations.HELICAL: (_TRANSLATION, (ROTATION_VECTOR, ("RX", "RY", "RZ"), ANGLES)),
+    Rotations.EULER: (_TRANSLATION, (EULER_XYZ, ("RX", "RY", "RZ"), ANGLES)),
+    Rotations.NONE: ((PLACE, ("X", "Y", "Z"), LENGTHS),),
+}
 # The sections that hold poses or points; the others are forces, joint angles and the like.
 READ = ("objects", "segments", "trajectories")
 _NAME = re.compile(r"^(?:(?P<frame>global|local)\s+)?angle\s*(?:\((?P<word>[^)]*)\))?\s+(?P<name>.+)$", re.IGNORECASE)
@@ -44,11 +48,7 @@ class Group:
     """The columns of one subject."""
 
     name: str
-    rotations: Rotations
-    rotation_columns: tuple[int, ...]
-    rotation_scale: float  # to rad
-    position_columns: tuple[int, ...]
-    position_scale: float  # to m
+    columns: dict[str, tuple[int, float]]  # of each channel, those of the place first: its column, and its unit in SI
     assumed: bool  # the header does not say what its angles are
 
 
@@ -69,11 +69,8 @@ def read_head(lines: list[str], *, where: str, rotations: Rotations | None) -> S
     name = _first_cell(lines[0])
     rate = _rate(lines[1] if len(lines) > 1 else "", name, where)
     if len(lines) < 4:
-        raise InputError(
-            f"section {name!r} ends before its columns",
-            where=where,
-            hint="a section begins with its name, its rate, the subjects and the columns",
-        )
+        hint = "a section begins with its name, its rate, the subjects and the columns"
+        raise InputError(f"section {name!r} ends before its columns", where=where, hint=hint)
     delimiter = max(",;\t", key=lines[3].count)
     try:
         titles, headings, units = (_cells(line, delimiter) for line in (lines[2], lines[3].upper(), (*lines, "")[4]))
@@ -81,23 +78,17 @@ def read_head(lines: list[str], *, where: str, rotations: Rotations | None) -> S
         message = f"the head of section {name!r} cannot be read: {error}"
         raise InputError(message, where=where, hint="export the section again") from None
     if "FRAME" not in headings:
-        raise InputError(
-            f"section {name!r} has no column Frame",
-            where=where,
-            hint="the lines of a section are: its name, its rate, the subjects, the columns, the units, then frames",
-        )
+        hint = "the lines of a section are: its name, its rate, the subjects, the columns, the units, then frames"
+        raise InputError(f"section {name!r} has no column Frame", where=where, hint=hint)
     frame_columns = tuple(headings.index(heading) for heading in ("FRAME", "SUB FRAME") if heading in headings)
     if name.lower() not in READ:
         return Section(name, rate, delimiter, frame_columns, (), (f"section {name}",))
     starts = [index for index, cell in enumerate(titles) if cell]
     if not starts:
-        raise InputError(
-            f"section {name!r} names no subject above its columns",
-            where=where,
-            hint="the line above the columns names each subject over its first column",
-        )
+        hint = "the line above the columns names each subject over its first column"
+        raise InputError(f"section {name!r} names no subject above its columns", where=where, hint=hint)
     groups, left_out = [], []
-    for first, after in zip(starts, [*starts[1:], len(headings)], strict=True):
+    for first, after in pairwise([*starts, len(headings)]):
         columns = {headings[index]: index for index in reversed(range(first, min(after, len(headings))))}
         group = _group(titles[first], columns, units, where, rotations)
         if group is None:
@@ -126,38 +117,40 @@ def _rate(line: str, section: str, where: str) -> float:
 
 
 def _group(
-    title: str, columns: dict[str, int], units: list[str], where: str, rotations: Rotations | None
+    title: str, headings: dict[str, int], units: list[str], where: str, rotations: Rotations | None
 ) -> Group | None:
     """Return the subject under a title; None where it is no pose. Raises InputError where columns are missing."""
     match = _NAME.match(title)
     frame, word, name = (match[key] or "" for key in ("frame", "word", "name")) if match else ("", "", title)
-    subject, _, segment = name.strip().partition(":")
-    name = subject if subject == segment else name.strip()  # an object and its only segment
+    parent, _, segment = name.strip().partition(":")
+    name = parent if parent == segment else name.strip()  # an object and its only segment
     stated = next((kind for kind in (Rotations.EULER, Rotations.HELICAL) if kind in word.lower()), None)
-    if {"X", "Y", "Z"} <= set(columns):
+    if {"X", "Y", "Z"} <= set(headings):
         kind = Rotations.NONE
-    elif frame.lower() == "local" or not set(columns) & {"RX", "RY", "RZ", "RW", "TX", "TY", "TZ"}:
+    elif frame.lower() == "local" or not set(headings) & {"RX", "RY", "RZ", "RW", "TX", "TY", "TZ"}:
         return None
-    elif "RW" in columns or word.lower() == Rotations.QUATERNION:
+    elif "RW" in headings or word.lower() == Rotations.QUATERNION:
         kind = Rotations.QUATERNION
     else:
         kind = stated or rotations or Rotations.HELICAL
-    missing = [column for part in COLUMNS[kind] for column in part if column not in columns]
+    missing = [heading for _, listed, _ in COLUMNS[kind] for heading in listed if heading not in headings]
     if missing:
         message = f"subject {name!r} has no column {', '.join(missing)}"
         raise InputError(message, where=where, hint="export its rotation and its translation, with all their axes")
-    turn, place = (tuple(columns[column] for column in part) for part in COLUMNS[kind])
-    angles = kind in (Rotations.EULER, Rotations.HELICAL)
-    length = _unit(units, place, LENGTHS, name, where)
-    angle = _unit(units, turn, ANGLES, name, where) if angles else 1.0
-    return Group(name, kind, turn, angle, place, length, assumed=angles and stated is None and rotations is None)
+    columns: dict[str, tuple[int, float]] = {}
+    for channels, listed, known in COLUMNS[kind]:
+        found = [headings[heading] for heading in listed]
+        unit = _unit([units[column] if column < len(units) else "" for column in found], known, name, where)
+        columns |= {channel: (column, unit) for channel, column in zip(channels, found, strict=True)}
+    assumed = kind in (Rotations.EULER, Rotations.HELICAL) and stated is None and rotations is None
+    return Group(name, columns, assumed)
 
 
-def _unit(units: list[str], columns: tuple[int, ...], known: dict[str, float], name: str, where: str) -> float:
-    """Return the factor to SI. Raises InputError unless all the columns have one known unit."""
-    found = sorted({units[column].lower().strip("()[] ") if column < len(units) else "" for column in columns})
-    if len(found) == 1 and found[0] in known:
-        return known[found[0]]
+def _unit(units: list[str], known: dict[str, float], name: str, where: str) -> float:
+    """Return the factor to SI, 1 where no unit is known. Raises InputError unless all columns have one known unit."""
+    found = sorted({unit.lower().strip("()[] ") for unit in units})
+    if not known or (len(found) == 1 and found[0] in known):
+        return known.get(found[0], 1.0)
     if any(text == "" or is_number(text) for text in found):
         hint = f"the line after the columns' names says {' or '.join(known)} for each"
         raise InputError(f"no unit over the columns of {name!r}", where=where, hint=hint)

@@ -1,7 +1,8 @@
 """Write the report as one self-contained HTML page: tables, charts, events, certificate, provenance."""
 
 import html
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +24,16 @@ body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1180px; ma
 h1 { font-size: 1.6em; } h2 { font-size: 1.25em; margin-top: 2.2em; border-bottom: 1px solid #ddd; }
 h3 { font-size: 1.05em; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .25em .9em .25em 0; text-align: left; border-bottom: 1px solid #eee; vertical-align: top; }
-td.n, th.n { text-align: right; } .note { background: #fff6e0; padding: .4em .8em; border-left: 4px solid #e69f00; }
+.numbers td + td, .numbers th + th, .events td:first-child { text-align: right; }
+.note { background: #fff6e0; padding: .4em .8em; border-left: 4px solid #e69f00; }
 .fail, .error { color: #b02020; font-weight: 600; } .warning { color: #9a6700; }
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(440px, 100%), 1fr)); gap: 1em 1.5em; }
 .heads { display: flex; flex-wrap: wrap; gap: 0 5em; align-items: start; } summary { cursor: pointer; color: #555; }
-.charts svg { width: 100%; height: auto; } .scroll { overflow-x: auto; } footer { color: #777; margin-top: 3em; }
-@media print { body { max-width: none; margin: 0; } .charts svg, table { break-inside: avoid; } }
+.charts svg { width: 100%; height: auto; } figure { margin: 0; } figcaption { padding-left: 8%; color: #444; }
+figcaption b { display: block; } figcaption span { font-size: .75em; margin-right: 1.3em; overflow-wrap: anywhere; }
+figcaption i { display: inline-block; width: 14px; margin-right: .4em; vertical-align: middle; }
+.scroll { overflow-x: auto; } footer { color: #777; margin-top: 3em; }
+@media print { body { max-width: none; margin: 0; } figure, table { break-inside: avoid; } }
 """
 
 
@@ -62,17 +67,24 @@ def _summary(flights: Sequence[ReportedFlight]) -> str:
     return _columns(flights, lambda flight: [*head(flight), *rows(flight)])
 
 
-def _columns(flights: Sequence[ReportedFlight], table: Callable[[ReportedFlight], list[tuple[str, str]]]) -> str:
-    columns = [table(flight) for flight in flights]
-    names = "" if len(flights) == 1 else "".join(f'<th class="n">{html.escape(f.name)}</th>' for f in flights)
-    body = [
-        f"<tr><td>{html.escape(label)}</td>"
-        + "".join(f'<td class="n">{html.escape(column[index][1])}</td>' for column in columns)
-        + "</tr>"
-        for index, (label, _) in enumerate(columns[0])
-    ]
-    heading = f"<tr><th></th>{names}</tr>" if names else ""
-    return f'<div class="scroll"><table>{heading}{"".join(body)}</table></div>'
+def _columns(flights: Sequence[ReportedFlight], rows_of: Callable[[ReportedFlight], list[tuple[str, str]]]) -> str:
+    heads = ["", *(flight.name for flight in flights)] if len(flights) > 1 else []
+    rows = [(cells[0][0], *(value for _, value in cells)) for cells in zip(*map(rows_of, flights), strict=True)]
+    return _table("numbers", rows, heads=heads)
+
+
+def _table(
+    kind: str, rows: Iterable[Sequence[str]], *, heads: Sequence[str] = (), marks: Iterable[str] = repeat("")
+) -> str:
+    """Return a table of a class; `marks` are the classes of its rows."""
+
+    def line(cells: Sequence[str], tag: str, mark: str = "") -> str:
+        body = "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells)
+        return f'<tr class="{html.escape(mark)}">{body}</tr>'
+
+    lines = [line(heads, "th")] if heads else []
+    lines += [line(row, "td", mark) for row, mark in zip(rows, marks, strict=False)]
+    return f'<div class="scroll"><table class="{kind}">{"".join(lines)}</table></div>'
 
 
 def _comparison(flights: Sequence[ReportedFlight]) -> str:
@@ -160,39 +172,28 @@ def _events(flight: ReportedFlight) -> str:
         return "<h3>Events</h3><p>None were recorded.</p>"
     entries.sort(key=lambda entry: entry[0])
     grave = [entry for entry in entries if entry[1] in (Level.WARNING, Level.ERROR)]
-    told = f"<table>{_event_rows(record, grave)}</table>" if grave else "<p>No warnings and no errors.</p>"
+    told = _event_table(record, grave) if grave else "<p>No warnings and no errors.</p>"
     return (
         f"<h3>Events</h3>{told}<details><summary>All {len(entries)} events and phases</summary>"
-        f"<table>{_event_rows(record, entries)}</table></details>"
+        f"{_event_table(record, entries)}</details>"
     )
 
 
-def _event_rows(record: Record, entries: Sequence[tuple[float, str, str]]) -> str:
-    return "".join(
-        f'<tr class="{html.escape(level)}"><td class="n">{time - record.start:.2f} s</td><td>{html.escape(level)}</td>'
-        f"<td>{html.escape(text)}</td></tr>"
-        for time, level, text in entries
-    )
+def _event_table(record: Record, entries: Sequence[tuple[float, str, str]]) -> str:
+    rows = [(f"{time - record.start:.2f} s", level, text) for time, level, text in entries]
+    return _table("events", rows, marks=[level for _, level, _ in entries])
 
 
 def _certificate(flight: ReportedFlight) -> str:
-    if flight.certificate is None:
+    certificate = flight.certificate
+    if certificate is None:
         return ""
     heads = ("limit", "worst", "allowed", "share", "at", "where, m")
-    head = "".join(f'<th class="n">{name}</th>' if index else f"<th>{name}</th>" for index, name in enumerate(heads))
-    lines = [
-        f'<tr class="{"" if margin.passed else "fail"}">'
-        + "".join(f"<td{' class=n' if index else ''}>{html.escape(cell)}</td>" for index, cell in enumerate(row))
-        + "</tr>"
-        for margin, row in zip(flight.certificate.margins, flight.certificate.rows(), strict=True)
-    ]
-    verdict = "passed" if flight.certificate.passed else '<span class="fail">failed</span>'
-    return (
-        f"<h3>Certificate of the plan: {verdict}</h3><p>{flight.certificate.samples} samples along the flight.</p>"
-        f'<div class="scroll"><table><tr>{head}</tr>{"".join(lines)}</table></div>'
-    )
+    marks = ["" if margin.passed else "fail" for margin in certificate.margins]
+    table = _table("numbers", certificate.rows(), heads=heads, marks=marks)
+    verdict = "passed" if certificate.passed else '<span class="fail">failed</span>'
+    return f"<h3>Certificate of the plan: {verdict}</h3><p>{certificate.samples} samples along the flight.</p>{table}"
 
 
 def _provenance(flight: ReportedFlight) -> str:
-    lines = [f"<tr><td>{html.escape(what)}</td><td>{html.escape(value)}</td></tr>" for what, value in flight.provenance]
-    return f"<h3>Where it comes from</h3><table>{''.join(lines)}</table>"
+    return f"<h3>Where it comes from</h3>{_table('provenance', flight.provenance)}"

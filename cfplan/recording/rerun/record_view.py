@@ -81,7 +81,9 @@ def log_record(stream: rr.RecordingStream, record: Record) -> None:
     """Send all of a record."""
     stream.send_recording_name(record.header.name)
     log_room(stream, record.header)
-    shown = [replace(plot, limits=near_limits(plot)) for plot in plots(record)]
+    shown = [
+        replace(plot, limits=near_limits(plot.limits, [line.values for line in plot.lines])) for plot in plots(record)
+    ]
     log_styles(stream, shown)
     log_columns(stream, record, shown, record.start)
     log_plan(stream, record)

@@ -1,6 +1,7 @@
 """The report: the numbers of the record, on a page that needs nothing else and runs nothing."""
 
 import dataclasses
+import html
 import json
 import math
 import re
@@ -12,8 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given
-from hypothesis import strategies as st
 
 from cfplan.cli import cfplan
 from cfplan.errors import InputError
@@ -21,7 +20,7 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import save_plan
 from cfplan.recording.record import Events
-from cfplan.recording.report.charts import WIDTH, Curve, place_chart, thinned, ticks, time_chart
+from cfplan.recording.report.charts import Curve, place_chart, time_chart
 from cfplan.recording.report.page import page, write_page
 from cfplan.recording.report.report import flight_to_dict, read_flight, rows
 from cfplan.recording.summary import reference_span, summarise
@@ -97,13 +96,11 @@ def test_the_peak_acceleration_is_that_of_the_estimates_along_the_path(folder):
 def test_the_page_needs_nothing_else_and_runs_nothing(folder):
     shown = Page(page([read_flight(folder)] * 2))
     assert {tag for tag, _ in shown.tags} & {"script", "link", "img", "iframe", "object"} == set()
-    addresses = [
-        value
-        for _, values in shown.tags
-        for name, value in values.items()
-        if name in ("src", "href", "style", "onload")
-    ]
-    assert addresses == []
+    values = [value for _, attributes in shown.tags for value in attributes.items()]
+    addresses = [value for name, value in values if name in ("src", "href", "xlink:href")]
+    addresses += [place for _, value in values for place in re.findall(r"url\(([^)]*)", value or "")]
+    assert all(address.startswith("#") for address in addresses)
+    assert not [name for name, _ in values if name.startswith("on")]
     policy = next(values["content"] for tag, values in shown.tags if values.get("http-equiv"))
     assert policy.startswith("default-src 'none'")
 
@@ -227,31 +224,28 @@ def made_plan():
 # charts
 
 
-def points(svg):
-    """(x, y) in the chart of all that is drawn as paths, one array a path."""
-    paths = re.findall(r'<path d="([^"]*)"', svg)
-    return [np.array(re.findall(r"[ML]([-\d.]+) ([-\d.]+)", text), dtype=float) for text in paths]
+def points(chart, colour="#000000"):
+    """(x, y) in the chart of each line that is drawn in a colour, and whether a new stroke begins there."""
+    paths = re.findall(rf'<path d="([^"]*)"[^>]*stroke: {colour}', chart)
+    return [
+        np.array([(float(x), float(y), move == "M") for move, x, y in re.findall(r"([ML]) ([-\d.]+) ([-\d.]+)", path)])
+        for path in paths
+    ]
+
+
+def time_labels(chart):
+    """Where on the time axis which number stands."""
+    return re.findall(r'text-anchor: middle[^"]*" x="([\d.]+)"[^>]*>([^<]*)', chart)
 
 
 def test_no_spike_is_lost_however_many_points_there_are():
-    x, y = np.linspace(0, 100, 200_000), np.zeros(200_000)
+    x, y = np.linspace(0, 100, 200_000), np.random.default_rng(0).normal(0, 0.1, 200_000)
     y[[20_001, 123_457]] = 5.0, -3.0
-    chart = time_chart("spikes", [Curve("a", x, y, (0, 0, 0))])
-    (drawn,) = points(chart)
-    assert len(drawn) < 3000
+    (drawn,) = points(time_chart("spikes", [Curve("a", x, y, (0, 0, 0))]))
+    assert len(drawn) < 10_000
     level = np.median(drawn[:, 1])
-    assert np.sum(drawn[:, 1] < level - 30) == 1
-    assert np.sum(drawn[:, 1] > level + 30) == 1
-
-
-@given(size=st.integers(0, 3000), columns=st.integers(1, 50), seed=st.integers(0, 99))
-def test_what_is_drawn_has_the_extremes_of_what_there_is(size, columns, seed):
-    y = np.random.default_rng(seed).normal(size=size)
-    kept = thinned(np.arange(size) * 0.01, y, columns)
-    assert np.all(np.diff(kept) > 0)
-    if size:
-        assert (y[kept].min(), y[kept].max()) == (y.min(), y.max())
-        assert (kept[0], kept[-1]) == (0, size - 1)
+    assert drawn[:, 1].max() > level + 30
+    assert drawn[:, 1].min() < level - 30
 
 
 @pytest.mark.parametrize("size", [50, 50_000])
@@ -259,8 +253,7 @@ def test_a_gap_breaks_the_line(size):
     x = np.linspace(0, 50, size)
     y = np.where((x > 20) & (x < 30), np.nan, x)
     chart = time_chart("gap", [Curve("a", x, y, (0, 0, 0))])
-    (text,) = re.findall(r'<path d="([^"]*)"', chart)
-    assert text.count("M") == 2
+    assert sum(points(chart)[0][:, 2]) == 2
     assert "nan" not in chart
 
 
@@ -270,26 +263,22 @@ def test_places_are_drawn_to_one_scale_in_both_axes():
     assert np.ptp(circle[:, 0]) == pytest.approx(np.ptp(circle[:, 1]), abs=0.3)
 
 
-def test_a_legend_too_long_for_a_row_goes_on_in_the_next_with_every_name_whole():
-    names = [f"flight number {number} of a long name" for number in range(5)]
-    chart = place_chart("many", [Curve(name, np.arange(2.0), np.arange(2.0), (0, 0, 0)) for name in names], ("x", "y"))
-    assert all(name in chart for name in names)
-    ends = [float(x) + 6.2 * len(text) for x, text in re.findall(r'<text x="(\d+)" y="[\d.]+">(flight[^<]*)', chart)]
-    assert len(ends) == len(names)
-    assert max(ends) <= WIDTH
+@pytest.mark.parametrize("name", [f"flight of a long name {'long ' * 40}", "_hidden", "$x", "飛行", "a & <b>"])
+def test_every_name_stands_whole_in_the_legend(name):
+    chart = place_chart("many", [Curve(name, np.arange(2.0), np.arange(2.0), (0, 0, 0))], ("x", "y"))
+    assert html.escape(name) in chart
 
 
 def test_charts_over_the_same_span_are_of_one_time_axis():
     axes = [
-        re.findall(
-            r'<text x="([\d.]+)" y="[\d.]+" text-anchor="middle">([^<]*)', time_chart("t", [curve], span=(0.0, 9.0))
-        )
+        time_labels(time_chart("t", [curve], span=(0.0, 9.0)))
         for curve in (
             Curve("a", np.array([4.0, 5.0]), np.ones(2), (0, 0, 0)),
-            Curve("b", np.arange(9.0), np.arange(9.0), (0,) * 3),
+            Curve("b", np.arange(9.0), 1e-4 * np.arange(9.0), (0, 0, 0)),
         )
     ]
-    assert axes[0] == axes[1] != []
+    assert axes[0] == axes[1]
+    assert len(axes[0]) > 3
 
 
 def test_a_limit_far_above_is_named_and_does_not_flatten_the_curve():
@@ -306,16 +295,8 @@ def test_charts_of_hardly_anything_are_charts(values):
     values = np.array(values)
     curve = Curve("a", np.arange(len(values)) * 1.0, values, (0, 0, 0))
     for chart in (time_chart("t", [curve], limits=[1.0], band=(0.0, 1.0)), place_chart("p", [curve], ("x", "y"))):
-        assert chart.startswith("<svg")
+        assert "<svg" in chart
         assert "nan" not in chart
-
-
-@given(low=st.floats(-1e6, 1e6), width=st.floats(1e-3, 1e6), count=st.integers(3, 10))
-def test_ticks_are_round_few_and_inside(low, width, count):
-    found = ticks(low, low + width, count)
-    assert 1 <= len(found) <= count + 1
-    step = width / count
-    assert all(low - step * 1e-6 - 1e-6 <= tick <= low + width + step * 1e-6 + 1e-6 for tick in found)
 
 
 @pytest.mark.integration

@@ -110,7 +110,7 @@ def test_every_curve_reads_back_equal(flight, rrd):
 
 
 def test_every_limit_near_what_was_measured_is_a_level_line_over_the_whole_flight(flight, rrd):
-    drawn = {plot.name: near_limits(plot) for plot in plots(flight.record)}
+    drawn = {plot.name: near_limits(plot.limits, [line.values for line in plot.lines]) for plot in plots(flight.record)}
     assert len(drawn["motor_thrust"]) == 2
     assert drawn["deviation"] == ()  # 0.5 m would make centimetres invisible
     for name, limits in drawn.items():

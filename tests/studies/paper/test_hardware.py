@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+import torch
 
-from cfplan.errors import CfplanError
 from cfplan.safety.limits_file import DEFAULTS, load_limits
 from cfplan.safety.space import check_space
 from studies.paper.hardware import (
@@ -13,7 +13,6 @@ from studies.paper.hardware import (
     RAW,
     SHIPPED,
     STUDY,
-    FlownPlanner,
     HardwareFlight,
     Settings,
     hardware_paths,
@@ -23,7 +22,11 @@ from studies.paper.hardware import (
     plans_of,
     tables,
 )
-from studies.paper.trials import TOPPQUAD
+from studies.paper.networks import Kind, build_network
+from studies.paper.sequences import Inputs
+from studies.paper.trained import TrainedNetwork
+from studies.paper.training import SequenceOptions
+from studies.paper.trials import TOPPQUAD, failed
 from studies.runner.cases import run_study
 
 USUAL = load_limits(DEFAULTS)
@@ -103,13 +106,14 @@ def test_the_paths_stay_in_the_room_and_the_first_is_straight():
     assert long_path(USUAL).length > 2.0 * longest
 
 
-def test_a_planner_without_a_plan_fails_every_flight_of_that_path():
-    def none(*_):
-        raise CfplanError("no plan", hint="none")
-
-    planners = {"text": [FlownPlanner("none", none, none, 3)]}
+def test_a_network_without_an_answer_fails_every_flight_of_that_path():
+    network = build_network(Kind.MLP, Inputs.ALL.width)
+    for tensor in network.parameters():
+        torch.nn.init.constant_(tensor, np.nan)
+    options = SequenceOptions(kind=Kind.MLP)
+    networks = {"text": {"MLP": TrainedNetwork("MLP", options, network, learned_from=0, training_seconds=0.0)}}
     paths = {LONG: long_path(USUAL), **hardware_paths(USUAL, 1)}
-    flown = [flight for plan in plans_of(planners, paths).values() for flight in measure(planners, paths, None, plan)]
-    assert [(flight.path, flight.way, flight.failed) for flight in flown] == 3 * [("1", RAW, True)] + 3 * [
-        ("1", CERTIFIED, True)
-    ]
+    plans = [plan for plan in plans_of(networks, paths).values() if plan.planner == "MLP"]
+    flights = [flight for plan in plans for flight in measure(networks, paths, 3, plan)]
+    assert [(flight.path, flight.way) for flight in flights] == 3 * [("1", RAW)] + 3 * [("1", CERTIFIED)]
+    assert all("not a number" in flight.reason and failed(flight) for flight in flights)
