@@ -62,8 +62,9 @@ COLUMNS = (
         meaning="least distance of the true position from walls and ceiling; negative beyond them",
     ),
     Column("end", "end", meaning="on the floor, disarmed, and how long all motors were off in the air"),
-    Column("record", "record", meaning="whether it can be read"),
-    Column("why", "why"),
+    Column("record", "record", meaning="whether it can be read",
+           value=lambda rows: "readable" if rows[0].readable else "not readable"),
+    Column("why", "why", value=lambda rows: rows[0].planner if rows[0].reason == "landed" else rows[0].reason),
 )  # fmt: skip
 _DOWN = 0.05  # m
 _SETTLING = 0.1  # s in which the supervisor notices that it was disarmed
@@ -120,16 +121,6 @@ class FaultFlight:
         ends = [text for text, holds in (("landed", self.landed), ("disarmed", self.disarmed)) if holds]
         without = f", {self.motors_off} ms without motors" if self.motors_off else ""
         return (", ".join(ends) or "in the air") + without
-
-    @property
-    def record(self) -> str:
-        """Return whether its record can be read, in words."""
-        return "readable" if self.readable else "not readable"
-
-    @property
-    def why(self) -> str:
-        """Return the reason for the rung; where the flight went on to its end, what the planner answered."""
-        return self.planner if self.reason == "landed" else self.reason
 
 
 @dataclass(slots=True)

@@ -119,7 +119,6 @@ class JudgedFlight:
     settled_after: float = math.nan  # s; not finite where it did not settle
     late_p99: float = math.nan  # s, of setpoints
     late_max: float = math.nan  # s
-    telemetry_dropped: int = 0
 
     @property
     def over_bound(self) -> float:
@@ -243,7 +242,6 @@ def _judged(row: JudgedFlight, trajectory: Trajectory, flight: RealTimeFlight) -
         settled_after=outcome.settled_after,
         late_p99=outcome.lateness.p99,
         late_max=outcome.lateness.max,
-        telemetry_dropped=outcome.telemetry_dropped,
     )
 
 

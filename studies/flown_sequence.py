@@ -61,7 +61,6 @@ class SequenceVerdict:
     speed: float  # m/s
     acceleration: float  # m/s², by differences of velocity outside stops, less what packets round
     stop_acceleration: float  # m/s², likewise in stops
-    fraction_fast: float  # of the time, faster than nine tenths of the limit
     joint: float  # quanta, the most that a field jumps by at a splice
     without_stop: int  # setpoints that were sent without a committed stop that begins there and rests inside
     faults: tuple[str, ...]  # what exceeds a limit, in words
@@ -92,7 +91,6 @@ def judge_sequence(
         speed=float(speed.max()),
         acceleration=float(accelerating[~stopping].max(initial=0.0)),
         stop_acceleration=float(accelerating[stopping].max(initial=0.0)),
-        fraction_fast=float((speed > 0.9 * limits.plan.speed).mean()),
         joint=joint,
         without_stop=_without_stop(flown, stops[rows], limits),
         faults=(),

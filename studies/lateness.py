@@ -83,7 +83,6 @@ class WakeUps:
     above: float = math.nan  # of the count, by more than 1 ms
     skipped: int = 0  # deadlines that passed altogether
     stolen: float = 0.0  # s that the host took from this virtual machine meanwhile, over all its processors
-    refusals: int = 0  # tries before it that preflight refused for lateness
     view_failure: str = ""  # why the live view ended early
 
     @staticmethod
@@ -160,13 +159,13 @@ def _streaming(priority: str, sleeper: Sleeper, fly: Callable[..., RealTimeFligh
     if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:
         raise KeyboardInterrupt  # who ends the flight ends the study
     if not flight.sent or flight.outcome is None:
-        return [WakeUps("stream", priority, flight.reason, refusals=flight.refusals)]
+        return [WakeUps("stream", priority, flight.reason)]
     begin, end = flight.sent[0].due, flight.sent[-1].due
     queued, asleep = sleeper.queued(begin, end), sleeper.late(begin, end)
     late, stolen = [message.time - message.due for message in flight.sent], _stolen() - stolen
     stream = WakeUps.of(
         "stream", priority, late, "" if flight.landed else flight.reason, skipped=flight.outcome.lateness.skipped,
-        stolen=stolen, refusals=flight.refusals, view_failure=flight.view_failure,
+        stolen=stolen, view_failure=flight.view_failure,
     )  # fmt: skip
     waiting = [WakeUps.of(QUEUED, priority, queued, stolen=stolen)] if queued else []
     return [stream, *waiting, WakeUps.of("asleep meanwhile", priority, asleep, stolen=stolen)]

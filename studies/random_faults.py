@@ -45,7 +45,9 @@ _MANY = (0.5, 0.3, 0.2)  # fraction of flights with one, two, three faults
 _APART = 1.5  # s within which several faults begin
 _BESIDE_START = 0.4  # m from the path's start at which the vehicle stands
 _INSIDE = 0.02  # m that it stands inside the margin, as preflight measures its place
-_GROUPS = {FaultKind: "pose", RadioFaultKind: "radio", VehicleFaultKind: "vehicle"}
+_GROUPS: dict[type, tuple[str, Any]] = {
+    FaultKind: ("pose", ViconFault), RadioFaultKind: ("radio", RadioFault), VehicleFaultKind: ("vehicle", VehicleFault),
+}  # fmt: skip
 _LONGEST_STALL = 5.0  # s
 _WORST = 10
 
@@ -243,15 +245,12 @@ def _beside_start(mission: Mission, chance: np.random.Generator) -> tuple[float,
 
 
 def _fault(kind: Any, start: float, length: float, size: float | None) -> Fault:
-    if isinstance(kind, FaultKind):
-        return ViconFault(kind, start, length, size)
-    if isinstance(kind, RadioFaultKind):
-        return RadioFault(kind, start, length, size)
-    return VehicleFault(kind, start, length, size)
+    fault: Fault = _GROUPS[type(kind)][1](kind, start, length, size)
+    return fault
 
 
 def _text(kind: Any, start: float, length: float, size: float | None) -> str:
-    text = f"{_GROUPS.get(type(kind), 'computer')}:{str(kind).replace(' ', '-')}"
+    text = f"{_GROUPS.get(type(kind), ('computer',))[0]}:{str(kind).replace(' ', '-')}"
     if size is not None:
         text += f" {size:.2f}"
     if kind not in (_MAIN, _PILOT):

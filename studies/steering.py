@@ -8,8 +8,8 @@ meet a fault of the planner. No limit may be exceeded.
 import contextlib
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -34,7 +34,7 @@ from cfplan.steering.stepped_steering import SteppedSteering
 from cfplan.steering.waypoint_lines import parse_line
 from cfplan.vehicle.joint import JoinedTrajectory
 from studies.faults import on_floor, to_wall
-from studies.flown_sequence import Committed, judge_sequence
+from studies.flown_sequence import Committed, SequenceVerdict, judge_sequence
 from studies.runner.limits import limits_for
 from studies.runner.options import option
 from studies.runner.reductions import count, largest, mean, smallest, total
@@ -57,6 +57,7 @@ _RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)
 _ENDS = ("flown", "landed", "stopped and landed")  # how a flight is ended: at its end, in motion, after a stop
 _BAD_SHOWN = 20
 _STANDING = 1e-9  # m/s, up to which a motion stands still
+Judge = Callable[[dict[int, SetpointSent], list[Committed], Limits], SequenceVerdict]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,6 @@ class SteeredFlight:
     superseded: int
     invalid: int  # refused before they were asked for, as no waypoints
     unanswered: int
-    stops: int  # accepted
     ended: str
     end: str  # in words, as the pilot says it
     landed: bool  # on the floor, disarmed, by the operator or at its end
@@ -96,7 +96,6 @@ class SteeredFlight:
     speed: float
     acceleration: float
     stop_acceleration: float
-    fraction_fast: float
     joint: float
     without_stop: int
     faults: Sequence[str]
@@ -229,64 +228,46 @@ def flown_later(flown: JoinedTrajectory, splice: int, later: int) -> JoinedTraje
     return JoinedTrajectory(flown.trajectories, starts)
 
 
-@dataclass(slots=True)
-class Steered:
-    """What a flight with random requests left behind."""
-
-    seed: int
-    planning: float  # s, that a plan takes
-    ended: str  # as drawn
-    flight: WatchedSteering
-    vehicle: SteeredVehicle
-    asked: list[int] = field(default_factory=list)  # numbers of the requests
-    invalid: int = 0  # refused before they were asked for, as no waypoints
-    failure: str = ""
-
-
-def steer(seed: int, limits: Limits, requests: int, seconds: float) -> Steered:
-    """Fly number `seed`, with so many requests in so many s."""
+def fly_steered(
+    seed: int, limits: Limits, requests: int, seconds: float, judge: Judge = judge_sequence
+) -> SteeredFlight:
+    """Fly number `seed`, with so many requests in so many s, and judge it by what it streamed and by the truth."""
     chance = np.random.default_rng(seed)
     planning = float(chance.choice(_PLANNING))
     flight = WatchedSteering(limits, planning=planning, seed=seed, vehicle=_vehicle(seed, limits, chance))
-    ended = str(chance.choice(_ENDS))
-    steered = Steered(seed, planning, ended, flight, SteeredVehicle(flight, limits, uri="sim://0"))
+    ended, invalid, asked = str(chance.choice(_ENDS)), 0, list[int]()
+    vehicle = SteeredVehicle(flight, limits, uri="sim://0")
+    failure = ""
     try:
-        with steered.vehicle as vehicle:
+        with vehicle:
             vehicle.take_off(float(chance.uniform(*_TAKE_OFF_HEIGHT)))
             for wish, waypoints, pause in _requests(chance, vehicle, flight, limits, requests, seconds):
                 try:
-                    steered.asked.append(vehicle.request(wish, waypoints))
+                    asked.append(vehicle.request(wish, waypoints))
                 except InputError:
-                    steered.invalid += 1
+                    invalid += 1
                 vehicle.sleep(pause)
-            steered.asked += _end(vehicle, ended)
+            asked += _end(vehicle, ended)
     except CfplanError as error:
-        steered.failure = str(error)
-    return steered
-
-
-def judge_steered(steered: Steered, limits: Limits) -> SteeredFlight:
-    """Judge a flight by what it streamed, and by the truth."""
-    flight, outcome = steered.flight, steered.vehicle.outcome
-    answers = Counter(answer.verdict for answer in steered.vehicle.answers())
+        failure = str(error)
+    answers, outcome = Counter(answer.verdict for answer in vehicle.answers()), vehicle.outcome
     pending = frozenset() if flight.planner is None else flight.planner.pending  # as the flight ends
-    verdict, truth = judge_sequence(flight.sent, flight.commitments, limits), flight.lab.truth()
+    verdict, truth = judge(flight.sent, flight.commitments, limits), flight.lab.truth()
     well = outcome is not None and outcome.exit_code in (ExitCode.OK, ExitCode.ENDED_BY_OPERATOR)
     return SteeredFlight(
-        seed=steered.seed,
-        planning=steered.planning,
+        seed=seed,
+        planning=planning,
         seconds=verdict.setpoints / RATE,
-        requests=len(steered.asked) + steered.invalid,
+        requests=len(asked) + invalid,
         accepted=answers[PathVerdict.ACCEPTED],
         refused=answers[PathVerdict.REFUSED],
         late=answers[PathVerdict.LATE],
         superseded=answers[PathVerdict.SUPERSEDED],
-        invalid=steered.invalid,
-        unanswered=sum(flight.answered[number] != (number not in pending) for number in steered.asked),
-        stops=sum(0 < each.stop_from <= each.splice for each in flight.commitments),
-        ended=steered.ended,
-        end=steered.failure or (outcome.reason if outcome is not None else "no outcome"),
-        landed=well and not steered.failure and on_floor(truth),
+        invalid=invalid,
+        unanswered=sum(flight.answered[number] != (number not in pending) for number in asked),
+        ended=ended,
+        end=failure or (outcome.reason if outcome is not None else "no outcome"),
+        landed=well and not failure and on_floor(truth),
         deviation=outcome.deviation.max if outcome is not None else math.nan,
         to_wall=to_wall(truth, limits.space),
         **asdict(verdict),
@@ -367,11 +348,6 @@ def work(settings: Settings, run: Run) -> Work:
     seeds = range(settings.seed, settings.seed + settings.flights)
     measure = partial(fly_steered, limits=limits_for(Path()), requests=settings.requests, seconds=settings.seconds)
     return Work({str(seed): seed for seed in seeds}, measure, SteeredFlight)
-
-
-def fly_steered(seed: int, limits: Limits, requests: int, seconds: float) -> SteeredFlight:
-    """Fly number `seed`, with so many requests in so many s, and judge it."""
-    return judge_steered(steer(seed, limits, requests, seconds), limits)
 
 
 def tables(settings: Settings, rows: list[SteeredFlight]) -> Iterator[Table]:

@@ -12,14 +12,19 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.steering.steered_vehicle import SteeredVehicle
 from studies.flown_sequence import judge_sequence
 from studies.runner.cases import run_study
-from studies.steering import STUDY, Settings, WatchedSteering, judge_steered, steer
+from studies.steering import STUDY, Settings, WatchedSteering, fly_steered
 
 
 @pytest.fixture(scope="module")
 def flown(limits):
     """A flight of some requests as judged, and what was sent and committed in it."""
-    steered = steer(4, limits, 14, 8.0)
-    return judge_steered(steered, limits), steered.flight.sent, steered.flight.commitments
+    kept = []
+
+    def judge(*given):
+        kept.append(given)
+        return judge_sequence(*given)
+
+    return fly_steered(4, limits, 14, 8.0, judge), *kept[0][:2]
 
 
 def test_random_requests_are_flown_or_refused_within_every_limit(flown):
