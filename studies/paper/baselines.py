@@ -81,7 +81,7 @@ class Settings(NetworkSettings):
 
     paths: int = option(50, "Random paths.", least=1)
     corridors: int = option(2000, "Corridors that the time allocation learns from.", least=2)
-    seed: int = option(60_000, "Seed of the first path.")
+    seed: int = option(60_000, "Seed of the first path.", least=0)
 
 
 @dataclass(frozen=True, slots=True)

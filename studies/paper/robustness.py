@@ -111,6 +111,7 @@ USUAL = (*MODELS, *(name for name in PLANNERS if name != "toppquad"))  # that ta
 class Settings(NetworkSettings):
     """Which models are asked, about which paths."""
 
+    paths: int = option(100, "Paths for testing.", least=1)
     draws: int = option(10, "Perturbations of each path, each ε.", least=1)
     models: tuple[str, ...] = option(USUAL, "Network or planner.", choices=(*MODELS, *PLANNERS))
     reference: str = option(

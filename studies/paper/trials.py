@@ -147,8 +147,8 @@ def _both(plan: Plan, path: Path, begun: PaperTrial) -> tuple[PaperTrial, PaperT
     try:
         profile = plan(path)
     except CfplanError as error:
-        failed = replace(begun, reason=str(error))
-        return failed, replace(failed, repaired=True)
+        refused = replace(begun, reason=str(error))
+        return refused, replace(refused, repaired=True)
     seconds = time.process_time() - started
     raw = _flown(Trajectory(path, profile, PAPER.airframe), replace(begun, seconds=seconds))
     try:

@@ -44,7 +44,7 @@ class Settings:
     """Which pairs are planned."""
 
     pairs: int = option(100, "Pairs of random paths.", least=1)
-    seed: int = option(50_000, "Seed of the first pair.")
+    seed: int = option(50_000, "Seed of the first pair.", least=0)
 
 
 @dataclass(frozen=True, slots=True)

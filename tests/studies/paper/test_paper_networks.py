@@ -28,7 +28,6 @@ OPTIONS = SequenceOptions(epochs=3, batch=4)
 
 @pytest.fixture(scope="module")
 def sequences(tmp_path_factory):
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("data")
     spec = DatasetSpec(
         count=8, seed=2, limits="paper", families=(), boxes=((10.0,) * 3,), waypoints=(4, 4), nodes=99, yaw=YawMode.FREE

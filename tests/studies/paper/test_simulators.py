@@ -7,7 +7,18 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STILL_AIR, TIME_STEP, pack_body, step_body
 from cfplan.simulation.geometric_flight import fly_geometric, positions_by_both
-from studies.paper.simulators import HARDWARE, PLANNED, BodyFlight, Settings, bodies_for, tables
+from studies.paper.simulators import (
+    HARDWARE,
+    PLANNED,
+    SHIPPED,
+    SHIPPED_PLANNER,
+    Asked,
+    BodyFlight,
+    Settings,
+    bodies_for,
+    measure,
+    tables,
+)
 from studies.paper.trials import FLOWN, PAPER_LAG, TOPPQUAD, profile_by, trajectory_by
 
 LAGS = [f"RotorPy, {lag:g} s" for lag in (0.072, 0.005)]
@@ -37,6 +48,16 @@ def test_rotorpy_with_the_papers_motor_lag_follows_as_cfplan_does(trajectory):
     wanted, theirs, own = positions_by_both(body.make(FLOWN), trajectory, body.beside(FLOWN))
     assert np.linalg.norm(theirs - own, axis=1).max() < 0.03
     assert np.linalg.norm(theirs - wanted, axis=1).max() < 0.05
+
+
+def test_bytes_of_the_planner_that_ships_are_followed_by_every_body():
+    pytest.importorskip("rotorpy")
+    path = min_snap([[0, 0, 1], [1.5, 0.8, 1.6], [2.9, 0.0, 1.1]])
+    flights = measure(None, Asked(SHIPPED, SHIPPED_PLANNER, "1", path))
+    assert {flight.body for flight in flights} >= set(LAGS)
+    assert all(not flight.reason and flight.both_flown for flight in flights)
+    assert max(flight.own_deviation for flight in flights) < 0.1
+    assert all(0.0 < flight.apart < 0.2 for flight in flights)
 
 
 def test_the_lost_count_as_a_metre_and_are_left_out_of_how_far_bodies_are_apart():

@@ -1,0 +1,5 @@
+"""Networks work on one thread, as in the studies' own processes."""
+
+import torch
+
+torch.set_num_threads(1)
