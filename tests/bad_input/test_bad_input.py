@@ -5,15 +5,15 @@
 
 import os
 import resource
+import shutil
 import signal
 import warnings
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from random import Random
-from tempfile import TemporaryDirectory
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from cfplan.errors import CfplanError, ExitCode, InputError, printable
@@ -31,32 +31,37 @@ _LONGEST_MESSAGE = 2000  # characters
 
 @pytest.mark.parametrize("name", INPUTS)
 def test_wrong_input_is_read_or_refused_with_place_and_hint(tmp_path, name):
-    kind = INPUTS[name]
+    kind, folder = INPUTS[name], tmp_path / "input"  # where the one that failed is left
     sound = kind.sound(tmp_path)
     for number in range(3):  # what is loaded and compiled once is counted to no input
-        with TemporaryDirectory() as folder, suppress(Exception):
-            kind.spoil(sound, Random(number), Path(folder))
-            kind.use(Path(folder))
+        with suppress(Exception):
+            kind.spoil(sound, Random(number), emptied(folder))
+            kind.use(folder)
 
     @settings(
-        max_examples=max(3, round(EXAMPLES * kind.fraction)), deadline=None, suppress_health_check=list(HealthCheck)
-    )
+        max_examples=max(3, round(EXAMPLES * kind.fraction)), deadline=None, suppress_health_check=list(HealthCheck),
+        phases=(Phase.reuse, Phase.generate),  # making an input smaller would take minutes
+    )  # fmt: skip
     @given(chance=st.randoms(use_true_random=False))
     def check(chance: Random) -> None:
-        with TemporaryDirectory() as place:
-            folder = Path(place)
-            kind.spoil(sound, chance, folder)
-            given_files = taken(folder)
-            (folder / MADE).mkdir()
-            try:
-                with bounded():
-                    kind.use(folder)
-            except CfplanError as error:
-                check_refusal(error, name, folder)
-                if name in FILES:
-                    assert taken(folder) == given_files, "a refused input has left files behind"
+        kind.spoil(sound, chance, emptied(folder))
+        given_files = taken(folder)
+        (folder / MADE).mkdir()
+        try:
+            with bounded():
+                kind.use(folder)
+        except CfplanError as error:
+            check_refusal(error, name, folder)
+            if name in FILES:
+                assert taken(folder) == given_files, "a refused input has left files behind"
 
     check()
+
+
+def emptied(folder: Path) -> Path:
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
 
 
 def check_refusal(error: CfplanError, name: str, folder: Path) -> None:

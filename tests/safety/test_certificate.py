@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
-from cfplan.safety.certificate import _bounds, _raise_peaks, _search, _search_interpreted, _segments, certify
+from cfplan.safety.certificate import certify, raise_peaks, segments_of
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
@@ -77,21 +77,6 @@ def test_what_just_passes_keeps_every_limit_on_a_far_finer_grid(make_profile, wa
     assert -true["specific thrust, least"] >= LIMITS.specific_thrust_min
 
 
-@pytest.mark.parametrize("batch", [3, 1_000])
-@pytest.mark.parametrize("broken", [False, True])
-def test_numpy_finds_the_peaks_that_compiled_loops_find(trajectory, batch, broken):
-    _, table = _bounds(AIRFRAME, LIMITS, SPACE)
-    source = dense.sample_source(AIRFRAME, trajectory.path, trajectory.profile)
-    if broken:
-        source.nodes[7, 3] = np.nan
-    given = table, np.array([SPACE.low, SPACE.high]), batch, source, _segments(trajectory)
-    (values, added, places), (expected, expected_added, expected_places) = _search_interpreted(*given), _search(*given)
-    assert np.isnan(values).any() == broken
-    np.testing.assert_allclose(values, expected, rtol=1e-11)
-    np.testing.assert_allclose(places, expected_places, atol=1e-11)
-    np.testing.assert_allclose(added, expected_added, rtol=1e-6, atol=1e-9)
-
-
 @pytest.fixture(scope="module")
 def trajectory(make_profile):
     path, random = min_snap([[0, 0, 1], [1, 1.5, 1.3], [-1, 2, 0.7]]), np.random.default_rng(0)
@@ -101,7 +86,7 @@ def trajectory(make_profile):
 def _peak(rows, sign, counts):
     """Index and value of the peak of all rows."""
     values, places, table = np.array([-np.inf]), np.array([-1.0]), np.array([[0, len(rows), sign]])
-    _raise_peaks(values, np.zeros(1), places, table, rows, np.arange(float(rows.shape[1])), counts)
+    raise_peaks(values, np.zeros(1), places, table, rows, np.arange(float(rows.shape[1])), counts)
     return int(places[0]), values[0]
 
 
@@ -148,7 +133,7 @@ def test_one_value_that_is_not_finite_fails(wrong):
 
 
 def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval(trajectory):
-    segments = _segments(trajectory)
+    segments = segments_of(trajectory)
     body, coefficients, origins, nodes = dense.sample_source(AIRFRAME, trajectory.path, trajectory.profile)
     sampled = [np.empty((dense.SAMPLED_ROWS, count)) for count in segments.counts]
     for rows, left, right, interval, piece, _ in zip(sampled, *segments, strict=True):
@@ -161,15 +146,9 @@ def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval
     assert certify(fast, LIMITS).samples >= 10 * (len(trajectory.profile.s) - 1)
 
 
-def test_batches_change_nothing(trajectory, monkeypatch):
-    whole = certify(trajectory, LIMITS, SPACE)
-    monkeypatch.setattr("cfplan.safety.certificate.BATCH", 500)
-    assert certify(trajectory, LIMITS, SPACE) == whole
-
-
 def plainly(trajectory, limits, samples):
     """The certificate's rule, sample by sample, on the flatness map in plain numpy: the worst of each quantity."""
-    path, profile, segments = trajectory.path, trajectory.profile, _segments(trajectory)
+    path, profile, segments = trajectory.path, trajectory.profile, segments_of(trajectory)
     gaps = segments.counts - 1
     nearer = (samples - len(gaps)) // gaps.sum()
     assert nearer in (1, 4, 16)
