@@ -133,7 +133,8 @@ def _samples(_: Path) -> list[Sound]:
 
 def _use_path(folder: Path) -> None:
     read = load_path_file(folder / "path.yaml")
-    read.path(np.linspace(0.0, read.path.end, 500), 4)
+    s = np.linspace(0.0, read.path.end, 500)
+    assert all(np.isfinite(read.path(s, order)).all() for order in range(5))
     if read.path.length < _LONGEST_PLANNED and len(read.path.breaks) < 100 and _is_planned(folder):
         plan_flight(folder / "path.yaml", load_limits(SAFETY), FlightOptions("convex"))
 
@@ -153,6 +154,9 @@ def _airframe(_: Path) -> list[Sound]:
 
 def _use_safety(folder: Path) -> None:
     limits = load_limits(folder / "safety.yaml")
+    plan, flight = limits.plan, limits.flight
+    assert plan.motor_thrust_min < limits.airframe.hover_thrust < plan.motor_thrust_max
+    assert 0 < plan.speed < flight.speed.brake < flight.speed.land < flight.speed.cut
     for planner in ("convex", "expert") if _is_planned(folder) else ():
         plan_flight(LINE, limits, FlightOptions(planner, nodes=30))
 
