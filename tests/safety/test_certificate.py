@@ -203,29 +203,6 @@ def test_the_compiled_certificate_is_that_of_plain_numpy(make_profile, waypoints
         assert as_upper(margin) == pytest.approx(expected[margin.name], rel=1e-9, abs=1e-9), margin.name
 
 
-def test_margins_are_what_they_once_were(make_profile):
-    """Worst value, share and time of each, as computed by plain numpy; processors round the path differently."""
-    once = {
-        "speed": (2.5812494200507654, 1.2906247100253827, 3.9599245506935365),
-        "acceleration": (3.953892151082605, 0.7907784302165209, 2.661764298369392),
-        "angular velocity": (1.8812567520172414, 0.23515709400215518, 2.4830677188036367),
-        "angular acceleration": (12.612820425062466, 0.3603662978589276, 2.6734970470091093),
-        "tilt": (0.4093329600397851, 0.7817683675292288, 2.656878824875043),
-        "motor thrust, most": (0.0948633432171529, 0.8703059010747972, 1.1991307149339256),
-        "motor thrust, least": (0.06767034129397484, 0.1911326962840027, 2.41455839412602),
-        "specific thrust, least": (9.253827585212946, 0.11338887151621907, 2.4363737362107485),
-        "distance to the walls": (0.4682227869012947, 0.6647215163733816, 5.2162251673040085),
-    }
-    path = min_snap([[0, 0, 1], [1, 1.5, 1.3], [-1, 2, 0.7], [-1.5, -1.0, 1.2]])
-    h, yaw = 1.0 + 0.5 * np.sin(1.3 * np.arange(30)), 0.3 * np.cos(0.9 * np.arange(29)).cumsum()
-    trajectory = Trajectory(path, make_profile(path.end, h, yaw), AIRFRAME)
-    certificate = certify(trajectory, replace(LIMITS, angular_acceleration=35.0), SPACE)
-    assert certificate.duration == pytest.approx(7.2628029465075254, rel=1e-9)
-    assert certificate.samples == 7610
-    for margin in certificate.margins:
-        assert (margin.worst, margin.share, margin.time) == pytest.approx(once[margin.name], rel=1e-9)
-
-
 def test_the_worst_value_is_where_and_when_the_certificate_says(trajectory):
     margins = {margin.name: margin for margin in certify(trajectory, LIMITS, SPACE).margins}
     for name, value_of in (
