@@ -50,7 +50,7 @@ slow: $(VENV)/installed-tests
 
 fuzz: $(VENV)/installed-tests
 	$(BIN)/python -m pytest -m "hypothesis and not slow" --hypothesis-profile=random
-	$(BIN)/python -m tests.fuzzing --inputs 100000
+	$(BIN)/python -m tests.bad_input --inputs 100000
 
 # An archive of the sources, and the wheel made from that archive, in dist/.
 dist: $(VENV)/installed-tests

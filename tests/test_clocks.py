@@ -8,7 +8,6 @@ import pytest
 
 TESTS = Path(__file__).parent
 PACKAGE = TESTS.parent / "cfplan"
-FUZZING = TESTS / "fuzzing"  # a program that looks for hangs; its tests are slow
 LAYERS = ("flight", "simulation", "recording")
 # Modules of those layers that may import `time`, and why.
 READ_REAL_TIME = {
@@ -63,7 +62,7 @@ def test_what_flies_records_or_watches_asks_its_clock():
 
 
 def test_only_slow_tests_read_the_computers_clock():
-    found = {file for file in TESTS.rglob("*.py") if imports_time(file) and FUZZING not in file.parents}
+    found = {file for file in TESTS.rglob("*.py") if imports_time(file)}
     slow = {file for file in found if re.search(r"^pytestmark = .*\bpytest\.mark\.slow\b", file.read_text(), re.M)}
     assert found - slow == {TESTS / "waiting.py"}
 

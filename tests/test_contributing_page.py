@@ -68,14 +68,3 @@ def test_the_source_of_poses_of_the_page_delivers_frames(monkeypatch):
         child.run(parse_uri("vicon://lab/cf1", subject_needed=True), Outlet(), again=False)
     assert sum(isinstance(message, Frame) for message in sent) == 3
     assert any(isinstance(message, Scene) for message in sent)
-
-
-def test_the_page_names_what_is_there():
-    for file in re.findall(r"`((?:planning|flight|preparation|safety|cli|tests|planners)/[\w/]+\.py)`", PAGE):
-        place = REPOSITORY / file if file.startswith("tests/") else REPOSITORY / "cfplan" / file
-        assert place.is_file(), file
-    for mark in re.findall(r"pytest -m (\w+)", PAGE):
-        assert f'"{mark}: ' in (REPOSITORY / "pyproject.toml").read_text()
-    rules = (REPOSITORY / "Makefile").read_text()
-    for rule in re.findall(r"`make (\w+)`|^ {4}make (\w+)", PAGE, re.MULTILINE):
-        assert f"\n{''.join(rule)}:" in rules

@@ -50,7 +50,7 @@ def identify(records: Sequence[Record], *, mass: float | None = None) -> Identif
             where=str(records[0].folder),
             hint="fly flights/identify.yaml; `cfplan report` shows the gaps",
         )
-    return assemble(models, _fit(models), mass=mass, voltage=voltage)
+    return assemble(models, fit_unknowns(models), mass=mass, voltage=voltage)
 
 
 def _check_same_vehicle(records: Sequence[Record]) -> None:
@@ -150,7 +150,7 @@ class _Problem:
         return doubts
 
 
-def _fit(models: Sequence[FlightModel]) -> FittedUnknowns:
+def fit_unknowns(models: Sequence[FlightModel]) -> FittedUnknowns:
     problem = _Problem(models)
     start, bounds = problem.start(), problem.bounds()
     found = least_squares(

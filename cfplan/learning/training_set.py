@@ -102,7 +102,7 @@ def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> Tr
     """Read the rows of a dataset that can be learned from.
 
     Raises:
-        InputError: no dataset, a damaged one, or no row that was solved and certified.
+        InputError: no dataset, a damaged one, or no two paths that were solved and certified.
     """
     spec, rows = read_dataset(folder)
     usable = rows.filter(
@@ -125,7 +125,12 @@ def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> Tr
     h *= np.array([each.time**2 for each in known])[:, None, None]
     bounds, numbers = np.stack([each.bounds for each in known]), np.stack([each.numbers for each in known])
     labels = Labels(*_joined(paths, known), length, h, yaw, chooses, bounds, numbers)
-    return TrainingSet(spec, usable["row"].to_numpy(), paths, known, labels, travel_time)
+    row_numbers = usable["row"].to_numpy()
+    if len(np.unique(row_numbers // (1 + spec.copies))) < 2:
+        raise InputError(
+            "only one path to learn from and to be judged on", where=str(folder), hint="make a dataset of more paths"
+        )
+    return TrainingSet(spec, row_numbers, paths, known, labels, travel_time)
 
 
 def _scaled(rows: pa.Table, folder: FilePath) -> tuple[ScaledLimits, ...]:
@@ -198,8 +203,6 @@ def split(training_set: TrainingSet, seed: int) -> tuple[TrainingSet, TrainingSe
     known = np.unique(paths)
     order = np.random.default_rng([seed, SPLIT_STREAM]).permutation(known)
     count = min(MAX_UNSEEN, max(1, round(UNSEEN_SHARE * len(known))))
-    if count >= len(known):
-        raise InputError("only one path to learn from and to be judged on", where="dataset", hint="make more paths")
     apart = np.isin(paths, order[:count])
     return training_set.part(np.flatnonzero(~apart)), training_set.part(np.flatnonzero(apart))
 

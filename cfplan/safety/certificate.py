@@ -126,7 +126,7 @@ def certify(
     trajectory: Trajectory, limits: PlanLimits, space: Space | None = None, caps: SpeedCaps | None = None
 ) -> Certificate:
     """Check every limit everywhere; space and speed caps too, where given. Never raises: what is not a number fails."""
-    segments, (bounds, table) = _segments(trajectory), _bounds(trajectory.airframe, limits, space)
+    segments, (bounds, table) = segments_of(trajectory), _bounds(trajectory.airframe, limits, space)
     walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
     source = dense.sample_source(trajectory.airframe, trajectory.path, trajectory.profile)
     values, added, places = _search(table, walls, BATCH, source, segments)
@@ -235,7 +235,7 @@ def _capped_speed(trajectory: Trajectory, caps: SpeedCaps, segments: Segments) -
     )  # fmt: skip
 
 
-def _segments(trajectory: Trajectory) -> Segments:
+def segments_of(trajectory: Trajectory) -> Segments:
     """Cut at the grid points, at the breaks of the path, and where the timing was refined because h changes fast."""
     timing = trajectory.timing
     return Segments(*_cut(timing.s, timing.interval, timing.nodes, trajectory.path.breaks))
@@ -245,7 +245,7 @@ def _segments(trajectory: Trajectory) -> Segments:
 def _cut(
     s: NDArray, intervals: NDArray, nodes: NDArray, breaks: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """Return what `_segments` does, of the timing's pieces, which end at `s`, and its profile's table."""
+    """Return what `segments_of` does, of the timing's pieces, which end at `s`, and its profile's table."""
     every, here, there = np.empty(len(s) + len(breaks)), 0, 0  # both in order
     for n in range(len(every)):
         if there == len(breaks) or (here < len(s) and s[here] <= breaks[there]):
@@ -343,13 +343,13 @@ def _search(
             position = rows[dense.POSITION + axis]
             for n in range(samples):
                 position[n] = half - abs(position[n] - middle)
-        _raise_peaks(values, added, places, table, rows, rows[dense.PLACE], counts[begin:end])
+        raise_peaks(values, added, places, table, rows, rows[dense.PLACE], counts[begin:end])
         begin = end
     return values, added, places
 
 
 @njit
-def _raise_peaks(
+def raise_peaks(
     values: NDArray, added: NDArray, places: NDArray, table: NDArray, rows: NDArray, s: NDArray, counts: NDArray
 ) -> None:
     """Update the running maxima with this batch. `table`, (Q, 3): first row, how many, and side.

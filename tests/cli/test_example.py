@@ -6,9 +6,7 @@ import pytest
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["plan"], "Missing argument 'PATH' (or --example)"),
         (["check"], "Missing argument 'PATH_OR_PLAN' (or --example)"),
-        (["plan", "--example", "figure9"], "no such example"),
         (["sim", "--example", "line", "flights/line.yaml"], "both a path and an example"),
         (["fly"], "neither a path nor waypoints"),
         (["fly", "--example", "line", "--uri", "radio://0/80/2M/E7E7E7E7E7"], "only in a room of yours"),

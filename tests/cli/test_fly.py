@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from cfplan.cli.fly import why_late
+from cfplan.errors import ExitCode
 from cfplan.recording.importers.formats import read_log
 
 REPOSITORY = Path(__file__).parents[2]
@@ -99,3 +101,11 @@ def test_a_truncated_record_says_so_and_replays_what_is_there(flight, tmp_path, 
     assert ended.code == 0
     assert "truncated" in ended.out
     assert (tmp_path / "part.rrd").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("code", "late", "said"),
+    [(7, 0.12, True), (7, 0.004, False), (7, None, False), (6, 0.12, False), (8, 0.12, False)],
+)
+def test_a_flight_that_a_safety_rule_ended_on_a_busy_computer_says_so(code, late, said):
+    assert ("120 ms late" in why_late(ExitCode(code), {"lateness_max": late})) is said

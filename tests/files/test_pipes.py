@@ -4,16 +4,14 @@ import os
 import threading
 from pathlib import Path
 
-import pytest
-
 from cfplan.errors import InputError
-from cfplan.files import text
+from cfplan.files.text import read_text
 from cfplan.geometry.path_file import load_path_file
 from cfplan.learning.dataset import describe
 from cfplan.learning.model_files import WEIGHTS, load_card, load_model, save_model
 from cfplan.planning.plan_file import load_plan
 from cfplan.recording.importers.formats import read_log
-from cfplan.recording.reader import read_record
+from cfplan.recording.reader import is_record, read_record
 from cfplan.safety.limits_file import load_limits
 from cfplan.vehicle.airframes import load_airframe
 from tests.learning.conftest import card, weights
@@ -32,6 +30,7 @@ READERS = {
     "own.yaml": lambda file: load_airframe(str(file)),
     "plan.parquet": load_plan,
     "log.csv": read_log,
+    "record": read_record,
     "flight.mcap": lambda file: read_record(file.parent),
     "card.json": lambda file: load_card(file.parent),
     "weights": load_piped_weights,
@@ -39,23 +38,27 @@ READERS = {
 }
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_a_pipe_without_a_writer_is_refused(tmp_path, name, monkeypatch):
-    monkeypatch.setattr(text, "PIPE_PATIENCE", 0.2)
-    os.mkfifo(tmp_path / name)
-    found: list[InputError] = []
+def test_a_pipe_without_a_writer_is_refused(tmp_path):
+    """By all readers at the same time, some of which wait for a moment."""
+    found: dict[str, InputError] = {}
 
-    def read() -> None:
+    def read(name: str) -> None:
+        folder = tmp_path / name.partition(".")[0]
+        folder.mkdir()
+        os.mkfifo(folder / name)
         try:
-            READERS[name](tmp_path / name)
+            READERS[name](folder / name)
         except InputError as error:
-            found.append(error)
+            found[name] = error
 
-    reading = threading.Thread(target=read, daemon=True)
-    reading.start()
-    reading.join(30.0)
-    assert found, "it waits"
-    assert found[0].hint
+    reading = [threading.Thread(target=read, args=(name,), daemon=True) for name in READERS]
+    for thread in reading:
+        thread.start()
+    for thread in reading:
+        thread.join(30.0)
+    assert set(found) == set(READERS), "some wait"
+    assert all(error.hint and error.where for error in found.values())
+    assert not is_record(tmp_path / "flight" / "flight.mcap")
 
 
 def test_points_may_come_from_a_pipe_that_is_written(tmp_path):
@@ -64,3 +67,10 @@ def test_points_may_come_from_a_pipe_that_is_written(tmp_path):
     writing = threading.Thread(target=(tmp_path / "points.csv").write_text, args=("0,0,1\n1,0,1\n",), daemon=True)
     writing.start()
     assert len(load_path_file(tmp_path / "path.yaml").waypoints) == 2
+
+
+def test_a_pipe_is_read_to_its_end(tmp_path):
+    pipe, words = tmp_path / "pipe", "1 2 3\n" * 50_000
+    os.mkfifo(pipe)
+    threading.Thread(target=pipe.write_text, args=(words,), daemon=True).start()
+    assert read_text(pipe) == words

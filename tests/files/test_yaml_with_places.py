@@ -3,9 +3,6 @@
 import pathlib
 
 import pytest
-import yaml
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field
 
 from cfplan.errors import InputError
@@ -139,57 +136,6 @@ def test_an_alias_bomb_is_refused_at_its_first_anchor(read):
         lines.append(f"{name}: &{name} [{','.join(['*' + before] * 10)}]")
     with pytest.raises(InputError, match=r":1:4: anchors and aliases"):
         read("\n".join(lines))
-
-
-scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
-structures = st.recursive(
-    scalars, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text() | st.integers(), inner, max_size=4)
-)
-keyed = st.fixed_dictionaries(
-    {},
-    optional={
-        "name": structures,
-        "box": structures | st.fixed_dictionaries({}, optional={"low": structures, "margin": structures}),
-        "mode": structures,
-        "count": structures,
-    },
-)
-anything = settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-def only_input_errors(read, content: str | bytes) -> None:
-    try:
-        read(content)
-    except InputError as refusal:
-        said = refusal
-    else:
-        return
-    assert "room.yaml" in said.where
-    assert "\n" not in str(said)
-
-
-@anything
-@given(st.text())
-def test_any_text_is_read_or_refused(read, text):
-    only_input_errors(read, text.encode(errors="surrogatepass"))
-
-
-@anything
-@given(st.binary())
-def test_any_bytes_are_read_or_refused(read, content):
-    only_input_errors(read, content)
-
-
-@anything
-@given(st.text(alphabet="nameboxlw:-?[]{}&*!|>'\"%@`#,.01 \n\t", max_size=200))
-def test_any_punctuation_is_read_or_refused(read, text):
-    only_input_errors(read, text)
-
-
-@anything
-@given(structures | keyed)
-def test_any_structure_is_read_or_refused(read, data):
-    only_input_errors(read, yaml.safe_dump(data, allow_unicode=True))
 
 
 def test_a_file_that_would_take_long_to_read_is_refused_at_once(tmp_path):

@@ -6,8 +6,6 @@ import pathlib
 import numpy as np
 import pytest
 import yaml
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
@@ -150,62 +148,6 @@ def test_decimal_commas_in_a_file_are_refused_as_such(load, row):
 @pytest.mark.parametrize("row", ["1,0,1", "1, 0, 1", "1 , 0 ,1", "1;0;1", "1; 0; 1", "1 0 1", "1\t0\t1", "1,0,1,"])
 def test_one_separator_is_enough(load, row):
     assert load("points: rows.csv\n", rows=f"0,0,1\n{row}\n").path.end > 0.9
-
-
-numbers = st.floats() | st.integers(-3, 3) | st.floats(-3, 3)
-points = st.lists(st.lists(numbers, min_size=3, max_size=3) | st.lists(numbers, max_size=4), max_size=6)
-contents = st.fixed_dictionaries(
-    {},
-    optional={
-        "name": st.text() | numbers,
-        "waypoints": points | st.text(),
-        "points": st.sampled_from(["knots.csv", "..", "", "x\0y"]) | st.text(),
-        "polynomials": st.just("knots.csv") | st.text(),
-        "samples": st.just("knots.csv") | st.text(),
-        "yaw": st.sampled_from([*YawMode]).map(str) | st.dictionaries(st.sampled_from(["mode", "angle_deg"]), numbers),
-        "laps": st.integers(-1, 5),
-        "speed": numbers,
-        "place": st.dictionaries(st.sampled_from(["x", "y", "z", "yaw_deg"]), numbers),
-    },
-)
-anything = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-def loaded_or_refused(load, content: str | dict, **files: str) -> None:
-    try:
-        flight = load(content, **files)
-    except InputError as refusal:
-        said = str(refusal)
-    else:
-        s = np.linspace(0, flight.path.end, 20)
-        assert all(np.isfinite(flight.path(s, order)).all() for order in range(5))
-        return
-    assert "\n" not in said
-
-
-@anything
-@given(contents)
-def test_any_content_is_a_path_or_refused(load, content):
-    loaded_or_refused(load, content, knots="0,0,1\n1,0,1\n")
-
-
-@anything
-@given(points.filter(lambda rows: len(rows) > 1))
-def test_any_waypoints_are_a_path_or_refused(load, waypoints):
-    loaded_or_refused(load, {"waypoints": waypoints})
-
-
-@anything
-@given(st.text() | st.text(alphabet="0123456789.,;-+e \n\tnaif#"))
-def test_any_points_file_is_a_path_or_refused(load, text):
-    loaded_or_refused(load, {"points": "knots.csv"}, knots=text.encode(errors="replace").decode())
-
-
-@anything
-@given(st.lists(st.lists(st.floats(-1e3, 1e3) | st.floats(), min_size=33, max_size=33), max_size=3))
-def test_any_polynomial_file_is_a_path_or_refused(load, rows):
-    text = "\n".join(",".join(map(str, row)) for row in rows)
-    loaded_or_refused(load, {"polynomials": "rows.csv"}, rows=text)
 
 
 def test_there_are_flights_of_every_kind():

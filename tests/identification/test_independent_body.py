@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from cfplan.identification.identify import _fit
+from cfplan.identification.identify import fit_unknowns
 from cfplan.identification.quantities import assemble
 from cfplan.identification.signals import FlightSignals
 from cfplan.identification.translation import flight_model
@@ -63,7 +63,7 @@ def fly(liveliness):
 
 def identified(signals):
     models = [flight_model(signals, 3.8)]
-    return assemble(models, _fit(models), mass=MASS, voltage=3.8)
+    return assemble(models, fit_unknowns(models), mass=MASS, voltage=3.8)
 
 
 def test_the_independent_body_is_found():

@@ -34,12 +34,6 @@ def test_shapes_are_those_of_torch(architecture):
     assert set(inference.NETWORKS) == {str(kind) for kind in networks.NETWORKS}
 
 
-def test_the_hyperbolic_tangent_is_one():
-    x = np.linspace(-20, 20, 4001, dtype=np.float32)
-    found = np.array([inference._tanh(value) for value in x])
-    np.testing.assert_allclose(found, np.tanh(x.astype(float)), atol=4e-7)
-
-
 def test_the_decoder_is_fed_its_own_answers():
     """With the true answers before it, the attention network answers otherwise, and in one go."""
     torch.manual_seed(0)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
-from cfplan.safety.certificate import _bounds, _raise_peaks, _search, _search_interpreted, _segments, certify
+from cfplan.safety.certificate import certify, raise_peaks, segments_of
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
@@ -77,21 +77,6 @@ def test_what_just_passes_keeps_every_limit_on_a_far_finer_grid(make_profile, wa
     assert -true["specific thrust, least"] >= LIMITS.specific_thrust_min
 
 
-@pytest.mark.parametrize("batch", [3, 1_000])
-@pytest.mark.parametrize("broken", [False, True])
-def test_numpy_finds_the_peaks_that_compiled_loops_find(trajectory, batch, broken):
-    _, table = _bounds(AIRFRAME, LIMITS, SPACE)
-    source = dense.sample_source(AIRFRAME, trajectory.path, trajectory.profile)
-    if broken:
-        source.nodes[7, 3] = np.nan
-    given = table, np.array([SPACE.low, SPACE.high]), batch, source, _segments(trajectory)
-    (values, added, places), (expected, expected_added, expected_places) = _search_interpreted(*given), _search(*given)
-    assert np.isnan(values).any() == broken
-    np.testing.assert_allclose(values, expected, rtol=1e-11)
-    np.testing.assert_allclose(places, expected_places, atol=1e-11)
-    np.testing.assert_allclose(added, expected_added, rtol=1e-6, atol=1e-9)
-
-
 @pytest.fixture(scope="module")
 def trajectory(make_profile):
     path, random = min_snap([[0, 0, 1], [1, 1.5, 1.3], [-1, 2, 0.7]]), np.random.default_rng(0)
@@ -101,7 +86,7 @@ def trajectory(make_profile):
 def _peak(rows, sign, counts):
     """Index and value of the peak of all rows."""
     values, places, table = np.array([-np.inf]), np.array([-1.0]), np.array([[0, len(rows), sign]])
-    _raise_peaks(values, np.zeros(1), places, table, rows, np.arange(float(rows.shape[1])), counts)
+    raise_peaks(values, np.zeros(1), places, table, rows, np.arange(float(rows.shape[1])), counts)
     return int(places[0]), values[0]
 
 
@@ -148,7 +133,7 @@ def test_one_value_that_is_not_finite_fails(wrong):
 
 
 def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval(trajectory):
-    segments = _segments(trajectory)
+    segments = segments_of(trajectory)
     body, coefficients, origins, nodes = dense.sample_source(AIRFRAME, trajectory.path, trajectory.profile)
     sampled = [np.empty((dense.SAMPLED_ROWS, count)) for count in segments.counts]
     for rows, left, right, interval, piece, _ in zip(sampled, *segments, strict=True):
@@ -161,15 +146,9 @@ def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval
     assert certify(fast, LIMITS).samples >= 10 * (len(trajectory.profile.s) - 1)
 
 
-def test_batches_change_nothing(trajectory, monkeypatch):
-    whole = certify(trajectory, LIMITS, SPACE)
-    monkeypatch.setattr("cfplan.safety.certificate.BATCH", 500)
-    assert certify(trajectory, LIMITS, SPACE) == whole
-
-
 def plainly(trajectory, limits, samples):
     """The certificate's rule, sample by sample, on the flatness map in plain numpy: the worst of each quantity."""
-    path, profile, segments = trajectory.path, trajectory.profile, _segments(trajectory)
+    path, profile, segments = trajectory.path, trajectory.profile, segments_of(trajectory)
     gaps = segments.counts - 1
     nearer = (samples - len(gaps)) // gaps.sum()
     assert nearer in (1, 4, 16)
@@ -222,29 +201,6 @@ def test_the_compiled_certificate_is_that_of_plain_numpy(make_profile, waypoints
         return
     for margin in certificate.margins:
         assert as_upper(margin) == pytest.approx(expected[margin.name], rel=1e-9, abs=1e-9), margin.name
-
-
-def test_margins_are_what_they_once_were(make_profile):
-    """Worst value, share and time of each, as computed by plain numpy; processors round the path differently."""
-    once = {
-        "speed": (2.5812494200507654, 1.2906247100253827, 3.9599245506935365),
-        "acceleration": (3.953892151082605, 0.7907784302165209, 2.661764298369392),
-        "angular velocity": (1.8812567520172414, 0.23515709400215518, 2.4830677188036367),
-        "angular acceleration": (12.612820425062466, 0.3603662978589276, 2.6734970470091093),
-        "tilt": (0.4093329600397851, 0.7817683675292288, 2.656878824875043),
-        "motor thrust, most": (0.0948633432171529, 0.8703059010747972, 1.1991307149339256),
-        "motor thrust, least": (0.06767034129397484, 0.1911326962840027, 2.41455839412602),
-        "specific thrust, least": (9.253827585212946, 0.11338887151621907, 2.4363737362107485),
-        "distance to the walls": (0.4682227869012947, 0.6647215163733816, 5.2162251673040085),
-    }
-    path = min_snap([[0, 0, 1], [1, 1.5, 1.3], [-1, 2, 0.7], [-1.5, -1.0, 1.2]])
-    h, yaw = 1.0 + 0.5 * np.sin(1.3 * np.arange(30)), 0.3 * np.cos(0.9 * np.arange(29)).cumsum()
-    trajectory = Trajectory(path, make_profile(path.end, h, yaw), AIRFRAME)
-    certificate = certify(trajectory, replace(LIMITS, angular_acceleration=35.0), SPACE)
-    assert certificate.duration == pytest.approx(7.2628029465075254, rel=1e-9)
-    assert certificate.samples == 7610
-    for margin in certificate.margins:
-        assert (margin.worst, margin.share, margin.time) == pytest.approx(once[margin.name], rel=1e-9)
 
 
 def test_the_worst_value_is_where_and_when_the_certificate_says(trajectory):

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from cfplan.errors import CfplanError, InputError
+from cfplan.errors import InputError
 from cfplan.flight.firmware import NEWEST_KNOWN
 from cfplan.safety.limits import Ladder
 from cfplan.safety.limits_file import DEFAULTS, load_limits
@@ -211,47 +209,3 @@ def test_the_place_of_a_wrong_value_is_its_line_and_column(tmp_path):
     with pytest.raises(InputError) as error:
         load_limits(file)
     assert error.value.where == f"{file}:{line}:13"
-
-
-def read_or_refused(file):
-    """The limits, or what the error says."""
-    try:
-        return load_limits(file)
-    except CfplanError as error:
-        return str(error)
-
-
-leaves = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8), st.lists(st.floats(), max_size=4)
-)
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.dictionaries(st.sampled_from([".".join(place) for place in keys()]), leaves, min_size=1, max_size=3))
-def test_any_values_are_read_soundly_or_refused_in_one_line(tmp_path, changes):
-    limits = read_or_refused(changed(tmp_path, changes))
-    if isinstance(limits, str):
-        assert "\n" not in limits
-    else:
-        assert limits.plan.motor_thrust_min < limits.airframe.hover_thrust < limits.plan.motor_thrust_max
-        assert 0 < limits.plan.speed < limits.flight.speed.brake < limits.flight.speed.land < limits.flight.speed.cut
-
-
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.integers(0, len(SAFETY.read_text())), st.text(max_size=6))
-def test_a_file_with_a_slip_anywhere_is_read_or_refused_in_one_line(tmp_path, place, slip):
-    text = SAFETY.read_text()
-    file = tmp_path / "safety.yaml"
-    file.write_text(text[:place] + slip + text[place + len(slip) :], encoding="utf-8", errors="surrogatepass")
-    limits = read_or_refused(file)
-    assert not isinstance(limits, str) or "\n" not in limits
-
-
-@pytest.mark.parametrize("value", [None, True, "word", "", -1, 1e9, [], [1, 2], {"a": 1}, {}])
-@pytest.mark.parametrize("place", [".".join(place) for place in keys()] + ["plan", "flight.speed", "space"])
-def test_every_value_of_a_wrong_kind_is_refused_with_a_hint(tmp_path, place, value):
-    try:
-        load_limits(changed(tmp_path, {place: value}))
-    except InputError as error:
-        assert error.where  # noqa: PT017  some of them are right
-        assert error.hint  # noqa: PT017

@@ -179,8 +179,8 @@ def program_of(task):
     """The numbers by which TOPPQuad's program knows the limits: bounds of variables and rows, and rows at a point."""
     grid = np.linspace(0.0, task.path.end, task.nodes + 1)
     at = np.random.default_rng(0).uniform(0.2, 0.8, toppquad_nlp.VARIABLES), np.ones(8)
-    rows = toppquad_nlp._node(task.airframe, task.limits.angular_acceleration)(*at)
-    return toppquad._bounds(task, grid, YawMode.FIXED) | {"rows": np.array(rows)}
+    rows = toppquad_nlp.node_rows(task.airframe, task.limits.angular_acceleration)(*at)
+    return toppquad.program_bounds(task, grid, YawMode.FIXED) | {"rows": np.array(rows)}
 
 
 @each_quantity

@@ -66,7 +66,7 @@ def connect(
         crazyflie.open_link(uri)
         if crazyflie.link is not None:
             empty_air(crazyflie.link, clock.now)
-            crazyflie.link = _Serialized(crazyflie.link, clock)
+            crazyflie.link = SerializedDriver(crazyflie.link, clock)
 
     threading.Thread(target=open_link, daemon=True).start()
     try:
@@ -128,7 +128,7 @@ def _table_cache() -> str | None:
     return str(folder) if os.access(folder, os.W_OK) else None
 
 
-class _Serialized:
+class SerializedDriver:
     """A link driver that sends for one thread at a time, and in flight drops a packet rather than wait for long.
 
     cflib's radio driver has a queue of one and waits for 2 s if the radio is dead. A setpoint or a pose that waited

@@ -80,7 +80,7 @@ def plan_convex(task: PlanningTask) -> Solution:
     rows = inner_rows(at, airframe, limits, fastest)
     rows = replace(rows, ceiling=np.minimum(rows.ceiling, allowed_speed(limits.speed, task.speed_caps, at.s) ** 2))
     try:
-        speeds = _solved(at, rows, boundary)
+        speeds = solve_rows(at, rows, boundary)
     except InfeasibleError as error:
         return Solution(Status.INFEASIBLE, None, str(error))
     along = YawSpline.along(task.path, task.nodes, task.yaw, task.yaw_angle)
@@ -139,7 +139,7 @@ def _reachable_top(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
         ) from error
 
 
-def _solved(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
+def solve_rows(at: Stations, rows: Rows, boundary: Boundary) -> NDArray:
     try:
         return copp_py.solver.topp2_ra.solve(_problem(at, rows, boundary))
     except copp_py.core.CoppError as error:

@@ -64,8 +64,8 @@ def plan_toppquad(task: PlanningTask, *, penalty: float = PENALTY) -> Solution:
     if task.start is not None and yaw is YawMode.FREE:
         yaw_angle = task.start.yaw
     angles = YawSpline.along(path, nodes, yaw, yaw_angle).yaw
-    asked = _bounds(task, grid, yaw)
-    held = _bounds(task, grid, YawMode.FIXED)
+    asked = program_bounds(task, grid, yaw)
+    held = program_bounds(task, grid, YawMode.FIXED)
     guesses = [_guess(path, grid, airframe, angles, _guessed_h(path, grid, limits, speed)) for speed in GUESS_SPEEDS]
     parameters = _parameters(path, grid, angles)
 
@@ -122,7 +122,7 @@ def _parameters(path: Path, grid: NDArray, angles: NDArray) -> NDArray:
     return np.concatenate([[grid[1] - grid[0]], columns.ravel()])
 
 
-def _bounds(task: PlanningTask, grid: NDArray, yaw: YawMode) -> dict[str, NDArray]:
+def program_bounds(task: PlanningTask, grid: NDArray, yaw: YawMode) -> dict[str, NDArray]:
     """Return lbx, ubx, lbg, ubg for that way to yaw."""
     path, airframe, limits = task.path, task.airframe, task.limits
     count = len(grid)

@@ -62,8 +62,8 @@ def build_toppquad(
     path = casadi.MX.sym("path", 8, nodes)  # γ' and γ'', cosine and sine of half the yaw where it is fixed
     step = casadi.MX.sym("step")
 
-    rows = _node(airframe, angular_acceleration).map(nodes)(x, path)
-    steps = _interval().map(nodes - 1)(x[:, :-1], x[:, 1:], casadi.repmat(step, 1, nodes - 1))
+    rows = node_rows(airframe, angular_acceleration).map(nodes)(x, path)
+    steps = interval_residual().map(nodes - 1)(x[:, :-1], x[:, 1:], casadi.repmat(step, 1, nodes - 1))
     first = casadi.sumsqr(x[2:6, 0])
     h, alpha = x[0, :], x[9:12, :]
     duration = casadi.sum2(2 * step / (casadi.sqrt(h[:-1]) + casadi.sqrt(h[1:])))
@@ -89,7 +89,7 @@ def build_toppquad(
     return ToppquadNlp(casadi.nlpsol("toppquad", "ipopt", nlp, options), nodes)
 
 
-def _node(airframe: Airframe, angular_acceleration: float) -> Any:
+def node_rows(airframe: Airframe, angular_acceleration: float) -> Any:
     """Return the rows of one grid point: the dynamics in units of g and of a motor's hover torque, then limits."""
     import casadi
 
@@ -125,7 +125,7 @@ def _node(airframe: Airframe, angular_acceleration: float) -> Any:
     return casadi.Function("node", [x, path], [rows])
 
 
-def _interval() -> Any:
+def interval_residual() -> Any:
     """Return the residual of one step: zero where x at its end follows from x at its start."""
     import casadi
 

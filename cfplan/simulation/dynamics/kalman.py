@@ -111,7 +111,7 @@ def step_filter(
     if tick % PREDICTION_PERIOD == 0 and kalman.sums[6] > 0:
         for place in range(6):
             kalman.sums[place] /= kalman.sums[6]
-        _predict(kalman, prior, flying)
+        predict(kalman, prior, flying)
         _clear(kalman.sums)
         changed = True
     _add_noise(kalman, prior)
@@ -162,7 +162,7 @@ def _within_bounds(kalman: Filter, prior: NDArray) -> bool:
 
 
 @njit
-def _predict(kalman: Filter, prior: NDArray, flying: bool) -> None:
+def predict(kalman: Filter, prior: NDArray, flying: bool) -> None:
     """Predict over PREDICTION_PERIOD with the means in `sums`.
 
     In body axes dv/dt = f − ω × v − g Rᵀe₃ − drag v, where in flight f is along z alone.
@@ -174,7 +174,7 @@ def _predict(kalman: Filter, prior: NDArray, flying: bool) -> None:
     fx, fy, fz = sums[3], sums[4], sums[5]
     if flying:
         fx = fy = 0.0
-    _carry(kalman.covariance, _linearised(state, turn, sums, prior, dt, flying))
+    _carry(kalman.covariance, linearised(state, turn, sums, prior, dt, flying))
 
     px, py, pz = state[3], state[4], state[5]
     dx, dy, dz = px * dt + fx * dt * dt / 2, py * dt + fy * dt * dt / 2, pz * dt + fz * dt * dt / 2
@@ -198,7 +198,7 @@ def _predict(kalman: Filter, prior: NDArray, flying: bool) -> None:
 
 
 @njit
-def _linearised(state: NDArray, turn: NDArray, gyro: NDArray, prior: NDArray, dt: float, flying: bool) -> NDArray:
+def linearised(state: NDArray, turn: NDArray, gyro: NDArray, prior: NDArray, dt: float, flying: bool) -> NDArray:
     """Return the (9, 9) Jacobian of one prediction."""
     step = np.zeros((_SIZE, _SIZE))
     for axis in range(_SIZE):
@@ -281,7 +281,7 @@ def _bound(covariance: NDArray) -> None:
 def _fuse_pose(kalman: Filter, poses: NDArray, row: int) -> None:
     x, y, z, w = poses[row, 3], poses[row, 4], poses[row, 5], poses[row, 6]
     for axis in range(3):
-        _fuse(kalman, axis, poses[row, axis] - kalman.state[axis], poses[row, 7])
+        fuse(kalman, axis, poses[row, axis] - kalman.state[axis], poses[row, 7])
     if x == 0.0 and y == 0.0 and z == 0.0 and w == 0.0:
         return
     # The residual estimate⁻¹ ⊗ measured, in body axes; small angles.
@@ -293,11 +293,11 @@ def _fuse_pose(kalman: Filter, poses: NDArray, row: int) -> None:
         scale * (d * z + a * y - b * x + c * w),
     )
     for axis in range(3):
-        _fuse(kalman, 6 + axis, error[axis], poses[row, 8])
+        fuse(kalman, 6 + axis, error[axis], poses[row, 8])
 
 
 @njit(error_model="numpy")
-def _fuse(kalman: Filter, measured: int, error: float, deviation: float) -> None:
+def fuse(kalman: Filter, measured: int, error: float, deviation: float) -> None:
     """Fuse a direct measurement of one state: with c = P e and k = c / (eᵀc + σ²), P ← P − k cᵀ."""
     covariance = kalman.covariance
     spread = covariance[measured, measured] + deviation * deviation

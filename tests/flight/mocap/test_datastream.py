@@ -1,6 +1,5 @@
 """Vicon's DataStream, byte by byte."""
 
-import contextlib
 import math
 import socket
 import struct
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError, LinkError
-from cfplan.flight.mocap.datastream import Block, Decoder, MalformedError, kinds, packet, read_blocks
+from cfplan.flight.mocap.datastream import Block, Decoder, kinds, packet, read_blocks
 from cfplan.flight.mocap.datastream_client import DataStreamClient
 
 
@@ -129,18 +128,6 @@ def test_what_is_unchanged_is_kept():
 
 def test_a_packet_without_a_frame_is_none():
     assert decode(Decoder(), block(42, bytes(8))) is None
-
-
-@given(st.binary(max_size=200))
-def test_any_bytes_are_blocks_or_malformed(data):
-    with contextlib.suppress(MalformedError):
-        Decoder().frame(memoryview(data), 0.0)
-
-
-@given(st.sampled_from([2, 5, 9, 26, 37, 39, 40, 100004]), st.binary(max_size=120))
-def test_any_payload_is_read_or_malformed(kind, data):
-    with contextlib.suppress(MalformedError):
-        Decoder().frame(memoryview(block(kind, data)), 0.0)
 
 
 def test_what_is_packed_is_unpacked():

@@ -9,7 +9,7 @@ import pytest
 from cflib.crtp.radiodriver import _RadioDriverThread
 from waiting import until
 
-from cfplan.flight.radio.connection import _Serialized
+from cfplan.flight.radio.connection import SerializedDriver
 from cfplan.flight.radio.link import packet
 from cfplan.flight.radio.perishable import KEEPS_FOR, empty_air, is_perishable
 from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
@@ -64,7 +64,7 @@ def driver(dongle):
     driver._thread._radio_link_statistics = SimpleNamespace(update=lambda *_: None)
     empty_air(driver, lambda: dongle.now)
     driver._thread.start()
-    yield _Serialized(driver, SimpleNamespace(now=lambda: dongle.now))
+    yield SerializedDriver(driver, SimpleNamespace(now=lambda: dongle.now))
     driver._thread.stop()
 
 

@@ -99,7 +99,7 @@ def test_the_inner_solution_keeps_the_limits_when_differentiated_in_the_world(se
     chosen = LIMIT_SETS[set_name]
     at = stations(wiggly, spacing=0.004, turn=0.004)
     fastest = np.full(len(at.length), chosen.limits.speed)
-    b = convex._solved(at, inner_rows(at, chosen.airframe, chosen.limits, fastest), (0.0, 0.0))
+    b = convex.solve_rows(at, inner_rows(at, chosen.airframe, chosen.limits, fastest), (0.0, 0.0))
     time = np.concatenate([[0.0], np.cumsum(2 * np.diff(at.length) / (np.sqrt(b[1:]) + np.sqrt(b[:-1])))])
     velocity = np.diff(wiggly(at.s), axis=0) / np.diff(time)[:, None]
     middle = 0.5 * (time[1:] + time[:-1])

@@ -53,7 +53,7 @@ def variables() -> np.ndarray:
 
 def test_a_step_turns_the_quaternion_as_scipy_does_and_keeps_its_length(variables):
     step, after = 0.1, np.zeros(toppquad_nlp.VARIABLES)
-    residual = np.array(toppquad_nlp._interval()(variables, after, step)).ravel()
+    residual = np.array(toppquad_nlp.interval_residual()(variables, after, step)).ravel()
     h, q, omega = -residual[0], -residual[1:5], -residual[5:8]
     turn = Rotation.from_quat(np.append(step / 2 * variables[6:9], 1.0))
     expected = (Rotation.from_quat(variables[2:6]) * turn).as_quat()
@@ -81,7 +81,7 @@ def test_the_coupling_is_newton_and_euler_in_time(variables):
     torque_gap = inertia * turning + np.cross(now, inertia * now) - wrench[1:]
 
     parameters = np.concatenate([first, second, [1.0, 0.0]])
-    rows = np.array(toppquad_nlp._node(airframe, 35.0)(variables, parameters)).ravel()
+    rows = np.array(toppquad_nlp.node_rows(airframe, 35.0)(variables, parameters)).ravel()
     np.testing.assert_allclose(rows[:3] * GRAVITY, force_gap, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(rows[3:6] * airframe.arm * airframe.hover_thrust, torque_gap, rtol=1e-6, atol=1e-10)
     assert rows[6] == pytest.approx(acceleration @ acceleration, rel=1e-6)

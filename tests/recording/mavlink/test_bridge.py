@@ -230,13 +230,16 @@ def test_a_ground_station_learns_where_the_vehicle_is(station, link):
 
 
 def test_each_kind_comes_at_its_rate(station, link):
-    hover(link, station.clock.now())
-    link.show(SetpointSent(0.0, 0.0, 5, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, (0, 0, 0, 1.0), (0.0,) * 3))
+    sent = SetpointSent(0.0, 0.0, 5, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, (0, 0, 0, 1.0), (0.0,) * 3)
+    estimate = Estimate(0.0, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, (0.0, 0.0, 0.0, 1.0))
+    status = VehicleStatus(0.0, (0.0,) * 3, (0,) * 4, 4.0, 0)
+    for message in (sent, estimate, status):
+        link.show(message)
     station.listen(0.3)
     station.heard.clear()
     station.listen(3.0)
     kinds = [message.get_type() for message in station.heard]
-    mav, latest = common.MAVLink(None), link._latest
+    mav, latest = common.MAVLink(None), Latest(0.0, estimate=estimate, status=status, setpoint=sent)
     for make, rate in RATES:
         kind = make(mav, latest).get_type()
         assert abs(kinds.count(kind) - 3 * rate) <= 1, kind

@@ -8,7 +8,6 @@ from rerun.chunk import RrdReader
 from cfplan.errors import InputError
 from cfplan.flight.clock import SteppedClock
 from cfplan.flight.telemetry import PhaseEntered, PoseReceived, SetpointSent
-from cfplan.recording.record import Record
 from cfplan.recording.rerun import layout, live
 from cfplan.recording.rerun.live import LiveView, live_blueprint, open_live
 from cfplan.recording.topics import TOPICS, columns_from_json, columns_of, message_to_json
@@ -95,10 +94,11 @@ def test_a_view_that_cannot_keep_up_leaves_the_oldest_out(flight):
     assert len(view._waiting) == live.CAPACITY
 
 
-def test_an_empty_part_is_a_record_that_can_be_laid_out(flight):
-    part = live._part(flight.header, [])
-    assert isinstance(part, Record)
-    assert part.duration == 0.0
+def test_a_view_of_a_flight_that_says_nothing_is_no_failure(flight):
+    clock = SteppedClock()
+    with LiveView(rr.RecordingStream("cfplan"), flight.header, clock=clock) as view:
+        clock.sleep(1.0)
+    assert view.failure == ""
 
 
 def test_without_a_screen_there_is_no_live_view(flight, monkeypatch):

@@ -17,8 +17,14 @@ def go_to(planner, place, yaw=0.0, duration=2.0, time=0.0, relative=0, linear=0)
 
 
 @pytest.fixture
-def planner():
-    return HighLevelCommander(bytearray(4096), lambda: Goal(np.array([1.0, 2.0, 0.5, 0.3]), STILL, STILL, STILL))
+def memory():
+    """The memory that clients upload to."""
+    return bytearray(4096)
+
+
+@pytest.fixture
+def planner(memory):
+    return HighLevelCommander(memory, lambda: Goal(np.array([1.0, 2.0, 0.5, 0.3]), STILL, STILL, STILL))
 
 
 def test_a_septic_meets_its_ends_and_moves_smoothly():
@@ -116,10 +122,10 @@ def start(planner, *, relative=0, backwards=0, scale=1.0):
 
 
 @pytest.fixture
-def uploaded(planner):
+def uploaded(planner, memory):
     """Two seconds of x(t) = t, then one of x(t) = 2 + t + t²."""
     content = piece(2.0, {0: [0.0, 1.0], 2: [1.0]}) + piece(1.0, {0: [2.0, 1.0, 1.0], 2: [1.0]})
-    planner._memory[: len(content)] = content
+    memory[: len(content)] = content
     assert planner.receive(struct.pack("<BBBBIB", 6, 1, 1, 0, 0, 2), 0.0, blocked=False)[3] == 0
     return planner
 
@@ -148,12 +154,12 @@ def test_a_curve_that_was_never_defined_is_not_executed(planner):
     assert planner.receive(struct.pack("<BBBBIB", 6, 1, 1, 0, 4000, 2), 0.0, blocked=False)[3] == 8
 
 
-def test_compressed_pieces_are_flown_once_forwards_at_their_own_pace(planner):
+def test_compressed_pieces_are_flown_once_forwards_at_their_own_pace(planner, memory):
     """From (1, 0, 0.5) m by a straight piece to x = 2 m in 2 s, then at rest in x while y goes up a cubic."""
     content = struct.pack("<4h", 1000, 0, 500, 0)
     content += struct.pack("<BHh", 1, 2000, 2000) + struct.pack("<BH3h", 2 << 2, 1000, 0, 300, 300)
-    planner._memory[100 : 100 + len(content)] = content
-    planner._memory[100 + len(content) : 103 + len(content)] = bytes(3)
+    memory[100 : 100 + len(content)] = content
+    memory[100 + len(content) : 103 + len(content)] = bytes(3)
     assert planner.receive(struct.pack("<BBBBIB", 6, 1, 1, 1, 100, 2), 0.0, blocked=False)[3] == 0
     assert start(planner, scale=2.0) == 8
     assert start(planner, backwards=1) == 8
@@ -166,7 +172,7 @@ def test_compressed_pieces_are_flown_once_forwards_at_their_own_pace(planner):
     assert not end[VELOCITY].any()
 
 
-def test_compressed_pieces_that_do_not_end_are_not_executed(planner):
-    planner._memory[:] = b"\x01" * len(planner._memory)
+def test_compressed_pieces_that_do_not_end_are_not_executed(planner, memory):
+    memory[:] = b"\x01" * len(memory)
     assert planner.receive(struct.pack("<BBBBIB", 6, 1, 1, 1, 0, 2), 0.0, blocked=False)[3] == 0
     assert start(planner) == 8

@@ -40,7 +40,7 @@ def predicted(change, drag):
     kalman = moving_filter()
     kalman.state[0:6] += change[0:6]
     kalman.quaternion[:] = (Rotation.from_quat(kalman.quaternion) * Rotation.from_rotvec(change[6:9])).as_quat()
-    estimator._predict(kalman, prior, True)
+    estimator.predict(kalman, prior, True)
     return kalman
 
 
@@ -58,7 +58,7 @@ def test_covariance_goes_by_the_derivative_of_the_prediction(drag):
         numeric[6:9, column] = (errors[0] - errors[1]) / (2 * step)
     start = moving_filter()
     prior = Prior(drag_x=drag, drag_y=drag, drag_z=drag).pack()
-    linear = estimator._linearised(start.state, matrix_of(start.quaternion), start.sums, prior, 0.01, True)
+    linear = estimator.linearised(start.state, matrix_of(start.quaternion), start.sums, prior, 0.01, True)
     assert linear[0:6] == pytest.approx(numeric[0:6], abs=5e-4)  # it leaves out dt² × acceleration
     # The firmware turns the attitude's covariance by half the angle that the attitude turns by.
     half = np.eye(3) + (numeric[6:9, 6:9] - np.eye(3)) / 2
@@ -71,7 +71,7 @@ def test_a_measurement_is_fused_as_the_textbook_has_it():
     root = np.random.default_rng(3).normal(size=(9, 9))
     kalman.covariance[:] = 0.01 * root @ root.T
     before, state = kalman.covariance.copy(), kalman.state.copy()
-    estimator._fuse(kalman, 4, 0.2, 0.1)
+    estimator.fuse(kalman, 4, 0.2, 0.1)
     row = np.eye(9)[4]
     gain = before @ row / (row @ before @ row + 0.1**2)
     keep = np.eye(9) - np.outer(gain, row)

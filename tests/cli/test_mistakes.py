@@ -1,0 +1,144 @@
+"""Mistakes in files and commands end in one line with place and hint, the designed exit code, and nothing written.
+
+docs/mistakes.md shows the line of each; its computed numbers may round differently.
+"""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.texts import same_text
+
+PAGE = (Path(__file__).parents[2] / "docs" / "mistakes.md").read_text()
+LINE = "waypoints: [[0, 0, 1], [1, 0, 1]]\n"
+
+BAD_PATHS = {
+    "malformed YAML": ("waypoints: [[0, 0, 1], [1, 0, 1]\nyaw: fixed\n", 2),
+    "not a mapping": ("- 1\n- 2\n", 2),
+    "empty": ("", 2),
+    "an unknown key": (LINE + "waypoint: 3\n", 2),
+    "one waypoint": ("waypoints: [[0, 0, 1]]\n", 2),
+    "coincident waypoints": ("waypoints:\n  - [0, 0, 1]\n  - [1, 0, 1]\n  - [1, 0, 1]\n", 2),
+    "nearly coincident": ("waypoints:\n  - [0, 0, 1]\n  - [1, 0, 1]\n  - [1, 1.0e-6, 1]\n", 2),
+    "a NaN": ("waypoints:\n  - [0, 0, 1]\n  - [1, .nan, 1]\n", 2),
+    "two coordinates": ("waypoints: [[0, 0, 1], [1, 0]]\n", 2),
+    "words for numbers": ("waypoints: [[0, 0, one], [1, 0, 1]]\n", 2),
+    "a waypoint outside the space": ("waypoints: [[0, 0, 1], [3, 0, 1]]\n", 3),
+    "a waypoint within the margin": ("waypoints: [[0, 0, 1], [2.15, 0, 1]]\n", 3),
+    "a path that leaves between its waypoints": (
+        "waypoints: [[-2, 0, 1], [2.04, 3.7, 1], [2.04, -3.7, 1], [-2, 0, 1]]\n", 3),
+    "no such file of points": ("points: nowhere.csv\n", 2),
+    "millimetres": ("waypoints: [[0, -1500, 1000], [300, 1500, 1000]]\n", 3),
+    "a path under the floor": ("waypoints: [[0, 0, 1], [1, 0, -0.1]]\n", 3),
+    "a yaw without its mode": (LINE + "yaw: 90\n", 2),
+    "a speed that is no share": (LINE + "speed: 2\n", 2),
+    "a speed in m/s": (LINE + "speed: 1.5 m/s\n", 2),
+    "a negative speed": (LINE + "speed: -0.5\n", 2),
+}  # fmt: skip
+
+BAD_SAFETY = {
+    "a negative limit": (r"^  speed: 2.0", "  speed: -2.0", 2),
+    "a zero limit": (r"^  acceleration: 5.0", "  acceleration: 0", 2),
+    "an unknown key": (r"^  tilt_deg: 30", "  tilt: 30", 2),
+    "a tilt in radians": (r"^  tilt_deg: 30", "  tilt_deg: 0.52", 2),
+    "an unknown vehicle": (r"^vehicle: \S+", "vehicle: crazyflie-9", 2),
+    "limits under which it cannot hover": (r"^  motor_reserve: 0.2", "  motor_reserve: 0.45", 2),
+    "a battery too small for the path": (r"^  endurance: 240", "  endurance: 9", 3),
+}
+
+COMMANDS = {
+    "a path file that is not there": ("plan", "no.yaml"),
+    "a mistyped command": ("fyl", "path.yaml"),
+    "a mistyped option": ("plan", "path.yaml", "--sped", "0.5"),
+    "a mistyped planner": ("plan", "path.yaml", "--planner", "exprt"),
+    "no path at all": ("plan",),
+    "an example that is not there": ("plan", "--example", "figure9"),
+    "hardware without motion capture": ("fly", "path.yaml", "--uri", "radio://0/80/2M/E7E7E7E7E7"),
+    "an address of no kind": ("fly", "path.yaml", "--uri", "tcp://somewhere"),
+    "another body than the virtual one": ("fly", "path.yaml", "--mocap", "vicon://lab/cf2"),
+    "a plan that is no Parquet file": ("plan", "path.yaml", "-o", "line.csv"),
+    "a folder that is no record": ("replay", "."),
+    "a picture that is no PNG": ("replay", ".", "--png", "flight.jpg"),
+    "a folder of records, to be checked": ("check", "."),
+    "speed in m/s on the command line": ("plan", "path.yaml", "--speed", "2"),
+}
+
+BESIDE = re.compile(r"… [^:]+, \d+ s( \(.*\))?|Usage: .*|Try .*|")  # waiting on a slow computer; how to use a command
+
+
+@pytest.fixture
+def folder(path_file, safety_file, tmp_path, monkeypatch):
+    """A folder with a path and limits, to work in."""
+    path_file(LINE)
+    safety_file()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def error_of(ended, code):
+    """The error, one line, of a command that ended with this code."""
+    assert ended.code == code, ended.err
+    (error,) = [line for line in ended.err.splitlines() if not BESIDE.fullmatch(line)]
+    assert error.lower().startswith("error: ")
+    return error
+
+
+def check_as_on_page(mistake, folder, error):
+    on_page = re.search(rf"^\| {re.escape(mistake)} \| (?:`` (.*) ``|`(.*)`) \|$", PAGE, re.MULTILINE)
+    assert on_page, f"the page does not have {mistake!r}"
+    assert same_text(re.sub(r"\S*/(?=(?:path|safety)\.yaml)", "", error), on_page[1] or on_page[2]), error
+    assert {file.name for file in folder.iterdir()} == {"path.yaml", "safety.yaml"}
+
+
+@pytest.mark.parametrize("mistake", BAD_PATHS)
+def test_a_mistake_in_a_path_file(cfplan, folder, path_file, mistake):
+    text, code = BAD_PATHS[mistake]
+    path_file(text)
+    check_as_on_page(mistake, folder, error_of(cfplan("check", "path.yaml"), code))
+
+
+@pytest.mark.parametrize("mistake", BAD_SAFETY)
+def test_a_mistake_in_safety_yaml(cfplan, folder, safety_file, mistake):
+    pattern, replacement, code = BAD_SAFETY[mistake]
+    safety_file((pattern, replacement))
+    check_as_on_page(f"{mistake}, in safety.yaml", folder, error_of(cfplan("check", "path.yaml"), code))
+
+
+@pytest.mark.parametrize("mistake", COMMANDS)
+def test_a_mistake_on_the_command_line(cfplan, folder, mistake):
+    check_as_on_page(mistake, folder, error_of(cfplan(*COMMANDS[mistake]), 2))
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["fly", "path.yaml", "--records", "/proc/records"], ["/proc/records", "--records"]),
+        (["plan", "path.yaml", "-o", "no/such/line.parquet"], ["no/such", "make it first"]),
+        (["plan", "path.yaml", "-o", "safety.yaml.parquet"], ["safety.yaml.parquet", "--force"]),
+    ],
+)
+def test_what_would_fail_at_the_end_is_refused_before_anything_is_planned(cfplan, folder, words, parts):
+    kept = folder / "safety.yaml.parquet"
+    kept.write_text("precious")
+    ended = cfplan(*words)
+    error = error_of(ended, 2)
+    assert ended.out == ""
+    assert all(part in error for part in parts), error
+    assert kept.read_text() == "precious"
+    assert {file.name for file in folder.iterdir()} == {"path.yaml", "safety.yaml", kept.name}
+
+
+def test_a_missing_safety_file_is_named(cfplan, folder):
+    (folder / "safety.yaml").unlink()
+    error = error_of(cfplan("plan", "path.yaml"), 2)
+    assert "safety.yaml" in error
+    assert "--safety" in error
+
+
+def test_an_error_is_a_document_where_json_is_asked_for(cfplan, folder, path_file):
+    path_file("waypoints: [[0, 0, 1]]\n")
+    ended = cfplan("check", "path.yaml", "--json")
+    assert ended.code == ended.json["exit_code"] == 2
+    assert ended.json["error"]
+    assert ended.json["where"].endswith("path.yaml:1:12")
