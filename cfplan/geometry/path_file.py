@@ -29,6 +29,7 @@ from cfplan.geometry.polynomial_csv import read_polynomials
 from cfplan.geometry.timed_samples import timed_samples
 from cfplan.geometry.yaw import YawMode
 
+_LEAST_SAMPLED = 4  # points that a smooth path with free ends needs
 _DENSE = 8  # points: fewer are waypoints with room between them to gather speed
 _MAX_POINTS = 50_000  # over all laps
 _POINTS_HINT = "give x, y, z in metres, as [[0, 0, 1], [1, 0, 1]]"
@@ -223,6 +224,12 @@ def _from_samples(content: _Content, places: Places) -> tuple[Any, ...]:
     motion = timed_samples(rows, lines, str(file))
     points = _repeated(motion.points(), content.laps, places)
     check_points(points, MIN_DENSE_SPACING, lambda _: str(file))
+    if len(points) < _LEAST_SAMPLED:
+        raise InputError(
+            f"the motion is too short for a smooth path: it leaves {len(points)} points, not {_LEAST_SAMPLED}",
+            where=str(file),
+            hint="give a longer motion, or list waypoints",
+        )
     path = smooth_through(points)
     return path, points, *motion.losses(path)
 

@@ -73,6 +73,7 @@ def test_the_rate_does_not_matter(load):
         (lambda rows: rows * [1.0, 1000.0, 1000.0, 1000.0], "the motion jumps"),
         (lambda rows: rows * [1.0, 0.001, 0.001, 0.001], "stays within"),
         (lambda rows: rows[:1], "two samples"),
+        (lambda rows: np.array([[0.0, 1.0, 0.0, 1.0], [0.1, 0.995, 0.1, 1.0]]), r"csv: .* too short for a smooth path"),
         (lambda rows: rows + 5.0 * (np.arange(len(rows)) == 77)[:, None] * [0, 1, 0, 0], "jumps by"),
         (lambda rows: rows[:, :3], "3 numbers, not 4"),
     ],
