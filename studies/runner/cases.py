@@ -10,6 +10,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import partial
 from itertools import takewhile
@@ -59,7 +60,7 @@ def run_study(name: str, module: str, study: Study, settings: Any, effort: Effor
 
 
 def _measured(name: str, module: str, settings: Any, work: Work, effort: Effort) -> tuple[list[Any], bool, float]:
-    """Return the rows in the order of the cases, whether there was an interrupt, and the processor's seconds."""
+    """Return the rows in the order of the cases, whether some were not measured, and the processor's seconds."""
     file = None if effort.output is None else unfinished_file(effort.output)
     header = {
         "study": name, "settings": plain(asdict(settings)), "files": _digests(settings),
@@ -68,21 +69,18 @@ def _measured(name: str, module: str, settings: Any, work: Work, effort: Effort)
     }  # fmt: skip
     kept = {} if file is None else _resume(file, header, effort.say)
     done = {case: kept[case] for case in work.cases if case in kept}
-    show, until, interrupted = effort.progress(name), time.monotonic() + 60.0 * effort.minutes, False
+    show, until = effort.progress(name), time.monotonic() + 60.0 * effort.minutes
     show(len(done), len(work.cases))
     left = takewhile(lambda _: time.monotonic() < until, (case for case in work.cases.items() if case[0] not in done))
-    try:
-        with pool(effort.workers, effort.scheduler) as measure:
-            for each in measure(partial(_timed, work.measure), left):
-                done[each.name] = each
-                if file is not None:
-                    _append(file, each._asdict())
-                show(len(done), len(work.cases))
-    except KeyboardInterrupt:
-        interrupted = True
+    with suppress(KeyboardInterrupt), pool(effort.workers, effort.scheduler) as measure:
+        for each in measure(partial(_timed, work.measure), left):
+            done[each.name] = each
+            if file is not None:
+                _append(file, each._asdict())
+            show(len(done), len(work.cases))
     found = [done[case] for case in work.cases if case in done]
     rows = [work.row(**row) for each in found for row in each.rows]
-    return rows, interrupted, sum(each.seconds for each in found)
+    return rows, len(found) < len(work.cases), sum(each.seconds for each in found)
 
 
 def _digests(settings: Any) -> dict[str, str]:

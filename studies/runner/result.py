@@ -144,7 +144,7 @@ class StudyResult:
     settings: Mapping[str, Any]  # what the run was asked for
     tables: tuple[Table, ...]
     rows: Sequence[Any] = ()  # what was measured case by case; not in the JSON
-    interrupted: bool = False  # by the user: holds what was measured until then
+    interrupted: bool = False  # by the user or for lack of time: holds what was measured until then
     seconds: float = 0.0  # of the processor, to measure the cases
     provenance: Provenance | None = None
 

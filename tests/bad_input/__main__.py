@@ -1,6 +1,6 @@
 """Draw many wrong inputs of every kind: `python -m tests.bad_input --inputs 100000 [--only plans]`.
 
-An input that fails is left in the test's folder; hypothesis keeps its numbers in .hypothesis and begins with it next.
+An input that fails is left in the folder that the failure names.
 """
 
 import argparse

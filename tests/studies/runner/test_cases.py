@@ -92,7 +92,7 @@ def test_rows_come_in_the_order_of_the_cases_and_are_as_they_were(workers):
 def test_after_an_interrupt_only_what_was_not_done_is_measured(log, tmp_path):
     out = tmp_path / "r.json"
     first = run_study("squares", MODULE, STUDY, Settings(log=str(log)), Effort(minutes=0.0, output=out))
-    assert first.rows == []
+    assert (first.rows, first.interrupted) == ([], True)
     stopping = Study(Settings, lambda s, run: Work(work(s, run).cases, partial(squared, Settings(log=s.log, stop_at=2)),
                                                    Square), tables, "")  # fmt: skip
     stopped = run_study("squares", MODULE, stopping, Settings(log=str(log)), Effort(output=out))
