@@ -356,7 +356,8 @@ def _first_bag(folder: Path) -> list[Sound]:
     with Ros1Writer(folder / "first.bag") as writer:
         topic = writer.add_connection("/cf1/pose", kind, typestore=types)
         for i in range(logs.COUNT):
-            raw = types.serialize_ros1(logs.MESSAGES[kind][1](types.types, i), kind)
+            *header, pose = logs.MESSAGES[kind][1](i)
+            raw = struct.pack("<3II5s", i, *header[:2], 5, b"world") + np.asarray(pose, "<f8").tobytes()
             writer.write(topic, round((logs.START + logs.TIMES[i]) * 1e9), raw)
     return [{"bag": (folder / "first.bag").read_bytes()}]
 

@@ -21,7 +21,7 @@ from tests.bad_input.files import FILES, MADE, REPOSITORY, taken
 from tests.bad_input.packets import PACKETS
 
 INPUTS = FILES | PACKETS
-EXAMPLES = int(os.environ.get("BAD_INPUTS", "1500")) / sum(kind.fraction for kind in INPUTS.values())
+EXAMPLES = int(os.environ.get("BAD_INPUTS", "600")) / sum(kind.fraction for kind in INPUTS.values())
 PLANNED = ("paths", "points", "polynomials", "samples", "safety", "airframes")  # what is read well may be infeasible
 _PROCESSOR_TIME = 10.0  # s for one input; others may have the processor meanwhile
 _MOST_MEMORY = 1_000_000  # kB for one input
