@@ -357,7 +357,7 @@ def _first_bag(folder: Path) -> list[Sound]:
         topic = writer.add_connection("/cf1/pose", kind, typestore=types)
         for i in range(logs.COUNT):
             *header, pose = logs.MESSAGES[kind][1](i)
-            raw = struct.pack("<3II5s", i, *header[:2], 5, b"world") + np.asarray(pose, "<f8").tobytes()
+            raw = struct.pack("<2II5s", *header[:2], 5, b"world") + np.asarray(pose, "<f8").tobytes()
             writer.write(topic, round((logs.START + logs.TIMES[i]) * 1e9), raw)
     return [{"bag": (folder / "first.bag").read_bytes()}]
 
