@@ -25,6 +25,7 @@ from cfplan.errors import CfplanError, NotCertifiedError
 from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
+from cfplan.learning.model_files import find_model
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import default_budget, plan
@@ -49,6 +50,7 @@ from studies.runner.study import Run, Study, Work
 
 LENGTHS = (20.0, 40.0, 100.0, 200.0, 400.0, 1000.0, 2000.0)  # m, 1 to 100 times the mean of the paper's paths
 EXPERT, TOPPQUAD = "expert", "toppquad"
+FLOWN = ("learned", EXPERT)  # whose setpoints are encoded and rehearsed
 REFINED = ("learned", "convex")  # whose profiles are proposals, refined to the optimum
 LOST = 1.0  # m from its place: a dry run that gets there has failed
 PATIENCE = 5.0  # budgets after which a path counts as hanging
@@ -262,7 +264,8 @@ def measure(settings: Settings, named: tuple[Any, int]) -> list[Trial]:
     except CfplanError as error:
         return [Trial(str(group), seed, name, np.nan, 0, Answer.REFUSED, str(error)) for name in settings.planners]
     order = settings.planners[:: -1 if seed % 2 else 1]
-    trials = [replace(_trial(name, case), bound=bound) for name in order]
+    planned = [_trial(name, case) for name in order]  # all before any is rehearsed, which empties the caches
+    trials = [replace(_rehearsed(trial, trajectory, case.chosen), bound=bound) for trial, trajectory in planned]
     reference = {trial.planner: trial for trial in trials}
     if EXPERT in reference:
         best = reference[EXPERT]
@@ -289,19 +292,20 @@ def _case(settings: Settings, group: Any, seed: int) -> Case:
     return Case(label, seed, random_path(seed, box), chosen, settings.nodes, settings.yaw)
 
 
-def _trial(name: str, case: Case) -> Trial:
-    """Plan, repair, certify, encode and rehearse. What fails is a trial with its reason."""
+def _trial(name: str, case: Case) -> tuple[Trial, Trajectory | None]:
+    """Plan, repair and certify; return the certified flight too. A failure is a trial with its reason."""
     _warm_up(name, case.chosen.name)
-    trial = Trial(case.group, case.seed, name, case.path.length, case.nodes)
+    find_model(case.chosen.airframe, case.chosen.limits)  # read once for these limits
+    trial, trajectory = Trial(case.group, case.seed, name, case.path.length, case.nodes), None
     before = _memory_begins()
     try:
-        trial = _planned(trial, case)
+        trial, trajectory = _planned(trial, case)
     except CfplanError as error:
         trial = replace(trial, answer=Answer.REFUSED if error.hint else Answer.FAILED, reason=str(error))
-    return replace(trial, memory=process_memory("VmHWM") - before)
+    return replace(trial, memory=process_memory("VmHWM") - before), trajectory
 
 
-def _planned(trial: Trial, case: Case) -> Trial:
+def _planned(trial: Trial, case: Case) -> tuple[Trial, Trajectory | None]:
     airframe, limits = case.chosen.airframe, case.chosen.limits
     begun = time.process_time()
     task = PlanningTask(case.path, airframe, limits, case.nodes, case.yaw, case.yaw_angle)
@@ -309,7 +313,7 @@ def _planned(trial: Trial, case: Case) -> Trial:
     seconds, solving = time.process_time() - begun, float(solution.stats.get("solve_seconds", np.nan))
     trial = replace(trial, plan_seconds=seconds, solve_seconds=solving)
     if solution.profile is None:
-        return replace(trial, answer=Answer.REFUSED, reason=solution.reason or str(solution.status))
+        return replace(trial, answer=Answer.REFUSED, reason=solution.reason or str(solution.status)), None
     finish = refine if trial.planner in REFINED else repair if trial.planner == EXPERT else slow
     begun = time.process_time()
     found = finish(task, solution.profile)
@@ -320,10 +324,13 @@ def _planned(trial: Trial, case: Case) -> Trial:
         worst_usage=certify(raw, limits).worst.share, planned_time=raw.duration,
         certified_time=found.trajectory.duration, speed_factor=found.speed_factor,
     )  # fmt: skip
-    return _rehearsed(trial, found.trajectory, case.chosen) if trial.planner in (EXPERT, "learned") else trial
+    return trial, found.trajectory
 
 
-def _rehearsed(trial: Trial, trajectory: Trajectory, chosen: LimitSet) -> Trial:
+def _rehearsed(trial: Trial, trajectory: Trajectory | None, chosen: LimitSet) -> Trial:
+    """Encode and rehearse the flights of the planners that cfplan flies by."""
+    if trajectory is None or trial.planner not in FLOWN:
+        return trial
     begun = time.process_time()
     try:
         encoded = encode_trajectory(trajectory)
