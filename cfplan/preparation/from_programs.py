@@ -17,9 +17,9 @@ from cfplan.simulation.dry_run import DryRun
 
 
 def load_path(source: Path | str | ArrayLike) -> PathFile:
-    """Return the path of a path file, or through points, (K, 3) m, at yaw 0: from 8 points on they are samples of it.
+    """Return the path of a path file, or through points, (K, 3) m, at yaw 0: 8 points or more are samples of a curve.
 
-    Raises InputError, with place and hint, where there is no such file, it has a mistake, or the points are none.
+    Raises InputError, with place and hint, if the file does not exist or has a mistake, or the points are not such.
     """
     return path_file.load_path_file(source) if isinstance(source, Path | str) else path_file.path_through(source)
 
@@ -40,7 +40,7 @@ def plan(
         limits: from load_limits, or a safety.yaml.
         planner: "auto", "learned", "expert", "convex", …; docs/planning.md has them.
         speed_factor: of the speed that the limits allow, above 0 and at most 1; None takes the path's own.
-        budget: s that planning may take, and giving way as much again; None chooses it by the path's length.
+        budget: s that planning and giving way may take together; None chooses it by the path's length.
         on_step: hears of the steps of planning.
 
     Raises:
@@ -61,7 +61,7 @@ def plan(
 
 
 def rehearse(plan: PlannedFlight, *, on_step: OnStep = ignore_steps) -> DryRun:
-    """Fly the plan's very setpoints in the simulator, as the dry run of `cfplan fly`; `.deviation` is the worst, m.
+    """Fly the plan's own setpoints in the simulator, as `cfplan fly` does in its dry run; `.deviation` is the worst, m.
 
     Raises NotCertifiedError where the certificate, the setpoints or the dry run do not pass.
     """

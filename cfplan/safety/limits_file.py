@@ -231,7 +231,7 @@ def _filled(content: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]
 
 
 def load_limits(file: Path | str) -> Limits:
-    """Read safety.yaml, strictly validated, and find its vehicle. What it leaves out is as in DEFAULTS.
+    """Read safety.yaml, strictly validated, and find its vehicle. Keys that it leaves out have their default.
 
     Raises:
         InputError: unknown keys, limits that are not positive, that contradict each other, that make hovering

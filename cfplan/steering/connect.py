@@ -34,7 +34,7 @@ def connect(
     on_record: Callable[[SteeringRecord], None] = lambda _: None,
     more_orders: Callable[[], Iterable[Order]] = tuple,
 ) -> SteeredVehicle:
-    """Connect to a vehicle and return it, on the ground; use it in a `with` block, behind which it has landed.
+    """Connect to a vehicle and return it, on the ground; use it in a `with` block, at whose end it lands.
 
     Args:
         uri: the vehicle, as radio://0/80/2M/E7E7E7E7E7; sim://0 is the virtual Crazyflie.
@@ -48,7 +48,7 @@ def connect(
         on_record: is given the record when it begins, so that others may listen.
         more_orders: returns orders to the pilot since its last call, as of a ground station; must not wait.
 
-    Raises a CfplanError, with place and hint, where an argument is wrong, or vehicle, radio or poses cannot be had.
+    Raises a CfplanError, with place and hint, if an argument is wrong, or no vehicle, radio or poses are found.
     """
     check_uris(uri, mocap)
     if stepped and (not uri.startswith(SIMULATED) or mocap is not None):

@@ -45,10 +45,10 @@ _FLYING = (Phase.STREAM, Phase.HOLD)
 
 
 class SteeredVehicle:
-    """One flight of a vehicle; a context manager, behind which the vehicle is landed and disarmed.
+    """One flight of a vehicle; a context manager that lands and disarms the vehicle at its end.
 
-    `cfplan.connect` makes it. Its methods raise a FlightEndedError once the flight has ended otherwise than by `land`:
-    by the operator's keys, by a safety rule, or as the link was lost; the error says which.
+    `cfplan.connect` makes it. Its methods raise a FlightEndedError once the flight has ended by anything but `land`:
+    by the operator's keys, by a safety rule, or because the link was lost; the error says which.
     """
 
     def __init__(
