@@ -25,6 +25,7 @@ SMALL = {  # of a command, by its beginning: what is appended
     "cfplan dataset make": "--count 120 --workers 1",
     "cfplan dataset info": "",
     "cfplan train": "--epochs 1 --hidden 4 --layers 1 --batch 8",
+    "python -m studies paper": "--quick",
     "python -m studies": "",
 }
 DATASET = "cfplan dataset make datasets/any --count 50000 --seed 1 --workers 2"  # which others read
@@ -36,7 +37,7 @@ SMALL_STUDIES = {
     "exports": LINE,
     "faults": f"{LINE} --only radio",
     "flights": f"{LINE} --repeats 1",
-    "giving-way": f"{LINE} --paths 1",
+    "giving-way": f"{LINE} --random 1",
     "hardware": QUICK,
     "horizon": "--paths 1 --waypoints 5",
     "identification": "flights/identify.yaml flights/figure8.yaml --vehicles 1",
