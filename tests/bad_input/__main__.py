@@ -1,6 +1,6 @@
 """Draw many wrong inputs of every kind: `python -m tests.bad_input --inputs 100000 [--only plans]`.
 
-An input that fails is left in the test's folder; hypothesis keeps its numbers in .hypothesis and begins with it next.
+A failing input is left in the test's folder; hypothesis stores it in .hypothesis and tries it first in the next run.
 """
 
 import argparse
@@ -12,7 +12,7 @@ import pytest
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Draw many wrong inputs of every kind.")
-    parser.add_argument("--inputs", type=int, default=2000, help="of all kinds together")
+    parser.add_argument("--inputs", type=int, default=2000, help="number of inputs, all kinds together")
     parser.add_argument("--only", default="", help="part of the name of a kind")
     given = parser.parse_args()
     os.environ["BAD_INPUTS"] = str(given.inputs)
