@@ -1,6 +1,6 @@
 """Export each PATH for the vehicle's memory, fly it on board, and compare deviations with those of streaming the plan.
 
-Exports are flown in the dry run; the pilot flies them on board in the stepped lab's virtual Crazyflie.
+Exports are flown in the dry run; the pilot flies on-board plans on the stepped lab's virtual Crazyflie.
 """
 
 import math

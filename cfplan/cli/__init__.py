@@ -30,7 +30,7 @@ EPILOG = """\b
 Examples:
   cfplan init --room 4x6x2.5               write a safety.yaml and a first path for this room
   cfplan fly flights/figure8.yaml          fly the virtual Crazyflie
-  cfplan check flights/circle.yaml         is the plan within every limit?
+  cfplan check flights/circle.yaml         check the plan against every limit
   cfplan replay records/<flight>           look at a flight in rerun
 
 \b

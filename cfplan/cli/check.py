@@ -13,7 +13,7 @@ from cfplan.preparation.compiled_calls import Stage
 
 
 @click.command(
-    short_help="The certificate of a path, of a plan or of a record.",
+    short_help="Certify a path, a plan or a record.",
     epilog="""\b
 Examples:
   cfplan check flights/circle.yaml

@@ -85,6 +85,6 @@ def _check(form: str, output: Path, force: bool, pieces: int | None) -> None:
     if pieces is not None and form != "crazyswarm" and pieces > 31:
         raise InputError("a vehicle's memory holds 31 pieces", where="--pieces", hint="use --to compressed")
     if output.exists() and not force:
-        raise InputError("there is a file already", where=str(output), hint="give --force to overwrite it")
+        raise InputError("the file already exists", where=str(output), hint="give --force to overwrite it")
     if not output.absolute().parent.is_dir():
         raise InputError("no such folder", where=str(output.parent), hint="make it first")

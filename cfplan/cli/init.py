@@ -48,7 +48,7 @@ def init(folder: Path, room: str, vehicle: str, mass: float | None, as_json: boo
     }
     for name in texts:
         if (folder / name).exists():
-            raise InputError("there is such a file already", where=str(folder / name), hint="name another folder")
+            raise InputError("the file already exists", where=str(folder / name), hint="name another folder")
     with steps.step("write") as results:
         _write(folder, texts)
         load_limits(folder / options.SAFETY_FILE)
@@ -63,7 +63,7 @@ def _sides(text: str) -> tuple[float, float, float]:
         x, y, z = (float(side) for side in text.lower().split("x"))
     except ValueError:
         raise InputError(
-            f"{text!r} is no room", where="--room", hint=f"write length x width x height, as {_ROOM}"
+            f"{text!r} is not a room size", where="--room", hint=f"write length x width x height, as {_ROOM}"
         ) from None
     if not (min(x, y) >= _LEAST_SIDE and max(x, y) <= _MOST_SIDE and _LEAST_HEIGHT <= z <= _MOST_HEIGHT):
         raise InputError(
@@ -86,7 +86,7 @@ def _airframe(vehicle: str, mass: float | None) -> str | None:
         return None
     if not 0.5 * known.mass <= mass <= 2.0 * known.mass:
         raise InputError(
-            f"{mass:g} kg is not the mass of a {vehicle}, some {known.mass:g} kg",
+            f"{mass:g} kg is implausible for a {vehicle} of about {known.mass:g} kg",
             where="--mass",
             hint="weigh it with battery and markers, and write kilograms",
         )
@@ -127,7 +127,7 @@ waypoints:            # m, in the frame of motion capture: x, y, height
   - [{-a}, 0, {high}]
   - [0, {-b}, {low}]
 yaw: fixed            # or tangent, free, or {{mode: fixed, angle_deg: 90}}
-speed: 0.5            # share of the speed that safety.yaml allows
+speed: 0.5            # factor on the speed that safety.yaml allows
 """
 
 

@@ -152,9 +152,9 @@ def check_place(uri: str, given: Path | None, records: Path) -> None:
     """Raise InputError if an example would fly hardware without --safety, or if no record could be written."""
     if _EXAMPLE in click.get_current_context().meta and not uri.startswith("sim://") and given is None:
         raise InputError(
-            "an example flies a vehicle of yours only in a room of yours",
+            "an example flies hardware only with an explicit safety.yaml",
             where=uri,
-            hint="name your safety.yaml with --safety; `cfplan init` writes one",
+            hint="name that of your room with --safety; `cfplan init` writes one",
         )
     _check_records_folder(records)
 

@@ -13,7 +13,8 @@ from cfplan.preparation.compiled_calls import Stage
 
 
 @click.command(
-    short_help="Plan a certified trajectory.", epilog="Example: cfplan plan flights/circle.yaml -o circle.parquet"
+    short_help="Plan a certified trajectory for a path.",
+    epilog="Example: cfplan plan flights/circle.yaml -o circle.parquet",
 )
 @options.path_file
 @options.planning
@@ -80,6 +81,6 @@ def _check_files(output: Path | None, figure: Path | None, force: bool) -> None:
             hint=f"name it {output.with_suffix(PLAN_SUFFIX).name}",
         )
     if output.exists() and not force:
-        raise InputError("there is a file already", where=str(output), hint="give --force to overwrite it")
+        raise InputError("the file already exists", where=str(output), hint="give --force to overwrite it")
     if not output.absolute().parent.is_dir():
         raise InputError("no such folder", where=str(output.parent), hint="make it first")
